@@ -1,0 +1,91 @@
+"""What one sample of the box motion asks of the two contacts, as one CasADi function.
+
+Joins rotation, force allocation and centre of pressure (paper Section 4.4).
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from symbolic.contact_forces import allocate, required_force
+from symbolic.pressure import pressure_shift, required_moment
+from symbolic.rotation import angular_acceleration, angular_velocity, rotation_matrix
+from symbolic.workcell import Workcell
+
+LOAD_OUTPUTS = (
+    "angular_velocity",
+    "angular_acceleration",
+    "normal_force",
+    "tangential_force",
+    "contact_force",
+    "pressure_shift",
+    "shift_vector",
+    "required_moment",
+    "point_moment_residual",
+    "moment_residual",
+    "wrench_1",
+    "wrench_2",
+)
+"""Outputs of `load_function`, in order.
+
+angular_velocity, angular_acceleration (3,): world frame [rad/s, rad/s^2]. normal_force,
+tangential_force (2,) [N]. contact_force (6,): forces of robots 1 and 2 on the box, world [N].
+pressure_shift (2,): lengths of the shifts [m]; shift_vector (6,): both shifts, world [m].
+required_moment, point_moment_residual, moment_residual (3,): about the centre of mass, world
+[N m]. wrench_1, wrench_2 (6,): force and moment that each robot exerts on the box, about the
+nominal contact point, world axes [N, N m].
+"""
+
+
+def load_function(workcell: Workcell) -> ca.Function:
+    """Contact forces and centres of pressure from a box pose and its time derivatives.
+
+    Inputs: pose, rate, second_rate (6,) as in `symbolic.time_law.TimedPath`.
+    Outputs: see `LOAD_OUTPUTS`.
+    """
+    pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
+    payload, contacts = workcell.payload, workcell.contacts
+    rotation = rotation_matrix(pose[3:])
+    omega = angular_velocity(pose[3:], rate[3:])
+    alpha = angular_acceleration(pose[3:], rate[3:], second[3:])
+
+    offset = ca.mtimes(rotation, ca.DM(payload.centre_of_mass))
+    acceleration = second[:3] + ca.cross(alpha, offset) + ca.cross(omega, ca.cross(omega, offset))
+    force = required_force(payload.mass, acceleration)
+    normal = ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, 2]))
+    forces = allocate(force, normal, (contacts[0].friction, contacts[1].friction))
+
+    moment = required_moment(ca.SX(ca.DM(payload.inertia)), rotation, omega, alpha)
+    arms = tuple(
+        ca.mtimes(rotation, ca.DM(c.T_box_pad[:3, 3] - payload.centre_of_mass)) for c in contacts
+    )
+    tangents = tuple(ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, k])) for k in (0, 1))
+    shift = pressure_shift(
+        moment, (arms[0], arms[1]), (forces.force_1, forces.force_2), (tangents[0], tangents[1])
+    )
+    outputs = {
+        "angular_velocity": omega,
+        "angular_acceleration": alpha,
+        "normal_force": forces.normal,
+        "tangential_force": forces.tangential,
+        "contact_force": ca.vertcat(forces.force_1, forces.force_2),
+        "pressure_shift": ca.vertcat(_length(shift.shift_1), _length(shift.shift_2)),
+        "shift_vector": ca.vertcat(shift.shift_1, shift.shift_2),
+        "required_moment": shift.required_moment,
+        "point_moment_residual": shift.point_residual,
+        "moment_residual": shift.residual,
+        "wrench_1": ca.vertcat(forces.force_1, ca.cross(shift.shift_1, forces.force_1)),
+        "wrench_2": ca.vertcat(forces.force_2, ca.cross(shift.shift_2, forces.force_2)),
+    }
+    return ca.Function(
+        "load",
+        [pose, rate, second],
+        [ca.densify(outputs[name]) for name in LOAD_OUTPUTS],
+        ["pose", "rate", "second_rate"],
+        list(LOAD_OUTPUTS),
+    )
+
+
+def _length(vector: ca.SX) -> ca.SX:
+    """Length with a finite derivative at zero; 1e-12 m is far below any patch."""
+    return ca.sqrt(ca.sumsqr(vector) + 1e-24)
