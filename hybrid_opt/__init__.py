@@ -1,0 +1,1 @@
+"""Collision checking, the optimisation problem, the searches, their metrics, polish and timing."""

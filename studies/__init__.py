@@ -1,0 +1,1 @@
+"""Programs to run: `python -m studies.rack` and its siblings, with the cells they need."""

@@ -93,10 +93,16 @@ def _extension() -> ModuleType:
         ) from error
     require_same_minor(
         {"pinocchio": extension.PINOCCHIO_VERSION, "casadi": extension.CASADI_VERSION},
-        {"pinocchio": pinocchio.__version__, "casadi": casadi.__version__},
+        {"pinocchio": pinocchio.__version__, "casadi": casadi.CasadiMeta.version()},
     )
     return extension
 
 
 def _function(serialised: str) -> casadi.Function:
-    return casadi.Function.deserialize(serialised)
+    """The function, with the terms shared that Pinocchio's algorithms compute twice."""
+    function = casadi.Function.deserialize(serialised)
+    inputs = function.sx_in()
+    outputs = casadi.cse(function.call(inputs))
+    return casadi.Function(
+        function.name(), inputs, outputs, function.name_in(), function.name_out()
+    )
