@@ -6,17 +6,16 @@ that NumPy sees (n_samples, dim).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 
 from symbolic.arm import REACH_TOLERANCE, TRACK_OUTPUTS, track_function
+from symbolic.cell_model import CellModel
+from symbolic.contact_forces import GRAVITY
 from symbolic.path import sample_basis, waypoint_matrix
 from symbolic.payload_load import LOAD_OUTPUTS, load_function
-from symbolic.robot_model import RobotModel
 from symbolic.time_law import timed_path
-from symbolic.workcell import Array, Workcell
+from symbolic.workcell import Workcell
 
 CONSTRAINTS = (
     "reach_1",
@@ -40,21 +39,6 @@ Limits and singularity of a lost arm are unknown and count as satisfied; its los
 
 FRICTION_TOLERANCE = 1e-9
 """Rounding allowed in a tight friction cone, as a share of the payload's weight."""
-
-
-@dataclass(frozen=True)
-class CellModel:
-    """A workcell with its robots' models and the chosen start posture.
-
-    Attributes:
-        workcell: the description.
-        robots: the models of the two arms.
-        start: joint positions (6,) of each arm at the first waypoint [rad].
-    """
-
-    workcell: Workcell
-    robots: tuple[RobotModel, RobotModel]
-    start: tuple[Array, Array]
 
 
 def candidate_function(model: CellModel) -> ca.Function:
@@ -127,7 +111,7 @@ def _constraint_function(workcell: Workcell) -> ca.Function:
     """Constraint values (9,) of one sample from the named outputs."""
     sizes = {"normal_force": 2, "tangential_force": 2, "pressure_shift": 2}
     inputs = {name: ca.SX.sym(name, sizes.get(name, 1)) for name in _CONSTRAINT_INPUTS}
-    weight = workcell.payload.mass * 9.81
+    weight = -workcell.payload.mass * GRAVITY[2]
     values: dict[str, ca.SX] = {}
     cones = []
     for i in (0, 1):

@@ -1,0 +1,61 @@
+"""A workcell together with its robots' models and the postures it starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from symbolic.branches import StartBranch, start_branches
+from symbolic.errors import WorkcellError
+from symbolic.robot_model import RobotModel, build_robot_model
+from symbolic.workcell import Array, Workcell
+
+
+@dataclass(frozen=True)
+class CellModel:
+    """Everything that the symbolic model of a cell is built from.
+
+    Attributes:
+        workcell: the description.
+        robots: the models of the two arms.
+        branches: per arm every branch at the start, best first.
+        start: (6,) joint positions of each arm at the first waypoint [rad].
+    """
+
+    workcell: Workcell
+    robots: tuple[RobotModel, RobotModel]
+    branches: tuple[tuple[StartBranch, ...], tuple[StartBranch, ...]]
+    start: tuple[Array, Array]
+
+
+def build_cell_model(workcell: Workcell) -> CellModel:
+    """Read the robots, list all start branches and choose one per arm.
+
+    The workcell's `start_branch` picks from the ranked branches; -1 stands for the best.
+
+    Raises:
+        RobotModelError: a URDF does not give a six-joint arm.
+        WorkcellError: an arm cannot reach the start, or a chosen branch does not exist.
+    """
+    robots = (build_robot_model(workcell.robots[0]), build_robot_model(workcell.robots[1]))
+    branches = (start_branches(workcell, 0, robots[0]), start_branches(workcell, 1, robots[1]))
+    problems = []
+    for i, found in enumerate(branches):
+        name, wanted = workcell.robots[i].name, workcell.start_branch[i]
+        if not found:
+            problems.append(
+                f"task.start: robot {name!r} has no posture within its joint limits that holds "
+                "its contact there; move the start, the contact or the robot's base"
+            )
+        elif wanted >= len(found):
+            problems.append(
+                f"robots[{i}].start_branch: {wanted}; robot {name!r} has branches 0 to "
+                f"{len(found) - 1} at the start"
+            )
+    if problems:
+        raise WorkcellError(str(workcell.source), tuple(problems))
+    first, second = (
+        np.array(found[max(workcell.start_branch[i], 0)].q) for i, found in enumerate(branches)
+    )
+    return CellModel(workcell, robots, branches, (first, second))
