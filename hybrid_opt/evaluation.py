@@ -1,0 +1,158 @@
+"""Evaluation of candidates: compiled physics, collision verdict, objectives, feasibility.
+
+This is what every search calls. A candidate is a decision vector; it is judged on the task's
+samples. Infeasible candidates get the paper's penalty (Eq. 60), extended to every constraint:
+all objectives take the value 1 + (time in violation, summed over the constraints) / duration.
+The same evaluation also returns each constraint's violation for constraint domination.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.workcell_functions import workcell_functions
+from hybrid_opt.objectives import PAPER_OBJECTIVES, select_objectives
+from symbolic.errors import SettingsError
+from symbolic.evaluator import CONSTRAINTS
+from symbolic.workcell import Array, Workcell
+
+COLLISION = "collision"
+NOT_FINITE = "not_finite"
+REASONS = (*CONSTRAINTS, COLLISION, NOT_FINITE)
+"""What can make a candidate infeasible; `Evaluations.reason` indexes it.
+
+not_finite: an objective is NaN or infinite (a solver or model failure, never a front member).
+"""
+
+FEASIBLE = -1
+"""`Evaluations.reason` of a feasible candidate."""
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """Verdicts on n candidates; every array has a leading axis over them.
+
+    Attributes:
+        x: (n, n_var) decision vectors.
+        objectives: (n, m) values without penalty; only meaningful where feasible.
+        penalised: (n, m) objectives with the paper's penalty, always finite.
+        feasible: (n,).
+        reason: (n,) index into `REASONS` of the constraint violated first along the path, or
+            `FEASIBLE`.
+        position: (n,) path parameter in [0, 1] of the first violation; NaN where feasible.
+        violation: (n, len(REASONS)) violation of each constraint, 0 where satisfied; the unit
+            is the constraint's (`symbolic.evaluator.CONSTRAINTS`), time share for collision.
+        violation_time: (n, len(REASONS)) time in violation over the duration.
+    """
+
+    x: Array
+    objectives: Array
+    penalised: Array
+    feasible: NDArray[np.bool_]
+    reason: NDArray[np.int8]
+    position: Array
+    violation: Array
+    violation_time: Array
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Evaluations:
+        return Evaluations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+
+class CandidateEvaluator:
+    """Evaluates candidates of one workcell with a fixed selection of objectives.
+
+    Attributes:
+        workcell: the cell.
+        objective_names: the selected objectives.
+        n_var, lower, upper: size and bounds of the decision vector.
+        count: candidates evaluated so far.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        objectives: tuple[str, ...] = PAPER_OBJECTIVES,
+        threads: int = 1,
+    ) -> None:
+        """Load or build the compiled functions.
+
+        Raises:
+            SettingsError: an objective is unknown.
+            DualArmError: the model cannot be built (see `symbolic.cell_model`, `codegen`).
+        """
+        self.workcell = workcell
+        self.objective_names = objectives
+        self._objectives = select_objectives(objectives)
+        self._threads = threads
+        self._candidate = workcell_functions(workcell)["candidate"]
+        self.n_var = workcell.task.n_var
+        self.lower = workcell.task.lower
+        self.upper = workcell.task.upper
+        self.count = 0
+
+    def outputs(self, x: Array) -> dict[str, Array]:
+        """Every per-sample output for decision vectors (n, n_var); see `symbolic.evaluator`."""
+        return self._candidate.batch(self._checked(x), threads=self._threads)
+
+    def evaluate(self, x: Array) -> Evaluations:
+        """Verdicts on decision vectors (n, n_var).
+
+        Raises:
+            SettingsError: x has the wrong shape.
+        """
+        x = self._checked(x)
+        outputs = self.outputs(x)
+        self.count += len(x)
+        return self._judge(x, outputs)
+
+    def _checked(self, x: Array) -> Array:
+        x = np.ascontiguousarray(np.atleast_2d(x), dtype=float)
+        if x.ndim != 2 or x.shape[1] != self.n_var:
+            raise SettingsError(
+                f"decision vectors have shape {x.shape}; this cell needs (n, {self.n_var})"
+            )
+        return x
+
+    def _judge(self, x: Array, outputs: dict[str, Array]) -> Evaluations:
+        n = len(x)
+        values = np.column_stack(
+            [objective.evaluate(outputs, self.workcell) for objective in self._objectives]
+        )
+        n_constraints = len(CONSTRAINTS)
+        violation = np.zeros((n, len(REASONS)))
+        violation_time = np.zeros((n, len(REASONS)))
+        violation[:, :n_constraints] = outputs["violation"]
+        violation_time[:, :n_constraints] = outputs["violation_time"]
+        broken = ~np.isfinite(values).all(axis=1) | ~np.isfinite(violation).all(axis=1)
+        violation[broken] = 0.0
+        violation_time[broken] = 0.0
+        violation[broken, REASONS.index(NOT_FINITE)] = 1.0
+        violation_time[broken, REASONS.index(NOT_FINITE)] = 1.0
+
+        feasible = ~(violation > 0.0).any(axis=1)
+        share = violation_time.sum(axis=1)
+        penalised = np.where(feasible[:, None], values, (1.0 + share)[:, None])
+        reason = np.full(n, FEASIBLE, dtype=np.int8)
+        position = np.full(n, np.nan)
+        for row in np.flatnonzero(~feasible):
+            reason[row], position[row] = _first_violation(
+                outputs["constraint"][row], bool(broken[row])
+            )
+        return Evaluations(
+            x, values, penalised, feasible, reason, position, violation, violation_time
+        )
+
+
+def _first_violation(constraint: Array, broken: bool) -> tuple[int, float]:
+    """Reason and path parameter of the first violated sample; constraint (samples, k)."""
+    if broken:
+        return REASONS.index(NOT_FINITE), 0.0
+    violated = constraint > 0.0
+    sample = int(np.argmax(violated.any(axis=1)))
+    return int(np.argmax(violated[sample])), sample / (len(constraint) - 1)

@@ -1,0 +1,21 @@
+"""All CasADi functions of a workcell that are worth compiling."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from symbolic.cell_model import build_cell_model
+from symbolic.evaluator import candidate_function
+from symbolic.workcell import Workcell
+
+
+def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
+    """The functions by name.
+
+    candidate: the evaluator of a whole candidate (`symbolic.evaluator.candidate_function`).
+
+    Raises:
+        DualArmError: the cell's model cannot be built.
+    """
+    model = build_cell_model(workcell)
+    return {"candidate": candidate_function(model)}
