@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pinocchio as pin
 
@@ -152,8 +152,7 @@ def _meshes(root: ElementTree.Element, kind: str) -> tuple[str, ...]:
 
 
 def _carried_by_last(model: pin.Model, frame: pin.Frame) -> bool:
-    is_body = frame.type == pin.FrameType.BODY
-    return is_body and frame.parentJoint == model.njoints - 1
+    return bool(frame.type == pin.FrameType.BODY and frame.parentJoint == model.njoints - 1)
 
 
 def _first_line(error: Exception) -> str:

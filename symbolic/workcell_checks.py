@@ -94,7 +94,8 @@ def check_references(workcell: Workcell, problems: Problems) -> None:
         if problems.clean(path) and contact.body not in environment:
             hint = suggestion(contact.body, environment) or f"; they are {', '.join(environment)}"
             problems.add(path, f"found {contact.body!r}; allowed is an environment body{hint}")
-    if not problems.clean("robots"):
+    parts = ("name", "urdf", "tool")
+    if not problems.clean(*(f"robots[{index}].{part}" for index in (0, 1) for part in parts)):
         return
     known = [name for group in body_names(workcell).values() for name in group]
     for index, pair in enumerate(workcell.collision.ignored):
@@ -129,26 +130,26 @@ def check_reach(workcell: Workcell, problems: Problems) -> None:
 
     This is necessary, not sufficient: it costs no inverse kinematics.
     """
-    if not problems.clean("payload.size"):
-        return
+    poses = [(path, pose) for path, pose in _fixed_poses(workcell) if problems.clean(path)]
+    parts = ("urdf", "locked_joints", "flange", "base", "pad")
     for index, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
-        if not problems.clean(f"robots[{index}]", f"contacts[{index}]"):
+        needed = [f"robots[{index}].{part}" for part in parts]
+        if not problems.clean("payload.size", f"contacts[{index}]", *needed):
             continue
         shoulder, length = stretched_length(robot)
         T_box_flange = contact.T_box_pad @ inverse(robot.T_flange_pad)
-        for path, pose in _fixed_poses(workcell):
-            if not problems.clean(path):
-                continue
+        for path, pose in poses:
             flange = (pose_matrix(pose[:3], pose[3:]) @ T_box_flange)[:3, 3]
             distance = float(np.linalg.norm(flange - shoulder))
             if distance > length + REACH_SLACK:
                 where = ", ".join(f"{entry:.3f}" for entry in flange)
+                box = ", ".join(f"{entry:g}" for entry in pose[:3])
                 problems.add(
                     path,
-                    f"out of reach: the flange of robot {robot.name!r} has to stand at ({where}) "
-                    f"m, {distance:.3f} m from its first joint; allowed is {length:.3f} m, its "
-                    f"links stretched out (look at robots[{index}].base, robots[{index}].pad and "
-                    f"contacts[{index}] as well)",
+                    f"the box at ({box}) m is out of reach: the flange of robot {robot.name!r} "
+                    f"has to stand at ({where}) m, {distance:.3f} m from its first joint; allowed "
+                    f"is {length:.3f} m, its links stretched out (look at robots[{index}].base, "
+                    f"robots[{index}].pad and contacts[{index}] as well)",
                 )
 
 

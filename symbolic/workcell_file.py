@@ -70,9 +70,9 @@ def _build(table: Table, source: Path, content: bytes) -> Workcell | None:
     """The records, as far as they can be built; None where a section has the wrong count."""
     problems, folder = table.problems, source.parent
     name = table.text("name")
-    robots = [read_robot(entry, folder) for entry in table.tables("robots", 2, 2)]
+    robots = [read_robot(entry, folder) for entry in table.tables("robots", exactly=2)]
     payload = read_payload(table.table("payload"))
-    contacts = [read_contact(entry, payload.size) for entry in table.tables("contacts", 2, 2)]
+    contacts = [read_contact(entry, payload.size) for entry in table.tables("contacts", exactly=2)]
     task = read_task(table.table("task"))
     environment = tuple(read_body(entry, folder) for entry in table.tables("environment"))
     collision = read_collision(table.table("collision", {}))

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -71,9 +72,9 @@ class Problems:
         self.found.append((path, text))
 
     def clean(self, *prefixes: str) -> bool:
-        """Whether nothing was found at or below any of these key paths."""
+        """Whether nothing was found at, below or above any of these key paths."""
         return not any(
-            path == prefix or path.startswith((f"{prefix}.", f"{prefix}["))
+            _is_within(path, prefix) or _is_within(prefix, path)
             for path, _ in self.found
             for prefix in prefixes
         )
@@ -81,6 +82,10 @@ class Problems:
     def messages(self) -> tuple[str, ...]:
         """All problems as `key.path: text`."""
         return tuple(f"{path}: {text}" for path, text in self.found)
+
+
+def _is_within(path: str, prefix: str) -> bool:
+    return path == prefix or path.startswith((f"{prefix}.", f"{prefix}["))
 
 
 def read_only(values: Any) -> Array:
@@ -122,6 +127,9 @@ class Table:
 
     def __contains__(self, key: str) -> bool:
         return key in self._data
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._data)
 
     def at(self, key: str) -> str:
         """The full key path of a key."""
@@ -218,19 +226,22 @@ class Table:
             self.problems.add(self.at(key), f"found {shown(value)}; allowed is a table")
         return Table({}, self.at(key), Problems())
 
-    def tables(self, key: str, low: int = 0, high: int | None = None) -> list[Table]:
-        """An array of `low` to `high` tables."""
-        value = self.raw(key, [] if low == 0 else _REQUIRED)
+    def tables(self, key: str, exactly: int | None = None) -> list[Table]:
+        """An array of tables, of any length (and not required) or of exactly that many."""
+        value = self.raw(key, [] if exactly is None else _REQUIRED)
         if value is None:
             return []
         if not isinstance(value, list) or not all(isinstance(entry, Mapping) for entry in value):
+            heading = re.sub(r"\[\d+\]", "", self.at(key))
             self.problems.add(
-                self.at(key), f"found {shown(value)}; allowed is an array of tables, [[{key}]]"
+                self.at(key),
+                f"found {shown(value)}; allowed is an array of tables, [[{heading}]]",
             )
             return []
-        if len(value) < low or (high is not None and len(value) > high):
-            count = f"exactly {low}" if low == high else f"at least {low}"
-            self.problems.add(self.at(key), f"found {len(value)} tables; allowed is {count}")
+        if exactly is not None and len(value) != exactly:
+            self.problems.add(
+                self.at(key), f"found {len(value)} tables; allowed are exactly {exactly}"
+            )
         return [
             Table(entry, f"{self.at(key)}[{index}]", self.problems)
             for index, entry in enumerate(value)

@@ -87,8 +87,7 @@ def _read_folders(table: Table, folder: Path) -> tuple[Path, ...]:
 
 def _read_locked(table: Table) -> tuple[tuple[str, float], ...]:
     inner = table.table("locked_joints", {})
-    names = list(table.raw("locked_joints", {})) if "locked_joints" in table else []
-    return tuple((name, inner.number(name, quantity.LOCKED_POSITION)) for name in names)
+    return tuple((name, inner.number(name, quantity.LOCKED_POSITION)) for name in inner)
 
 
 def _read_model(

@@ -27,11 +27,8 @@ FACE_TOLERANCE = 1e-6  # [m], how far a contact may be written off its face; it 
 SHAPE_KINDS = ("box", "cylinder", "sphere", "mesh")
 
 
-def read_pose(table: Table, key: str, required: bool = True) -> Array:
+def read_pose(table: Table, key: str) -> Array:
     """A transform from a sub-table {xyz, rpy}, both zero by default. Returns (4, 4), read-only."""
-    if not required and key not in table:
-        table.raw(key, {})
-        return read_only(np.eye(4))
     inner = table.table(key)
     pose = _xyz_rpy(inner)
     inner.close()
@@ -178,7 +175,7 @@ def inertia_problem(inertia: Array, bound: float) -> str:
 
 
 def read_contact(table: Table, size: Array) -> Contact:
-    """A contact on a face of the box; `size` is None-free only where the payload is in order."""
+    """A contact on a face of a box of the given edge lengths (3,) [m]."""
     point = table.vector("xyz", (quantity.POSITION,) * 3)
     spin = table.number("spin", quantity.ANGLE, 0.0)
     radius = table.number("patch_radius", quantity.PATCH_RADIUS)
@@ -190,7 +187,8 @@ def read_contact(table: Table, size: Array) -> Contact:
         face = _face_of(point, size, table.at("xyz"), problems)
         if face is not None:
             axis, side = face
-            _check_patch(point, size, axis, radius, table.at("xyz"), problems)
+            for problem in _overhang(point, size, axis, radius):
+                problems.add(table.at("xyz"), problem)
             origin = np.array(point)
             origin[axis] = side * size[axis] / 2
             pose = transform(pad_rotation(axis, side, spin), origin)
@@ -214,7 +212,8 @@ def pad_rotation(axis: int, side: int, spin: float) -> Array:
     reference = np.eye(3)[0 if axis == 2 else 2]
     base = np.column_stack([reference, np.cross(normal, reference), normal])
     cosine, sine = np.cos(spin), np.sin(spin)
-    return base @ np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(base @ turn, dtype=np.float64)
 
 
 def _face_of(point: Array, size: Array, path: str, problems: Problems) -> tuple[int, int] | None:
@@ -240,17 +239,15 @@ def _face_of(point: Array, size: Array, path: str, problems: Problems) -> tuple[
     return axis, 1 if point[axis] > 0 else -1
 
 
-def _check_patch(
-    point: Array, size: Array, axis: int, radius: float, path: str, problems: Problems
-) -> None:
-    for other in range(3):
-        room = size[other] / 2 - abs(point[other])
-        if other != axis and radius > room + FACE_TOLERANCE:
-            problems.add(
-                path,
-                f"found a patch of radius {radius:g} m only {room:g} m from the edge of the face "
-                f"along box axis {'xyz'[other]}; allowed is a patch that lies on the face",
-            )
+def _overhang(point: Array, size: Array, axis: int, radius: float) -> list[str]:
+    """For each edge of the face that a patch reaches over, what is wrong."""
+    rooms = {other: size[other] / 2 - abs(point[other]) for other in range(3) if other != axis}
+    return [
+        f"found a patch of radius {radius:g} m only {room:g} m from the edge of the face along "
+        f"box axis {'xyz'[other]}; allowed is a patch that lies on the face"
+        for other, room in rooms.items()
+        if radius > room + FACE_TOLERANCE
+    ]
 
 
 def read_collision(table: Table) -> CollisionSettings:

@@ -90,9 +90,9 @@ def _waypoints(table: Table) -> list[Waypoint]:
 
 def _read_initial(table: Table, free: list[Waypoint]) -> Array:
     """The hand-made free waypoints (n_free, 6); the centres of the bounds by default."""
-    value = table.raw("initial", ())
+    value = table.raw("initial", None)
     path, problems = table.at("initial"), table.problems
-    if value == ():
+    if value is None:
         return read_only(np.reshape([(w.lower + w.upper) / 2 for w in free], (-1, 6)))
     if not isinstance(value, list):
         problems.add(path, f"found {shown(value)}; allowed is an array of rows of 6 numbers")
