@@ -1,0 +1,274 @@
+"""Compare the search algorithms on analytic problems with known fronts.
+
+Prints hypervolume and IGD of MOPSO and NSGA-II over several seeds, beside the figures that a
+correct implementation of Coello's MOPSO reaches, and the comparison on a ZDT problem whose
+optimum lies inside the bounds. Objectives are normalised by ideal and nadir of the true front;
+the hypervolume's reference point is (1.1, 1.1); IGD is the mean Euclidean distance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+from hybrid_opt import algorithms, analytic_problems, metrics
+from hybrid_opt.algorithms import Evaluated
+from hybrid_opt.analytic_problems import AnalyticProblem
+from hybrid_opt.statistics import RankTest, Summary, corrected, rank_test, summarise
+from studies.algorithm_bands import BAND_SOURCE, BANDS, Band, Verdict, judge
+from symbolic.errors import DualArmError, SettingsError
+
+POPULATION = 100
+SHIFTED = "shifted-zdt1"
+SHIFTED_POPULATION = 40
+SHIFTED_EVALUATIONS = 1000
+
+
+@dataclass(frozen=True)
+class Row:
+    """One algorithm on one problem with one budget, over all seeds.
+
+    Attributes:
+        hypervolume, igd: of the algorithm's final front, of limited size.
+        archive_hypervolume, archive_igd: of all non-dominated points that it evaluated.
+        overhead_us: the algorithm's own time per evaluation [us].
+        infeasible_in_front: members of final fronts that violate a constraint.
+        hypervolume_verdict, igd_verdict: against the band, None without one.
+    """
+
+    problem: str
+    evaluations: int
+    algorithm: str
+    hypervolume: Summary
+    igd: Summary
+    archive_hypervolume: Summary
+    archive_igd: Summary
+    overhead_us: float
+    infeasible_in_front: int
+    hypervolume_verdict: Verdict | None
+    igd_verdict: Verdict | None
+
+
+@dataclass(frozen=True)
+class _Run:
+    hypervolume: float
+    igd: float
+    archive_hypervolume: float
+    archive_igd: float
+    overhead_us: float
+    infeasible_in_front: int
+
+
+def _indicators(target: AnalyticProblem, points: Evaluated) -> tuple[float, float]:
+    front = target.normalise(metrics.front_of(points.objectives, points.feasible))
+    return metrics.hypervolume(front), metrics.igd(front, target.normalise(target.front))
+
+
+def _settings(name: str, population: int) -> dict[str, object]:
+    known = algorithms.settings_of(name)
+    size = next(key for key in ("swarm", "population", "batch") if hasattr(known, key))
+    return {size: population}
+
+
+def _run(target: AnalyticProblem, name: str, evaluations: int, population: int, seed: int) -> _Run:
+    algorithm = algorithms.make(name, _settings(name, population))
+    result = algorithms.search(target.problem, algorithm, evaluations, seed)
+    # Judged anew from the decisions: an algorithm's word for feasibility is not enough.
+    constraints = target.problem.evaluate(result.front.decisions, return_values_of=["G"])
+    return _Run(
+        *_indicators(target, result.front),
+        *_indicators(target, result.evaluated),
+        1e6 * result.algorithm_seconds / evaluations,
+        int((constraints > 0.0).any(axis=1).sum()) if target.problem.n_ieq_constr else 0,
+    )
+
+
+def _band(problem: str, evaluations: int, algorithm: str) -> Band | None:
+    """The band of Coello's MOPSO and of the variants of it."""
+    return BANDS.get((problem, evaluations)) if algorithm.startswith("mopso") else None
+
+
+def _row(problem: str, evaluations: int, algorithm: str, runs: Sequence[_Run]) -> Row:
+    hypervolume = summarise([run.hypervolume for run in runs])
+    distance = summarise([run.igd for run in runs])
+    band = _band(problem, evaluations, algorithm)
+    verdicts: tuple[Verdict | None, Verdict | None] = (None, None)
+    if band is not None:
+        verdicts = (
+            judge(hypervolume, band.hypervolume, higher_is_better=True),
+            judge(distance, band.igd, higher_is_better=False, std=band.igd_std),
+        )
+    return Row(
+        problem,
+        evaluations,
+        algorithm,
+        hypervolume,
+        distance,
+        summarise([run.archive_hypervolume for run in runs]),
+        summarise([run.archive_igd for run in runs]),
+        sum(run.overhead_us for run in runs) / len(runs),
+        sum(run.infeasible_in_front for run in runs),
+        *verdicts,
+    )
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All rows, and the rank tests of the first algorithm against each other one on the
+    problem with its optimum inside the bounds (hypervolume, then IGD; Holm-corrected)."""
+
+    seeds: int
+    rows: tuple[Row, ...]
+    tests: tuple[RankTest, ...]
+
+
+def compare(
+    problems: Sequence[str],
+    budgets: Sequence[int],
+    names: Sequence[str],
+    seeds: int,
+    progress: bool = False,
+) -> Comparison:
+    """Run every algorithm on every problem with every budget and seeds 0, 1, ...
+
+    The problem with its optimum inside the bounds has its own budget and population.
+
+    Raises:
+        SettingsError: unknown names, no seeds, or a budget below the population.
+    """
+    for name in names:
+        algorithms.settings_of(name)
+    targets = [analytic_problems.make(problem) for problem in problems]
+    if seeds < 1 or min(budgets) < POPULATION:
+        raise SettingsError(
+            f"{seeds} seeds of {min(budgets)} evaluations; at least 1 seed and {POPULATION} "
+            "evaluations (the population) are needed"
+        )
+    tasks = [
+        (target, budget, name, POPULATION)
+        for target in targets
+        if target.name != SHIFTED
+        for budget in budgets
+        for name in names
+    ] + [
+        (target, SHIFTED_EVALUATIONS, name, SHIFTED_POPULATION)
+        for target in targets
+        if target.name == SHIFTED
+        for name in names
+    ]
+    rows: list[Row] = []
+    shifted: dict[str, list[_Run]] = {}
+    start = time.perf_counter()
+    for done, (target, budget, name, population) in enumerate(tasks, 1):
+        runs = [_run(target, name, budget, population, seed) for seed in range(seeds)]
+        rows.append(_row(target.name, budget, name, runs))
+        if target.name == SHIFTED:
+            shifted[name] = runs
+        if progress:
+            elapsed = time.perf_counter() - start
+            print(
+                f"{done}/{len(tasks)} {target.name} {budget} {name}, {elapsed:.0f} s",
+                file=sys.stderr,
+            )
+    return Comparison(seeds, tuple(rows), _tests(shifted))
+
+
+def _tests(shifted: dict[str, list[_Run]]) -> tuple[RankTest, ...]:
+    tests = []
+    for name in list(shifted)[1:]:
+        first, others = next(iter(shifted)), shifted[name]
+        for figure in ("hypervolume", "igd"):
+            ours = [getattr(run, figure) for run in shifted[first]]
+            theirs = [getattr(run, figure) for run in others]
+            labels = (f"{first} {figure}", f"{name} {figure}")
+            tests.append(rank_test(ours, theirs, labels))
+    return corrected(tests)
+
+
+def table(result: Comparison) -> str:
+    """The comparison as text."""
+    lines = [
+        f"Mean over {result.seeds} seeds; final front of at most {POPULATION} points, and archive "
+        "of all evaluated points",
+        f"Bands: {BAND_SOURCE}",
+        f"{'problem':13}{'evals':>6}  {'algorithm':16}{'HV':>7}{'sd':>7}{'band':>7} {'':8}"
+        f"{'IGD':>8}{'sd':>8}{'band':>8} {'':8}{'HV all':>7}{'IGD all':>9}{'us/eval':>9}",
+    ]
+    for row in result.rows:
+        band = _band(row.problem, row.evaluations, row.algorithm)
+        lines.append(
+            f"{row.problem:13}{row.evaluations:6d}  {row.algorithm:16}"
+            f"{row.hypervolume.mean:7.3f}{row.hypervolume.std:7.3f}"
+            f"{f'{band.hypervolume:.3f}' if band else '':>7} {row.hypervolume_verdict or '':8}"
+            f"{row.igd.mean:8.4f}{row.igd.std:8.4f}"
+            f"{f'{band.igd:.4f}' if band else '':>8} {row.igd_verdict or '':8}"
+            f"{row.archive_hypervolume.mean:7.3f}{row.archive_igd.mean:9.4f}"
+            f"{row.overhead_us:9.1f}"
+        )
+    for name in dict.fromkeys(row.algorithm for row in result.rows):
+        rows = [row for row in result.rows if row.algorithm == name]
+        verdicts = [v for row in rows for v in (row.hypervolume_verdict, row.igd_verdict) if v]
+        if verdicts:
+            counts = ", ".join(f"{verdicts.count(v)} {v}" for v in ("inside", "better", "worse"))
+            lines.append(f"{name} against the bands: {counts}")
+    infeasible = sum(row.infeasible_in_front for row in result.rows)
+    lines.append(f"infeasible members of final fronts: {infeasible}")
+    if result.tests:
+        lines.append(
+            f"{SHIFTED}, {SHIFTED_EVALUATIONS} evaluations, population {SHIFTED_POPULATION}:"
+        )
+    lines += [
+        f"  {test.first} against {test.second}: A12 {test.a12:.2f} ({test.magnitude}), "
+        f"exact Mann-Whitney p {test.p:.3g}, Holm {test.p_holm:.3g}"
+        for test in result.tests
+    ]
+    return "\n".join(lines)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.algorithms",
+        description="Compare search algorithms on analytic problems with known fronts.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    every = analytic_problems.names()
+    parser.add_argument("--seeds", type=int, default=10, help="runs per figure, seeds 0, 1, ...")
+    parser.add_argument(
+        "--evaluations",
+        type=int,
+        nargs="+",
+        default=[1000, 10_000, 25_000],
+        help=f"budgets ({SHIFTED} always has {SHIFTED_EVALUATIONS})",
+    )
+    parser.add_argument("--problems", nargs="+", default=list(every), metavar="NAME", help="which")
+    parser.add_argument(
+        "--algorithms", nargs="+", default=["mopso", "nsga2"], metavar="NAME", help="which"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the comparison; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        result = compare(
+            options.problems, options.evaluations, options.algorithms, options.seeds, progress=True
+        )
+    except DualArmError as error:
+        print(error, file=sys.stderr)
+        return 2
+    if options.json:
+        document = asdict(result)
+        print(json.dumps({"band_source": BAND_SOURCE, **document}, indent=2))
+    else:
+        print(table(result))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
