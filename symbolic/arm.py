@@ -153,3 +153,42 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
         ["state", "pose", "wrench"],
         ["next_state", *TRACK_OUTPUTS],
     )
+
+
+def follow_function(
+    robot: Robot, model: RobotModel, contact: Contact, samples: int, name: str
+) -> ca.Function:
+    """An arm's motion along all samples of a box path.
+
+    Inputs: start (6,), joints at the first pose [rad]; pose (6, samples) of the box; wrench
+    (6, samples) on the box about the nominal contact point. Outputs: `TRACK_OUTPUTS`.
+
+    The second sample has no motion before it to extrapolate: Newton steps from the start posture
+    predict it, and what they find takes the extrapolation's place.
+    """
+    start, pose = ca.MX.sym("start", 6), ca.MX.sym("pose", 6, samples)
+    wrench = ca.MX.sym("wrench", 6, samples)
+    track = track_function(robot, model, contact, f"{name}_sample")
+    first = track(ca.vertcat(start, start, 0.0), pose[:, 0], wrench[:, 0])
+    predicted = _prediction_function(robot, model, contact, f"{name}_prediction")(start, pose[:, 1])
+    state = ca.vertcat(start, 2.0 * start - predicted, first[0][12])
+    rest = track.mapaccum(f"{name}_samples", samples - 1)(state, pose[:, 1:], wrench[:, 1:])
+    return ca.Function(
+        name,
+        [start, pose, wrench],
+        [ca.horzcat(one, more) for one, more in zip(first[1:], rest[1:], strict=True)],
+        ["start", "pose", "wrench"],
+        list(TRACK_OUTPUTS),
+    )
+
+
+def _prediction_function(
+    robot: Robot, model: RobotModel, contact: Contact, name: str
+) -> ca.Function:
+    """Joints (6,) after `NEWTON_STEPS` from given joints towards a box pose (6,)."""
+    start, pose = ca.SX.sym("start", 6), ca.SX.sym("pose", 6)
+    R_target, p_target = flange_target(robot, contact, pose[:3], rotation_matrix(pose[3:]))
+    q = start
+    for _ in range(NEWTON_STEPS):
+        q = newton_step(model, q, R_target, p_target)
+    return ca.Function(name, [start, pose], ca.cse([q]), ["start", "pose"], ["q"])

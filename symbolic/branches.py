@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from scipy.stats import qmc
 
-from symbolic.arm import TRACK_OUTPUTS, box_flange, track_function
+from symbolic.arm import TRACK_OUTPUTS, box_flange, follow_function
 from symbolic.path import sample_basis, waypoint_matrix
 from symbolic.pose import inverse, pose_matrix
 from symbolic.robot_model import RobotModel
@@ -163,14 +163,11 @@ def start_branches(
     robot, contact = workcell.robots[arm], workcell.contacts[arm]
     poses = initial_poses(workcell)
     target = start_flange(workcell, robot, contact)
-    step = track_function(robot, model, contact, f"follow_{arm + 1}")
-    follow = step.mapaccum("follow", len(poses))
+    follow = follow_function(robot, model, contact, len(poses), f"follow_{arm + 1}")
     branches = []
     for q in inverse_kinematics(robot, model, target):
-        tracked = follow(np.concatenate([q, q, [0.0]]), poses.T, np.zeros((6, len(poses))))
-        result = {
-            name: np.array(value) for name, value in zip(TRACK_OUTPUTS, tracked[1:], strict=True)
-        }
+        tracked = follow(q, poses.T, np.zeros((6, len(poses))))
+        result = {name: np.array(value) for name, value in zip(TRACK_OUTPUTS, tracked, strict=True)}
         margin, measure = result["limit_margin"][0], result["manipulability"][0]
         good = (result["lost"][0] == 0.0) & (margin >= 0.0) & (measure >= robot.min_manipulability)
         kept = int(np.argmin(good)) if not good.all() else len(poses)

@@ -7,9 +7,8 @@ that NumPy sees (n_samples, dim).
 from __future__ import annotations
 
 import casadi as ca
-import numpy as np
 
-from symbolic.arm import REACH_TOLERANCE, TRACK_OUTPUTS, track_function
+from symbolic.arm import REACH_TOLERANCE, TRACK_OUTPUTS, follow_function
 from symbolic.cell_model import CellModel
 from symbolic.contact_forces import GRAVITY
 from symbolic.path import sample_basis, waypoint_matrix
@@ -85,11 +84,10 @@ def candidate_function(model: CellModel) -> ca.Function:
 
 def _track(model: CellModel, i: int, pose: ca.MX, wrench: ca.MX) -> dict[str, ca.MX]:
     robot, contact = model.workcell.robots[i], model.workcell.contacts[i]
-    step = track_function(robot, model.robots[i], contact, f"track_{i + 1}")
-    start = np.concatenate([model.start[i], model.start[i], [0.0]])
     n = model.workcell.task.samples
-    results = step.mapaccum(f"arm_{i + 1}", n)(ca.DM(start), pose, wrench)
-    return dict(zip(TRACK_OUTPUTS, results[1:], strict=True))
+    follow = follow_function(robot, model.robots[i], contact, n, f"arm_{i + 1}")
+    results = follow(ca.DM(model.start[i]), pose, wrench)
+    return dict(zip(TRACK_OUTPUTS, results, strict=True))
 
 
 _CONSTRAINT_INPUTS = (
