@@ -84,8 +84,12 @@ def waypoint_matrix(task: Task, x: ca.MX | ca.SX) -> ca.MX | ca.SX:
 
 
 def _unwrap(reference: ca.MX | ca.SX, angles: ca.MX | ca.SX) -> ca.MX | ca.SX:
-    """Angles moved by full turns to lie within half a turn of the reference."""
-    turns = ca.floor((angles - reference) / (2.0 * np.pi) + 0.5)
+    """Angles moved by full turns to lie within half a turn of the reference.
+
+    Half a turn in either direction stays as it is written (NumPy's `unwrap`).
+    """
+    difference = angles - reference
+    turns = ca.sign(difference) * ca.ceil(ca.fabs(difference) / (2.0 * np.pi) - 0.5)
     return angles - 2.0 * np.pi * turns
 
 

@@ -148,7 +148,8 @@ def _ramp_function(task: Task) -> ca.Function:
     from_end = arc > total / 2.0
     share = ca.fmin(arc, total - arc) / (cruise * ramp)
     # Speed rises as 3 tau^2 - 2 tau^3, so that share = tau^3 - tau^4 / 2 during the ramp.
-    inside = ca.fmin(ca.fmax(share, 1e-18), 0.5)
+    # The floor keeps the root's derivative finite; it leaves less than 1e-9 m/s^2 at the ends.
+    inside = ca.fmin(ca.fmax(share, 1e-30), 0.5)
     tau = (2.0 * inside) ** (1.0 / 3.0)
     for _ in range(RAMP_NEWTON_STEPS):
         tau = tau - (tau**3 - tau**4 / 2.0 - inside) / (3.0 * tau**2 - 2.0 * tau**3)
