@@ -10,7 +10,7 @@ from typing import Any
 
 from symbolic.errors import WorkcellError
 from symbolic.urdf_model import read_urdf_content, resolve_mesh
-from symbolic.workcell import Mesh, Robot, Workcell
+from symbolic.workcell import Body, Mesh, Robot, Workcell
 from symbolic.workcell_checks import check_all
 from symbolic.workcell_reader import Problems, Table
 from symbolic.workcell_robots import read_robot
@@ -95,7 +95,7 @@ def _build(table: Table, source: Path, content: bytes) -> Workcell | None:
     return workcell
 
 
-def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Any]) -> str:
+def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Body]) -> str:
     """SHA-256 over a workcell file and the content of every file it names.
 
     Where the files stand does not matter, only what is in them: the file's own bytes, per robot
@@ -108,9 +108,9 @@ def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Any]) 
         for address in (*urdf.collision_meshes, *urdf.visual_meshes):
             mesh = resolve_mesh(address, robot.urdf, robot.package_dirs)
             parts.append(b"" if mesh is None else mesh.read_bytes())
-    for body in (*(body for robot in robots for body in robot.tool), *environment):
-        if isinstance(body.shape, Mesh):
-            parts.append(body.shape.path.read_bytes())
+    bodies = (*(body for robot in robots for body in robot.tool), *environment)
+    shapes = (body.shape for body in bodies)
+    parts.extend(shape.path.read_bytes() for shape in shapes if isinstance(shape, Mesh))
     outer = hashlib.sha256()
     for part in parts:  # fixed-length inner digests keep the parts apart
         outer.update(hashlib.sha256(part).digest())

@@ -41,7 +41,7 @@ PATCH_RADIUS = Quantity("m", 0.0, 0.5, low_open=True, mistaken=_MILLIMETRES)
 JOINT_POSITION = Quantity("rad", -4 * math.pi, 4 * math.pi, mistaken=_DEGREES)
 LOCKED_POSITION = Quantity("rad or m", -4 * math.pi, 4 * math.pi)
 TORQUE = Quantity("N m", 0.0, 1e5, low_open=True)
-MANIPULABILITY = Quantity("m^3", 0.0, 10.0)
+MANIPULABILITY = Quantity("m^3", 0.0, 10.0, low_open=True)
 
 # Below 20 N a value is kgf by all likelihood: it would be a hold of less than 2 kg per robot.
 FORCE = Quantity("N", 20.0, 1e5, mistaken=(("kgf", STANDARD_GRAVITY),))

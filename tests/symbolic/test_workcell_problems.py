@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from symbolic.errors import WorkcellError
 from symbolic.workcell import Workcell
@@ -179,3 +183,29 @@ def test_further_checks_run_on_a_valid_cell_only(tmp_path: Path) -> None:
     with pytest.raises(WorkcellError, match=r"payload\.mass"):
         load(write(tmp_path, data), checks=[no_solution])
     assert len(seen) == 1
+
+
+NUMBERS = [-1, 0, 1e308, 10**400, float("nan"), True]
+ARRAYS = [[], [[]], [{}], [0.0] * 3, [0.0] * 6, ["a"] * 6, [[0.0] * 3] * 3, [True] * 3]
+ODD_VALUES = [*NUMBERS, *ARRAYS, "", "x", "a\0", {}, {"a": {}}]
+
+
+def key_paths(data: Any, path: str = "") -> list[str]:
+    """Every key path of nested tables and arrays."""
+    if isinstance(data, dict):
+        inner = [(f"{path}.{key}".lstrip("."), value) for key, value in data.items()]
+    elif isinstance(data, list):
+        inner = [(f"{path}[{index}]", value) for index, value in enumerate(data)]
+    else:
+        return []
+    return [found for key, value in inner for found in (key, *key_paths(value, key))]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.sampled_from(key_paths(rack_data())), st.sampled_from(ODD_VALUES))
+def test_odd_values_raise_no_other_error(path: str, value: Any) -> None:
+    data = rack_data()
+    put(data, path, value)
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(WorkcellError):
+        # Some odd values are right where they stand, e.g. zero for an angle.
+        assert load(write(Path(folder), data)).digest

@@ -200,7 +200,7 @@ CASES: list[tuple[str, Any, str, str]] = [
         "found 2 rad for joint 'joint_3', not below its upper limit",
     ),
     ("robots[0].position_lower", -1.0, "robots[0].position_lower", "an array of 6 numbers"),
-    ("robots[0].min_manipulability", -1, "robots[0].min_manipulability", "allowed is 0 to"),
+    ("robots[0].min_manipulability", 0, "robots[0].min_manipulability", "more than 0 up"),
     # other files, collision pairs
     (
         "environment[0]",

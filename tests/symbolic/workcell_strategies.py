@@ -51,7 +51,7 @@ def robots(draw: st.DrawFn, name: str) -> dict[str, Any]:
         "torque_max": vectors(1, 500, 6),
         "position_lower": vectors(-6, -0.1, 6),
         "position_upper": vectors(0.1, 6, 6),
-        "min_manipulability": numbers(0, 0.1),
+        "min_manipulability": numbers(1e-6, 0.1),
         "start_branch": st.integers(-1, 7),
     }
     return {
