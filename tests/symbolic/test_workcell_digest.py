@@ -10,7 +10,7 @@ import trimesh
 
 from symbolic.workcell import Mesh
 from symbolic.workcell_file import load
-from tests.symbolic.workcell_samples import GOFA, rack_data, write
+from tests.symbolic.workcell_samples import GOFA, sample_data, write
 
 COLLISION_BOX = '<geometry><box size="0.161 0.093 0.707"/></geometry>'
 FILES = (
@@ -32,7 +32,7 @@ def make_cell(folder: Path) -> Path:
     assert COLLISION_BOX in urdf
     mesh = '<geometry><mesh filename="package://own/link.stl"/></geometry>'
     (folder / "arm.urdf").write_text(urdf.replace(COLLISION_BOX, mesh), encoding="utf-8")
-    data = rack_data()
+    data = sample_data()
     for robot in data["robots"]:
         robot |= {"urdf": "arm.urdf", "package_dirs": ["packages"]}
     data["environment"].append({"name": "stored", "kind": "mesh", "path": "shapes/stored.stl"})

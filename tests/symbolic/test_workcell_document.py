@@ -10,7 +10,7 @@ import pytest
 from symbolic.errors import WorkcellError
 from symbolic.workcell_file import load
 from tests.symbolic.workcell_problem_cases import put
-from tests.symbolic.workcell_samples import STUDIES, rack_data, write
+from tests.symbolic.workcell_samples import STUDIES, sample_data, write
 
 DOCUMENT = (STUDIES.parent / "docs" / "workcell.md").read_text(encoding="utf-8")
 SECTIONS = (
@@ -38,7 +38,7 @@ def problems(path: Path) -> tuple[str, ...]:
 
 
 def test_every_key_is_documented(tmp_path: Path) -> None:
-    data = rack_data()
+    data = sample_data()
     data["task"]["allowed_contacts"] = [{"body": "ground", "departure": 0.1}]
     data["collision"]["ignored"] = [{"first": "payload", "second": "ground", "reason": "r"}]
     (tmp_path / "m.stl").write_bytes(b"")
@@ -55,7 +55,7 @@ def test_every_key_is_documented(tmp_path: Path) -> None:
 
 
 def test_the_messages_shown_are_real(tmp_path: Path) -> None:
-    data = rack_data()
+    data = sample_data()
     put(data, "payload.size[0]", 300)
     put(data, "task.reference_force", 12)
     told = problems(write(tmp_path, data))

@@ -16,7 +16,7 @@ from symbolic.errors import WorkcellError
 from symbolic.workcell import Workcell
 from symbolic.workcell_file import load
 from tests.symbolic.workcell_problem_cases import CASES, put
-from tests.symbolic.workcell_samples import GOFA, RACK, rack_data, write
+from tests.symbolic.workcell_samples import GOFA, RACK, sample_data, write
 
 
 def problems_of(path: Path) -> list[str]:
@@ -33,7 +33,7 @@ def problems_of(path: Path) -> list[str]:
     ids=[f"{index}-{case[2]}" for index, case in enumerate(CASES)],
 )
 def test_problem(tmp_path: Path, where: str, value: Any, key_path: str, words: str) -> None:
-    data = rack_data()
+    data = sample_data()
     put(data, where, value)
     found = problems_of(write(tmp_path, data))
     assert any(problem.startswith(f"{key_path}: ") and words in problem for problem in found), found
@@ -42,11 +42,11 @@ def test_problem(tmp_path: Path, where: str, value: Any, key_path: str, words: s
 
 
 def test_the_unchanged_data_is_valid(tmp_path: Path) -> None:
-    assert load(write(tmp_path, rack_data())).name == rack_data()["name"]
+    assert load(write(tmp_path, sample_data())).name == sample_data()["name"]
 
 
 def test_one_mistake_is_one_problem(tmp_path: Path) -> None:
-    data = rack_data()
+    data = sample_data()
     put(data, "payload.size[0]", 300)
     put(data, "contacts[0].spin", 45)
     found = problems_of(write(tmp_path, data))
@@ -54,13 +54,13 @@ def test_one_mistake_is_one_problem(tmp_path: Path) -> None:
 
 
 def test_a_missing_section_does_not_blame_others(tmp_path: Path) -> None:
-    data = rack_data()
+    data = sample_data()
     del data["payload"]
     assert problems_of(write(tmp_path, data)) == ["payload: is missing"]
 
 
 def test_many_problems_at_once(tmp_path: Path) -> None:
-    data = rack_data()
+    data = sample_data()
     wrong: list[tuple[str, Any, str]] = [
         ("robots[0].flange", "tol0", "robots[0].flange"),
         ("robots[1].base.rpy[2]", 90, "robots[1].base.rpy[2]"),
@@ -81,7 +81,7 @@ def test_many_problems_at_once(tmp_path: Path) -> None:
 
 
 def test_both_arms_and_all_poses_are_judged(tmp_path: Path) -> None:
-    data = rack_data()
+    data = sample_data()
     data["task"]["start"][2] = data["task"]["goal"][2] = 2.6
     found = problems_of(write(tmp_path, data))
     assert [problem.split(": ")[0] for problem in found] == ["task.start", "task.goal"] * 2
@@ -163,7 +163,7 @@ def test_unusable_urdf(tmp_path: Path, change: UrdfChange, key_path: str, words:
     text = GOFA.read_text(encoding="utf-8")
     assert change(text) != text
     (tmp_path / "arm.urdf").write_text(change(text), encoding="utf-8")
-    data = rack_data()
+    data = sample_data()
     data["robots"][0]["urdf"] = "arm.urdf"
     found = problems_of(write(tmp_path, data))
     assert any(p.startswith(f"{key_path}: ") and words in p for p in found), found
@@ -178,7 +178,7 @@ def test_further_checks_run_on_a_valid_cell_only(tmp_path: Path) -> None:
 
     with pytest.raises(WorkcellError, match=r"task\.start: no joint angles"):
         load(RACK, checks=[no_solution])
-    data = rack_data()
+    data = sample_data()
     put(data, "payload.mass", -1)
     with pytest.raises(WorkcellError, match=r"payload\.mass"):
         load(write(tmp_path, data), checks=[no_solution])
@@ -202,9 +202,9 @@ def key_paths(data: Any, path: str = "") -> list[str]:
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.sampled_from(key_paths(rack_data())), st.sampled_from(ODD_VALUES))
+@given(st.sampled_from(key_paths(sample_data())), st.sampled_from(ODD_VALUES))
 def test_odd_values_raise_no_other_error(path: str, value: Any) -> None:
-    data = rack_data()
+    data = sample_data()
     put(data, path, value)
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(WorkcellError):
         # Some odd values are right where they stand, e.g. zero for an angle.

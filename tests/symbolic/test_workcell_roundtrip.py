@@ -18,7 +18,7 @@ from symbolic.pose import inverse, pose_matrix
 from symbolic.workcell import Body, Box, Cylinder, Sphere, Workcell
 from symbolic.workcell_file import load
 from symbolic.workcell_sections import pad_rotation
-from tests.symbolic.workcell_samples import GOFA, rack_data, write
+from tests.symbolic.workcell_samples import GOFA, sample_data, write
 from tests.symbolic.workcell_strategies import cells, numbers, vectors
 
 
@@ -130,7 +130,7 @@ def test_inverse_of_a_pose(xyz: list[float], rpy: list[float]) -> None:
 
 
 def test_contact_is_moved_onto_its_face(tmp_path: Path) -> None:
-    data = rack_data()
+    data = sample_data()
     data["contacts"][0]["xyz"] = [0.01, 0.2 + 9e-7, -0.02]
     cell = load(write(tmp_path, data))
     assert cell.contacts[0].T_box_pad[:3, 3].tolist() == [0.01, 0.2, -0.02]
@@ -147,7 +147,7 @@ def test_locked_joint_leaves_six(tmp_path: Path) -> None:
         '<origin xyz="0 0 0.1"/><limit lower="-3" upper="3" velocity="1" effort="500"/></joint>',
     )
     (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
-    data = rack_data()
+    data = sample_data()
     data["robots"][0] |= {"urdf": "arm.urdf", "locked_joints": {"turn": 0.5}}
     cell = load(write(tmp_path, data))
     assert cell.robots[0].locked_joints == (("turn", 0.5),)
@@ -160,7 +160,7 @@ def test_another_make_of_arm(tmp_path: Path) -> None:
     (entry,) = (file for file in files if file.name == "ur10_robot.urdf")
     urdf = Path(str(entry.locate())).resolve()
     share = next(folder.parent for folder in urdf.parents if folder.name == "example-robot-data")
-    data = rack_data()
+    data = sample_data()
     for robot in data["robots"]:
         robot |= {"urdf": str(urdf), "package_dirs": [str(share)], "flange": "tool0"}
     cell = load(write(tmp_path, data))

@@ -1,4 +1,4 @@
-"""Wrong entries for the rack's workcell file, and how to put them in."""
+"""Wrong entries for the sample workcell file, and how to put them in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Workcell files for tests: the rack as plain data to change, and a writer for such data."""
+"""Workcell files for tests: a valid cell as plain data to change, and a writer for such data."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import studies
 
 STUDIES = Path(studies.__file__).parent
 RACK = STUDIES / "workcells" / "rack.toml"
+SAMPLE = Path(__file__).with_name("sample_cell.toml")
 GOFA = STUDIES / "robots" / "gofa12.urdf"
 
 
-def rack_data() -> dict[str, Any]:
-    """The rack's content with absolute URDF paths, fresh at each call."""
-    data = tomllib.loads(RACK.read_text(encoding="utf-8"))
+def sample_data() -> dict[str, Any]:
+    """A valid cell's content with absolute URDF paths, fresh at each call."""
+    data = tomllib.loads(SAMPLE.read_text(encoding="utf-8"))
     for robot in data["robots"]:
         robot["urdf"] = str(GOFA)
     return data
