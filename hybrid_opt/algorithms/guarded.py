@@ -90,7 +90,9 @@ class Guarded(Algorithm):  # type: ignore[misc]
             for index in np.flatnonzero(np.isinf(violation)):
                 infills[index].F = np.full_like(objectives[index], WORST_OBJECTIVE)
                 infills[index].G = np.full_like(constraints[index], WORST_OBJECTIVE)
-            infills.set("CV", violation[:, None])
+            # Not `infills.set`, which first lets pymoo compute the value in Python.
+            for individual, total in zip(infills, violation[:, None], strict=True):
+                individual.CV = total
         return super().advance(infills=infills, **kwargs)
 
     def _set_optimum(self) -> None:
@@ -118,9 +120,7 @@ class WarmSampling(FloatRandomSampling):  # type: ignore[misc]
             )
         # Written so that a NaN coordinate is refused too.
         if not ((initial >= problem.xl) & (initial <= problem.xu)).all():
-            raise SettingsError(
-                "an initial point lies outside the problem's bounds; move it inside"
-            )
+            raise SettingsError("an initial point lies outside the bounds; move it inside")
         samples[: len(initial)] = initial
         return samples
 

@@ -12,6 +12,12 @@ def _require(algorithm: str, name: str, value: float, low: float, high: float) -
         raise SettingsError(f"{algorithm}: {name} is {value}; allowed is {low:g} to {high:g}")
 
 
+def _require_whole(algorithm: str, name: str, value: int, low: int, high: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise SettingsError(f"{algorithm}: {name} is {value!r}; allowed are whole numbers")
+    _require(algorithm, name, value, low, high)
+
+
 @dataclass(frozen=True)
 class GeneticSettings:
     """Of NSGA-II and SMS-EMOA.
@@ -31,7 +37,7 @@ class GeneticSettings:
     mutation_eta: float = 20.0
 
     def __post_init__(self) -> None:
-        _require("genetic algorithm", "population", self.population, 4, 100_000)
+        _require_whole("genetic algorithm", "population", self.population, 4, 100_000)
         _require("genetic algorithm", "crossover_probability", self.crossover_probability, 0.0, 1.0)
         _require("genetic algorithm", "crossover_eta", self.crossover_eta, 1.0, 1000.0)
         _require("genetic algorithm", "mutation_eta", self.mutation_eta, 1.0, 1000.0)
@@ -65,15 +71,15 @@ class MopsoSettings:
     horizon: int | None = None
 
     def __post_init__(self) -> None:
-        _require("mopso", "swarm", self.swarm, 1, 100_000)
-        _require("mopso", "archive", self.archive, 1, 100_000)
-        _require("mopso", "divisions", self.divisions, 1, 1000)
+        _require_whole("mopso", "swarm", self.swarm, 1, 100_000)
+        _require_whole("mopso", "archive", self.archive, 1, 100_000)
+        _require_whole("mopso", "divisions", self.divisions, 1, 1000)
         _require("mopso", "inertia", self.inertia, 0.0, 1.0)
         _require("mopso", "cognitive", self.cognitive, 0.0, 4.0)
         _require("mopso", "social", self.social, 0.0, 4.0)
         _require("mopso", "mutation_share", self.mutation_share, 0.0, 1.0)
         if self.horizon is not None:
-            _require("mopso", "horizon", self.horizon, 1, 1e9)
+            _require_whole("mopso", "horizon", self.horizon, 1, 1_000_000_000)
 
 
 @dataclass(frozen=True)
@@ -83,4 +89,4 @@ class RandomSettings:
     batch: int = 100
 
     def __post_init__(self) -> None:
-        _require("random", "batch", self.batch, 1, 100_000)
+        _require_whole("random", "batch", self.batch, 1, 100_000)
