@@ -1,0 +1,1 @@
+"""Collision checking: python-fcl judges, the compiled bounds decide what it has to judge."""

@@ -1,0 +1,82 @@
+"""Maximum, minimum, absolute value and root, exact or smooth, each on its safe side.
+
+A lower bound of a distance stays one if every operation that it is made of errs downwards (or
+upwards where it is subtracted). `EXACT` computes the sharpest bound, with kinks; `Smooth(width)`
+replaces each kink by a hyperbola of that width, twice (in fact infinitely often) differentiable:
+
+  |x|  <=  sqrt(x^2 + w^2)              exceeds |x| by at most w,
+  max(a, b)  >=  (a + b + sqrt((a-b)^2 + w^2) - w) / 2    falls short by at most w / 2,
+  min(a, b)  >=  (a + b - sqrt((a-b)^2 + w^2)) / 2        falls short by at most w / 2,
+  |v|  >=  sqrt(v.v + w^2) - w          falls short by at most w.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import casadi as ca
+
+_TINY = 1e-12
+"""Added under roots so that derivatives stay finite."""
+
+
+@dataclass(frozen=True)
+class Softness:
+    """The operations; width [m] 0 means exact.
+
+    `above` results are at least the true value, `below` results at most.
+    """
+
+    width: float = 0.0
+
+    def absolute_above(self, x: ca.SX) -> ca.SX:
+        """|x| or slightly more."""
+        return ca.sqrt(x * x + self.width**2) if self.width else ca.fabs(x)
+
+    def absolute_below(self, x: ca.SX) -> ca.SX:
+        """|x| or slightly less."""
+        return self.absolute_above(x) - self.width
+
+    def ramp_above(self, x: ca.SX) -> ca.SX:
+        """max(x, 0) or up to half a width more; never negative."""
+        return (x + ca.sqrt(x * x + self.width**2)) / 2.0 if self.width else ca.fmax(x, 0.0)
+
+    def maximum_above(self, values: Sequence[ca.SX]) -> ca.SX:
+        """Largest value or slightly more."""
+        return _fold(self._pair_above if self.width else ca.fmax, values)
+
+    def maximum_below(self, values: Sequence[ca.SX]) -> ca.SX:
+        """Largest value or slightly less."""
+        if not self.width:
+            return _fold(ca.fmax, values)
+        return _fold(lambda a, b: self._pair_above(a, b) - self.width / 2.0, values)
+
+    def minimum_below(self, values: Sequence[ca.SX]) -> ca.SX:
+        """Least value or slightly less."""
+        return -self.maximum_above([-value for value in values])
+
+    def norm_below(self, squared: ca.SX) -> ca.SX:
+        """Root of a squared length, or slightly less."""
+        if self.width:
+            return ca.sqrt(squared + self.width**2) - self.width
+        return ca.sqrt(ca.fmax(squared, _TINY)) - _TINY**0.5
+
+    def cosine_above(self, sine: ca.SX) -> ca.SX:
+        """sqrt(1 - sine^2) or slightly more."""
+        rest = 1.0 - sine * sine
+        if self.width:
+            # 1 - sine^2 may be -1e-16 by roundoff; the width keeps the root's argument positive.
+            return ca.sqrt(rest + self.width**2)
+        return ca.sqrt(ca.fmax(rest, _TINY))
+
+    def _pair_above(self, a: ca.SX, b: ca.SX) -> ca.SX:
+        return (a + b + ca.sqrt((a - b) ** 2 + self.width**2)) / 2.0
+
+
+def _fold(operation: Callable[[ca.SX, ca.SX], ca.SX], values: Sequence[ca.SX]) -> ca.SX:
+    return reduce(operation, values)
+
+
+EXACT = Softness()
