@@ -1,0 +1,228 @@
+"""The compiled functions that timing needs, built once per workcell, and what they return."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.build import build, load_or_build
+from codegen.cache import Cache, digest
+from codegen.workcell_functions import workcell_functions, workcell_key
+from hybrid_opt.timing.records import TimedCarry
+from symbolic.errors import SettingsError
+from symbolic.urdf_model import arm_model
+from symbolic.workcell import Array, Robot, Workcell
+
+STAGES = 200
+"""Pieces of constant path acceleration."""
+
+REFINEMENT = 10
+"""Samples per piece at which a timing is recomputed."""
+
+
+@dataclass(frozen=True)
+class PathMotion:
+    """Geometry of a carry at samples of the path parameter; arms side by side (12 joints).
+
+    `symbolic.path_motion` describes the quantities.
+    """
+
+    parameter: Array
+    pose: Array
+    pose_first: Array
+    pose_second: Array
+    angular_first: Array
+    angular_second: Array
+    normal: Array
+    force_by_acceleration: Array
+    force_by_speed: Array
+    q: Array
+    q_first: Array
+    q_second: Array
+    torque_by_acceleration: Array
+    torque_by_speed: Array
+    torque_at_rest: Array
+    wrench_torque: Array
+    ik_residual: Array
+    lost: Array
+    limit_margin: Array
+    manipulability: Array
+
+    def at(self, samples: NDArray[np.intp]) -> PathMotion:
+        """The given samples in the given order."""
+        return PathMotion(*[getattr(self, f.name)[samples] for f in fields(self)])
+
+
+_BOX = (
+    "pose",
+    "pose_first",
+    "pose_second",
+    "angular_first",
+    "angular_second",
+    "normal",
+    "force_by_acceleration",
+    "force_by_speed",
+)
+_ARMS = tuple(f.name for f in fields(PathMotion) if f.name not in (*_BOX, "parameter"))
+
+
+class TimingModel:
+    """Timing of one workcell's trajectories.
+
+    Attributes:
+        workcell: the cell.
+        stages: pieces of constant path acceleration.
+        joint_names: names of both arms' joints.
+    """
+
+    def __init__(
+        self, workcell: Workcell, stages: int = STAGES, cache: Cache | None = None
+    ) -> None:
+        """Load or build the compiled functions.
+
+        Raises:
+            SettingsError: the number of stages is out of range.
+            DualArmError: the model or its code cannot be built.
+        """
+        if not 10 <= stages <= 2000:
+            raise SettingsError(f"{stages} stages; allowed are 10 to 2000")
+        self.workcell = workcell
+        self.stages = stages
+        self.joint_names = (joint_names(workcell.robots[0]), joint_names(workcell.robots[1]))
+        samples = REFINEMENT * stages + 1
+
+        def make() -> Any:
+            # Only a first use builds expressions; CasADi and Pinocchio are heavy to import.
+            from symbolic.cell_model import build_cell_model
+            from symbolic.path_motion import path_motion_function
+            from symbolic.payload_load import load_function
+
+            model = build_cell_model(workcell)
+            return {
+                "path_motion": path_motion_function(model, samples),
+                "load": load_function(workcell),
+                "inverse_dynamics_1": model.robots[0].inverse_dynamics,
+                "inverse_dynamics_2": model.robots[1].inverse_dynamics,
+            }
+
+        if workcell.digest:
+            key = digest("timing", workcell_key(workcell), str(samples))
+            self._functions = load_or_build(key, make, cache)
+        else:  # not read from a file: nothing identifies it but the functions themselves
+            self._functions = build(make(), cache).functions
+        self._cache = cache
+
+    def path_motion(self, x: Array) -> PathMotion:
+        """The geometry at `REFINEMENT` samples per stage, uniform in u.
+
+        Raises:
+            SettingsError: x has the wrong shape or is not finite.
+        """
+        out = self._functions["path_motion"](self._checked(x))
+        n = len(out["pose"])
+        values = {name: out[name] for name in _BOX}
+        for name in _ARMS:
+            values[name] = np.concatenate([out[f"{name}_1"], out[f"{name}_2"]], axis=1)
+        values["wrench_torque"] = values["wrench_torque"].reshape(n, 2, 6, 6)
+        return PathMotion(parameter=np.linspace(0.0, 1.0, n), **values)
+
+    def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
+        """`symbolic.payload_load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
+        return self._functions["load"].batch(pose, rate, second_rate)
+
+    def drive(self, motion: PathMotion, speed: Array, acceleration: Array) -> dict[str, Array]:
+        """Loads of a path driven with u' and u'' (n,) per sample; see also `contact_torque`."""
+        rate = motion.pose_first * speed[:, None]
+        second = motion.pose_second * speed[:, None] ** 2 + (
+            motion.pose_first * acceleration[:, None]
+        )
+        return self.load(motion.pose, rate, second)
+
+    def carry(
+        self, motion: PathMotion, time: Array, speed: Array, acceleration: Array
+    ) -> TimedCarry:
+        """The carry with the given timing (n,) at the samples of `motion`."""
+        load = self.drive(motion, speed, acceleration)
+        v, w, a = speed[:, None], speed[:, None] ** 2, acceleration[:, None]
+        own = motion.torque_by_acceleration * a + motion.torque_by_speed * w
+        return TimedCarry(
+            parameter=motion.parameter,
+            time=time,
+            pose=motion.pose,
+            rate=motion.pose_first * v,
+            second_rate=motion.pose_second * w + motion.pose_first * a,
+            q=motion.q,
+            q_rate=motion.q_first * v,
+            q_second=motion.q_second * w + motion.q_first * a,
+            **_loads(load),
+            contact_torque=contact_torque(motion, load),
+            own_torque=own + motion.torque_at_rest,
+        )
+
+    def search_carry(self, x: Array) -> TimedCarry:
+        """The carry as the search sees it: the task's own time law and samples.
+
+        Joint rates are second-order finite differences on the law's times, as the paper takes
+        the box's (one-sided at the ends).
+        """
+        x = self._checked(x)
+        out = workcell_functions(self.workcell, self._cache)["candidate"](x)
+        time = out["time"].reshape(-1)
+        q = np.concatenate([out["q_1"], out["q_2"]], axis=1)
+        q_rate = np.gradient(q, time, axis=0, edge_order=2)
+        q_second = np.gradient(q_rate, time, axis=0, edge_order=2)
+        own = [
+            self._functions[f"inverse_dynamics_{i + 1}"]
+            .batch(*[np.ascontiguousarray(v[:, 6 * i : 6 * i + 6]) for v in (q, q_rate, q_second)])
+            .popitem()[1]
+            for i in (0, 1)
+        ]
+        return TimedCarry(
+            parameter=np.linspace(0.0, 1.0, len(time)),
+            time=time,
+            pose=out["pose"],
+            rate=out["rate"],
+            second_rate=out["second_rate"],
+            q=q,
+            q_rate=q_rate,
+            q_second=q_second,
+            **_loads(self.load(out["pose"], out["rate"], out["second_rate"])),
+            contact_torque=np.concatenate([out["joint_torque_1"], out["joint_torque_2"]], axis=1),
+            own_torque=np.concatenate(own, axis=1),
+        )
+
+    def _checked(self, x: Array) -> Array:
+        x = np.ascontiguousarray(x, dtype=float)
+        n_var = self.workcell.task.n_var
+        if x.shape != (n_var,) or not np.isfinite(x).all():
+            raise SettingsError(f"decision vector of shape {x.shape}; needs {n_var} finite numbers")
+        return x
+
+
+def joint_names(robot: Robot) -> tuple[str, ...]:
+    """The six joints of a robot in the order of q."""
+    return tuple(arm_model(robot).names)[1:]
+
+
+def contact_torque(motion: PathMotion, load: dict[str, Array]) -> Array:
+    """(n, 12) joint torques of the contact wrenches [N m]."""
+    wrench = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
+    torque: Array = np.einsum("nijk,nik->nij", motion.wrench_torque, wrench)
+    return torque.reshape(len(torque), 12)
+
+
+def _loads(load: dict[str, Array]) -> dict[str, Array]:
+    names = (
+        "angular_velocity",
+        "angular_acceleration",
+        "normal_force",
+        "tangential_force",
+        "pressure_shift",
+        "point_moment_residual",
+        "moment_residual",
+    )
+    forces = load["contact_force"].reshape(-1, 2, 3)
+    return {name: load[name] for name in names} | {"contact_force": forces}

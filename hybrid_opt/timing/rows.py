@@ -1,0 +1,172 @@
+"""Limits of a carry as linear rows on the path's timing.
+
+At a point of the path every limit reads alpha u'' + beta u'^2 <= bound, either exactly (joint
+speeds and accelerations) or as a supporting line of a convex limit (payload acceleration, normal
+force), or as the linearisation of a limit that is not convex (joint torque, pressure shift).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from hybrid_opt.timing.adapter import SPEED_CEILING, StageRows
+from hybrid_opt.timing.model import PathMotion
+from hybrid_opt.timing.records import TimingLimits
+from symbolic.contact_forces import GRAVITY, normal_force_branches
+from symbolic.workcell import Array, Workcell
+
+STAGE_POINTS = (0.0, 1.0)
+"""Places within a stage at which limits are imposed, as a share of its length."""
+
+
+@dataclass(frozen=True)
+class PointRows:
+    """Limits at points of the path: alpha u'' + beta u'^2 <= bound, each (points, k)."""
+
+    alpha: Array
+    beta: Array
+    bound: Array
+
+
+def join(rows: list[PointRows]) -> PointRows:
+    """All rows side by side."""
+    return PointRows(
+        *[
+            np.concatenate([getattr(row, name) for row in rows], axis=1)
+            for name in ("alpha", "beta", "bound")
+        ]
+    )
+
+
+def stage_rows(rows: PointRows, stages: int, scale: float) -> StageRows:
+    """The rows of each stage's points in terms of its u'' and its initial u'^2.
+
+    Args:
+        rows: at the points of all stages, `STAGE_POINTS` per stage in order.
+        scale: the path coordinate is scale times u.
+    """
+    k = rows.alpha.shape[1]
+    # Within a stage u'^2 = u'^2_0 + 2 share length u''.
+    progress = np.tile(np.array(STAGE_POINTS) * 2.0 * scale / stages, stages)[:, None]
+    alpha, beta = rows.alpha / scale, rows.beta / scale**2
+    shape = (stages, len(STAGE_POINTS) * k)
+    return StageRows(
+        (alpha + progress * beta).reshape(shape), beta.reshape(shape), rows.bound.reshape(shape)
+    )
+
+
+def squared_speed_limit(motion: PathMotion, workcell: Workcell, limits: TimingLimits) -> Array:
+    """(n,) largest u'^2 by all limits on speeds; infinite where nothing moves."""
+    robots, payload, task = workcell.robots, workcell.payload, workcell.task
+    velocity = np.concatenate([robot.velocity_max for robot in robots])
+    linear = np.linalg.norm(motion.pose_first[:, :3], axis=1)
+    angular = np.linalg.norm(motion.angular_first, axis=1)
+    demands = [
+        (np.abs(motion.q_first) / velocity).max(axis=1),
+        linear / payload.velocity_max,
+        angular / payload.angular_velocity_max,
+    ]
+    if limits.reference_speed:
+        demands += [linear / task.reference_speed, angular / task.reference_angular_speed]
+    demand = np.max(demands, axis=0)
+    with np.errstate(divide="ignore"):
+        limit: Array = 1.0 / demand**2
+    return limit
+
+
+def speed_rows(
+    motion: PathMotion, workcell: Workcell, limits: TimingLimits, scale: float
+) -> PointRows:
+    """Limits on speeds, which bound u'^2 alone."""
+    limit = squared_speed_limit(motion, workcell, limits)
+    limit = np.minimum(limit, SPEED_CEILING / scale**2)[:, None]
+    return PointRows(np.zeros_like(limit), 1.0 / limit, np.ones_like(limit))
+
+
+def joint_acceleration_rows(motion: PathMotion, workcell: Workcell) -> PointRows:
+    """Limits on joint accelerations q' u'' + q'' u'^2, both signs."""
+    limit = np.concatenate([robot.acceleration_max for robot in workcell.robots])
+    alpha, beta = motion.q_first / limit, motion.q_second / limit
+    return PointRows(
+        np.concatenate([alpha, -alpha], axis=1),
+        np.concatenate([beta, -beta], axis=1),
+        np.ones((len(alpha), 24)),
+    )
+
+
+def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> PointRows:
+    """Supporting lines of |first u'' + second u'^2| <= limit.
+
+    Args:
+        first, second: (n, 3).
+        directions: (n, k, 3) unit vectors e; each gives e.(first u'' + second u'^2) <= limit.
+    """
+    alpha = np.einsum("nkd,nd->nk", directions, first) / limit
+    beta = np.einsum("nkd,nd->nk", directions, second) / limit
+    return PointRows(alpha, beta, np.ones_like(alpha))
+
+
+def spanning_directions(first: Array, second: Array) -> Array:
+    """(n, 4, 3): both signs of two orthogonal unit vectors that span first and second (n, 3)."""
+    one = _unit(first)
+    two = _unit(second - np.sum(second * one, axis=1, keepdims=True) * one)
+    return np.stack([one, -one, two, -two], axis=1)
+
+
+def force_rows(motion: PathMotion, workcell: Workcell, force: float, tangent: Array) -> PointRows:
+    """Supporting lines of both normal forces at most `force`.
+
+    Each normal force is the largest of five functions, affine in the normal part and in the
+    length of the tangential part of the required force (`normal_force_branches`), so it is convex
+    in (u'', u'^2); a unit vector in the tangent plane turns the length into a lower bound that is
+    exact along it.
+
+    Args:
+        force: limit [N].
+        tangent: (n, 3) unit vectors, orthogonal to the contact normals.
+    """
+    friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
+    by_normal = np.array(normal_force_branches(ca.DM(1), ca.DM(0), friction)).reshape(-1)
+    by_tangent = np.array(normal_force_branches(ca.DM(0), ca.DM(1), friction)).reshape(-1)
+    weight = workcell.payload.mass * np.array(GRAVITY)
+    normal_share = np.concatenate([by_normal + 1.0, by_normal])  # N_1 = N_2 + F_n
+    tangent_share = np.concatenate([by_tangent, by_tangent])
+    axes = (
+        normal_share[None, :, None] * motion.normal[:, None, :]
+        + tangent_share[None, :, None] * tangent[:, None, :]
+    )
+    return PointRows(
+        np.einsum("nkd,nd->nk", axes, motion.force_by_acceleration) / force,
+        np.einsum("nkd,nd->nk", axes, motion.force_by_speed) / force,
+        1.0 + axes @ weight / force,
+    )
+
+
+def tangent_direction(motion: PathMotion, workcell: Workcell, a: Array, w: Array) -> Array:
+    """(n, 3) direction of the tangential force at u'' = a and u'^2 = w (n,)."""
+    weight = workcell.payload.mass * np.array(GRAVITY)
+    force = motion.force_by_acceleration * a[:, None] + motion.force_by_speed * w[:, None] - weight
+    return _unit(force - np.sum(force * motion.normal, axis=1, keepdims=True) * motion.normal)
+
+
+def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> PointRows:
+    """Linearisation of value <= 1 about z, kept satisfiable at rest.
+
+    Args:
+        value: (n, k) at z.
+        gradient: (n, k, 2) by (u'', u'^2).
+        at_rest: (n, k) at u'' = u'^2 = 0, below one.
+        z: (n, 2) the point of linearisation.
+    """
+    bound = 1.0 - value + np.einsum("nkd,nd->nk", gradient, z)
+    # Rest is truly allowed; a linearisation from far away must not forbid it.
+    return PointRows(gradient[..., 0], gradient[..., 1], np.maximum(bound, (1.0 - at_rest) / 2.0))
+
+
+def _unit(vectors: Array) -> Array:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit: Array = np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), 0.0)
+    return unit

@@ -1,0 +1,109 @@
+"""How far a carry uses each limit, recomputed from its physical quantities alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybrid_opt.timing.records import Excess, Place, TimedCarry, TimingLimits
+from symbolic.workcell import Array, Workcell
+
+JOINT_CONSTRAINTS = ("joint velocity", "joint acceleration", "joint torque")
+CONTACT_CONSTRAINTS = ("normal force", "friction", "pressure shift")
+
+FORCE_FLOOR = 1e-9
+"""A contact with less normal force than this carries nothing [N]."""
+
+
+def limit_ratios(carry: TimedCarry, workcell: Workcell, limits: TimingLimits) -> dict[str, Array]:
+    """Every limited quantity over its limit at every sample.
+
+    Returns:
+        By constraint (n, 12) for joints, (n, 2) for contacts, (n, 1) for the box; only the limits
+        that apply.
+    """
+    robots, payload, task = workcell.robots, workcell.payload, workcell.task
+
+    def joints(name: str) -> Array:
+        return np.concatenate([getattr(robot, name) for robot in robots])
+
+    friction = np.array([contact.friction for contact in workcell.contacts])
+    radius = np.array([contact.patch_radius for contact in workcell.contacts])
+    linear, angular = _norm(carry.rate[:, :3]), _norm(carry.angular_velocity)
+    ratios = {
+        "joint velocity": np.abs(carry.q_rate) / joints("velocity_max"),
+        "joint acceleration": np.abs(carry.q_second) / joints("acceleration_max"),
+        "payload velocity": linear / payload.velocity_max,
+        "payload acceleration": _norm(carry.second_rate[:, :3]) / payload.acceleration_max,
+        "payload angular velocity": angular / payload.angular_velocity_max,
+        "payload angular acceleration": _norm(carry.angular_acceleration)
+        / payload.angular_acceleration_max,
+        "friction": carry.tangential_force
+        / np.maximum(carry.normal_force * friction, FORCE_FLOOR),
+    }
+    if limits.torque:
+        ratios["joint torque"] = np.abs(carry.torque) / joints("torque_max")
+    if limits.pressure:
+        ratios["pressure shift"] = carry.pressure_shift / radius
+    if limits.force is not None:
+        ratios["normal force"] = carry.normal_force / limits.force
+    if limits.reference_speed:
+        ratios["path speed"] = np.maximum(
+            linear / task.reference_speed, angular / task.reference_angular_speed
+        )
+    return ratios
+
+
+def limit_use(
+    carry: TimedCarry,
+    workcell: Workcell,
+    limits: TimingLimits,
+    joint_names: tuple[tuple[str, ...], tuple[str, ...]],
+) -> dict[str, Excess]:
+    """The largest use of every limit and where, by constraint.
+
+    Args:
+        joint_names: names of both arms' joints.
+    """
+    use = {}
+    for name, ratio in limit_ratios(carry, workcell, limits).items():
+        sample, column = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+        robot, joint = "", ""
+        if name in JOINT_CONSTRAINTS:
+            robot = workcell.robots[column // 6].name
+            joint = joint_names[column // 6][column % 6]
+        elif name in CONTACT_CONSTRAINTS:
+            robot = workcell.robots[column].name
+        place = Place(name, robot, joint, int(sample), float(carry.parameter[sample]))
+        use[name] = Excess(float(ratio[sample, column]), place)
+    return use
+
+
+def joint_use(
+    carry: TimedCarry, workcell: Workcell
+) -> dict[str, Array]:
+    """Worst use of every joint's limits over the carry, (12,) per joint constraint.
+
+    Beside the three limits, `contact torque` is the share of the contact wrench alone.
+    """
+    ratios = limit_ratios(carry, workcell, TimingLimits())
+    use = {name: ratios[name].max(axis=0) for name in JOINT_CONSTRAINTS}
+    limit = np.concatenate([robot.torque_max for robot in workcell.robots])
+    return use | {"contact torque": (np.abs(carry.contact_torque) / limit).max(axis=0)}
+
+
+def worst(use: dict[str, Excess]) -> Excess:
+    """The limit with the largest use; friction, tight by construction, counts only when broken."""
+    candidates = [
+        excess
+        for name, excess in use.items()
+        if name != "friction" or excess.ratio > 1.0 + FRICTION_ROUNDING
+    ]
+    return max(candidates, key=lambda excess: excess.ratio)
+
+
+FRICTION_ROUNDING = 1e-6
+"""The least-effort forces lie on the friction cones; this much beyond them is rounding."""
+
+
+def _norm(vectors: Array) -> Array:
+    return np.linalg.norm(vectors, axis=1, keepdims=True)
