@@ -26,6 +26,7 @@ class Band:
 
 
 BAND_SEEDS = 10
+BAND_POPULATION = 100
 BAND_SOURCE = (
     "reference runs of an independent implementation of the 2002/2004 algorithm, made when this "
     "program was specified: mean of 10 seeds, swarm and archive 100"

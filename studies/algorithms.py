@@ -19,10 +19,9 @@ from hybrid_opt import algorithms, analytic_problems, metrics
 from hybrid_opt.algorithms import Evaluated
 from hybrid_opt.analytic_problems import AnalyticProblem
 from hybrid_opt.statistics import RankTest, Summary, corrected, rank_test, summarise
-from studies.algorithm_bands import BAND_SOURCE, BANDS, Band, Verdict, judge
+from studies.algorithm_bands import BAND_POPULATION, BAND_SOURCE, BANDS, Band, Verdict, judge
 from symbolic.errors import DualArmError, SettingsError
 
-POPULATION = 100
 SHIFTED = "shifted-zdt1"
 SHIFTED_POPULATION = 40
 SHIFTED_EVALUATIONS = 1000
@@ -43,6 +42,7 @@ class Row:
     problem: str
     evaluations: int
     algorithm: str
+    population: int
     hypervolume: Summary
     igd: Summary
     archive_hypervolume: Summary
@@ -87,15 +87,18 @@ def _run(target: AnalyticProblem, name: str, evaluations: int, population: int, 
     )
 
 
-def _band(problem: str, evaluations: int, algorithm: str) -> Band | None:
-    """The band of Coello's MOPSO and of the variants of it."""
-    return BANDS.get((problem, evaluations)) if algorithm.startswith("mopso") else None
+def _band(problem: str, evaluations: int, algorithm: str, population: int) -> Band | None:
+    """The band of Coello's MOPSO and of the variants of it, for the swarm that it holds for."""
+    applies = algorithm.startswith("mopso") and population == BAND_POPULATION
+    return BANDS.get((problem, evaluations)) if applies else None
 
 
-def _row(problem: str, evaluations: int, algorithm: str, runs: Sequence[_Run]) -> Row:
+def _row(
+    problem: str, evaluations: int, algorithm: str, population: int, runs: Sequence[_Run]
+) -> Row:
     hypervolume = summarise([run.hypervolume for run in runs])
     distance = summarise([run.igd for run in runs])
-    band = _band(problem, evaluations, algorithm)
+    band = _band(problem, evaluations, algorithm, population)
     verdicts: tuple[Verdict | None, Verdict | None] = (None, None)
     if band is not None:
         verdicts = (
@@ -106,6 +109,7 @@ def _row(problem: str, evaluations: int, algorithm: str, runs: Sequence[_Run]) -
         problem,
         evaluations,
         algorithm,
+        population,
         hypervolume,
         distance,
         summarise([run.archive_hypervolume for run in runs]),
@@ -131,6 +135,7 @@ def compare(
     budgets: Sequence[int],
     names: Sequence[str],
     seeds: int,
+    population: int = BAND_POPULATION,
     progress: bool = False,
 ) -> Comparison:
     """Run every algorithm on every problem with every budget and seeds 0, 1, ...
@@ -143,13 +148,13 @@ def compare(
     for name in names:
         algorithms.settings_of(name)
     targets = [analytic_problems.make(problem) for problem in problems]
-    if seeds < 1 or min(budgets) < POPULATION:
+    if seeds < 1 or min(budgets) < population:
         raise SettingsError(
-            f"{seeds} seeds of {min(budgets)} evaluations; at least 1 seed and {POPULATION} "
+            f"{seeds} seeds of {min(budgets)} evaluations; at least 1 seed and {population} "
             "evaluations (the population) are needed"
         )
     tasks = [
-        (target, budget, name, POPULATION)
+        (target, budget, name, population)
         for target in targets
         if target.name != SHIFTED
         for budget in budgets
@@ -163,9 +168,9 @@ def compare(
     rows: list[Row] = []
     shifted: dict[str, list[_Run]] = {}
     start = time.perf_counter()
-    for done, (target, budget, name, population) in enumerate(tasks, 1):
-        runs = [_run(target, name, budget, population, seed) for seed in range(seeds)]
-        rows.append(_row(target.name, budget, name, runs))
+    for done, (target, budget, name, size) in enumerate(tasks, 1):
+        runs = [_run(target, name, budget, size, seed) for seed in range(seeds)]
+        rows.append(_row(target.name, budget, name, size, runs))
         if target.name == SHIFTED:
             shifted[name] = runs
         if progress:
@@ -192,16 +197,16 @@ def _tests(shifted: dict[str, list[_Run]]) -> tuple[RankTest, ...]:
 def table(result: Comparison) -> str:
     """The comparison as text."""
     lines = [
-        f"Mean over {result.seeds} seeds; final front of at most {POPULATION} points, and archive "
-        "of all evaluated points",
+        f"Mean over {result.seeds} seeds of the final front (limited size) and of all evaluated "
+        "points",
         f"Bands: {BAND_SOURCE}",
-        f"{'problem':13}{'evals':>6}  {'algorithm':16}{'HV':>7}{'sd':>7}{'band':>7} {'':8}"
-        f"{'IGD':>8}{'sd':>8}{'band':>8} {'':8}{'HV all':>7}{'IGD all':>9}{'us/eval':>9}",
+        f"{'problem':13}{'evals':>6}{'pop':>5}  {'algorithm':16}{'HV':>7}{'sd':>7}{'band':>7}"
+        f"{'':9}{'IGD':>8}{'sd':>8}{'band':>8} {'':8}{'HV all':>7}{'IGD all':>9}{'us/eval':>9}",
     ]
     for row in result.rows:
-        band = _band(row.problem, row.evaluations, row.algorithm)
+        band = _band(row.problem, row.evaluations, row.algorithm, row.population)
         lines.append(
-            f"{row.problem:13}{row.evaluations:6d}  {row.algorithm:16}"
+            f"{row.problem:13}{row.evaluations:6d}{row.population:5d}  {row.algorithm:16}"
             f"{row.hypervolume.mean:7.3f}{row.hypervolume.std:7.3f}"
             f"{f'{band.hypervolume:.3f}' if band else '':>7} {row.hypervolume_verdict or '':8}"
             f"{row.igd.mean:8.4f}{row.igd.std:8.4f}"
@@ -244,6 +249,13 @@ def _parser() -> argparse.ArgumentParser:
         default=[1000, 10_000, 25_000],
         help=f"budgets ({SHIFTED} always has {SHIFTED_EVALUATIONS})",
     )
+    parser.add_argument(
+        "--population",
+        type=int,
+        default=BAND_POPULATION,
+        help=f"swarm or population, the bands hold for {BAND_POPULATION} "
+        f"({SHIFTED} always has {SHIFTED_POPULATION})",
+    )
     parser.add_argument("--problems", nargs="+", default=list(every), metavar="NAME", help="which")
     parser.add_argument(
         "--algorithms", nargs="+", default=["mopso", "nsga2"], metavar="NAME", help="which"
@@ -257,7 +269,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         result = compare(
-            options.problems, options.evaluations, options.algorithms, options.seeds, progress=True
+            options.problems,
+            options.evaluations,
+            options.algorithms,
+            options.seeds,
+            options.population,
+            progress=True,
         )
     except DualArmError as error:
         print(error, file=sys.stderr)

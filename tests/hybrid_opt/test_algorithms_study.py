@@ -45,6 +45,14 @@ def test_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert printed.err.splitlines()[-1].startswith("4/4 shifted-zdt1 1000 nsga2")
 
 
+def test_bands_hold_for_their_population_only(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--seeds", "2", "--evaluations", "1000", "--problems", "srn"]
+    assert algorithms.main(arguments) == 0
+    assert "mopso against the bands" in capsys.readouterr().out
+    assert algorithms.main([*arguments, "--population", "40"]) == 0
+    assert "mopso against the bands" not in capsys.readouterr().out
+
+
 def test_json_repeats_to_the_digit(capsys: pytest.CaptureFixture[str]) -> None:
     documents = []
     for _ in range(2):
@@ -64,6 +72,7 @@ def test_json_repeats_to_the_digit(capsys: pytest.CaptureFixture[str]) -> None:
         (["--algorithms", "pso"], "unknown algorithm 'pso'"),
         (["--seeds", "0"], "at least 1 seed"),
         (["--evaluations", "99"], "100 evaluations (the population)"),
+        (["--population", "0", "--problems", "tnk"], "swarm is 0"),
     ],
 )
 def test_wrong_arguments(
