@@ -1,42 +1,45 @@
-"""The compiled functions of a workcell, built once and then found by content."""
+"""The evaluators of a workcell, compiled."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
-from functools import cache
 from importlib.metadata import version
-from importlib.resources import files
+from typing import TYPE_CHECKING
 
-from codegen.build import CompiledFunction, load_or_build
-from symbolic.cell_functions import cell_functions
+from codegen.build import build, load_or_build
+from codegen.cache import Cache, digest, source_digest
+from codegen.function import NumericFunction
 from symbolic.workcell import Workcell
 
+if TYPE_CHECKING:
+    import casadi as ca
 
-def workcell_functions(workcell: Workcell) -> Mapping[str, CompiledFunction]:
-    """Compiled functions of a workcell by name (see `symbolic.cell_functions`).
 
-    A warm start finds them by the workcell's digest, the text of the symbolic package and the
-    versions of the libraries that write the expressions, and builds no expression.
+def workcell_functions(
+    workcell: Workcell, cache: Cache | None = None
+) -> dict[str, NumericFunction]:
+    """Every function of `symbolic.cell_functions.cell_functions`, from the cache where it was built before.
+
+    A first use builds expressions and compiles; later ones, also by other processes, only load.
 
     Raises:
-        DualArmError: the model or its code cannot be built.
+        DualArmError: the workcell has no model, or its functions cannot be built.
     """
-    return load_or_build(
-        f"{workcell.digest}-{_model_digest()}", lambda: cell_functions(workcell)
-    )
+
+    def make() -> Mapping[str, ca.Function]:
+        # Not imported at the top: a warm start needs neither CasADi nor Pinocchio.
+        from symbolic.cell_functions import cell_functions
+
+        return cell_functions(workcell)
+
+    if not workcell.digest:
+        # Not read from a file: nothing identifies it but the functions themselves.
+        return build(make(), cache).functions
+    return load_or_build(workcell_key(workcell), make, cache)
 
 
-@cache
-def _model_digest() -> str:
-    """SHA-256 over the symbolic package's sources and the expression libraries' versions."""
-    digest = hashlib.sha256()
-    sources = sorted(
-        (path for path in files("symbolic").iterdir() if path.name.endswith(".py")),
-        key=lambda path: path.name,
-    )
-    for path in sources:
-        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    for library in ("casadi", "pin", "scipy"):
-        digest.update(f"{library} {version(library)}\0".encode())
-    return digest.hexdigest()
+def workcell_key(workcell: Workcell) -> str:
+    """What a workcell's functions are made from: its files, the symbolic package's sources and
+    the libraries that write the expressions (CasADi's version is part of every set's key)."""
+    libraries = [f"{library} {version(library)}" for library in ("pin", "scipy")]
+    return digest(workcell.digest, source_digest("symbolic"), *libraries)

@@ -1,0 +1,272 @@
+"""Build sets of functions: from the cache where possible, otherwise compiled side by side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from codegen.cache import FORMAT, Cache, Entry, digest, source_digest
+from codegen.compiled import CompiledFunction
+from codegen.compiler import FLAGS, Compiler, default_level, find_compiler
+from codegen.function import NumericFunction, available_cores
+from codegen.interpreted import InterpretedFunction, warn_interpreted
+from codegen.signature import Signature
+from symbolic.errors import CodegenError
+
+if TYPE_CHECKING:
+    import casadi as ca
+
+
+@dataclass(frozen=True)
+class FunctionReport:
+    """How one function was built.
+
+    Attributes:
+        name: in the set that was built.
+        operations: instructions per evaluation, see `codegen.source.operations`.
+        c_bytes: size of the C text; 0 where the function is interpreted.
+        compile_seconds: what the compiler took, now or when the cached library was made; 0 where
+            the function is interpreted.
+        level: the compiler's optimisation level.
+        from_cache: whether the library was there already.
+        compiled: False where the function is interpreted for want of a compiler.
+    """
+
+    name: str
+    operations: int
+    c_bytes: int
+    compile_seconds: float
+    level: int
+    from_cache: bool
+    compiled: bool
+
+
+@dataclass(frozen=True)
+class Build:
+    """A set of functions and how each was built, in the order they were given.
+
+    Attributes:
+        functions: by name.
+        reports: how each was built.
+        keys: by name, where the cache holds it; empty where functions are interpreted.
+    """
+
+    functions: dict[str, NumericFunction]
+    reports: tuple[FunctionReport, ...]
+    keys: dict[str, str]
+
+
+def compile_function(
+    function: ca.Function, cache: Cache | None = None, *, level: int | None = None
+) -> NumericFunction:
+    """Compile one CasADi function, or take it from the cache.
+
+    Args:
+        function: any function that CasADi can write as C; sparse inputs and outputs become dense.
+        cache: where libraries are kept; by default the user's (`codegen.cache.default_folder`).
+        level: optimisation level 0 to 3; by default by the size of the source.
+
+    Returns:
+        A `CompiledFunction`, or without a C compiler an `InterpretedFunction`, with one warning
+        per process.
+
+    Raises:
+        CodegenError: it cannot be generated, compiled, cached or loaded.
+    """
+    levels = None if level is None else {"function": level}
+    return build({"function": function}, cache, levels=levels).functions["function"]
+
+
+def build(
+    functions: Mapping[str, ca.Function],
+    cache: Cache | None = None,
+    *,
+    levels: Mapping[str, int] | None = None,
+    jobs: int = 0,
+    rebuild: bool = False,
+) -> Build:
+    """Compile a set of CasADi functions, several at once.
+
+    Args:
+        functions: by the name under which they are wanted.
+        cache: where libraries are kept; by default the user's.
+        levels: optimisation level per name, where the default by size is not wanted.
+        jobs: compilers that run at once; 0 for one per core.
+        rebuild: compile also what is in the cache.
+
+    Raises:
+        CodegenError: see `compile_function`.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        return _interpreted(functions)
+    cache = cache or Cache()
+    with ThreadPoolExecutor(jobs or available_cores()) as pool:
+        futures = []
+        for name, function in functions.items():
+            source = _Source.of(function)
+            level = (levels or {}).get(name)
+            level = default_level(len(source.text)) if level is None else level
+            futures.append(pool.submit(_compile, source, compiler, cache, level, rebuild))
+        built = [future.result() for future in futures]
+    reports = tuple(
+        FunctionReport(
+            name=name,
+            operations=entry.facts["operations"],
+            c_bytes=entry.facts["c_bytes"],
+            compile_seconds=entry.facts["compile_seconds"],
+            level=entry.facts["level"],
+            from_cache=found,
+            compiled=True,
+        )
+        for name, (_, entry, found) in zip(functions, built, strict=True)
+    )
+    return Build(
+        {name: function for name, (function, _, _) in zip(functions, built, strict=True)},
+        reports,
+        {name: entry.key for name, (_, entry, _) in zip(functions, built, strict=True)},
+    )
+
+
+def load_or_build(
+    key: str, make: Callable[[], Mapping[str, ca.Function]], cache: Cache | None = None
+) -> dict[str, NumericFunction]:
+    """A set of functions by the key of what they are made from.
+
+    Where the set was built before, with this compiler and these library versions, neither
+    expressions nor C are made again: `make` is not called and CasADi is not imported.
+
+    Args:
+        key: changes with everything that `make` depends on, except the version of CasADi.
+        make: makes the functions.
+        cache: where libraries are kept; by default the user's.
+
+    Raises:
+        CodegenError: see `compile_function`; and whatever `make` raises.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        return _interpreted(make()).functions
+    cache = cache or Cache()
+    found = _load_set(key, compiler, cache)
+    if found is not None:
+        return found
+    with cache.lock(_set_key(key, compiler)):
+        found = _load_set(key, compiler, cache)
+        return found if found is not None else build_set(key, make(), cache).functions
+
+
+def build_set(
+    key: str, functions: Mapping[str, ca.Function], cache: Cache | None = None, **options: Any
+) -> Build:
+    """`build`, and remember the set for `load_or_build` under the same key."""
+    cache = cache or Cache()
+    built = build(functions, cache, **options)
+    compiler = find_compiler()
+    if compiler is not None:
+        cache.write_record(_set_key(key, compiler), {"members": built.keys})
+    return built
+
+
+@dataclass(frozen=True)
+class _Source:
+    signature: Signature
+    operations: int
+    text: str
+
+    @classmethod
+    def of(cls, function: ca.Function) -> _Source:
+        from codegen.source import c_source, dense, operations
+
+        densified = dense(function)
+        return cls(Signature.of(densified), operations(function), c_source(densified))
+
+
+def _compile(
+    source: _Source, compiler: Compiler, cache: Cache, level: int, rebuild: bool
+) -> tuple[CompiledFunction, Entry, bool]:
+    signature = source.signature
+    # Names and shapes are part of the C text, except which of two equal layouts they mean.
+    key = digest(
+        str(FORMAT), compiler.identity, str(level), *FLAGS, str(signature.to_json()), source.text
+    )
+
+    def make(library: Path) -> dict[str, Any]:
+        text = library.parent / f"{signature.name}.c"
+        text.write_text(source.text)
+        start = time.perf_counter()
+        compiler.compile(text, library, level)
+        return {
+            "signature": signature.to_json(),
+            "operations": source.operations,
+            "c_bytes": len(source.text),
+            "compile_seconds": time.perf_counter() - start,
+            "level": level,
+        }
+
+    if not rebuild and (hit := _load(key, cache)) is not None:
+        return *hit, True
+    with cache.lock(key):
+        if not rebuild and (hit := _load(key, cache)) is not None:
+            return *hit, True
+        entry = cache.store(key, make)
+    return CompiledFunction(signature, entry.library), entry, False
+
+
+def _load(key: str, cache: Cache) -> tuple[CompiledFunction, Entry] | None:
+    entry = cache.find(key)
+    if entry is None:
+        return None
+    try:
+        signature = Signature.from_json(entry.facts["signature"])
+        return CompiledFunction(signature, entry.library), entry
+    except CodegenError:
+        # Intact but not loadable, such as made against a newer C library: to be made again.
+        return None
+
+
+def _load_set(key: str, compiler: Compiler, cache: Cache) -> dict[str, NumericFunction] | None:
+    record = cache.read_record(_set_key(key, compiler))
+    if record is None:
+        return None
+    functions: dict[str, NumericFunction] = {}
+    for name, member in record["members"].items():
+        hit = _load(member, cache)
+        if hit is None:
+            return None
+        functions[name] = hit[0]
+    return functions
+
+
+def _set_key(key: str, compiler: Compiler) -> str:
+    return digest(
+        "set", str(FORMAT), key, compiler.identity, version("casadi"), source_digest("codegen")
+    )
+
+
+def _interpreted(functions: Mapping[str, ca.Function]) -> Build:
+    from codegen.source import dense, operations
+
+    warn_interpreted()
+    reports = tuple(
+        FunctionReport(
+            name=name,
+            operations=operations(function),
+            c_bytes=0,
+            compile_seconds=0.0,
+            level=0,
+            from_cache=False,
+            compiled=False,
+        )
+        for name, function in functions.items()
+    )
+    return Build(
+        {name: InterpretedFunction(dense(function)) for name, function in functions.items()},
+        reports,
+        {},
+    )

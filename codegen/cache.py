@@ -1,0 +1,272 @@
+"""A user's folder of compiled libraries, addressed by what they were made from.
+
+Every library has a manifest beside it, written last, that holds the library's checksum and its
+own: an interrupted or damaged build is not found and is made again. Files appear by renaming, so
+two processes that build the same thing do no harm; a lock per key spares them the second build.
+
+What lies here is loaded as code. The folder and its files must therefore belong to the user and be
+writable by nobody else, and nobody else may be able to exchange the folder itself.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import importlib.util
+import json
+import os
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import platformdirs
+
+from symbolic.errors import CodegenError
+
+FORMAT = 1
+"""Part of every key; rises when what is stored changes its meaning."""
+
+_STALE_SECONDS = 24 * 3600.0
+
+
+def digest(*parts: str | bytes) -> str:
+    """SHA-256 over the parts, each with its length so that none can flow into the next."""
+    total = hashlib.sha256()
+    for part in parts:
+        raw = part.encode() if isinstance(part, str) else part
+        total.update(len(raw).to_bytes(8, "big"))
+        total.update(raw)
+    return total.hexdigest()
+
+
+def source_digest(*packages: str) -> str:
+    """SHA-256 over the Python sources of installed packages, none of which is imported."""
+    total: list[str | bytes] = []
+    for package in packages:
+        spec = importlib.util.find_spec(package)
+        folders = [] if spec is None else spec.submodule_search_locations or []
+        for file in sorted(path for folder in folders for path in Path(folder).rglob("*.py")):
+            total += [f"{package}/{file.name}", file.read_bytes()]
+    return digest(*total)
+
+
+def default_folder() -> Path:
+    """DUAL_ARM_CACHE if set, otherwise `dual-arm-carry` in the user's cache folder
+    (XDG_CACHE_HOME, by default ~/.cache)."""
+    own = os.environ.get("DUAL_ARM_CACHE", "")
+    return Path(own).expanduser() if own else platformdirs.user_cache_path("dual-arm-carry")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A library found in the cache, its content verified.
+
+    Attributes:
+        key: what it was asked for by.
+        library: path of the shared library.
+        facts: what was stored with it.
+    """
+
+    key: str
+    library: Path
+    facts: dict[str, Any]
+
+
+class Cache:
+    """The folder, its safety and its files."""
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self.folder = Path(os.path.abspath(folder if folder is not None else default_folder()))
+
+    def find(self, key: str) -> Entry | None:
+        """The entry of this key, or None where it is missing or damaged.
+
+        Raises:
+            CodegenError: others than the user can write to the folder or the file.
+        """
+        facts = self.read_record(key)
+        if facts is None:
+            return None
+        library = self.folder / str(facts["library"])
+        content = self._read_own(library)
+        if content is None or hashlib.sha256(content).hexdigest() != facts["sha256"]:
+            return None
+        return Entry(key, library, facts)
+
+    def store(self, key: str, make: Callable[[Path], Mapping[str, Any]]) -> Entry:
+        """Make a library and put it under this key, replacing what is there.
+
+        Args:
+            key: see `digest`.
+            make: given the path of the library to write, in a folder of its own, it writes it and
+                returns further facts to store.
+
+        Raises:
+            CodegenError: the folder is unsafe or cannot be written to.
+        """
+        with self._build_folder() as scratch:
+            built = scratch / "library.so"
+            with _writing(self.folder):
+                facts = dict(make(built))
+                checksum = hashlib.sha256(built.read_bytes()).hexdigest()
+                library = self.folder / f"{key}-{checksum[:16]}.so"
+                built.chmod(0o700)
+                built.replace(library)
+        facts |= {"library": library.name, "sha256": checksum}
+        self.write_record(key, facts)
+        return Entry(key, library, facts)
+
+    def read_record(self, key: str) -> dict[str, Any] | None:
+        """The record stored under this key, or None where it is missing or damaged."""
+        self._require_safe()
+        raw = self._read_own(self.folder / f"{key}.json")
+        if raw is None:
+            return None
+        try:
+            stored = json.loads(raw)
+            facts = stored["facts"]
+            intact = stored["sha256"] == digest(_canonical(facts))
+        except (ValueError, KeyError, TypeError):
+            return None
+        return facts if intact and isinstance(facts, dict) else None
+
+    def write_record(self, key: str, facts: Mapping[str, Any]) -> None:
+        """Store a record with its checksum, in one step."""
+        text = json.dumps({"facts": facts, "sha256": digest(_canonical(facts))}, indent=1)
+        with self._build_folder() as scratch, _writing(self.folder):
+            written = scratch / "record.json"
+            written.write_text(text)
+            written.chmod(0o600)
+            written.replace(self.folder / f"{key}.json")
+
+    @contextmanager
+    def lock(self, key: str) -> Iterator[None]:
+        """Keep other processes and threads from building the same key meanwhile.
+
+        It only saves work: where the file system has no locks it does nothing.
+        """
+        self._make_folder()
+        with _writing(self.folder):
+            handle = os.open(self.folder / f"{key}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            with suppress(OSError):
+                fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(handle)
+
+    def clean(self) -> int:
+        """Remove everything this cache has stored; the number of libraries removed."""
+        if not self.folder.exists():
+            return 0
+        self._require_safe()
+        libraries = 0
+        with _writing(self.folder):
+            for path in self.folder.iterdir():
+                if path.is_dir() and path.name.startswith("build-"):
+                    shutil.rmtree(path, ignore_errors=True)
+                elif path.suffix in {".so", ".json", ".lock"}:
+                    libraries += path.suffix == ".so"
+                    path.unlink(missing_ok=True)
+        return libraries
+
+    @contextmanager
+    def _build_folder(self) -> Iterator[Path]:
+        self._make_folder()
+        self._sweep()
+        with _writing(self.folder):
+            scratch = Path(tempfile.mkdtemp(prefix="build-", dir=self.folder))
+        try:
+            yield scratch
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+
+    def _sweep(self) -> None:
+        """Remove what builds left behind that were killed long ago."""
+        for left in self.folder.glob("build-*"):
+            try:
+                stale = time.time() - left.stat().st_mtime > _STALE_SECONDS
+            except OSError:
+                continue
+            if stale:
+                shutil.rmtree(left, ignore_errors=True)
+
+    def _make_folder(self) -> None:
+        with _writing(self.folder):
+            missing = [self.folder, *self.folder.parents]
+            for folder in reversed([path for path in missing if not path.exists()]):
+                folder.mkdir(mode=0o700, exist_ok=True)
+        self._require_safe()
+
+    def _require_safe(self) -> None:
+        """Refuse a folder that others can write to or exchange."""
+        try:
+            own = self.folder.stat()
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise CodegenError(_cannot_use(self.folder, error)) from error
+        if not stat.S_ISDIR(own.st_mode):
+            raise CodegenError(f"the cache {self.folder} is not a folder; {_OTHER_FOLDER}")
+        _require_own(self.folder, own)
+        for parent in dict.fromkeys([*self.folder.parents, *self.folder.resolve().parents]):
+            mode = parent.stat().st_mode
+            if mode & (stat.S_IWGRP | stat.S_IWOTH) and not mode & stat.S_ISVTX:
+                raise CodegenError(
+                    f"compiled code in the cache {self.folder} is refused: others can write to "
+                    f"{parent} (mode {stat.S_IMODE(mode):04o}) and could exchange it; run "
+                    f"`chmod go-w {parent}`, or {_OTHER_FOLDER}"
+                )
+
+    def _read_own(self, path: Path) -> bytes | None:
+        """Content of a file that nobody else can have written; None where it is missing."""
+        try:
+            with path.open("rb") as file:
+                _require_own(path, os.fstat(file.fileno()))
+                return file.read()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise CodegenError(_cannot_use(path, error)) from error
+
+
+_OTHER_FOLDER = "name another folder in the environment variable DUAL_ARM_CACHE"
+
+
+def _canonical(facts: Mapping[str, Any]) -> str:
+    return json.dumps(facts, sort_keys=True, separators=(",", ":"))
+
+
+def _cannot_use(path: Path, error: OSError) -> str:
+    return (
+        f"the cache of compiled functions cannot be used: {path}: {error.strerror or error}; make "
+        f"room or grant access there, or {_OTHER_FOLDER}"
+    )
+
+
+def _require_own(path: Path, found: os.stat_result) -> None:
+    if found.st_uid != os.geteuid():
+        raise CodegenError(
+            f"compiled code in {path} is refused: it belongs to user {found.st_uid}, not to you "
+            f"({os.geteuid()}); remove it, or {_OTHER_FOLDER}"
+        )
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise CodegenError(
+            f"compiled code in {path} is refused: others can write to it (mode "
+            f"{stat.S_IMODE(found.st_mode):04o}); if you trust its content, run "
+            f"`chmod go-w {path}`, otherwise remove it, or {_OTHER_FOLDER}"
+        )
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise CodegenError(_cannot_use(folder, error)) from error

@@ -1,0 +1,138 @@
+"""The system's C compiler: which one, its identity, its flags, one call of it."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from symbolic.errors import CodegenError
+
+FLAGS = (
+    "-std=gnu11",
+    "-fPIC",
+    "-shared",
+    "-fvisibility=hidden",
+    "-fno-math-errno",
+    # Without fused multiply-adds the compiled results equal CasADi's own to the last bit, on every
+    # processor; fusing them was no faster on kinematics, where the machine's own instruction set
+    # (-march=native) gained nothing either. Never -ffast-math: NaN must stay NaN.
+    "-ffp-contract=off",
+    # Evaluations of functions with memory (solvers) that may run at once in one process.
+    "-DCASADI_MAX_NUM_THREADS=128",
+)
+
+SMALL_SOURCE = 300_000
+LARGE_SOURCE = 2_000_000
+"""Bytes of C. Straight-line code takes gcc about 15 s per megabyte at -O1 and 5 s at -O0, and
+-O3 is up to twice as slow to compile as -O1 without being faster to run; loops gain from -O3."""
+
+NAMES = ("cc", "gcc", "clang")
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A C compiler that answered.
+
+    Attributes:
+        command: its absolute path, then arguments that the user's CC carries.
+        version: everything that it says of itself, target included.
+    """
+
+    command: tuple[str, ...]
+    version: str
+
+    @property
+    def identity(self) -> str:
+        """Text that changes with the compiler, its version and its target."""
+        return "\n".join([*self.command, self.version])
+
+    def compile(self, source: Path, library: Path, level: int) -> None:
+        """Compile one C file into a shared library at optimisation `level` (0 to 3).
+
+        Raises:
+            CodegenError: the compiler refused the source, could not write, or was killed.
+        """
+        command = [*self.command, f"-O{level}", *FLAGS, "-o", str(library), str(source), "-lm"]
+        # The compiler's own temporary files stay in the build folder and go away with it.
+        environment = os.environ | {"TMPDIR": str(source.parent), "LC_ALL": "C"}
+        try:
+            done = subprocess.run(
+                command,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                check=False,
+            )
+        except OSError as error:
+            raise CodegenError(f"the C compiler {self.command[0]} cannot run: {error}") from error
+        if done.returncode != 0:
+            raise CodegenError(_failure(self.command[0], source, done))
+
+
+def default_level(c_bytes: int) -> int:
+    """Optimisation level that keeps the build of a source of this size short."""
+    if c_bytes <= SMALL_SOURCE:
+        return 3
+    return 1 if c_bytes <= LARGE_SOURCE else 0
+
+
+def find_compiler() -> Compiler | None:
+    """The C compiler: the one that CC names, otherwise the first of cc, gcc and clang that works.
+
+    None where there is none. A set CC is taken at its word: if it does not run, nothing else is
+    tried.
+    """
+    return _find(os.environ.get("CC", ""), os.environ.get("PATH", ""))
+
+
+@cache
+def _find(cc: str, path: str) -> Compiler | None:
+    candidates = [shlex.split(cc)] if cc.strip() else [[name] for name in NAMES]
+    for command in candidates:
+        executable = shutil.which(command[0], path=path)
+        if executable is None:
+            continue
+        full = (os.path.abspath(executable), *command[1:])
+        version = _version(full)
+        if version is not None:
+            return Compiler(full, version)
+    return None
+
+
+def _version(command: tuple[str, ...]) -> str | None:
+    try:
+        said = subprocess.run(
+            [*command, "-v"],
+            env=os.environ | {"LC_ALL": "C"},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=30,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return said.stdout + said.stderr if said.returncode == 0 else None
+
+
+def _failure(compiler: str, source: Path, done: subprocess.CompletedProcess[str]) -> str:
+    if done.returncode < 0:
+        return (
+            f"the C compiler {compiler} was ended by signal {-done.returncode} at {source.name}; "
+            "if memory ran out, build fewer functions at once"
+        )
+    lines = [line for line in done.stderr.splitlines() if "error" in line or "No space" in line]
+    said = (lines or done.stderr.splitlines() or ["no message"])[0].strip()
+    return (
+        f"the C compiler {compiler} failed at {source.name}: {said}; make sure that it compiles a "
+        "C file with math.h (packages such as build-essential or gcc and libc-dev), or name "
+        "another one in the environment variable CC"
+    )

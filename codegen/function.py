@@ -1,0 +1,191 @@
+"""Numeric functions that NumPy calls: the interface that all share.
+
+Arrays are C-contiguous float64 and are passed by address, never copied; anything else that NumPy
+can turn into such an array is converted where that is allowed (`__call__`, `batch`).
+"""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from codegen.signature import Shape, Signature
+from symbolic.errors import CodegenError
+
+Array = NDArray[np.float64]
+
+_FLOAT = np.dtype(np.float64)
+
+
+class NumericFunction(ABC):
+    """A function from dense float64 arrays to dense float64 arrays.
+
+    Attributes:
+        signature: names and shapes.
+        name, input_names, output_names, input_shapes, output_shapes: those of the signature.
+    """
+
+    def __init__(self, signature: Signature) -> None:
+        self.signature = signature
+        self.name = signature.name
+        self.input_names = signature.input_names
+        self.output_names = signature.output_names
+        self.input_shapes = signature.input_shapes
+        self.output_shapes = signature.output_shapes
+        self._record = signature.output_record()
+
+    def __call__(self, *inputs: ArrayLike) -> dict[str, Array]:
+        """Evaluate once.
+
+        Args:
+            inputs: one array per input, of its shape in `input_shapes`.
+
+        Returns:
+            The outputs by name, in their `output_shapes`; they share one block of memory.
+
+        Raises:
+            CodegenError: a wrong number of inputs, a wrong shape or type, or the function failed.
+        """
+        self._require_count(len(inputs))
+        arrays = []
+        for given, name, shape in zip(inputs, self.input_names, self.input_shapes, strict=True):
+            array = self._as_array(given, name)
+            if array.shape != shape:
+                raise self._wrong_shape(name, array.shape, str(shape))
+            arrays.append(array)
+        block = np.empty((), self._record)
+        self._evaluate_block(arrays, block)
+        return {name: block[name] for name in self.output_names}
+
+    def evaluate_into(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
+        """Evaluate once into arrays that the caller keeps; nothing is allocated or converted.
+
+        Args:
+            inputs: one C-contiguous float64 array per input, of its exact shape.
+            outputs: likewise per output, writable, not overlapping each other or an input.
+
+        Raises:
+            CodegenError: an array that does not fit, or the function failed.
+        """
+        self._require_count(len(inputs))
+        if len(outputs) != len(self.output_names):
+            raise CodegenError(
+                f"{self.name}: {len(outputs)} output arrays given, {len(self.output_names)} "
+                f"needed: {', '.join(self.output_names)}"
+            )
+        self._require_exact(inputs, self.input_names, self.input_shapes, write=False)
+        self._require_exact(outputs, self.output_names, self.output_shapes, write=True)
+        self._evaluate_into(inputs, outputs)
+
+    def batch(self, *inputs: ArrayLike, threads: int = 1) -> dict[str, Array]:
+        """Evaluate n candidates.
+
+        Args:
+            inputs: one array per input, (n, *shape), or (*shape) where all candidates share it.
+            threads: threads to spread the candidates over; 0 for one per core that this process
+                may use. The results do not depend on it. Interpreted functions use one.
+
+        Returns:
+            The outputs by name, (n, *shape).
+
+        Raises:
+            CodegenError: inputs that do not fit or agree on n, or the function failed.
+        """
+        self._require_count(len(inputs))
+        if threads < 0:
+            raise CodegenError(f"{self.name}: threads is {threads}; give 0 (all cores) or more")
+        arrays: list[Array] = []
+        batched: list[bool] = []
+        n = -1
+        for given, name, shape in zip(inputs, self.input_names, self.input_shapes, strict=True):
+            array = self._as_array(given, name)
+            per_candidate = array.shape != shape
+            if per_candidate:
+                if array.shape[1:] != shape or array.ndim != len(shape) + 1:
+                    raise self._wrong_shape(name, array.shape, f"{shape} or (n, *{shape})")
+                if n not in (-1, array.shape[0]):
+                    raise CodegenError(
+                        f"{self.name}: input '{name}' has {array.shape[0]} candidates, an input "
+                        f"before it {n}; give each the same number, or one value for all"
+                    )
+                n = array.shape[0]
+            arrays.append(array)
+            batched.append(per_candidate)
+        if n < 0:
+            raise CodegenError(
+                f"{self.name}: no input has a leading axis of candidates; give at least one as "
+                "(n, *shape), or call the function for one evaluation"
+            )
+        outputs = [np.empty((n, *shape)) for shape in self.output_shapes]
+        if n:
+            self._evaluate_batch(arrays, batched, outputs, n, threads or available_cores())
+        return dict(zip(self.output_names, outputs, strict=True))
+
+    @abstractmethod
+    def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
+        """Evaluate once into a record of `Signature.output_record`."""
+
+    @abstractmethod
+    def _evaluate_into(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
+        """Evaluate once into separate arrays."""
+
+    @abstractmethod
+    def _evaluate_batch(
+        self,
+        inputs: Sequence[Array],
+        batched: Sequence[bool],
+        outputs: Sequence[Array],
+        n: int,
+        threads: int,
+    ) -> None:
+        """Evaluate n > 0 candidates; `batched` says which inputs have one value for each."""
+
+    def _require_count(self, given: int) -> None:
+        if given != len(self.input_names):
+            raise CodegenError(
+                f"{self.name}: {given} inputs given, {len(self.input_names)} needed: "
+                f"{', '.join(self.input_names)}"
+            )
+
+    def _as_array(self, given: ArrayLike, name: str) -> Array:
+        try:
+            # Only casts that keep the value: integers and booleans, never complex or text.
+            array = np.asarray(given)
+            if array.dtype != _FLOAT:
+                array = array.astype(_FLOAT, casting="same_kind")
+        except (TypeError, ValueError) as error:
+            raise CodegenError(
+                f"{self.name}: input '{name}' is not an array of real numbers: {error}"
+            ) from error
+        flags = array.flags
+        if flags.carray or (flags.c_contiguous and flags.aligned):
+            return array
+        return array.copy(order="C")
+
+    def _require_exact(
+        self, arrays: Sequence[Array], names: Sequence[str], shapes: Sequence[Shape], *, write: bool
+    ) -> None:
+        for array, name, shape in zip(arrays, names, shapes, strict=True):
+            flags = array.flags
+            usable = flags.carray or (not write and flags.c_contiguous and flags.aligned)
+            if not usable or array.dtype != _FLOAT or array.shape != shape:
+                raise CodegenError(
+                    f"{self.name}: array '{name}' is {array.dtype} {array.shape}, C-contiguous "
+                    f"{flags.c_contiguous}, writable {flags.writeable}; needed is C-contiguous "
+                    f"{'writable ' if write else ''}float64 {shape}"
+                )
+
+    def _wrong_shape(self, name: str, found: Shape, needed: str) -> CodegenError:
+        return CodegenError(f"{self.name}: input '{name}' has shape {found}, needed is {needed}")
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1

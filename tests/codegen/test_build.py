@@ -1,0 +1,279 @@
+"""Sets of functions: built once, found again, safe beside other builds and after dead ones."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from codegen.build import build, build_set, compile_function, load_or_build
+from codegen.cache import Cache
+from codegen.compiled import CompiledFunction
+from codegen.compiler import LARGE_SOURCE, SMALL_SOURCE, default_level, find_compiler
+from codegen.source import operations
+from symbolic.errors import CodegenError
+
+SET = """
+import casadi as ca
+x = ca.MX.sym("x", 4)
+functions = {
+    "square": ca.Function("square", [x], [x**2], ["x"], ["y"]),
+    "norm": ca.Function("norm", [x], [ca.norm_2(x)], ["x"], ["y"]),
+}
+"""
+
+
+def functions() -> dict[str, ca.Function]:
+    scope: dict[str, dict[str, ca.Function]] = {}
+    exec(SET, scope)
+    return scope["functions"]
+
+
+def run(program: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_second_build_comes_from_the_cache(cache: Cache) -> None:
+    first, second = build(functions(), cache), build(functions(), cache)
+    assert [report.from_cache for report in first.reports] == [False, False]
+    assert [report.from_cache for report in second.reports] == [True, True]
+    for one, other in zip(first.reports, second.reports, strict=True):
+        assert one.compile_seconds == other.compile_seconds > 0.0
+        assert (one.name, one.operations, one.c_bytes) == (
+            other.name,
+            other.operations,
+            other.c_bytes,
+        )
+    rebuilt = build(functions(), cache, rebuild=True)
+    assert [report.from_cache for report in rebuilt.reports] == [False, False]
+
+
+def test_what_the_key_depends_on(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
+    x = ca.MX.sym("x", 4)
+    keys = [build(functions(), cache).keys["square"]]
+    other = ca.Function("square", [x], [x**2 + 1.0], ["x"], ["y"])
+    keys.append(build({"square": other}, cache).keys["square"])
+    keys.append(build(functions(), cache, levels={"square": 1}).keys["square"])
+    monkeypatch.setenv("CC", "gcc -g0")
+    keys.append(build(functions(), cache).keys["square"])
+    assert len(set(keys)) == len(keys)
+
+
+@pytest.mark.parametrize("damage", [b"", b"not a library", None])
+def test_damaged_library_is_built_anew(cache: Cache, damage: bytes | None) -> None:
+    function = compile_function(functions()["square"], cache)
+    assert isinstance(function, CompiledFunction)
+    if damage is None:
+        content = bytearray(function.library.read_bytes())
+        content[len(content) // 2] ^= 1
+        damage = bytes(content)
+    # As a disk would: another file in its place, for the loaded one is mapped into this process.
+    replacement = function.library.with_suffix(".damaged")
+    replacement.write_bytes(damage)
+    replacement.replace(function.library)
+    again = build({"square": functions()["square"]}, cache)
+    assert not again.reports[0].from_cache
+    np.testing.assert_array_equal(
+        again.functions["square"](np.arange(4.0))["y"], np.arange(4.0) ** 2
+    )
+
+
+def test_intact_library_that_cannot_be_loaded_is_built_anew(cache: Cache) -> None:
+    key = build(functions(), cache).keys["square"]
+
+    def make(path: Path) -> dict[str, object]:
+        path.write_bytes(b"\x7fELF of another system")
+        record = cache.read_record(key)
+        assert record is not None
+        return record
+
+    cache.store(key, make)
+    again = build(functions(), cache)
+    assert [report.from_cache for report in again.reports] == [False, True]
+    assert again.functions["square"](np.full(4, 3.0))["y"][0] == 9.0
+
+
+def test_warm_start_needs_neither_graph_nor_casadi(cache: Cache) -> None:
+    cold = load_or_build("cell", functions, cache)
+    program = """
+import sys
+from codegen.build import load_or_build
+def make():
+    raise AssertionError("made again")
+found = load_or_build("cell", make)
+assert "casadi" not in sys.modules
+print(found["norm"]([3.0, 4.0, 0.0, 0.0])["y"], *found)
+"""
+    done = run(program)
+    assert done.stderr == ""
+    assert done.stdout == "5.0 square norm\n"
+    assert cold["norm"].signature == load_or_build("cell", functions, cache)["norm"].signature
+
+
+def test_another_key_is_made_anew(cache: Cache) -> None:
+    load_or_build("cell", functions, cache)
+    x = ca.MX.sym("x", 4)
+    other = load_or_build("other", lambda: {"f": ca.Function("f", [x], [x])}, cache)
+    assert list(other) == ["f"]
+
+
+def test_set_with_a_lost_member_is_made_anew(cache: Cache) -> None:
+    key = build_set("cell", functions(), cache).keys["norm"]
+    for path in cache.folder.glob(f"{key}*"):
+        path.unlink()
+    found = load_or_build("cell", functions, cache)
+    assert found["norm"]([3.0, 4.0, 0.0, 0.0])["y"] == 5.0
+
+
+def test_two_processes_at_once_build_once(cache: Cache, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    compiler = tmp_path / "counting-cc"
+    compiler.write_text(
+        f'#!/bin/sh\ncase "$*" in -v) ;; *) echo "$*" >> "{log}"; sleep 0.3 ;; esac\n'
+        'exec gcc "$@"\n'
+    )
+    compiler.chmod(0o755)
+    program = (
+        SET + "from codegen.build import load_or_build\n"
+        "found = load_or_build('cell', lambda: functions)\n"
+        "print(found['square']([1.0, 2.0, 3.0, 4.0])['y'].tolist())\n"
+    )
+    environment = os.environ | {"CC": str(compiler)}
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
+    for process in running:
+        assert process.communicate(timeout=120)[0] == "[1.0, 4.0, 9.0, 16.0]\n"
+    assert len(log.read_text().splitlines()) == 2  # one per function, not per process
+
+
+def test_killed_build_leaves_the_cache_usable(
+    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started, go_on = tmp_path / "started", tmp_path / "go_on"
+    compiler = tmp_path / "slow-cc"
+    compiler.write_text(
+        '#!/bin/sh\ncase "$*" in -v) exec gcc -v ;; esac\n'
+        f'gcc "$@"\ntouch "{started}"\n'
+        f'while [ ! -e "{go_on}" ]; do sleep 0.05; done\n'
+    )
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CC", str(compiler))
+    program = (
+        SET + "from codegen.build import load_or_build\nload_or_build('cell', lambda: functions)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program], start_new_session=True)
+    deadline = time.monotonic() + 60.0
+    while not started.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert list(cache.folder.glob("*.so")) == []
+    go_on.touch()
+    found = load_or_build("cell", functions, cache)
+    assert found["norm"]([3.0, 4.0, 0.0, 0.0])["y"] == 5.0
+
+
+def test_without_a_compiler_interpreted_with_one_warning(cache: Cache) -> None:
+    program = (
+        SET + "from codegen.build import build, compile_function, load_or_build\n"
+        "a = load_or_build('cell', lambda: functions)\n"
+        "b = build(functions)\n"
+        "c = compile_function(functions['norm'])\n"
+        "print(type(a['norm']).__name__, c([3.0, 4.0, 0.0, 0.0])['y'], b.reports[0].compiled)\n"
+    )
+    done = run("import warnings; warnings.simplefilter('always')\n" + program, CC="/missing/cc")
+    assert done.stdout == "InterpretedFunction 5.0 False\n"
+    assert done.stderr.count("RuntimeWarning") == 1
+    assert "no C compiler was found" in done.stderr
+    assert "set CC" in done.stderr
+    assert not cache.folder.exists()
+
+
+def test_compilers_are_tried_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CC", raising=False)
+    broken = tmp_path / "cc"
+    broken.write_text("#!/bin/sh\nexit 1\n")
+    broken.chmod(0o755)
+    gcc = shutil.which("gcc")
+    assert gcc is not None
+    (tmp_path / "gcc").symlink_to(gcc)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
+    found = find_compiler()
+    assert found is not None
+    assert found.command == (str(tmp_path / "gcc"),)
+    monkeypatch.setenv("PATH", "")
+    assert find_compiler() is None
+    monkeypatch.setenv("CC", "   ")
+    assert find_compiler() is None
+
+
+def test_compiler_that_fails_is_told(
+    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiler = tmp_path / "full-cc"
+    compiler.write_text(
+        '#!/bin/sh\ncase "$*" in -v) exec gcc -v ;; esac\n'
+        'echo "cc1: fatal error: No space left on device" >&2\nexit 1\n'
+    )
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CC", str(compiler))
+    with pytest.raises(CodegenError, match=r"square\.c: cc1: .*No space left on device; ") as told:
+        build({"square": functions()["square"]}, cache)
+    assert "\n" not in str(told.value)
+    assert list(cache.folder.glob("*.so")) == []
+
+
+def test_function_that_cannot_be_written_as_c_is_told(
+    cache: Cache, capfd: pytest.CaptureFixture[str]
+) -> None:
+    class Doubled(ca.Callback):  # type: ignore[misc]
+        def __init__(self) -> None:
+            ca.Callback.__init__(self)
+            self.construct("doubled", {})
+
+        def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
+            return [2.0 * arguments[0]]
+
+    doubled = Doubled()
+    x = ca.MX.sym("x")
+    with pytest.raises(CodegenError, match="uses_python"):
+        compile_function(ca.Function("uses_python", [x], [doubled(x)]), cache)
+    capfd.readouterr()
+
+
+def test_level_falls_with_size() -> None:
+    sizes = [0, SMALL_SOURCE, SMALL_SOURCE + 1, LARGE_SOURCE, LARGE_SOURCE + 1]
+    assert [default_level(size) for size in sizes] == [3, 3, 1, 1, 0]
+
+
+def test_operations_count_nested_calls() -> None:
+    a = ca.SX.sym("a", 2)
+    step = ca.Function("step", [a], [ca.sin(a) * a[0]])
+    own = step.n_instructions()
+    assert operations(step) == own
+    assert operations(step.map(10)) == 10 * own
+    assert operations(step.map(10, "thread", 2)) == 10 * own
+    x = ca.MX.sym("x", 2)
+    called_twice = ca.Function("twice", [x], [step(step(x))])
+    # Input, output and the two calls.
+    assert operations(called_twice) == 2 * own + 2
+    assert operations(step.mapaccum(100)) >= 100 * own

@@ -1,0 +1,242 @@
+"""The cache: found again, never trusted when damaged, unsafe or half written."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from codegen.cache import Cache, default_folder, digest, source_digest
+from symbolic.errors import CodegenError
+
+KEY = digest("test")
+
+
+def put(cache: Cache, content: bytes = b"library") -> Path:
+    """Store a library of this content."""
+
+    def make(path: Path) -> Mapping[str, object]:
+        path.write_bytes(content)
+        return {"note": "made"}
+
+    return cache.store(KEY, make).library
+
+
+def test_found_as_stored(cache: Cache) -> None:
+    assert cache.find(KEY) is None
+    library = put(cache)
+    entry = cache.find(KEY)
+    assert entry is not None
+    assert entry.library == library
+    assert entry.facts["note"] == "made"
+    assert library.read_bytes() == b"library"
+    assert cache.find(digest("another")) is None
+
+
+def test_private_to_the_user_whatever_the_umask(cache: Cache) -> None:
+    before = os.umask(0o000)
+    try:
+        put(cache)
+    finally:
+        os.umask(before)
+    assert cache.folder.stat().st_mode & 0o777 == 0o700
+    assert all(path.stat().st_mode & 0o077 == 0 for path in cache.folder.iterdir())
+    assert cache.find(KEY) is not None
+
+
+@pytest.mark.parametrize("damage", [b"", b"librarx", b"library and more"])
+def test_damaged_library_is_not_found(cache: Cache, damage: bytes) -> None:
+    library = put(cache)
+    library.write_bytes(damage)
+    assert cache.find(KEY) is None
+    put(cache)
+    assert cache.find(KEY) is not None
+
+
+def test_missing_library_is_not_found(cache: Cache) -> None:
+    put(cache).unlink()
+    assert cache.find(KEY) is None
+
+
+@pytest.mark.parametrize("damage", ["", "{", "[]", '{"facts": {}, "sha256": "0"}', "null", "\xff"])
+def test_damaged_manifest_is_not_found(cache: Cache, damage: str) -> None:
+    put(cache)
+    manifest = cache.folder / f"{KEY}.json"
+    manifest.write_text(damage, encoding="latin-1")
+    assert cache.find(KEY) is None
+
+
+def test_changed_manifest_is_not_found(cache: Cache) -> None:
+    """A plausible manifest that says something else than was written."""
+    put(cache)
+    manifest = cache.folder / f"{KEY}.json"
+    manifest.write_text(manifest.read_text().replace("made", "mads"))
+    assert cache.find(KEY) is None
+
+
+def test_failed_build_leaves_nothing(cache: Cache) -> None:
+    def fail(path: Path) -> Mapping[str, object]:
+        path.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cache.store(KEY, fail)
+    assert cache.find(KEY) is None
+    assert list(cache.folder.iterdir()) == []
+
+
+def test_what_killed_builds_left_is_swept_when_old(cache: Cache) -> None:
+    put(cache)
+    old, young = cache.folder / "build-old", cache.folder / "build-young"
+    for left in (old, young):
+        left.mkdir()
+        (left / "library.so").write_bytes(b"half")
+    two_days_ago = time.time() - 2 * 86400.0
+    os.utime(old, (two_days_ago, two_days_ago))
+    put(cache)
+    assert not old.exists()
+    assert young.exists()
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o707, 0o722])
+def test_folder_that_others_can_write_to_is_refused(cache: Cache, mode: int) -> None:
+    put(cache)
+    cache.folder.chmod(mode)
+    for use in (lambda: cache.find(KEY), lambda: put(cache), cache.clean):
+        with pytest.raises(
+            CodegenError, match=r"others can write to it.*chmod go-w.*DUAL_ARM_CACHE"
+        ):
+            use()
+    cache.folder.chmod(0o755)
+    assert cache.find(KEY) is not None
+
+
+@pytest.mark.parametrize("suffix", ["so", "json"])
+def test_file_that_others_can_write_to_is_refused(cache: Cache, suffix: str) -> None:
+    put(cache)
+    next(cache.folder.glob(f"*.{suffix}")).chmod(0o666)
+    with pytest.raises(CodegenError, match="others can write to it"):
+        cache.find(KEY)
+
+
+def test_parent_in_which_others_can_exchange_the_folder_is_refused(tmp_path: Path) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    cache = Cache(shared / "cache")
+    put(cache)
+    shared.chmod(0o777)
+    with pytest.raises(CodegenError, match=r"others can write to .*shared .*could exchange it"):
+        cache.find(KEY)
+    shared.chmod(0o1777)  # only owners may rename there, as in /tmp
+    assert cache.find(KEY) is not None
+    shared.chmod(0o777)
+    link = tmp_path / "link"
+    link.symlink_to(shared / "cache")
+    with pytest.raises(CodegenError, match="could exchange it"):
+        Cache(link).find(KEY)
+
+
+def test_foreign_folder_is_refused(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
+    put(cache)
+    own = os.geteuid()
+    monkeypatch.setattr(os, "geteuid", lambda: own + 1)
+    with pytest.raises(CodegenError, match=f"belongs to user {own}, not to you"):
+        cache.find(KEY)
+
+
+def test_not_a_folder_is_told(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("")
+    with pytest.raises(CodegenError, match="DUAL_ARM_CACHE"):
+        put(Cache(file))
+    with pytest.raises(CodegenError, match="DUAL_ARM_CACHE"):
+        put(Cache(file / "below"))
+
+
+def test_full_disk_is_one_message(tmp_path: Path) -> None:
+    """A process that may write no file beyond 4 kB meets the error of a full disk."""
+    program = """
+import resource, sys
+from pathlib import Path
+from codegen.cache import Cache
+from symbolic.errors import CodegenError
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+def make(path):
+    path.write_bytes(b"x" * 100_000)
+    return {}
+try:
+    Cache(Path(sys.argv[1])).store("0" * 64, make)
+except CodegenError as error:
+    print(error)
+"""
+    folder = tmp_path / "cache"
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(folder)], capture_output=True, text=True, check=True
+    )
+    assert "cannot be used" in done.stdout
+    assert "make room" in done.stdout
+    assert done.stdout.count("\n") == 1
+    assert list(folder.iterdir()) == []
+
+
+def test_clean_removes_all_of_ours_and_nothing_else(cache: Cache) -> None:
+    assert cache.clean() == 0
+    put(cache)
+    with cache.lock(KEY):
+        pass
+    (cache.folder / "build-left").mkdir()
+    (cache.folder / "notes.txt").write_text("kept")
+    assert cache.clean() == 1
+    assert [path.name for path in cache.folder.iterdir()] == ["notes.txt"]
+
+
+def test_lock_keeps_others_out(cache: Cache) -> None:
+    program = """
+import sys
+from pathlib import Path
+from codegen.cache import Cache
+cache = Cache(Path(sys.argv[1]))
+print("waiting", flush=True)
+with cache.lock("key"):
+    print("inside", flush=True)
+"""
+    with cache.lock("key"):
+        other = subprocess.Popen(
+            [sys.executable, "-c", program, str(cache.folder)], stdout=subprocess.PIPE, text=True
+        )
+        assert other.stdout is not None
+        assert other.stdout.readline() == "waiting\n"
+        with pytest.raises(subprocess.TimeoutExpired):
+            other.wait(timeout=0.5)
+    assert other.communicate(timeout=60)[0] == "inside\n"
+
+
+def test_default_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.delenv("DUAL_ARM_CACHE", raising=False)
+    if sys.platform.startswith("linux"):
+        assert default_folder() == tmp_path / "xdg" / "dual-arm-carry"
+    monkeypatch.setenv("DUAL_ARM_CACHE", str(tmp_path / "own"))
+    assert default_folder() == tmp_path / "own"
+
+
+def test_digest_separates_its_parts() -> None:
+    assert digest("ab", "c") != digest("a", "bc") != digest("abc")
+    assert digest("a") == digest(b"a")
+
+
+def test_source_digest_follows_the_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "some_package"
+    (package / "inner").mkdir(parents=True)
+    (package / "__init__.py").write_text("raise AssertionError('imported')\n")
+    (package / "inner" / "module.py").write_text("x = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    before = source_digest("some_package")
+    assert source_digest("some_package") == before
+    (package / "inner" / "module.py").write_text("x = 2\n")
+    assert source_digest("some_package") != before

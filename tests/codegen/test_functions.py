@@ -1,0 +1,298 @@
+"""Compiled and interpreted functions: the same laws, against CasADi's own evaluation."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from codegen.build import compile_function
+from codegen.cache import Cache
+from codegen.check import directional_derivative, relative_difference
+from codegen.compiled import CompiledFunction
+from codegen.function import NumericFunction
+from codegen.interpreted import InterpretedFunction
+from codegen.source import dense
+from symbolic.errors import CodegenError
+
+Array = NDArray[np.float64]
+Make = Callable[[ca.Function], NumericFunction]
+
+BINARY = [
+    lambda a, b: a + b,
+    lambda a, b: a * b,
+    lambda a, b: a - ca.cos(b),
+    lambda a, b: a / (1.0 + b * b),
+    lambda a, b: ca.atan2(a, 1.0 + b * b),
+    lambda a, b: ca.if_else(a > b, ca.sin(a), ca.sqrt(1.0 + b * b)),
+    lambda a, b: ca.fmax(a, ca.fabs(b)),
+]
+
+
+def random_function(rng: np.random.Generator, symbol: Any) -> ca.Function:
+    """A random expression graph of a matrix and a vector, as SX or MX, with three outputs."""
+    matrix, vector = symbol.sym("matrix", 2, 3), symbol.sym("vector", 3)
+    terms = [matrix @ vector, matrix[:, 0] * vector[0], ca.sin(vector[1:])]
+    for _ in range(rng.integers(5, 40)):
+        first, second = rng.integers(len(terms), size=2)
+        terms.append(BINARY[rng.integers(len(BINARY))](terms[first], terms[second]))
+    tail = terms[-3:]
+    return ca.Function(
+        "random_graph",
+        [matrix, vector],
+        [tail[0], ca.horzcat(*tail), ca.dot(tail[1], tail[2])],
+        ["matrix", "vector"],
+        ["column", "table", "number"],
+    )
+
+
+@pytest.fixture(params=["compiled", "interpreted"])
+def make(request: pytest.FixtureRequest, cache: Cache) -> Make:
+    """Make a numeric function of either kind."""
+    if request.param == "interpreted":
+        return lambda function: InterpretedFunction(dense(function))
+    return lambda function: compile_function(function, cache)
+
+
+def small() -> ca.Function:
+    x, y = ca.MX.sym("x", 3), ca.MX.sym("y", 2, 4)
+    return ca.Function(
+        "small", [x, y], [2.0 * y, ca.sumsqr(x) * x, ca.sum1(x)], ["x", "y"], ["a", "b", "c"]
+    )
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**32 - 1), symbol=st.sampled_from([ca.SX, ca.MX]))
+def test_compiled_equals_interpreted(cache: Cache, seed: int, symbol: Any) -> None:
+    rng = np.random.default_rng(seed)
+    function = random_function(rng, symbol)
+    for checked in (function, directional_derivative(function), function.jacobian()):
+        compiled = compile_function(checked, cache)
+        assert isinstance(compiled, CompiledFunction)
+        inputs = [rng.standard_normal(shape) for shape in compiled.input_shapes]
+        found = compiled(*inputs)
+        # CasADi's (r, c) is NumPy's (c, r): transpose in, transpose out.
+        reference = checked.call([ca.DM(i.T if i.ndim == 2 else i) for i in inputs])
+        for name, expected in zip(compiled.output_names, reference, strict=True):
+            plain = np.array(ca.densify(expected)).T.reshape(found[name].shape)
+            assert relative_difference(plain, found[name]) <= 1e-10
+
+
+def test_shapes_follow_the_convention(make: Make) -> None:
+    function = make(small())
+    assert function.input_shapes == ((3,), (4, 2))
+    assert function.output_shapes == ((4, 2), (3,), ())
+    x, y = np.arange(3.0), np.arange(8.0).reshape(4, 2)
+    found = function(x, y)
+    np.testing.assert_array_equal(found["a"], 2.0 * y)
+    np.testing.assert_array_equal(found["b"], 5.0 * x)
+    assert found["c"] == 3.0
+    assert [found[name].shape for name in "abc"] == list(function.output_shapes)
+
+
+def test_results_of_two_calls_are_independent(make: Make) -> None:
+    function = make(small())
+    y = np.zeros((4, 2))
+    first = function(np.ones(3), y)["b"]
+    function(np.zeros(3), y)
+    np.testing.assert_array_equal(first, np.full(3, 3.0))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 0])
+def test_batch_equals_loop_to_the_bit(make: Make, threads: int) -> None:
+    rng = np.random.default_rng(1)
+    function = make(random_function(rng, ca.MX))
+    matrices = rng.standard_normal((37, *function.input_shapes[0]))
+    vector = rng.standard_normal(function.input_shapes[1])
+    found = function.batch(matrices, vector, threads=threads)
+    for k, matrix in enumerate(matrices):
+        single = function(matrix, vector)
+        for name in function.output_names:
+            np.testing.assert_array_equal(found[name][k], single[name])
+
+
+def test_empty_batch(make: Make) -> None:
+    found = make(small()).batch(np.empty((0, 3)), np.zeros((4, 2)))
+    assert {name: array.shape for name, array in found.items()} == {
+        "a": (0, 4, 2),
+        "b": (0, 3),
+        "c": (0,),
+    }
+
+
+def test_sparse_becomes_dense(make: Make) -> None:
+    lower = ca.MX.sym("lower", ca.Sparsity.lower(3))
+    x = ca.MX.sym("x", 3)
+    product = ca.Function("product", [lower, x], [lower @ x, lower], ["L", "x"], ["y", "copy"])
+    function = make(product)
+    matrix = np.arange(1.0, 10.0).reshape(3, 3)
+    found = function(matrix.T, np.array([1.0, -2.0, 0.5]))
+    np.testing.assert_allclose(found["y"], np.tril(matrix) @ [1.0, -2.0, 0.5], rtol=1e-15)
+    np.testing.assert_array_equal(found["copy"].T, np.tril(matrix))
+
+
+def test_evaluate_into_uses_the_given_memory(make: Make) -> None:
+    function = make(small())
+    outputs = [np.full(shape, np.nan) for shape in function.output_shapes]
+    function.evaluate_into([np.ones(3), np.ones((4, 2))], outputs)
+    np.testing.assert_array_equal(outputs[0], np.full((4, 2), 2.0))
+    assert outputs[2] == 3.0
+
+
+def test_nan_and_infinity_pass_through(make: Make) -> None:
+    found = make(small())(np.array([np.nan, 1.0, 2.0]), np.full((4, 2), np.inf))
+    assert np.isnan(found["b"]).all()
+    assert np.isnan(found["c"])
+    assert np.isposinf(found["a"]).all()
+
+
+LAYOUTS: list[tuple[str, Any]] = [
+    ("strided", np.arange(6.0)[::2]),
+    ("integers", np.array([0, 2, 4])),
+    ("single precision", np.array([0.0, 2.0, 4.0], np.float32)),
+    ("big endian", np.array([0.0, 2.0, 4.0], ">f8")),
+    ("unaligned", np.frombuffer(b"\0" + np.array([0.0, 2.0, 4.0]).tobytes(), np.float64, 3, 1)),
+    ("list", [0.0, 2.0, 4.0]),
+]
+
+
+@pytest.mark.parametrize(("layout", "x"), LAYOUTS)
+def test_any_layout_is_taken(make: Make, layout: str, x: Any) -> None:
+    found = make(small())(x, np.asfortranarray(np.arange(8.0).reshape(4, 2)))
+    np.testing.assert_array_equal(found["b"], [0.0, 40.0, 80.0], err_msg=layout)
+    np.testing.assert_array_equal(found["a"], 2.0 * np.arange(8.0).reshape(4, 2))
+
+
+def test_read_only_inputs_are_taken_without_a_copy(make: Make) -> None:
+    x = np.arange(3.0)
+    x.flags.writeable = False
+    np.testing.assert_array_equal(make(small())(x, np.zeros((4, 2)))["b"], 5.0 * x)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "message"),
+    [
+        ((np.zeros(3),), "1 inputs given, 2 needed: x, y"),
+        ((np.zeros(4), np.zeros((4, 2))), r"'x' has shape \(4,\), needed is \(3,\)"),
+        ((np.zeros(3), np.zeros((2, 4))), r"'y' has shape \(2, 4\), needed is \(4, 2\)"),
+        ((np.zeros(3, complex), np.zeros((4, 2))), "'x' is not an array of real numbers"),
+        ((["a", "b", "c"], np.zeros((4, 2))), "'x' is not an array of real numbers"),
+        (([[1.0], [1.0, 2.0], []], np.zeros((4, 2))), "'x' is not an array of real numbers"),
+    ],
+)
+def test_wrong_inputs_are_told(make: Make, inputs: tuple[Array, ...], message: str) -> None:
+    with pytest.raises(CodegenError, match=message):
+        make(small())(*inputs)
+
+
+def test_wrong_batches_are_told(make: Make) -> None:
+    function = make(small())
+    with pytest.raises(CodegenError, match="no input has a leading axis"):
+        function.batch(np.zeros(3), np.zeros((4, 2)))
+    with pytest.raises(CodegenError, match="'y' has 6 candidates, an input before it 5"):
+        function.batch(np.zeros((5, 3)), np.zeros((6, 4, 2)))
+    with pytest.raises(CodegenError, match="has shape"):
+        function.batch(np.zeros((5, 4)), np.zeros((4, 2)))
+    with pytest.raises(CodegenError, match="threads is -1"):
+        function.batch(np.zeros((5, 3)), np.zeros((4, 2)), threads=-1)
+
+
+def test_wrong_memory_is_told(make: Make) -> None:
+    function = make(small())
+    inputs = [np.ones(3), np.ones((4, 2))]
+    outputs = [np.empty(shape) for shape in function.output_shapes]
+    locked = np.empty((4, 2))
+    locked.flags.writeable = False
+    wrongs: list[Any] = [
+        locked,
+        np.empty((4, 2), np.float32),
+        np.empty((4, 4))[:, ::2],
+        np.empty(8),
+    ]
+    for wrong in wrongs:
+        with pytest.raises(CodegenError, match="needed is C-contiguous writable float64"):
+            function.evaluate_into(inputs, [wrong, *outputs[1:]])
+    with pytest.raises(CodegenError, match="2 output arrays given, 3 needed"):
+        function.evaluate_into(inputs, outputs[:2])
+
+
+def test_zero_size_arguments(make: Make) -> None:
+    x, nothing = ca.MX.sym("x", 2), ca.MX.sym("nothing", 0, 1)
+    function = make(ca.Function("f", [x, nothing], [nothing, 3.0 * x], ["x", "n"], ["n2", "y"]))
+    found = function(np.ones(2), np.empty(0))
+    assert found["n2"].shape == (0,)
+    np.testing.assert_array_equal(found["y"], [3.0, 3.0])
+
+
+def test_many_threads_share_one_function(cache: Cache) -> None:
+    function = compile_function(random_function(np.random.default_rng(2), ca.MX), cache)
+    rng = np.random.default_rng(3)
+    cases = [[rng.standard_normal(s) for s in function.input_shapes] for _ in range(400)]
+    expected = [function(*case) for case in cases]
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda case: function(*case), cases))
+    for one, other in zip(expected, found, strict=True):
+        for name in function.output_names:
+            np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_functions_with_memory_in_threads(cache: Cache, capfd: pytest.CaptureFixture[str]) -> None:
+    """A solver keeps state in its generated code; each thread must have its own."""
+    x, target = ca.SX.sym("x", 2), ca.SX.sym("p", 2)
+    solver = ca.nlpsol(
+        "solver",
+        "sqpmethod",
+        {"x": x, "p": target, "f": ca.sumsqr(x - target) + ca.sumsqr(x) ** 2},
+        {
+            "qpsol": "qrqp",
+            "print_header": False,
+            "print_iteration": False,
+            "print_time": False,
+            "print_status": False,
+            "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False},
+        },
+    )
+    p = ca.MX.sym("p", 2)
+    function = compile_function(
+        ca.Function("nearest", [p], [solver(x0=[0.0, 0.0], p=p)["x"]], ["p"], ["x"]), cache
+    )
+    assert isinstance(function, CompiledFunction)
+    points = np.random.default_rng(4).standard_normal((64, 2))
+    serial = function.batch(points, threads=1)["x"]
+    parallel = function.batch(points, threads=4)["x"]
+    capfd.readouterr()
+    np.testing.assert_array_equal(serial, parallel)
+    gradient = 2.0 * (serial - points) + 4.0 * np.sum(serial**2, axis=1, keepdims=True) * serial
+    assert np.abs(gradient).max() < 1e-5
+
+
+def test_loaded_twice_from_one_library(cache: Cache) -> None:
+    first, second = compile_function(small(), cache), compile_function(small(), cache)
+    assert isinstance(first, CompiledFunction)
+    assert isinstance(second, CompiledFunction)
+    assert first.library == second.library
+    np.testing.assert_array_equal(
+        first(np.ones(3), np.ones((4, 2)))["b"], second(np.ones(3), np.ones((4, 2)))["b"]
+    )
+
+
+def test_a_forked_child_has_threads_of_its_own(cache: Cache, tmp_path: Path) -> None:
+    function = compile_function(small(), cache)
+    inputs = (np.ones((16, 3)), np.ones((4, 2)))
+    expected = function.batch(*inputs, threads=2)["b"]
+    reply = tmp_path / "reply.npy"
+    child = os.fork()
+    if child == 0:
+        np.save(reply, function.batch(*inputs, threads=2)["b"])
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    np.testing.assert_array_equal(np.load(reply), expected)
