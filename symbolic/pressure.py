@@ -12,8 +12,16 @@ import casadi as ca
 
 Expression = ca.SX | ca.MX
 
-RELATIVE_DAMPING = 1e-12
-"""Damping of the normal equations relative to their trace: the pseudo-inverse's limit."""
+RELATIVE_DAMPING = 1e-10
+"""Damping of the normal equations relative to their trace.
+
+Where one contact is unloaded or nothing is tangential, a direction of moment cannot be had, and
+rounding over the damping is the error that remains.
+"""
+
+REFINEMENTS = 2
+"""Repeated solves for what is left (iterated Tikhonov regularisation): they take the damping's
+own error to its third power, below rounding wherever a moment can be had at all."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +80,10 @@ def pressure_shift(
     )  # A (3, 4): moment per unit of each tangential shift
     gram = ca.mtimes(lever, lever.T)
     damping = RELATIVE_DAMPING * ca.trace(gram) + 1e-300
-    dual = _solve_symmetric_3(gram + damping * ca.DM.eye(3), point_residual)
+    damped = gram + damping * ca.DM.eye(3)
+    dual = _solve_symmetric_3(damped, point_residual)
+    for _ in range(REFINEMENTS):
+        dual += _solve_symmetric_3(damped, point_residual - ca.mtimes(gram, dual))
     shifts = ca.mtimes(lever.T, dual)
     return PressureShift(
         shift_1=ca.mtimes(plane, shifts[:2]),
