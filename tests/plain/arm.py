@@ -1,0 +1,115 @@
+"""One arm that follows the box, written plainly over numeric Pinocchio."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial.transform import Rotation
+
+from symbolic.arm import MAX_JOINT_STEP, NEWTON_STEPS, REACH_TOLERANCE
+from symbolic.workcell import Array, Contact, Robot
+from tests.plain.motion import rotation
+
+
+class PlainArm:
+    """The numeric model of an arm and the pad that it holds the box with."""
+
+    def __init__(self, robot: Robot, contact: Contact) -> None:
+        self.robot = robot
+        self.contact = contact
+        model = pin.buildModelFromUrdf(str(robot.urdf))
+        locked = [model.getJointId(name) for name, _ in robot.locked_joints]
+        q = pin.neutral(model)
+        for joint, (_, position) in zip(locked, robot.locked_joints, strict=True):
+            q[model.joints[joint].idx_q] = position
+        self.model = pin.buildReducedModel(model, locked, q)
+        self.flange = self.model.getFrameId(robot.flange)
+        self.data = self.model.createData()
+        self.T_root_world = pin.SE3(robot.T_world_base).inverse()
+        self.T_flange_pad = pin.SE3(robot.T_flange_pad)
+
+    def flange_target(self, pose: Array) -> pin.SE3:
+        """Flange placement in the root that puts the pad on its contact."""
+        world_box = pin.SE3(rotation(pose[3:]), pose[:3])
+        world_pad = world_box * pin.SE3(self.contact.T_box_pad)
+        return self.T_root_world * world_pad * self.T_flange_pad.inverse()
+
+    def place(self, q: Array) -> pin.SE3:
+        """Flange placement in the root; leaves the frames of `data` up to date."""
+        pin.forwardKinematics(self.model, self.data, q)
+        pin.updateFramePlacements(self.model, self.data)
+        return self.data.oMf[self.flange]
+
+    def jacobian(self, q: Array) -> Array:
+        """(6, 6) of the flange, linear rows first, axes of the root."""
+        J: Array = pin.computeFrameJacobian(
+            self.model, self.data, q, self.flange, pin.LOCAL_WORLD_ALIGNED
+        )
+        return J
+
+    def newton_step(self, q: Array, target: pin.SE3) -> Array:
+        """One Newton step, shortened to `MAX_JOINT_STEP`; none at a singular posture."""
+        here = self.place(q)
+        turn = Rotation.from_matrix(target.rotation @ here.rotation.T).as_rotvec()
+        angle = float(np.linalg.norm(turn))
+        error = np.concatenate(
+            [target.translation - here.translation, turn * np.sinc(angle / np.pi)]
+        )
+        try:
+            step = np.linalg.solve(self.jacobian(q), error)
+        except np.linalg.LinAlgError:
+            return q
+        if not np.abs(step).sum() < 1e9:
+            return q
+        shortened: Array = q + step * (MAX_JOINT_STEP / max(np.abs(step).max(), MAX_JOINT_STEP))
+        return shortened
+
+    def residual(self, q: Array, target: pin.SE3) -> float:
+        """Distance and twice the sine of half the angle between placement and target, joined."""
+        here = self.place(q)
+        angle = Rotation.from_matrix(target.rotation @ here.rotation.T).magnitude()
+        distance = np.linalg.norm(target.translation - here.translation)
+        return float(np.hypot(distance, 2.0 * np.sin(angle / 2.0)))
+
+    def follow(self, start: Array, poses: Array, wrenches: Array) -> dict[str, Array]:
+        """Every output of `symbolic.arm.TRACK_OUTPUTS` along the samples.
+
+        Args:
+            start: (6,) joints at the first pose [rad].
+            poses: (n, 6) of the box.
+            wrenches: (n, 6) on the box about the nominal contact point, world axes.
+        """
+        previous = before = start
+        predicted = start
+        for _ in range(NEWTON_STEPS):
+            predicted = self.newton_step(predicted, self.flange_target(poses[1]))
+        lost = 0.0
+        samples: dict[str, list[object]] = {}
+        for k, (pose, wrench) in enumerate(zip(poses, wrenches, strict=True)):
+            target = self.flange_target(pose)
+            q = 2.0 * previous - before
+            for _ in range(NEWTON_STEPS):
+                q = self.newton_step(q, target)
+            residual = self.residual(q, target)
+            jump = np.abs(q - previous).max()
+            if not (residual <= REACH_TOLERANCE and jump <= MAX_JOINT_STEP):
+                lost = 1.0
+            margins = [q - self.robot.position_lower, self.robot.position_upper - q]
+            to_root = self.robot.T_world_base[:3, :3].T
+            force, moment = to_root @ wrench[:3], to_root @ wrench[3:]
+            contact = target * self.T_flange_pad
+            lever = contact.translation - target.translation
+            at_flange = np.concatenate([force, moment + np.cross(lever, force)])
+            sample = {
+                "q": q,
+                "ik_residual": residual,
+                "lost": lost,
+                "limit_margin": np.min(margins),
+                "manipulability": abs(np.linalg.det(self.jacobian(q))),
+                "joint_torque": self.jacobian(q).T @ at_flange,
+            }
+            for name, value in sample.items():
+                samples.setdefault(name, []).append(value)
+            # The second sample has no motion to extrapolate: the prediction takes its place.
+            previous, before = q, previous if k > 0 else 2.0 * q - predicted
+        return {name: np.array(values) for name, values in samples.items()}

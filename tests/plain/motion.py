@@ -1,0 +1,174 @@
+"""The box motion written plainly: spline, time laws and rotation, one sample at a time."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import factorial
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from symbolic.time_law import STEP_TIME_FLOOR
+from symbolic.workcell import Array, Task
+
+
+def waypoints(task: Task, x: Array) -> Array:
+    """All waypoints (n_waypoints, 6) of a decision vector, angles unwrapped."""
+    free = iter(np.reshape(x, (-1, 6)))
+    rows = np.array([w.lower if w.is_fixed else next(free) for w in task.waypoints])
+    rows[:, 3:] = np.unwrap(rows[:, 3:], axis=0)
+    return rows
+
+
+def natural_quintic(points: Array) -> Array:
+    """Coefficients (n_segments, 6 powers, dim) of the natural quintic spline through points.
+
+    Powers of the local parameter s in [0, 1] of each segment. The conditions are written down
+    one by one and solved: values at both ends of every segment, derivatives 1 to 4 continuous at
+    inner knots, derivatives 3 and 4 zero at both ends. Two points are joined by a straight line.
+    """
+    segments = len(points) - 1
+    if segments == 1:
+        line = np.zeros((1, 6, points.shape[1]))
+        line[0, 0], line[0, 1] = points[0], points[1] - points[0]
+        return line
+    rows, values = [], []
+
+    def require(value: Array, *terms: tuple[int, Array]) -> None:
+        row = np.zeros(6 * segments)
+        for segment, powers in terms:
+            row[6 * segment : 6 * segment + 6] += powers
+        rows.append(row)
+        values.append(value)
+
+    nothing = np.zeros(points.shape[1])
+    for k in range(segments):
+        require(points[k], (k, _powers(0.0, 0)))
+        require(points[k + 1], (k, _powers(1.0, 0)))
+    for k in range(segments - 1):
+        for order in (1, 2, 3, 4):
+            require(nothing, (k, _powers(1.0, order)), (k + 1, -_powers(0.0, order)))
+    for order in (3, 4):
+        require(nothing, (0, _powers(0.0, order)))
+        require(nothing, (segments - 1, _powers(1.0, order)))
+    solution: Array = np.linalg.solve(np.array(rows), np.array(values))
+    return solution.reshape(segments, 6, -1)
+
+
+def evaluate_spline(coefficients: Array, u: float, order: int = 0) -> Array:
+    """Derivative of some order with respect to u in [0, 1] over the whole spline."""
+    segments = len(coefficients)
+    k = min(int(u * segments), segments - 1)
+    value: Array = _powers(u * segments - k, order) @ coefficients[k] * segments**order
+    return value
+
+
+def _powers(s: float, order: int) -> Array:
+    """Derivative of (1, s, ..., s^5)."""
+    return np.array(
+        [
+            factorial(p) / factorial(p - order) * s ** (p - order) if p >= order else 0.0
+            for p in range(6)
+        ]
+    )
+
+
+def rotation(rpy: Array) -> Array:
+    """R_world_box (3, 3)."""
+    matrix: Array = Rotation.from_euler("xyz", rpy).as_matrix()
+    return matrix
+
+
+def euler_axes(rpy: Array) -> tuple[Array, Array, Array]:
+    """World axes about which roll, pitch and yaw turn, in this order."""
+    yaw = Rotation.from_euler("z", rpy[2])
+    pitch = Rotation.from_euler("ZY", [rpy[2], rpy[1]])
+    return pitch.apply([1.0, 0.0, 0.0]), yaw.apply([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+def angular_rates(rpy: Array, rate: Array, second: Array) -> tuple[Array, Array]:
+    """Angular velocity and acceleration (3,) in the world frame.
+
+    Each axis is carried round by the turns outside it: d axis / dt = omega_outer x axis.
+    """
+    roll_axis, pitch_axis, yaw_axis = euler_axes(rpy)
+    yaw_rate, pitch_rate, roll_rate = rate[2] * yaw_axis, rate[1] * pitch_axis, rate[0] * roll_axis
+    acceleration = (
+        second[2] * yaw_axis
+        + second[1] * pitch_axis
+        + np.cross(yaw_rate, pitch_rate)
+        + second[0] * roll_axis
+        + np.cross(yaw_rate + pitch_rate, roll_rate)
+    )
+    return yaw_rate + pitch_rate + roll_rate, acceleration
+
+
+def timed_motion(task: Task, x: Array) -> tuple[Array, Array, Array, Array]:
+    """Time (n,), pose (n, 6), its rate and second rate (n, 6) of a candidate."""
+    coefficients = natural_quintic(waypoints(task, x))
+    u = np.linspace(0.0, 1.0, task.samples)
+    pose = np.array([evaluate_spline(coefficients, value) for value in u])
+    if task.time_law == "constant":
+        time = _constant_time(task, pose)
+        rate = np.gradient(pose, time, axis=0, edge_order=2)
+        return time, pose, rate, np.gradient(rate, time, axis=0, edge_order=2)
+    first = np.array([evaluate_spline(coefficients, value, 1) for value in u])
+    second = np.array([evaluate_spline(coefficients, value, 2) for value in u])
+    return _ramped(task, u, pose, first, second)
+
+
+def _constant_time(task: Task, pose: Array) -> Array:
+    time = [0.0]
+    for here, there in pairwise(pose):
+        step, middle = there - here, (here + there) / 2.0
+        turn, _ = angular_rates(middle[3:], step[3:], np.zeros(3))
+        needed = max(
+            float(np.linalg.norm(step[:3])) / task.reference_speed,
+            float(np.linalg.norm(turn)) / task.reference_angular_speed,
+            STEP_TIME_FLOOR,
+        )
+        time.append(time[-1] + needed)
+    return np.array(time)
+
+
+def _ramped(
+    task: Task, u: Array, pose: Array, first: Array, second: Array
+) -> tuple[Array, Array, Array, Array]:
+    lever = task.reference_speed / task.reference_angular_speed
+    slope, curvature = [], []
+    for here, d, dd in zip(pose, first, second, strict=True):
+        omega, alpha = angular_rates(here[3:], d[3:], dd[3:])
+        linear, angular = float(np.linalg.norm(d[:3])), lever * float(np.linalg.norm(omega))
+        if linear >= angular:
+            slope.append(linear)
+            curvature.append(float(d[:3] @ dd[:3]) / linear)
+        else:
+            slope.append(angular)
+            curvature.append(lever**2 * float(omega @ alpha) / angular)
+    arc = CubicHermiteSpline(u, slope, curvature).antiderivative()(u)
+    time, rate, second_rate = [], [], []
+    for k, length in enumerate(arc):
+        t, speed, acceleration = drive(task, float(length), float(arc[-1]))
+        u_rate = speed / slope[k]
+        u_second = (acceleration - curvature[k] * u_rate**2) / slope[k]
+        time.append(t)
+        rate.append(first[k] * u_rate)
+        second_rate.append(second[k] * u_rate**2 + first[k] * u_second)
+    return np.array(time), pose, np.array(rate), np.array(second_rate)
+
+
+def drive(task: Task, length: float, total: float) -> tuple[float, float, float]:
+    """Time, speed and acceleration where a rest-to-rest drive has covered a length."""
+    ramp, cruise = task.ramp_time, min(task.reference_speed, total / task.ramp_time)
+    duration = ramp + total / cruise
+    if length > total / 2.0:
+        t, speed, acceleration = drive(task, total - length, total)
+        return duration - t, speed, -acceleration
+    if length >= cruise * ramp / 2.0:
+        return ramp / 2.0 + length / cruise, cruise, 0.0
+    share = length / (cruise * ramp)
+    tau = brentq(lambda tau: tau**3 - tau**4 / 2.0 - share, 0.0, 1.0, xtol=1e-15, rtol=1e-14)
+    speed = cruise * (3.0 * tau**2 - 2.0 * tau**3)
+    return ramp * tau, speed, cruise / ramp * (6.0 * tau - 6.0 * tau**2)
