@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def workcell_functions(
     workcell: Workcell, cache: Cache | None = None
 ) -> dict[str, NumericFunction]:
-    """Every function of `symbolic.cell_functions.cell_functions`, from the cache where it was built before.
+    """Every function of `symbolic.cell_functions`, from the cache where it was built before.
 
     A first use builds expressions and compiles; later ones, also by other processes, only load.
 
