@@ -1,1 +1,43 @@
 """Timing of a carry that real robots can drive: limits judged, timings found and recomputed."""
+
+from hybrid_opt.timing.analysis import (
+    ForceCurve,
+    JudgedTiming,
+    TimingReport,
+    closest_to_reference_timing,
+    duration_against_force_limit,
+    fastest_timing,
+    force_limited_timing,
+    judge_timing,
+    report_timing,
+)
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.records import (
+    Excess,
+    Place,
+    TimedCarry,
+    Timing,
+    TimingLimits,
+    TimingStatus,
+)
+from hybrid_opt.timing.solve import time_path
+
+__all__ = [
+    "Excess",
+    "ForceCurve",
+    "JudgedTiming",
+    "Place",
+    "TimedCarry",
+    "Timing",
+    "TimingLimits",
+    "TimingModel",
+    "TimingReport",
+    "TimingStatus",
+    "closest_to_reference_timing",
+    "duration_against_force_limit",
+    "fastest_timing",
+    "force_limited_timing",
+    "judge_timing",
+    "report_timing",
+    "time_path",
+]

@@ -31,8 +31,7 @@ def path_failure(model: TimingModel, motion: PathMotion) -> Timing | None:
         ),
         (
             TimingStatus.NEAR_SINGULAR,
-            motion.manipulability
-            < [robot.min_manipulability for robot in model.workcell.robots],
+            motion.manipulability < [robot.min_manipulability for robot in model.workcell.robots],
             "manipulability",
             "comes too near a singular posture",
         ),

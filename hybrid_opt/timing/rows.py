@@ -129,8 +129,8 @@ def force_rows(motion: PathMotion, workcell: Workcell, force: float, tangent: Ar
         tangent: (n, 3) unit vectors, orthogonal to the contact normals.
     """
     friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
-    by_normal = np.array(normal_force_branches(ca.DM(1), ca.DM(0), friction)).reshape(-1)
-    by_tangent = np.array(normal_force_branches(ca.DM(0), ca.DM(1), friction)).reshape(-1)
+    by_normal: Array = np.array(normal_force_branches(ca.DM(1), ca.DM(0), friction)).reshape(-1)
+    by_tangent: Array = np.array(normal_force_branches(ca.DM(0), ca.DM(1), friction)).reshape(-1)
     weight = workcell.payload.mass * np.array(GRAVITY)
     normal_share = np.concatenate([by_normal + 1.0, by_normal])  # N_1 = N_2 + F_n
     tangent_share = np.concatenate([by_tangent, by_tangent])

@@ -16,20 +16,15 @@ from numpy.typing import NDArray
 
 from hybrid_opt.timing import rows as rows_of
 from hybrid_opt.timing.adapter import SolverFailure, fastest_speed
-from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel, contact_torque
+from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
 from hybrid_opt.timing.path_check import path_failure
+from hybrid_opt.timing.point_limits import POINT_TOLERANCE, PointLimits
 from hybrid_opt.timing.records import Place, TimedCarry, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.rows import STAGE_POINTS, PointRows
-from hybrid_opt.timing.use import limit_use, worst
+from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_ratios, limit_use, worst
 from symbolic.workcell import Array
 
 MAX_ITERATIONS = 25
-POINT_TOLERANCE = 1e-3
-"""Largest excess at the points where limits are imposed, as a share of the limit."""
-
-RECOMPUTED_TOLERANCE = 5e-3
-"""Largest excess on the refined samples, as a share of the limit."""
-
 SETTLED = 2e-4
 """Relative change of duration below which linearised limits count as settled."""
 
@@ -42,11 +37,21 @@ LEAST_SPEED = 0.98
 
 @dataclass
 class _State:
-    """What the iteration carries from one linear problem to the next."""
+    """What the iteration carries from one linear problem to the next.
+
+    Attributes:
+        cuts: supporting lines of convex limits.
+        tightened: (stages,) divisor of a stage's bounds, above one where a limit is exceeded
+            between the points at which it is imposed.
+        near: which of the limits that are not convex came near their bound so far.
+        linearised: their rows, about the last timing.
+        duration: of the last timing, in the scaled coordinate.
+    """
 
     cuts: list[PointRows]
+    tightened: Array
+    near: NDArray[np.bool_]
     linearised: PointRows | None = None
-    near: NDArray[np.bool_] | None = None
     duration: float = float("inf")
 
 
@@ -71,9 +76,7 @@ def time_path(
     return Timing(**{**vars(timing), "seconds": seconds})
 
 
-def _failure_at_rest(
-    model: TimingModel, motion: PathMotion, limits: TimingLimits
-) -> Timing | None:
+def _failure_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing | None:
     """A limit that is exceeded even standing still: then no timing exists.
 
     Otherwise one exists: slow enough, every quantity is as close to its value at rest as wanted.
@@ -100,162 +103,60 @@ class _Problem:
         self._model = model
         self._motion = motion
         self._limits = limits
-        stages = model.stages
-        offsets = np.array([round(REFINEMENT * share) for share in STAGE_POINTS])
-        self._index = (REFINEMENT * np.arange(stages)[:, None] + offsets).reshape(-1)
-        self._points = motion.at(self._index)
-        self._scale = self._nominal_duration()
-        self._grid = np.linspace(0.0, self._scale, stages + 1)
-        still = np.zeros(len(self._index))
-        self._rest = self._ratios(still, still)
+        self._at = PointLimits(model, motion, limits)
 
     def solve(self) -> Timing:
         """Solve linear problems until recomputed limits hold and nothing changes any more."""
-        state = _State(cuts=[self._first_cuts()])
-        fixed = rows_of.join(
-            [
-                rows_of.speed_rows(
-                    self._points, self._model.workcell, self._limits, self._scale
-                ),
-                rows_of.joint_acceleration_rows(self._points, self._model.workcell),
-            ]
+        stages = self._model.stages
+        state = _State(
+            [self._at.first_cuts()],
+            np.ones(stages),
+            np.zeros(self._at.rest.shape[1], dtype=bool),
         )
+        fixed = self._at.fixed()
         squared = np.zeros(0)
         settled = False
         for iteration in range(1, MAX_ITERATIONS + 1):
             parts = [fixed, *state.cuts]
             if state.linearised is not None:
                 parts.append(state.linearised)
-            linear = rows_of.stage_rows(rows_of.join(parts), self._model.stages, self._scale)
-            found = fastest_speed(linear, self._grid)
+            linear = rows_of.stage_rows(rows_of.join(parts), stages, self._at.scale)
+            linear.bound[:] /= state.tightened[:, None]
+            found = fastest_speed(linear, self._at.grid)
             if isinstance(found, SolverFailure):
                 return self._solver_failure(found, iteration)
             squared = found
-            settled = self._advance(state, squared)
+            settled = self._advance(state, squared) and not self._tighten(state, squared)
             if settled:
                 break
         return self._finish(squared, iteration, settled)
 
     def _advance(self, state: _State, squared: Array) -> bool:
         """Add or renew rows about a timing; whether it already holds and has settled."""
-        w, a = self._at_points(squared)
-        excess = self._cut(state, a, w)
-        ratios = self._ratios(a, w)
-        duration = _duration(squared, self._grid)
+        w, a = self._at.at_points(squared)
+        cuts, excess = self._at.cut(a, w)
+        state.cuts += cuts
+        ratios = self._at.ratios(a, w)
+        duration = _duration(squared, self._at.grid)
         change = abs(duration / state.duration - 1.0) if np.isfinite(state.duration) else 1.0
         state.duration = duration
-        if ratios.shape[1]:
+        if ratios.size:
             excess = max(excess, float(np.abs(ratios).max()) - 1.0)
-            near = (np.abs(ratios) > NEAR).any(axis=0)
-            state.near = near if state.near is None else state.near | near
-            renewed = bool(state.near.any())
-            if renewed:
-                state.linearised = self._linearise(ratios, state.near, a, w)
-            else:
-                change = 0.0
-        else:
-            change = 0.0
+            state.near |= (np.abs(ratios) > NEAR).any(axis=0)
+        if not state.near.any():
+            return excess <= POINT_TOLERANCE
+        state.linearised = self._at.linearise(ratios, state.near, a, w)
         return excess <= POINT_TOLERANCE and change <= SETTLED
 
-    def _nominal_duration(self) -> float:
-        """Duration at the reference speeds [s]: scales the path so that speeds are around one."""
-        limits = TimingLimits(reference_speed=True)
-        squared = rows_of.squared_speed_limit(self._motion, self._model.workcell, limits)
-        slowness = 1.0 / np.sqrt(np.minimum(squared, 1e8))
-        return float(np.trapezoid(slowness, self._motion.parameter))
-
-    def _at_points(self, squared: Array) -> tuple[Array, Array]:
-        """u'^2 and u'' (points,) of a timing (stages + 1,) in the scaled coordinate."""
-        slope = np.diff(squared)
-        w = squared[:-1, None] + np.outer(slope, STAGE_POINTS)
-        a = np.repeat(slope / (2.0 * np.diff(self._grid)), len(STAGE_POINTS))
-        return w.reshape(-1) / self._scale**2, a / self._scale
-
-    def _first_cuts(self) -> PointRows:
-        """Supporting lines of the convex limits before any timing is known."""
-        p, payload = self._points, self._model.workcell.payload
-        linear = (p.pose_first[:, :3], p.pose_second[:, :3])
-        angular = (p.angular_first, p.angular_second)
-        cuts = [
-            rows_of.norm_rows(*pair, limit, rows_of.spanning_directions(*pair))
-            for pair, limit in (
-                (linear, payload.acceleration_max),
-                (angular, payload.angular_acceleration_max),
-            )
-        ]
-        still = np.zeros(len(self._index))
-        return rows_of.join([*cuts, *self._force_cut(still, still)])
-
-    def _force_cut(self, a: Array, w: Array) -> list[PointRows]:
-        if self._limits.force is None:
-            return []
-        tangent = rows_of.tangent_direction(self._points, self._model.workcell, a, w)
-        return [
-            rows_of.force_rows(self._points, self._model.workcell, self._limits.force, tangent)
-        ]
-
-    def _cut(self, state: _State, a: Array, w: Array) -> float:
-        """Add supporting lines of the convex limits that a timing exceeds; the largest excess."""
-        p, payload = self._points, self._model.workcell.payload
-        worst_excess = -1.0
-        for first, second, limit in (
-            (p.pose_first[:, :3], p.pose_second[:, :3], payload.acceleration_max),
-            (p.angular_first, p.angular_second, payload.angular_acceleration_max),
-        ):
-            vector = first * a[:, None] + second * w[:, None]
-            length = np.linalg.norm(vector, axis=1, keepdims=True)
-            excess = float(length.max()) / limit - 1.0
-            worst_excess = max(worst_excess, excess)
-            if excess > POINT_TOLERANCE:
-                direction = vector / np.maximum(length, 1e-12)
-                state.cuts.append(rows_of.norm_rows(first, second, limit, direction[:, None, :]))
-        if self._limits.force is not None:
-            load = self._model.drive(p, np.sqrt(w), a)
-            excess = float(load["normal_force"].max()) / self._limits.force - 1.0
-            worst_excess = max(worst_excess, excess)
-            # What the force limit leaves for the motion is small, so the whole of it counts.
-            if excess > POINT_TOLERANCE * FORCE_SHARPNESS:
-                state.cuts += self._force_cut(a, w)
-                worst_excess = max(worst_excess, 2.0 * POINT_TOLERANCE)
-        return worst_excess
-
-    def _ratios(self, a: Array, w: Array) -> Array:
-        """Limits that are not convex, over their limits at the points, signed (n, k)."""
-        columns: list[Array] = []
-        if not (self._limits.torque or self._limits.pressure):
-            return np.zeros((len(a), 0))
-        p, workcell = self._points, self._model.workcell
-        load = self._model.drive(p, np.sqrt(w), a)
-        if self._limits.torque:
-            own = p.torque_by_acceleration * a[:, None] + p.torque_by_speed * w[:, None]
-            torque = contact_torque(p, load) + own + p.torque_at_rest
-            columns.append(torque / np.concatenate([r.torque_max for r in workcell.robots]))
-        if self._limits.pressure:
-            radius = np.array([contact.patch_radius for contact in workcell.contacts])
-            columns.append(load["pressure_shift"] / radius)
-        return np.concatenate(columns, axis=1)
-
-    def _linearise(
-        self, ratios: Array, near: NDArray[np.bool_], a: Array, w: Array
-    ) -> PointRows:
-        """Rows of the ratios near their limits, by forward differences in (u'', u'^2)."""
-        step_a = 1e-5 * max(float(np.abs(a).max()), 1e-6)
-        step_w = 1e-5 * max(float(w.max()), 1e-6)
-        gradient = np.stack(
-            [
-                (self._ratios(a + step_a, w) - ratios) / step_a,
-                (self._ratios(a, w + step_w) - ratios) / step_w,
-            ],
-            axis=-1,
-        )[:, near]
-        z = np.stack([a, w], axis=1)
-        value, rest = ratios[:, near], self._rest[:, near]
-        return rows_of.join(
-            [
-                rows_of.linearised_rows(sign * value, sign * gradient, sign * rest, z)
-                for sign in (1.0, -1.0)
-            ]
-        )
+    def _tighten(self, state: _State, squared: Array) -> bool:
+        """Tighten the stages that exceed a limit between their points; whether there are any."""
+        ratios = limit_ratios(self._refined(squared), self._model.workcell, self._limits)
+        del ratios["friction"]
+        use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
+        excess = use.reshape(self._model.stages, -1).max(axis=1)
+        exceeded = excess > 1.0 + RECOMPUTED_TOLERANCE / 2.0
+        state.tightened = np.where(exceeded, state.tightened * excess, state.tightened)
+        return bool(exceeded.any())
 
     def _finish(self, squared: Array, iterations: int, settled: bool) -> Timing:
         """Recompute on refined samples; slow down uniformly where a limit is still exceeded."""
@@ -290,7 +191,7 @@ class _Problem:
             place=excess.place,
             carry=carry,
             use=use,
-            grid_speed=np.sqrt(squared) / self._scale,
+            grid_speed=np.sqrt(squared) / self._at.scale,
             iterations=iterations,
             slowed=factor,
         )
@@ -301,7 +202,7 @@ class _Problem:
         share = np.linspace(0.0, 1.0, REFINEMENT + 1)
         w = squared[:-1, None] + np.outer(np.diff(squared), share)
         speed = np.sqrt(np.maximum(w, 0.0))
-        length = self._grid[1]
+        length = self._at.grid[1]
         # Average speed over a piece of constant acceleration is that of its ends.
         total = speed[:, :1] + speed
         elapsed = 2.0 * share * length / np.where(total > 0.0, total, 1.0)
@@ -311,16 +212,14 @@ class _Problem:
         return self._model.carry(
             self._motion.at(index.reshape(-1)),
             (starts[:, None] + elapsed).reshape(-1),
-            speed.reshape(-1) / self._scale,
-            a / self._scale,
+            speed.reshape(-1) / self._at.scale,
+            a / self._at.scale,
         )
 
     def _solver_failure(self, failure: SolverFailure, iterations: int) -> Timing:
         point = len(STAGE_POINTS) * failure.stage
-        columns = self._rest[point]
-        place = Place(
-            "path timing", "", "", failure.stage, float(self._points.parameter[point])
-        )
+        columns = self._at.rest[point]
+        place = Place("path timing", "", "", failure.stage, float(self._at.points.parameter[point]))
         detail = ""
         if columns.size:
             detail = f" (at rest there, limits are used to {100.0 * np.abs(columns).max():.1f} %)"
@@ -332,10 +231,6 @@ class _Problem:
             None,
             iterations=iterations,
         )
-
-
-FORCE_SHARPNESS = 0.02
-"""Tolerance of the normal force as a share of `POINT_TOLERANCE`."""
 
 
 def _duration(squared: Array, grid: Array) -> float:

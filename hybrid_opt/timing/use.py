@@ -10,6 +10,12 @@ from symbolic.workcell import Array, Workcell
 JOINT_CONSTRAINTS = ("joint velocity", "joint acceleration", "joint torque")
 CONTACT_CONSTRAINTS = ("normal force", "friction", "pressure shift")
 
+FRICTION_ROUNDING = 1e-6
+"""The least-effort forces lie on the friction cones; this much beyond them is rounding."""
+
+RECOMPUTED_TOLERANCE = 5e-3
+"""Largest excess of a recomputed limit, as a share of it."""
+
 FORCE_FLOOR = 1e-9
 """A contact with less normal force than this carries nothing [N]."""
 
@@ -37,8 +43,7 @@ def limit_ratios(carry: TimedCarry, workcell: Workcell, limits: TimingLimits) ->
         "payload angular velocity": angular / payload.angular_velocity_max,
         "payload angular acceleration": _norm(carry.angular_acceleration)
         / payload.angular_acceleration_max,
-        "friction": carry.tangential_force
-        / np.maximum(carry.normal_force * friction, FORCE_FLOOR),
+        "friction": carry.tangential_force / np.maximum(carry.normal_force * friction, FORCE_FLOOR),
     }
     if limits.torque:
         ratios["joint torque"] = np.abs(carry.torque) / joints("torque_max")
@@ -78,9 +83,7 @@ def limit_use(
     return use
 
 
-def joint_use(
-    carry: TimedCarry, workcell: Workcell
-) -> dict[str, Array]:
+def joint_use(carry: TimedCarry, workcell: Workcell) -> dict[str, Array]:
     """Worst use of every joint's limits over the carry, (12,) per joint constraint.
 
     Beside the three limits, `contact torque` is the share of the contact wrench alone.
@@ -101,9 +104,6 @@ def worst(use: dict[str, Excess]) -> Excess:
     return max(candidates, key=lambda excess: excess.ratio)
 
 
-FRICTION_ROUNDING = 1e-6
-"""The least-effort forces lie on the friction cones; this much beyond them is rounding."""
-
-
 def _norm(vectors: Array) -> Array:
-    return np.linalg.norm(vectors, axis=1, keepdims=True)
+    length: Array = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return length

@@ -1,0 +1,181 @@
+"""What people ask about a trajectory's timing, each as one function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.path_check import path_failure
+from hybrid_opt.timing.point_limits import nominal_duration
+from hybrid_opt.timing.records import Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, joint_use, limit_use, worst
+from symbolic.errors import SettingsError
+from symbolic.workcell import Array
+
+NEAREST_FORCE = 1.001
+"""Least force limit of the curve, over the force at rest: below, the motion has to creep."""
+
+
+@dataclass(frozen=True)
+class JudgedTiming:
+    """A given timing held against the limits.
+
+    Attributes:
+        timing: status `OK` or `EXCEEDED` (or why the path itself fails), with every limit's use.
+        joint_use: (12,) worst use of each joint by constraint, both arms in order.
+        start_speed, end_speed: joint speeds (12,) that the timing asks for at its ends, where a
+            robot stands still [rad/s].
+    """
+
+    timing: Timing
+    joint_use: dict[str, Array]
+    start_speed: Array
+    end_speed: Array
+
+
+@dataclass(frozen=True)
+class ForceCurve:
+    """Duration of the fastest timing against the limit on the normal forces.
+
+    Attributes:
+        force: (n,) limits [N].
+        duration: (n,) [s], infinite where there is no timing.
+        status: outcome per limit.
+        static_force: largest normal force standing still anywhere on the path [N].
+        unlimited_force: largest normal force of the fastest timing without force limit [N].
+    """
+
+    force: Array
+    duration: Array
+    status: tuple[TimingStatus, ...]
+    static_force: float
+    unlimited_force: float
+
+
+def judge_timing(model: TimingModel, x: Array) -> JudgedTiming:
+    """The search's own timing (the task's time law) held against every limit of the workcell.
+
+    Raises:
+        SettingsError: x does not fit the workcell.
+    """
+    carry = model.search_carry(x)
+    failure = path_failure(model, model.path_motion(x))
+    use = limit_use(carry, model.workcell, TimingLimits(), model.joint_names)
+    excess = worst(use)
+    status, reason = TimingStatus.OK, f"within all limits; most used: {excess.place}"
+    if excess.ratio > 1.0 + RECOMPUTED_TOLERANCE:
+        status = TimingStatus.EXCEEDED
+        reason = f"uses {100.0 * excess.ratio:.0f} % of the limit: {excess.place}"
+    timing = Timing(status, reason, excess.place, carry, use)
+    if failure is not None:
+        timing = replace(failure, carry=carry, use=use)
+    return JudgedTiming(timing, joint_use(carry, model.workcell), carry.q_rate[0], carry.q_rate[-1])
+
+
+def fastest_timing(model: TimingModel, x: Array) -> Timing:
+    """The fastest timing from rest to rest within the robots' and the payload's limits."""
+    return time_path(model, x, TimingLimits())
+
+
+def closest_to_reference_timing(model: TimingModel, x: Array) -> Timing:
+    """The timing from rest to rest that keeps to the reference speeds as far as limits allow.
+
+    It is the fastest of those that never exceed the task's reference speeds, so that the box moves
+    at a reference speed wherever no limit forbids it.
+    """
+    return time_path(model, x, TimingLimits(reference_speed=True))
+
+
+def force_limited_timing(model: TimingModel, x: Array, force: float) -> Timing:
+    """The fastest timing whose normal forces stay below a limit while friction holds.
+
+    Args:
+        force: largest normal force of each robot [N].
+
+    Raises:
+        SettingsError: the limit is not a positive force.
+    """
+    return time_path(model, x, TimingLimits(force=force))
+
+
+def duration_against_force_limit(model: TimingModel, x: Array, points: int = 12) -> ForceCurve:
+    """Durations of the fastest timings between the least force that holds and the unlimited one.
+
+    The limits are spaced evenly in the logarithm of what they leave above the force at rest.
+
+    Raises:
+        SettingsError: fewer than two points.
+    """
+    if points < 2:
+        raise SettingsError(f"{points} points of the force curve; give at least 2")
+    motion = model.path_motion(x)
+    still = np.zeros(len(motion.parameter))
+    static = float(model.drive(motion, still, still)["normal_force"].max())
+    free = time_path(model, x, TimingLimits(), motion)
+    if free.carry is None:
+        return ForceCurve(np.zeros(0), np.zeros(0), (free.status,), static, float("nan"))
+    top = float(free.carry.normal_force.max())
+    first = (NEAREST_FORCE - 1.0) * static
+    force = static + np.geomspace(first, max(top - static, 2.0 * first), points)
+    timings = [time_path(model, x, TimingLimits(force=float(limit)), motion) for limit in force]
+    return ForceCurve(
+        force,
+        np.array([timing.duration for timing in timings]),
+        tuple(timing.status for timing in timings),
+        static,
+        top,
+    )
+
+
+@dataclass(frozen=True)
+class TimingReport:
+    """A trajectory under the search's timing and under timings that robots can drive.
+
+    Attributes:
+        judged: the search's own timing.
+        nominal_duration: at the reference speeds without ramps [s].
+        fastest, closest: see the functions of those names.
+        force_limited: with the given limit, None without one.
+        objectives: (2,) peak normal forces over the reference forces by timing, the search's
+            beside the real ones.
+    """
+
+    judged: JudgedTiming
+    nominal_duration: float
+    fastest: Timing
+    closest: Timing
+    force_limited: Timing | None
+    objectives: dict[str, Array]
+
+
+def report_timing(model: TimingModel, x: Array, force: float | None = None) -> TimingReport:
+    """All timings of a trajectory beside one another.
+
+    Args:
+        force: limit on the normal forces for the force-limited timing [N].
+
+    Raises:
+        SettingsError: x does not fit the workcell, or the limit is not a positive force.
+    """
+    judged = judge_timing(model, x)
+    fastest = fastest_timing(model, x)
+    closest = closest_to_reference_timing(model, x)
+    limited = None if force is None else force_limited_timing(model, x, force)
+    timings = {"search": judged.timing, "fastest": fastest, "closest to reference": closest}
+    if limited is not None:
+        timings["force limited"] = limited
+    return TimingReport(
+        judged=judged,
+        nominal_duration=nominal_duration(model, model.path_motion(x)),
+        fastest=fastest,
+        closest=closest,
+        force_limited=limited,
+        objectives={
+            name: timing.carry.objectives(model.workcell)
+            for name, timing in timings.items()
+            if timing.carry is not None
+        },
+    )

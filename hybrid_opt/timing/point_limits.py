@@ -1,0 +1,149 @@
+"""Limits at the points of the path's stages: rows for the linear problem, recomputed values."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_opt.timing import rows as rows_of
+from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel, contact_torque
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.rows import STAGE_POINTS, PointRows
+from symbolic.workcell import Array
+
+POINT_TOLERANCE = 1e-3
+"""Largest excess at the points where limits are imposed, as a share of the limit."""
+
+FORCE_SHARPNESS = 0.02
+"""Tolerance of the normal force as a share of `POINT_TOLERANCE`."""
+
+
+class PointLimits:
+    """The limits of one path at `STAGE_POINTS` of every stage.
+
+    Attributes:
+        points: the path's geometry there.
+        scale: the solver's path coordinate is scale times u [s].
+        grid: (stages + 1,) the solver's path coordinate at the stages' ends.
+        rest: (points, k) `ratios` standing still.
+    """
+
+    def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
+        self._model = model
+        self._limits = limits
+        stages = model.stages
+        offsets = np.array([round(REFINEMENT * share) for share in STAGE_POINTS])
+        self._index = (REFINEMENT * np.arange(stages)[:, None] + offsets).reshape(-1)
+        self.points = motion.at(self._index)
+        self.scale = nominal_duration(model, motion)
+        self.grid = np.linspace(0.0, self.scale, stages + 1)
+        still = np.zeros(len(self._index))
+        self.rest = self.ratios(still, still)
+
+    def fixed(self) -> PointRows:
+        """The limits that are linear by themselves: joint speeds and accelerations."""
+        workcell = self._model.workcell
+        return rows_of.join(
+            [
+                rows_of.speed_rows(self.points, workcell, self._limits, self.scale),
+                rows_of.joint_acceleration_rows(self.points, workcell),
+            ]
+        )
+
+    def at_points(self, squared: Array) -> tuple[Array, Array]:
+        """u'^2 and u'' (points,) of a timing (stages + 1,) in the scaled coordinate."""
+        slope = np.diff(squared)
+        w = squared[:-1, None] + np.outer(slope, STAGE_POINTS)
+        a = np.repeat(slope / (2.0 * np.diff(self.grid)), len(STAGE_POINTS))
+        return w.reshape(-1) / self.scale**2, a / self.scale
+
+    def first_cuts(self) -> PointRows:
+        """Supporting lines of the convex limits before any timing is known."""
+        p, payload = self.points, self._model.workcell.payload
+        linear = (p.pose_first[:, :3], p.pose_second[:, :3])
+        angular = (p.angular_first, p.angular_second)
+        cuts = [
+            rows_of.norm_rows(*pair, limit, rows_of.spanning_directions(*pair))
+            for pair, limit in (
+                (linear, payload.acceleration_max),
+                (angular, payload.angular_acceleration_max),
+            )
+        ]
+        still = np.zeros(len(self._index))
+        return rows_of.join([*cuts, *self._force_cut(still, still)])
+
+    def _force_cut(self, a: Array, w: Array) -> list[PointRows]:
+        if self._limits.force is None:
+            return []
+        tangent = rows_of.tangent_direction(self.points, self._model.workcell, a, w)
+        return [rows_of.force_rows(self.points, self._model.workcell, self._limits.force, tangent)]
+
+    def cut(self, a: Array, w: Array) -> tuple[list[PointRows], float]:
+        """Supporting lines of the convex limits that a timing exceeds, and the largest excess."""
+        cuts: list[PointRows] = []
+        p, payload = self.points, self._model.workcell.payload
+        worst_excess = -1.0
+        for first, second, limit in (
+            (p.pose_first[:, :3], p.pose_second[:, :3], payload.acceleration_max),
+            (p.angular_first, p.angular_second, payload.angular_acceleration_max),
+        ):
+            vector = first * a[:, None] + second * w[:, None]
+            length = np.linalg.norm(vector, axis=1, keepdims=True)
+            excess = float(length.max()) / limit - 1.0
+            worst_excess = max(worst_excess, excess)
+            if excess > POINT_TOLERANCE:
+                direction = vector / np.maximum(length, 1e-12)
+                cuts.append(rows_of.norm_rows(first, second, limit, direction[:, None, :]))
+        if self._limits.force is not None:
+            load = self._model.drive(p, np.sqrt(w), a)
+            excess = float(load["normal_force"].max()) / self._limits.force - 1.0
+            worst_excess = max(worst_excess, excess)
+            # What the force limit leaves for the motion is small, so the whole of it counts.
+            if excess > POINT_TOLERANCE * FORCE_SHARPNESS:
+                cuts += self._force_cut(a, w)
+                worst_excess = max(worst_excess, 2.0 * POINT_TOLERANCE)
+        return cuts, worst_excess
+
+    def ratios(self, a: Array, w: Array) -> Array:
+        """Limits that are not convex, over their limits at the points, signed (n, k)."""
+        columns: list[Array] = []
+        if not (self._limits.torque or self._limits.pressure):
+            return np.zeros((len(a), 0))
+        p, workcell = self.points, self._model.workcell
+        load = self._model.drive(p, np.sqrt(w), a)
+        if self._limits.torque:
+            own = p.torque_by_acceleration * a[:, None] + p.torque_by_speed * w[:, None]
+            torque = contact_torque(p, load) + own + p.torque_at_rest
+            columns.append(torque / np.concatenate([r.torque_max for r in workcell.robots]))
+        if self._limits.pressure:
+            radius = np.array([contact.patch_radius for contact in workcell.contacts])
+            columns.append(load["pressure_shift"] / radius)
+        return np.concatenate(columns, axis=1)
+
+    def linearise(self, ratios: Array, near: NDArray[np.bool_], a: Array, w: Array) -> PointRows:
+        """Rows of the ratios near their limits, by forward differences in (u'', u'^2)."""
+        step_a = 1e-5 * max(float(np.abs(a).max()), 1e-6)
+        step_w = 1e-5 * max(float(w.max()), 1e-6)
+        gradient = np.stack(
+            [
+                (self.ratios(a + step_a, w) - ratios) / step_a,
+                (self.ratios(a, w + step_w) - ratios) / step_w,
+            ],
+            axis=-1,
+        )[:, near]
+        z = np.stack([a, w], axis=1)
+        value, rest = ratios[:, near], self.rest[:, near]
+        return rows_of.join(
+            [
+                rows_of.linearised_rows(sign * value, sign * gradient, sign * rest, z)
+                for sign in (1.0, -1.0)
+            ]
+        )
+
+
+def nominal_duration(model: TimingModel, motion: PathMotion) -> float:
+    """Duration of a path at the task's reference speeds [s], without ramps."""
+    limits = TimingLimits(reference_speed=True)
+    squared = rows_of.squared_speed_limit(motion, model.workcell, limits)
+    slowness = 1.0 / np.sqrt(np.minimum(squared, 1e8))
+    return float(np.trapezoid(slowness, motion.parameter))
