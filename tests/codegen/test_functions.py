@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -243,6 +244,21 @@ def test_many_threads_share_one_function(cache: Cache) -> None:
     for one, other in zip(expected, found, strict=True):
         for name in function.output_names:
             np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_other_threads_run_during_a_batch(cache: Cache) -> None:
+    """The interpreter's lock is free while candidates are computed, so that cores add up."""
+    x = ca.SX.sym("x")
+    step = ca.Function("step", [x], [ca.sin(x) + 0.5])
+    slow = compile_function(step.mapaccum("slow", 1000), cache)
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(slow.batch, np.zeros(40_000))
+        turns = 0
+        while not running.done():
+            time.sleep(0.001)
+            turns += 1
+    # The lock held, this thread would get a turn before and one after.
+    assert turns > 10
 
 
 def test_functions_with_memory_in_threads(cache: Cache, capfd: pytest.CaptureFixture[str]) -> None:
