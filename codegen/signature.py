@@ -1,7 +1,7 @@
 """What a numeric function takes and gives: names and NumPy shapes.
 
 CasADi stores matrices by column. A CasADi (r, c) matrix is therefore a NumPy (c, r) array in C
-order without a copy; a column vector (r, 1) is (r,) and a scalar (1, 1) is ().
+order without a copy; a column or row vector is (n,) and a scalar (1, 1) is ().
 """
 
 from __future__ import annotations
@@ -80,6 +80,6 @@ class Signature:
 
 def numpy_shape(rows: int, columns: int) -> Shape:
     """NumPy shape of a dense CasADi (rows, columns) matrix."""
-    if columns == 1:
-        return () if rows == 1 else (rows,)
+    if rows == 1 or columns == 1:
+        return () if rows == columns else (rows * columns,)
     return (columns, rows)

@@ -14,7 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.workcell_functions import workcell_functions
+from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.collision.verdict import Verdict
 from hybrid_opt.objectives import PAPER_OBJECTIVES, select_objectives
+from symbolic.collision_pairs import build_geometry
 from symbolic.errors import SettingsError
 from symbolic.evaluator import CONSTRAINTS
 from symbolic.workcell import Array, Workcell
@@ -70,6 +73,7 @@ class CandidateEvaluator:
     Attributes:
         workcell: the cell.
         objective_names: the selected objectives.
+        checker: FCL's verdict on samples.
         n_var, lower, upper: size and bounds of the decision vector.
         count: candidates evaluated so far.
     """
@@ -90,7 +94,9 @@ class CandidateEvaluator:
         self.objective_names = objectives
         self._objectives = select_objectives(objectives)
         self._threads = threads
-        self._candidate = workcell_functions(workcell)["candidate"]
+        functions = workcell_functions(workcell)
+        self._candidate = functions["candidate"]
+        self.checker = CollisionChecker(build_geometry(workcell), functions)
         self.n_var = workcell.task.n_var
         self.lower = workcell.task.lower
         self.upper = workcell.task.upper
@@ -135,24 +141,42 @@ class CandidateEvaluator:
         violation[broken, REASONS.index(NOT_FINITE)] = 1.0
         violation_time[broken, REASONS.index(NOT_FINITE)] = 1.0
 
-        feasible = ~(violation > 0.0).any(axis=1)
-        share = violation_time.sum(axis=1)
-        penalised = np.where(feasible[:, None], values, (1.0 + share)[:, None])
         reason = np.full(n, FEASIBLE, dtype=np.int8)
         position = np.full(n, np.nan)
-        for row in np.flatnonzero(~feasible):
-            reason[row], position[row] = _first_violation(
-                outputs["constraint"][row], bool(broken[row])
-            )
+        for row in range(n):
+            if broken[row]:
+                reason[row], position[row] = REASONS.index(NOT_FINITE), 0.0
+                continue
+            verdict = self._collisions(outputs, row)
+            share = verdict.collision_time / float(outputs["time"][row, -1])
+            violation[row, n_constraints] = violation_time[row, n_constraints] = share
+            if share > 0.0 or violation[row].any():
+                reason[row], position[row] = _first_violation(outputs["constraint"][row], verdict)
+        feasible = reason == FEASIBLE
+        penalty = 1.0 + violation_time.sum(axis=1)
+        penalised = np.where(feasible[:, None], values, penalty[:, None])
         return Evaluations(
             x, values, penalised, feasible, reason, position, violation, violation_time
         )
 
+    def _collisions(self, outputs: dict[str, Array], row: int) -> Verdict:
+        """The collision verdict on the samples that both arms reach."""
+        lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
+        reached = int(np.argmax(lost)) if lost.any() else len(lost)
+        return self.checker.check(
+            outputs["pose"][row, :reached],
+            outputs["q_1"][row, :reached],
+            outputs["q_2"][row, :reached],
+            outputs["time"][row, :reached],
+        )
 
-def _first_violation(constraint: Array, broken: bool) -> tuple[int, float]:
+
+def _first_violation(constraint: Array, verdict: Verdict) -> tuple[int, float]:
     """Reason and path parameter of the first violated sample; constraint (samples, k)."""
-    if broken:
-        return REASONS.index(NOT_FINITE), 0.0
+    last = len(constraint) - 1
     violated = constraint > 0.0
-    sample = int(np.argmax(violated.any(axis=1)))
-    return int(np.argmax(violated[sample])), sample / (len(constraint) - 1)
+    samples = np.flatnonzero(violated.any(axis=1))
+    contact = verdict.first_contact
+    if contact is not None and (len(samples) == 0 or contact.sample < samples[0]):
+        return REASONS.index(COLLISION), contact.sample / last
+    return int(np.argmax(violated[samples[0]])), float(samples[0]) / last

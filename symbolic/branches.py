@@ -40,7 +40,7 @@ ROBUST_CLEARANCE = 0.02
 """Clearance above which more of it does not make a branch better [m]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StartBranch:
     """One way for one arm to hold the box at the start, and how the carry goes from there.
 

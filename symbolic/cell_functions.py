@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from symbolic.cell_model import build_cell_model
+from symbolic.clearance import screening_functions
 from symbolic.evaluator import candidate_function
 from symbolic.workcell import Workcell
 
@@ -13,9 +14,15 @@ def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
     """The functions by name.
 
     candidate: the evaluator of a whole candidate (`symbolic.evaluator.candidate_function`).
+    clearance, frames: collision bounds and placements of one sample
+    (`symbolic.clearance.screening_functions`).
 
     Raises:
         DualArmError: the cell's model cannot be built.
     """
     model = build_cell_model(workcell)
-    return {"candidate": candidate_function(model)}
+    placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
+    return {
+        "candidate": candidate_function(model),
+        **screening_functions(model.geometry, placements),
+    }

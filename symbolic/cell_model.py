@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from symbolic.branches import StartBranch, start_branches
+from symbolic.clearance import screening_functions
+from symbolic.collision_pairs import CellGeometry, build_geometry
 from symbolic.errors import WorkcellError
 from symbolic.robot_model import RobotModel, build_robot_model
 from symbolic.workcell import Array, Workcell
@@ -19,12 +23,14 @@ class CellModel:
     Attributes:
         workcell: the description.
         robots: the models of the two arms.
+        geometry: the collision bodies and the pairs to be checked.
         branches: per arm every branch at the start, best first.
         start: (6,) joint positions of each arm at the first waypoint [rad].
     """
 
     workcell: Workcell
     robots: tuple[RobotModel, RobotModel]
+    geometry: CellGeometry
     branches: tuple[tuple[StartBranch, ...], tuple[StartBranch, ...]]
     start: tuple[Array, Array]
 
@@ -36,10 +42,18 @@ def build_cell_model(workcell: Workcell) -> CellModel:
 
     Raises:
         RobotModelError: a URDF does not give a six-joint arm.
+        CollisionModelError: a collision shape is unusable.
         WorkcellError: an arm cannot reach the start, or a chosen branch does not exist.
     """
     robots = (build_robot_model(workcell.robots[0]), build_robot_model(workcell.robots[1]))
-    branches = (start_branches(workcell, 0, robots[0]), start_branches(workcell, 1, robots[1]))
+    geometry = build_geometry(workcell)
+    clearance = screening_functions(
+        geometry, (robots[0].joint_placements, robots[1].joint_placements)
+    )["clearance"]
+    branches = (
+        start_branches(workcell, 0, robots[0], _own_clearance(geometry, clearance, 0)),
+        start_branches(workcell, 1, robots[1], _own_clearance(geometry, clearance, 1)),
+    )
     problems = []
     for i, found in enumerate(branches):
         name, wanted = workcell.robots[i].name, workcell.start_branch[i]
@@ -58,4 +72,30 @@ def build_cell_model(workcell: Workcell) -> CellModel:
     first, second = (
         np.array(found[max(workcell.start_branch[i], 0)].q) for i, found in enumerate(branches)
     )
-    return CellModel(workcell, robots, branches, (first, second))
+    return CellModel(workcell, robots, geometry, branches, (first, second))
+
+
+def _own_clearance(
+    geometry: CellGeometry, clearance: ca.Function, arm: int
+) -> Callable[[Array, Array], float]:
+    """Least clearance bound [m] of one arm over samples, the other arm left out.
+
+    The returned function takes box poses (n, 6) and the arm's joint positions (n, 6).
+    """
+    own, other = (f"{geometry.workcell.robots[i].name}/" for i in (arm, 1 - arm))
+    rows = [
+        k
+        for k, names in enumerate(geometry.pair_names)
+        if any(name.startswith(own) for name in names)
+        and not any(name.startswith(other) for name in names)
+    ]
+
+    def least(poses: Array, path: Array) -> float:
+        if not rows:
+            return float("inf")
+        absent = np.zeros_like(path)
+        joints = (path, absent) if arm == 0 else (absent, path)
+        bounds = np.array(clearance.map(len(poses))(poses.T, joints[0].T, joints[1].T))
+        return float(bounds[rows].min())
+
+    return least
