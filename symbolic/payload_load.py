@@ -43,22 +43,39 @@ def load_function(workcell: Workcell) -> ca.Function:
     Inputs: pose, rate, second_rate (6,) as in `symbolic.time_law.TimedPath`.
     Outputs: see `LOAD_OUTPUTS`.
     """
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    friction = ca.SX([contact.friction for contact in workcell.contacts])
+    centre_of_mass = ca.SX(ca.DM(workcell.payload.centre_of_mass))
+    return ca.Function(
+        "load",
+        motion,
+        uncertain_load_function(workcell).call([*motion, friction, centre_of_mass]),
+        ["pose", "rate", "second_rate"],
+        list(LOAD_OUTPUTS),
+    )
+
+
+def uncertain_load_function(workcell: Workcell) -> ca.Function:
+    """`load_function` with further inputs for what is known least.
+
+    Inputs: pose, rate, second_rate (6,); friction (2,) coefficients of the contacts;
+    centre_of_mass (3,) in the box frame [m]. Outputs: see `LOAD_OUTPUTS`.
+    """
     pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
+    friction, centre_of_mass = ca.SX.sym("friction", 2), ca.SX.sym("centre_of_mass", 3)
     payload, contacts = workcell.payload, workcell.contacts
     rotation = rotation_matrix(pose[3:])
     omega = angular_velocity(pose[3:], rate[3:])
     alpha = angular_acceleration(pose[3:], rate[3:], second[3:])
 
-    offset = ca.mtimes(rotation, ca.DM(payload.centre_of_mass))
+    offset = ca.mtimes(rotation, centre_of_mass)
     acceleration = second[:3] + ca.cross(alpha, offset) + ca.cross(omega, ca.cross(omega, offset))
     force = required_force(payload.mass, acceleration)
     normal = ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, 2]))
-    forces = allocate(force, normal, (contacts[0].friction, contacts[1].friction))
+    forces = allocate(force, normal, (friction[0], friction[1]))
 
     moment = required_moment(ca.SX(ca.DM(payload.inertia)), rotation, omega, alpha)
-    arms = tuple(
-        ca.mtimes(rotation, ca.DM(c.T_box_pad[:3, 3] - payload.centre_of_mass)) for c in contacts
-    )
+    arms = tuple(ca.mtimes(rotation, ca.DM(c.T_box_pad[:3, 3]) - centre_of_mass) for c in contacts)
     tangents = tuple(ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, k])) for k in (0, 1))
     shift = pressure_shift(
         moment, (arms[0], arms[1]), (forces.force_1, forces.force_2), (tangents[0], tangents[1])
@@ -78,10 +95,10 @@ def load_function(workcell: Workcell) -> ca.Function:
         "wrench_2": ca.vertcat(forces.force_2, ca.cross(shift.shift_2, forces.force_2)),
     }
     return ca.Function(
-        "load",
-        [pose, rate, second],
+        "uncertain_load",
+        [pose, rate, second, friction, centre_of_mass],
         [ca.densify(outputs[name]) for name in LOAD_OUTPUTS],
-        ["pose", "rate", "second_rate"],
+        ["pose", "rate", "second_rate", "friction", "centre_of_mass"],
         list(LOAD_OUTPUTS),
     )
 
