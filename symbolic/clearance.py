@@ -11,9 +11,12 @@ from __future__ import annotations
 
 import casadi as ca
 
+from symbolic.collision_bodies import BOX, WORLD, Frame
 from symbolic.collision_pairs import CellGeometry
+from symbolic.geometry import Piece
+from symbolic.motion import motion_function
 from symbolic.rotation import rotation_matrix
-from symbolic.scene import Scene, world_placements
+from symbolic.scene import Scene, clean, quaternion, world_placements
 from symbolic.softness import EXACT, Softness
 
 
@@ -44,12 +47,13 @@ def screening_functions(
     joint_placements: tuple[ca.Function, ca.Function],
     softness: Softness = EXACT,
 ) -> dict[str, ca.Function]:
-    """The functions of one sample that collision checking calls, by name.
+    """The functions that collision checking calls, by name.
 
-    Both take pose (6,), q_1 (6,) and q_2 (6,) [m, rad].
+    The first two take pose (6,), q_1 (6,) and q_2 (6,) [m, rad] of one sample.
     clearance: -> clearance (n_pairs,), see `clearance_expressions`.
-    frames: -> rotations (3, 39), positions (3, 13): the moving frames in the world, side by
-    side: the box, the six joints of robot 1, the six joints of robot 2.
+    piece_poses: -> quaternions (4, n_pieces) as w x y z, positions (3, n_pieces) [m]: every
+    piece of every body in the world, in the bodies' order.
+    motion: see `symbolic.motion.motion_function`.
 
     Args:
         joint_placements: of each robot, `RobotModel.joint_placements`.
@@ -59,16 +63,27 @@ def screening_functions(
     R, p = rotation_matrix(pose[3:]), pose[:3]
     first, second = (joint_placements[i](q[i]) for i in (0, 1))
     clearance = clearance_expressions(geometry, R, p, first, second, softness)
-    frames = [(R, p)]
-    for arm, placements in zip(geometry.arms, (first, second), strict=True):
-        frames += world_placements(arm.T_world_root, placements)
+    placed = {WORLD: (ca.SX.eye(3), ca.SX.zeros(3)), BOX: (R, p)}
+    for i, arm in enumerate(geometry.arms):
+        for j, joint in enumerate(world_placements(arm.T_world_root, (first, second)[i])):
+            placed[Frame("link", i, j)] = joint
+    poses = [
+        _piece_pose(*placed[body.frame], piece) for body in geometry.bodies for piece in body.pieces
+    ]
     names = ["pose", "q_1", "q_2"]
-    outputs = [ca.horzcat(*[R for R, _ in frames]), ca.horzcat(*[p for _, p in frames])]
+    outputs = [ca.horzcat(*column) for column in zip(*poses, strict=True)]
     return {
         "clearance": ca.Function(
             "clearance", [pose, *q], [clearance], names, ["clearance"], {"cse": True}
         ),
-        "frames": ca.Function(
-            "frames", [pose, *q], outputs, names, ["rotations", "positions"], {"cse": True}
+        "piece_poses": ca.Function(
+            "piece_poses", [pose, *q], outputs, names, ["quaternions", "positions"], {"cse": True}
         ),
+        "motion": motion_function(geometry, joint_placements),
     }
+
+
+def _piece_pose(R: ca.SX, p: ca.SX, piece: Piece) -> tuple[ca.SX, ca.SX]:
+    """Unit quaternion (4,) and position (3,) in the world of a piece of a placed body."""
+    rotation = ca.mtimes(R, ca.SX(clean(piece.rotation)))
+    return quaternion(rotation), ca.mtimes(R, ca.SX(clean(piece.centre))) + p

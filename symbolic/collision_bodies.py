@@ -88,9 +88,10 @@ def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
     bodies = [body for i in (0, 1) for body in _robot_bodies(workcell.robots[i], i)]
     payload = Piece(Box(np.asarray(workcell.payload.size)), np.eye(4))
     bodies.append(CollisionBody(PAYLOAD, "payload", BOX, (payload,)))
-    for body in workcell.environment:
-        pieces = shape_pieces(body.shape, body.pose, f"environment body {body.name!r}")
-        bodies.append(CollisionBody(body.name, "environment", WORLD, pieces))
+    for obstacle in workcell.environment:
+        owner = f"environment body {obstacle.name!r}"
+        pieces = shape_pieces(obstacle.shape, obstacle.pose, owner)
+        bodies.append(CollisionBody(obstacle.name, "environment", WORLD, pieces))
     for body in bodies:
         for piece in body.pieces:
             check_piece(piece, f"collision body {body.name!r}")
@@ -176,9 +177,7 @@ def _link_pieces(robot: Robot) -> dict[str, tuple[Piece, ...]]:
     return links
 
 
-def _urdf_shape(
-    geometry: ElementTree.Element | None, robot: Robot, owner: str
-) -> Shape | Capsule:
+def _urdf_shape(geometry: ElementTree.Element | None, robot: Robot, owner: str) -> Shape | Capsule:
     element = next(iter(geometry), None) if geometry is not None else None
     if element is None:
         raise CollisionModelError(f"{owner}: a collision shape without geometry; add or remove it")

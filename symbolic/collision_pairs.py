@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import combinations
 
-import coal
 import numpy as np
 import pinocchio as pin
 
+from symbolic.coal_shapes import coal_distance
 from symbolic.collision_bodies import (
     ArmGeometry,
     CollisionBody,
@@ -23,14 +23,13 @@ from symbolic.collision_bodies import (
 )
 from symbolic.errors import CollisionModelError
 from symbolic.geometry import (
-    Capsule,
-    Hull,
     Piece,
     ball,
+    farthest_from_axis,
     farthest_from_point,
     swept_cylinder,
 )
-from symbolic.workcell import Array, Box, Cylinder, IgnoredPair, Sphere, Workcell
+from symbolic.workcell import Array, IgnoredPair, Workcell
 
 POSTURES = 300
 """Random postures in which a pair has to touch to count as always touching."""
@@ -106,6 +105,7 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
             or _rigid(a, b, arms)
             or _neighbours(a, b, bodies)
             or _out_of_reach(a, b, arms, workcell.collision.tolerance)
+            or _never_meet(a, b, arms, workcell.collision.tolerance)
             or always.reason(a, b)
         )
         if reason:
@@ -113,37 +113,6 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
         else:
             active.append(ActivePair(i, j))
     return CellGeometry(workcell, bodies, arms, tuple(active), tuple(excluded))
-
-
-def coal_geometry(piece: Piece) -> tuple[coal.CollisionGeometry, coal.Transform3s]:
-    """A piece as a Coal shape at its pose in the body's frame."""
-    pose = coal.Transform3s(piece.rotation, piece.centre)
-    shape = piece.shape
-    match shape:
-        case Box():
-            return coal.Box(np.asarray(shape.size)), pose
-        case Cylinder():
-            return coal.Cylinder(shape.radius, shape.length), pose
-        case Sphere():
-            return coal.Sphere(shape.radius), pose
-        case Capsule():
-            return coal.Capsule(shape.radius, shape.length), pose
-        case Hull():
-            points = coal.StdVec_Vec3s()
-            points.extend([np.asarray(vertex) for vertex in shape.vertices])
-            return coal.Convex.convexHull(points, False, ""), pose
-
-
-def coal_distance(first: tuple[Piece, ...], second: tuple[Piece, ...]) -> float:
-    """Least distance between two sets of pieces in one frame; negative where they overlap."""
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    left, right = [coal_geometry(p) for p in first], [coal_geometry(p) for p in second]
-    distances = []
-    for a, T_a in left:
-        for b, T_b in right:
-            result.clear()
-            distances.append(coal.distance(a, T_a, b, T_b, request, result))
-    return float(min(distances))
 
 
 def _ignored(
@@ -159,7 +128,9 @@ def _ignored(
     return {frozenset((p.first, p.second)): f"ignored in the file: {p.reason}" for p in pairs}
 
 
-def _anchor(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int) -> CollisionBody:
+def _anchor(
+    body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int
+) -> CollisionBody:
     """The body with a carried box seen as part of a robot's last link."""
     if body.frame.kind != "box":
         return body
@@ -167,9 +138,7 @@ def _anchor(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: i
     return CollisionBody(body.name, body.group, Frame("link", robot, 5), pieces)
 
 
-def _rigid(
-    a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]
-) -> str:
+def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:
     """The pair does not move against each other: fixed, or held by the exact grasp."""
     for robot in (0, 1):
         left, right = _anchor(a, arms, robot), _anchor(b, arms, robot)
@@ -185,9 +154,7 @@ def _rigid(
     return ""
 
 
-def _neighbours(
-    a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody, ...]
-) -> str:
+def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody, ...]) -> str:
     """Links of one arm with no shape on the joints between them."""
     if a.group != b.group or a.group == "environment" or a.is_tool or b.is_tool:
         return ""
@@ -216,6 +183,46 @@ def _out_of_reach(
         gap = coal_distance((_zone(high, arms[robot], low.frame.joint),), low.pieces)
         if gap > margin:
             return f"out of reach: the zone of {high.name} stays {1e3 * gap:.0f} mm away"
+    return ""
+
+
+def _never_meet(
+    a: CollisionBody,
+    b: CollisionBody,
+    arms: tuple[ArmGeometry, ArmGeometry],
+    tolerance: float,
+) -> str:
+    """Bodies two joints apart that no position of the two joints brings together.
+
+    The farther body is replaced by its swept cylinder about the second joint's axis; the first
+    joint's range is cut into intervals, each cleared by the distance at its middle, which is
+    more than the body can move within half the interval.
+    """
+    for robot, arm in enumerate(arms):
+        left, right = _anchor(a, arms, robot), _anchor(b, arms, robot)
+        low, high = sorted((left, right), key=lambda body: body.frame.joint)
+        own_base = low.frame.robot == robot or low.group == f"robot {robot + 1}"
+        if high.frame.robot != robot or not own_base or high.frame.joint - low.frame.joint != 2:
+            continue
+        first = low.frame.joint + 1
+        swept = _zone(high, arm, first)
+        reach = farthest_from_axis(swept, np.zeros(3), arm.axes[first])
+        ranges = [(float(arm.lower[first]), float(arm.upper[first]))]
+        least = np.inf
+        while ranges:
+            start, end = ranges.pop()
+            q = np.zeros(6)
+            q[first] = (start + end) / 2.0
+            T = relative_placement(arm, low.frame.joint, first, q)
+            gap = coal_distance((swept.moved(T),), low.pieces)
+            if gap <= tolerance + 1e-3:
+                return ""
+            kept = gap - reach * (end - start) / 2.0
+            if kept > tolerance:
+                least = min(least, kept)
+            else:
+                ranges += [(start, q[first]), (q[first], end)]
+        return f"never meet: at least {1e3 * least:.1f} mm apart at all positions of both joints"
     return ""
 
 

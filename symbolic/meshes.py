@@ -96,7 +96,9 @@ def _load(path: Path, scale: Array) -> trimesh.Trimesh:
             f"{path}: enormous mesh, {len(mesh.faces)} triangles; at most {MOST_FACES} are "
             "allowed: simplify it for collision checking"
         )
-    mesh.apply_scale(np.asarray(scale, dtype=float))
+    mesh.vertices = mesh.vertices * np.asarray(scale, dtype=float)
+    if np.prod(scale) < 0.0:
+        mesh.faces = mesh.faces[:, ::-1]
     extents = np.ptp(mesh.vertices, axis=0)
     if extents.max() > LARGEST_EXTENT:
         raise CollisionModelError(

@@ -190,8 +190,7 @@ class Scene:
         for centre in centres:
             local = ca.mtimes(R.T, centre - p)
             beyond = [
-                self.soft.ramp_above(self.soft.absolute_below(local[k]) - half[k])
-                for k in range(3)
+                self.soft.ramp_above(self.soft.absolute_below(local[k]) - half[k]) for k in range(3)
             ]
             squared.append(ca.sumsqr(ca.vertcat(*beyond)))
         # Each of the three ramps may stand half a width above the true one.
@@ -222,7 +221,7 @@ class Scene:
     def _round_bound(self, index: int, piece: Piece) -> ca.SX:
         """A chain of spheres against a fixed cylinder, capsule or sphere."""
         centres, radius = self._chain(index)
-        T = clean(np.linalg.inv(piece.pose))
+        T = clean(np.asarray(np.linalg.inv(piece.pose), dtype=float))
         shape = piece.shape
         bounds = []
         for centre in centres:
@@ -251,6 +250,29 @@ def world_placements(
         )
         for j in range(positions.shape[1])
     ]
+
+
+def quaternion(R: ca.SX) -> ca.SX:
+    """The unit quaternion (4,), w x y z, of a rotation (3, 3), stable for every angle.
+
+    Each column below is the quaternion times one of its own components (times 4); the column of
+    the largest component is the accurate one (Shepperd 1978).
+    """
+    trace = ca.trace(R)
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    squares = [1.0 + trace] + [1.0 + 2.0 * R[k, k] - trace for k in range(3)]
+    columns = [
+        ca.vertcat(squares[0], x, y, z),
+        ca.vertcat(x, squares[1], xy, xz),
+        ca.vertcat(y, xy, squares[2], yz),
+        ca.vertcat(z, xz, yz, squares[3]),
+    ]
+    best, largest = columns[0], squares[0]
+    for column, square in zip(columns[1:], squares[1:], strict=True):
+        best = ca.if_else(square > largest, column, best)
+        largest = ca.fmax(largest, square)
+    return best / ca.norm_2(best)
 
 
 def clean(matrix: Array) -> Array:

@@ -8,6 +8,7 @@ than FCL's own resolution, so near the tolerance FCL alone decides, screened or 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +16,20 @@ from numpy.typing import NDArray
 from codegen.function import NumericFunction
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
 from hybrid_opt.collision.verdict import Contact, Verdict, sample_durations
+from symbolic.collision_bodies import PAYLOAD
 from symbolic.collision_pairs import CellGeometry
 from symbolic.workcell import Array
 
 RESTING_TOLERANCE = 1e-3
 """How deep the payload may sink into a body that it is allowed to rest on [m]."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Chord and bend (n, n_pairs) [m] of every pair between configurations: `symbolic.motion`."""
+
+    chord: Array
+    bend: Array
 
 
 class CollisionChecker:
@@ -40,8 +50,8 @@ class CollisionChecker:
         """Prepare FCL's objects.
 
         Args:
-            functions: 'clearance' and 'frames' of `symbolic.clearance.screening_functions`,
-                compiled or interpreted.
+            functions: 'clearance', 'piece_poses' and 'motion' of
+                `symbolic.clearance.screening_functions`, compiled or interpreted.
         """
         self.geometry = geometry
         self.resting_tolerance = resting_tolerance
@@ -49,6 +59,7 @@ class CollisionChecker:
         self._functions = functions
         self._free_beyond = geometry.workcell.collision.tolerance + FCL_RESOLUTION
         self._pairs = [(pair.first, pair.second) for pair in geometry.active]
+        self._names = geometry.pair_names
         self._resting = self._find_resting()
 
     def bounds(self, pose: Array, q_1: Array, q_2: Array) -> Array:
@@ -74,22 +85,22 @@ class CollisionChecker:
         Args:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, 6) joint positions [rad].
-            time: (n,) [s].
+            time: (n,) or (n, 1) [s].
             clearance: (n, n_pairs) bounds if known already, else they are computed.
             screened: False gives every pair of every sample to FCL.
         """
         if clearance is None:
             clearance = self.bounds(pose, q_1, q_2)
+        time = np.ravel(time)
         colliding = np.zeros(len(pose), dtype=bool)
         calls = self.judge.calls
         # `not >` keeps a NaN bound open.
         unsure = ~(clearance > self._free_beyond) if screened else np.full(clearance.shape, True)
-        rows = np.flatnonzero(unsure.any(axis=1))
+        rows, suspects = _by_sample(clearance, unsure)
         first: tuple[int, int] | None = None
         if len(rows):
             self._place(pose[rows], q_1[rows], q_2[rows])
-            for local, sample in enumerate(rows.tolist()):
-                pairs = self._suspects(clearance[sample], unsure[sample])
+            for local, (sample, pairs) in enumerate(zip(rows.tolist(), suspects, strict=True)):
                 hit = self._first_hit(local, pairs, self._resting_pairs(pose[sample, :3]))
                 if hit >= 0:
                     colliding[sample] = True
@@ -118,12 +129,45 @@ class CollisionChecker:
             dtype=bool,
         ).reshape(len(pose), len(self._pairs))
 
-    def distances(self, pose: Array, q_1: Array, q_2: Array, pairs: NDArray[np.intp]) -> Array:
-        """(n,) FCL's distance of one pair per sample [m]; 0 where they intersect."""
-        self._place(pose, q_1, q_2)
-        return np.array(
-            [self.judge.distance(k, *self._pairs[pair]) for k, pair in enumerate(pairs.tolist())]
-        )
+    def motion(self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]) -> Motion:
+        """Bounds of every pair's motion between configurations (pose, q_1, q_2), each (n, 6)."""
+        bounds = self._functions["motion"].batch(*start, *end)
+        return Motion(bounds["chord"], bounds["bend"])
+
+    def measure(
+        self,
+        pose: Array,
+        q_1: Array,
+        q_2: Array,
+        clearance: Array,
+        wanted: NDArray[np.bool_],
+    ) -> NDArray[np.intp]:
+        """Replace the bounds (n, n_pairs) of wanted pairs, in place, by FCL's distance [m].
+
+        FCL's resolution is subtracted; a bound that is higher already stays. For a payload that
+        may rest on a body, the distance of the payload smaller by the resting tolerance counts.
+
+        Returns:
+            (n,) the first wanted pair of each sample that collides, or -1.
+        """
+        hits = np.full(len(pose), -1)
+        rows = np.flatnonzero(wanted.any(axis=1))
+        if not len(rows):
+            return hits
+        self._place(pose[rows], q_1[rows], q_2[rows])
+        for local, k in enumerate(rows.tolist()):
+            resting_pairs = self._resting_pairs(pose[k, :3])
+            for pair in np.flatnonzero(wanted[k]).tolist():
+                resting = pair in resting_pairs
+                i, j = self._pairs[pair]
+                first = self.judge.shrunk_payload if resting else i
+                distance = self.judge.distance(local, first, j)
+                near = distance <= self._free_beyond
+                if near and self._judge_pair(local, pair, resting):
+                    hits[k] = pair
+                    break
+                clearance[k, pair] = np.fmax(clearance[k, pair], distance - FCL_RESOLUTION)
+        return hits
 
     def min_distance(
         self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None
@@ -147,18 +191,8 @@ class CollisionChecker:
         return best, where
 
     def _place(self, pose: Array, q_1: Array, q_2: Array) -> None:
-        frames = self._functions["frames"].batch(pose, q_1, q_2)
-        n = len(pose)
-        # A (3, 39) CasADi matrix arrives as (39, 3): its columns are the rows here.
-        rotations = frames["rotations"].reshape(n, 13, 3, 3).transpose(0, 1, 3, 2)
-        self.judge.set_placements(rotations, frames["positions"])
-
-    def _suspects(self, bounds: Array, unsure: NDArray[np.bool_]) -> list[int]:
-        """Open pairs, the least bound first; ties in the pairs' order."""
-        pairs = np.flatnonzero(unsure)
-        if len(pairs) > 1:
-            pairs = pairs[np.argsort(bounds[pairs], kind="stable")]
-        return list(pairs.tolist())
+        poses = self._functions["piece_poses"].batch(pose, q_1, q_2)
+        self.judge.set_placements(poses["quaternions"], poses["positions"])
 
     def _first_hit(self, local: int, pairs: list[int], resting: frozenset[int]) -> int:
         for pair in pairs:
@@ -173,7 +207,7 @@ class CollisionChecker:
         return self.judge.intersects(local, self.judge.shrunk_payload, j)
 
     def _contact(self, sample: int, pair: int, time: Array | None) -> Contact:
-        first, second = self.geometry.pair_names[pair]
+        first, second = self._names[pair]
         moment = float("nan") if time is None else float(time[sample])
         return Contact(sample, moment, first, second)
 
@@ -190,15 +224,11 @@ class CollisionChecker:
     def _find_resting(self) -> list[tuple[int, Array, float]]:
         """Per allowed contact and fixed pose that touches: pair, box centre, departure [m]."""
         task = self.geometry.workcell.task
-        names = self.geometry.pair_names
+        pairs = {names: k for k, names in enumerate(self._names)}
         still = np.zeros((1, 6))
         found = []
         for allowed in task.allowed_contacts:
-            pair = next(
-                (k for k, (_, second) in enumerate(names)
-                 if names[k][0] == "payload" and second == allowed.body),
-                None,
-            )
+            pair = pairs.get((PAYLOAD, allowed.body))
             if pair is None:
                 continue
             for waypoint in task.waypoints:
@@ -209,3 +239,13 @@ class CollisionChecker:
                 if self.judge.distance(0, *self._pairs[pair]) <= reach:
                     found.append((pair, waypoint.lower[:3], allowed.departure))
         return found
+
+
+def _by_sample(
+    bounds: Array, unsure: NDArray[np.bool_]
+) -> tuple[NDArray[np.intp], list[list[int]]]:
+    """Samples with open pairs, and each one's pairs: least bound first, ties in order."""
+    samples, pairs = np.nonzero(unsure)
+    order = np.lexsort((pairs, bounds[samples, pairs], samples))
+    rows, starts = np.unique(samples, return_index=True)
+    return rows, [part.tolist() for part in np.split(pairs[order], starts[1:])]

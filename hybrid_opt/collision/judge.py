@@ -6,15 +6,12 @@ most the tolerance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import fcl
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from symbolic.collision_bodies import CollisionBody, Frame
+from symbolic.collision_bodies import BOX, PAYLOAD, CollisionBody
 from symbolic.collision_pairs import CellGeometry
-from symbolic.geometry import Capsule, Hull, Piece
+from symbolic.geometry import SMALLEST_SIZE, Capsule, Hull, Piece
 from symbolic.workcell import Array, Box, Cylinder, Sphere
 
 FCL_RESOLUTION = 1e-5
@@ -36,22 +33,28 @@ class Judge:
         self.calls = 0
         self.updates = 0
         self._request = fcl.CollisionRequest()
-        self._bodies = [_Objects(body) for body in geometry.bodies]
-        payload = next(body for body in geometry.bodies if body.group == "payload")
+        firsts = np.cumsum([0] + [len(body.pieces) for body in geometry.bodies])
+        self._bodies = [
+            _Objects(body, int(first))
+            for body, first in zip(geometry.bodies, firsts[:-1], strict=True)
+        ]
+        payload = geometry.index(PAYLOAD)
         size = np.asarray(geometry.workcell.payload.size) - 2.0 * resting_tolerance
-        shrunk = (Piece(Box(np.maximum(size, 1e-6)), np.eye(4)),)
+        shrunk = Piece(Box(np.maximum(size, SMALLEST_SIZE)), np.eye(4))
         self.shrunk_payload = len(self._bodies)
         """Index of the payload made smaller by the resting tolerance on every side."""
         self._bodies.append(
-            _Objects(CollisionBody("shrunk payload", "payload", payload.frame, shrunk))
+            _Objects(
+                CollisionBody("shrunk payload", "payload", BOX, (shrunk,)), int(firsts[payload])
+            )
         )
+        self._quaternions = self._positions = np.zeros((0, 0, 0))
 
-    def set_placements(self, rotations: Array, positions: Array) -> None:
-        """Take the moving frames (n, 13, 3, 3) and (n, 13, 3) of n samples."""
-        self._positions = positions
-        self._rotations = rotations
+    def set_placements(self, quaternions: Array, positions: Array) -> None:
+        """Take the pieces' poses (n, n_pieces, 4) and (n, n_pieces, 3) of n samples."""
+        self._quaternions, self._positions = quaternions, positions
         for body in self._bodies:
-            body.forget()
+            body.sample = -1
 
     def collides(self, sample: int, i: int, j: int) -> bool:
         """Whether bodies i and j collide in a sample of the placements; see the module."""
@@ -77,60 +80,27 @@ class Judge:
         """Distance of bodies i and j; 0 where they intersect [m]."""
         first, second = self._placed(sample, i), self._placed(sample, j)
         self.calls += len(first) * len(second)
-        return max(0.0, min(fcl.distance(a, b) for a in first for b in second))
+        return max(0.0, min(float(fcl.distance(a, b)) for a in first for b in second))
 
-    def _placed(self, sample: int, index: int) -> Sequence[fcl.CollisionObject]:
+    def _placed(self, sample: int, index: int) -> list[fcl.CollisionObject]:
         body = self._bodies[index]
-        if body.slot >= 0 and body.sample != sample:
-            if body.quaternions is None:
-                body.carry(self._rotations[:, body.slot], self._positions[:, body.slot])
+        if body.moves and body.sample != sample:
+            body.sample = sample
+            for k, item in enumerate(body.objects, start=body.first_piece):
+                item.setQuatRotation(self._quaternions[sample, k].tolist())
+                item.setTranslation(self._positions[sample, k])
             self.updates += len(body.objects)
-            body.move(sample)
         return body.objects
 
 
 class _Objects:
-    """One body's FCL objects and, once asked for, their poses in every sample."""
+    """One body's FCL objects and the sample that they are placed for."""
 
-    def __init__(self, body: CollisionBody) -> None:
-        self.slot = frame_slot(body.frame)
+    def __init__(self, body: CollisionBody, first_piece: int) -> None:
+        self.moves = body.frame.kind != "world"
+        self.first_piece = first_piece
         self.sample = -1
-        self.pieces = body.pieces
         self.objects = [fcl_object(piece) for piece in body.pieces]
-        self.quaternions: list[list[list[float]]] | None = None
-        self.translations: list[list[Array]] = []
-
-    def forget(self) -> None:
-        self.sample, self.quaternions = -1, None
-
-    def carry(self, rotations: Array, positions: Array) -> None:
-        """Poses of the pieces in all samples, from the frame's (n, 3, 3) and (n, 3)."""
-        quaternions, self.translations = [], []
-        for piece in self.pieces:
-            turned = Rotation.from_matrix(rotations @ piece.rotation).as_quat()
-            quaternions.append(turned[:, [3, 0, 1, 2]].tolist())
-            self.translations.append(list(positions + rotations @ piece.centre))
-        self.quaternions = quaternions
-
-    def move(self, sample: int) -> None:
-        assert self.quaternions is not None
-        self.sample = sample
-        for item, turned, shifted in zip(
-            self.objects, self.quaternions, self.translations, strict=True
-        ):
-            item.setQuatRotation(turned[sample])
-            item.setTranslation(shifted[sample])
-
-
-def frame_slot(frame: Frame) -> int:
-    """Index of a frame among the moving frames of `screening_functions`; -1 for the world."""
-    match frame.kind:
-        case "world":
-            return -1
-        case "box":
-            return 0
-        case "link":
-            return 1 + 6 * frame.robot + frame.joint
 
 
 def fcl_object(piece: Piece) -> fcl.CollisionObject:

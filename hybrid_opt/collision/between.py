@@ -1,0 +1,254 @@
+"""Collisions between samples: motion bounds, refinement where they exceed the clearance, proof.
+
+A pair that is c_a and c_b apart at the two ends of an interval keeps a distance of at least
+
+  (c_a + c_b - D) / 2 - K / 8       and of at least       max(c_a, c_b) - D - K / 8
+
+inside it, with D and K the chords and bends of both bodies (`symbolic.motion`). Where neither
+exceeds the tolerance, the interval is halved; where the compiled clearance does not suffice,
+FCL's distance takes its place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_opt.collision.checker import CollisionChecker
+from symbolic.workcell import Array
+
+Status = Literal["free", "collision", "undecided"]
+
+SEARCH_DEPTH = 5
+"""Halvings of an interval in a search."""
+
+HALVING_WINS = 0.25
+"""Share of the chord that a clearance must exceed for two halvings to be likely enough."""
+
+PROOF_DEPTH = 12
+"""Halvings of an interval in a proof."""
+
+
+@dataclass(frozen=True)
+class PassingContact:
+    """A collision between samples, or an interval that could not be decided.
+
+    Attributes:
+        interval: index of the sample before it.
+        fraction: where in the interval, 0 to 1.
+        first, second: names of the bodies.
+    """
+
+    interval: int
+    fraction: float
+    first: str
+    second: str
+
+
+@dataclass(frozen=True)
+class MotionVerdict:
+    """What is known of the motion between samples.
+
+    Attributes:
+        status: 'free' is proven; 'collision' was found by FCL; 'undecided' where a clearance is
+            too small to be told at the finest subdivision.
+        contact: the earliest collision, else the earliest undecided interval, else None.
+        unsafe: (n - 1,) intervals with a collision or undecided.
+        intervals: intervals examined, halves included.
+        added: configurations added between the samples.
+        fcl_calls: FCL queries made.
+    """
+
+    status: Status
+    contact: PassingContact | None
+    unsafe: NDArray[np.bool_]
+    intervals: int
+    added: int
+    fcl_calls: int
+
+
+@dataclass(frozen=True)
+class _End:
+    """One end of m intervals.
+
+    Attributes:
+        configuration: (m, 18) pose, q_1, q_2.
+        clearance: (m, n_pairs), raised in place where FCL measured [m].
+        measured: (m, n_pairs) where it did.
+    """
+
+    configuration: Array
+    clearance: Array
+    measured: NDArray[np.bool_]
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> _End:
+        return _End(self.configuration[rows], self.clearance[rows], self.measured[rows])
+
+
+@dataclass(frozen=True)
+class _Intervals:
+    """Work list: intervals of equal width, both ends, and the pairs not yet cleared."""
+
+    index: NDArray[np.intp]
+    start: Array
+    width: float
+    a: _End
+    b: _End
+    chord: Array
+    bend: Array
+    pending: NDArray[np.bool_]
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> _Intervals:
+        return _Intervals(
+            self.index[rows],
+            self.start[rows],
+            self.width,
+            self.a[rows],
+            self.b[rows],
+            self.chord[rows],
+            self.bend[rows],
+            self.pending[rows],
+        )
+
+
+def check_between(
+    checker: CollisionChecker,
+    pose: Array,
+    q_1: Array,
+    q_2: Array,
+    clearance: Array | None = None,
+    depth: int = SEARCH_DEPTH,
+    margin: float = 0.0,
+) -> MotionVerdict:
+    """Whether anything collides between n samples that are themselves free of collisions.
+
+    Args:
+        pose: (n, 6) box poses [m, rad]; q_1, q_2: (n, 6) joint positions [rad]. Between samples
+            all of them move linearly.
+        clearance: (n, n_pairs) bounds if known already [m].
+        depth: how often an interval is halved before it counts as undecided.
+        margin: distance to be kept beyond the tolerance [m].
+    """
+    if clearance is None:
+        clearance = checker.bounds(pose, q_1, q_2)
+    return _Sweep(checker, margin).run(np.hstack([pose, q_1, q_2]), clearance, depth)
+
+
+class _Sweep:
+    def __init__(self, checker: CollisionChecker, margin: float) -> None:
+        self.checker = checker
+        self.margin = margin
+        self.required = checker.geometry.workcell.collision.tolerance + margin
+
+    def run(self, configuration: Array, clearance: Array, depth: int) -> MotionVerdict:
+        calls = self.checker.judge.calls
+        n = len(configuration) - 1
+        unsafe = np.zeros(n, dtype=bool)
+        hits: list[PassingContact] = []
+        examined = added = 0
+        ends = _End(configuration, clearance.copy(), np.zeros(clearance.shape, dtype=bool))
+        earlier = np.arange(n + 1) < n
+        pending = np.ones((n, clearance.shape[1]), dtype=bool)
+        work = self._intervals(
+            np.arange(n), np.zeros(n), 1.0, ends[earlier], ends[earlier[::-1]], pending
+        )
+        for level in range(depth + 1):
+            examined += len(work.index)
+            work = self._uncleared(work)
+            for end, fraction in ((work.a, 0.0), (work.b, 1.0)):
+                hit = self._measure(work, end)
+                for row in np.flatnonzero(hit >= 0).tolist():
+                    unsafe[work.index[row]] = True
+                    hits.append(self._contact(work, row, int(hit[row]), fraction))
+            work = self._uncleared(work[~unsafe[work.index]])
+            if not len(work.index) or level == depth:
+                break
+            added += len(work.index)
+            work = self._halves(work)
+        left = [
+            self._contact(work, row, int(np.flatnonzero(work.pending[row])[0]), 0.5)
+            for row in range(len(work.index))
+        ]
+        unsafe[work.index] = True
+        found = sorted(hits or left, key=lambda contact: (contact.interval, contact.fraction))
+        status: Status = "collision" if hits else "undecided" if left else "free"
+        return MotionVerdict(
+            status=status,
+            contact=found[0] if found else None,
+            unsafe=unsafe,
+            intervals=examined,
+            added=added,
+            fcl_calls=self.checker.judge.calls - calls,
+        )
+
+    def _intervals(
+        self,
+        index: NDArray[np.intp],
+        start: Array,
+        width: float,
+        a: _End,
+        b: _End,
+        pending: NDArray[np.bool_],
+    ) -> _Intervals:
+        motion = self.checker.motion(_split(a.configuration), _split(b.configuration))
+        return _Intervals(index, start, width, a, b, motion.chord, motion.bend, pending)
+
+    def _uncleared(self, work: _Intervals) -> _Intervals:
+        """The intervals with pairs that the motion bound does not clear."""
+        c_a, c_b = work.a.clearance, work.b.clearance
+        halfway = (c_a + c_b - work.chord) / 2.0
+        one_sided = np.fmax(c_a, c_b) - work.chord
+        kept = np.fmax(halfway, one_sided) - work.bend / 8.0
+        pending: NDArray[np.bool_] = work.pending & ~(kept > self.required)
+        left: NDArray[np.bool_] = np.any(pending, axis=1)
+        return replace(work, pending=pending)[left]
+
+    def _measure(self, work: _Intervals, end: _End) -> NDArray[np.intp]:
+        """Raise bounds to FCL's distance where halving alone would take too long.
+
+        Returns (m,) the first colliding pair of each configuration, or -1.
+        """
+        hopeless = ~(end.clearance - self.required > HALVING_WINS * work.chord)
+        wanted = work.pending & hopeless & ~end.measured
+        end.measured[wanted] = True
+        return self.checker.measure(*_split(end.configuration), end.clearance, wanted)
+
+    def _halves(self, work: _Intervals) -> _Intervals:
+        """Both halves of every interval, the earlier first."""
+        middle = (work.a.configuration + work.b.configuration) / 2.0
+        clearance = self.checker.bounds(*_split(middle))
+        new = _End(middle, clearance, np.zeros(clearance.shape, dtype=bool))
+        return self._intervals(
+            np.repeat(work.index, 2),
+            _alternating(work.start, work.start + work.width / 2.0),
+            work.width / 2.0,
+            _alternating_ends(work.a, new),
+            _alternating_ends(new, work.b),
+            np.repeat(work.pending, 2, axis=0),
+        )
+
+    def _contact(self, work: _Intervals, row: int, pair: int, fraction: float) -> PassingContact:
+        first, second = self.checker.geometry.pair_names[pair]
+        place = float(work.start[row]) + work.width * fraction
+        return PassingContact(int(work.index[row]), place, first, second)
+
+
+def _split(configuration: Array) -> tuple[Array, Array, Array]:
+    first, second, third = (np.ascontiguousarray(configuration[:, k : k + 6]) for k in (0, 6, 12))
+    return first, second, third
+
+
+def _alternating(first: Array, second: Array) -> Array:
+    """Rows of two arrays in turn."""
+    return np.stack([first, second], axis=1).reshape(-1, *first.shape[1:])
+
+
+def _alternating_ends(first: _End, second: _End) -> _End:
+    return _End(
+        _alternating(first.configuration, second.configuration),
+        _alternating(first.clearance, second.clearance),
+        np.stack([first.measured, second.measured], axis=1).reshape(-1, first.measured.shape[1]),
+    )

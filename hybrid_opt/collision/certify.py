@@ -1,0 +1,95 @@
+"""Continuous certification of a final trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybrid_opt.collision.between import PROOF_DEPTH, MotionVerdict, check_between
+from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.collision.verdict import Contact
+from symbolic.errors import SettingsError
+from symbolic.workcell import Array
+
+Configuration = Callable[[Array], tuple[Array, Array, Array]]
+"""From path parameters (n,) to box poses (n, 6) and joint positions q_1, q_2 (n, 6)."""
+
+STRAIGHTNESS = 1e-4
+"""Default for how far two bodies together may be off straight motion between grid points [m]."""
+
+MOST_POINTS = 100_000
+"""Grid points beyond which a path counts as not smooth."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The result of a certification.
+
+    Attributes:
+        is_free: proven free of collisions, within the meaning of `certify`.
+        at_sample: a collision at a grid point, or None.
+        at_parameter: path parameter of the earliest collision or undecided place; NaN if free.
+        motion: the verdict between the grid points; None where a grid point collides.
+        points: grid points used.
+        deviation: largest measured distance of a pair from straight motion between them [m].
+    """
+
+    is_free: bool
+    at_sample: Contact | None
+    at_parameter: float
+    motion: MotionVerdict | None
+    points: int
+    deviation: float
+
+
+def certify(
+    checker: CollisionChecker,
+    configuration: Configuration,
+    parameters: Array,
+    straightness: float = STRAIGHTNESS,
+    depth: int = PROOF_DEPTH,
+) -> Certificate:
+    """Prove that a continuous path is free of collisions, or find where it is not.
+
+    The grid is refined until no pair of bodies is, both together, farther than `straightness`
+    from straight motion (linear in joints and box pose) in the middle of any interval. The
+    straight motion is then checked by adaptive subdivision with a margin of twice that distance.
+    So the proof holds for a path whose largest distance from straight motion in an interval is
+    at most twice the one in its middle, as for every path that is smooth on the grid.
+
+    Args:
+        parameters: (n,) increasing path parameters to start from.
+
+    Raises:
+        SettingsError: the path does not become straight on any grid.
+    """
+    u = np.asarray(parameters, dtype=float)
+    while True:
+        grid = configuration(u)
+        middle = configuration((u[:-1] + u[1:]) / 2.0)
+        straight = tuple((array[:-1] + array[1:]) / 2.0 for array in grid)
+        chords = checker.motion(middle, (straight[0], straight[1], straight[2])).chord
+        off = np.max(chords, axis=1)
+        deviation = float(np.max(off))
+        if deviation <= straightness:
+            break
+        if len(u) > MOST_POINTS:
+            raise SettingsError(
+                f"the path is {deviation:g} m off straight motion between {len(u)} grid points; "
+                "it jumps or its straightness is set too small"
+            )
+        split = off > straightness
+        u = np.sort(np.concatenate([u, ((u[:-1] + u[1:]) / 2.0)[split]]))
+    clearance = checker.bounds(*grid)
+    verdict = checker.check(*grid, u, clearance)
+    if verdict.first_contact is not None:
+        hit = verdict.first_contact
+        return Certificate(False, hit, float(u[hit.sample]), None, len(u), deviation)
+    motion = check_between(checker, *grid, clearance, depth, margin=2.0 * deviation)
+    where = float("nan")
+    if motion.contact is not None:
+        k = motion.contact.interval
+        where = float(u[k] + motion.contact.fraction * (u[k + 1] - u[k]))
+    return Certificate(motion.status == "free", None, where, motion, len(u), deviation)
