@@ -26,8 +26,8 @@ MAX_JOINT_STEP = 0.5
 TRACK_OUTPUTS = ("q", "ik_residual", "lost", "limit_margin", "manipulability", "joint_torque")
 """Outputs of `track_function` after the state.
 
-q (6,) [rad]. ik_residual: pose residual [m, rad]. lost: 0 while this and all earlier samples
-were reached without a jump, else 1. limit_margin: least distance to a joint limit, negative
+q (6,) [rad], held at the last reached sample once the path is lost. ik_residual: pose residual
+of q [m, rad]. lost: 0 while this and all earlier samples were reached without a jump, else 1. limit_margin: least distance to a joint limit, negative
 beyond it [rad]. manipulability: |det J| of the flange [m^3]. joint_torque (6,): torque that
 exerts the contact wrench [N m].
 """
@@ -129,12 +129,14 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     q = 2.0 * previous - before
     for _ in range(NEWTON_STEPS):
         q = newton_step(model, q, R_target, p_target)
-    R, p = model.placement(q)
-    jacobian = model.jacobian(q)
-    _, residual = pose_error(R_target, p_target, R, p)
+    _, reached = pose_error(R_target, p_target, *model.placement(q))
     jump = ca.norm_inf(q - previous)
-    arrived = ca.logic_and(residual <= REACH_TOLERANCE, jump <= MAX_JOINT_STEP)
+    arrived = ca.logic_and(reached <= REACH_TOLERANCE, jump <= MAX_JOINT_STEP)
     lost = ca.fmax(lost, ca.if_else(arrived, 0.0, 1.0))
+    # A lost arm stays where it was: what Newton's method does off the path is arbitrary.
+    q = ca.vertcat(*[ca.if_else(lost > 0.5, previous[i], q[i]) for i in range(6)])
+    jacobian = model.jacobian(q)
+    _, residual = pose_error(R_target, p_target, *model.placement(q))
     outputs = ca.cse(
         [
             ca.vertcat(q, previous, lost),

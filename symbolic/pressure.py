@@ -12,16 +12,16 @@ import casadi as ca
 
 Expression = ca.SX | ca.MX
 
-RELATIVE_DAMPING = 1e-10
+RELATIVE_DAMPING = 1e-8
 """Damping of the normal equations relative to their trace.
 
 Where one contact is unloaded or nothing is tangential, a direction of moment cannot be had, and
 rounding over the damping is the error that remains.
 """
 
-REFINEMENTS = 2
+REFINEMENTS = 4
 """Repeated solves for what is left (iterated Tikhonov regularisation): they take the damping's
-own error to its third power, below rounding wherever a moment can be had at all."""
+own error to its fifth power, below rounding wherever a moment can be had at all."""
 
 
 @dataclass(frozen=True)
