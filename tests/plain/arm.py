@@ -90,10 +90,11 @@ class PlainArm:
             q = 2.0 * previous - before
             for _ in range(NEWTON_STEPS):
                 q = self.newton_step(q, target)
-            residual = self.residual(q, target)
             jump = np.abs(q - previous).max()
-            if not (residual <= REACH_TOLERANCE and jump <= MAX_JOINT_STEP):
+            if not (self.residual(q, target) <= REACH_TOLERANCE and jump <= MAX_JOINT_STEP):
                 lost = 1.0
+            if lost:
+                q = previous
             margins = [q - self.robot.position_lower, self.robot.position_upper - q]
             to_root = self.robot.T_world_base[:3, :3].T
             force, moment = to_root @ wrench[:3], to_root @ wrench[3:]
@@ -102,7 +103,7 @@ class PlainArm:
             at_flange = np.concatenate([force, moment + np.cross(lever, force)])
             sample = {
                 "q": q,
-                "ik_residual": residual,
+                "ik_residual": self.residual(q, target),
                 "lost": lost,
                 "limit_margin": np.min(margins),
                 "manipulability": abs(np.linalg.det(self.jacobian(q))),

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from symbolic.cell_model import CellModel
+from symbolic.collision_pairs import build_geometry
 from symbolic.evaluator import candidate_function
 from symbolic.pose import pose_matrix
 from symbolic.robot_model import RobotModel, build_robot_model
@@ -170,7 +171,13 @@ def gofa_model() -> RobotModel:
 
 def hand_model(cell: Workcell) -> CellModel:
     """A hand-written cell with its start postures, found without the branch search."""
-    return CellModel(cell, (gofa_model(), gofa_model()), ((), ()), start_posture(cell))
+    return CellModel(
+        workcell=cell,
+        robots=(gofa_model(), gofa_model()),
+        geometry=build_geometry(cell),
+        branches=((), ()),
+        start=start_posture(cell),
+    )
 
 
 @cache

@@ -61,7 +61,7 @@ def rounding(result: dict[str, Array]) -> float:
     An unloaded contact leaves one direction of moment to the damping of the solve.
     """
     n = result["normal_force"]
-    return 1e-8 if n.min() > 1e-3 * n.max() else 1e-5
+    return 1e-8 if n.min() > 1e-3 * n.max() else 1e-6
 
 
 # m = 10 kg, mu = 0.5, contacts 0.4 m apart: figures confirmed to 1e-4 N by an independent
