@@ -9,7 +9,7 @@ import numpy as np
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_check import path_failure
 from hybrid_opt.timing.point_limits import nominal_duration
-from hybrid_opt.timing.records import Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.records import Place, TimedCarry, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, joint_use, limit_use, worst
 from symbolic.errors import SettingsError
@@ -19,12 +19,17 @@ NEAREST_FORCE = 1.001
 """Least force limit of the curve, over the force at rest: below, the motion has to creep."""
 
 
+REST_SPEED = 1e-3
+"""Joint speed over its limit below which an arm counts as standing still."""
+
+
 @dataclass(frozen=True)
 class JudgedTiming:
     """A given timing held against the limits.
 
     Attributes:
-        timing: status `OK` or `EXCEEDED` (or why the path itself fails), with every limit's use.
+        timing: status `OK` or `EXCEEDED` (also for a carry that starts or ends at speed), or why
+            the path itself fails; with every limit's use.
         joint_use: (12,) worst use of each joint by constraint, both arms in order.
         start_speed, end_speed: joint speeds (12,) that the timing asks for at its ends, where a
             robot stands still [rad/s].
@@ -65,14 +70,36 @@ def judge_timing(model: TimingModel, x: Array) -> JudgedTiming:
     failure = path_failure(model, model.path_motion(x))
     use = limit_use(carry, model.workcell, TimingLimits(), model.joint_names)
     excess = worst(use)
-    status, reason = TimingStatus.OK, f"within all limits; most used: {excess.place}"
+    status, place = TimingStatus.OK, excess.place
+    reason = f"within all limits; most used: {place}"
+    jump = _jump(model, carry)
     if excess.ratio > 1.0 + RECOMPUTED_TOLERANCE:
         status = TimingStatus.EXCEEDED
-        reason = f"uses {100.0 * excess.ratio:.0f} % of the limit: {excess.place}"
-    timing = Timing(status, reason, excess.place, carry, use)
+        reason = f"uses {100.0 * excess.ratio:.0f} % of the limit: {place}"
+    elif jump is not None:
+        status, place = TimingStatus.EXCEEDED, jump
+        reason = f"the robots would have to be at speed without accelerating: {place}"
+    timing = Timing(status, reason, place, carry, use)
     if failure is not None:
         timing = replace(failure, carry=carry, use=use)
     return JudgedTiming(timing, joint_use(carry, model.workcell), carry.q_rate[0], carry.q_rate[-1])
+
+
+def _jump(model: TimingModel, carry: TimedCarry) -> Place | None:
+    """The joint that moves fastest, for its limit, at the carry's ends; None where all rest."""
+    limit = np.concatenate([robot.velocity_max for robot in model.workcell.robots])
+    ends = np.abs(carry.q_rate[[0, -1]]) / limit
+    if float(ends.max()) < REST_SPEED:
+        return None
+    end, joint = np.unravel_index(int(np.argmax(ends)), ends.shape)
+    sample = 0 if end == 0 else len(carry.time) - 1
+    return Place(
+        "start from rest" if end == 0 else "stop at rest",
+        model.workcell.robots[joint // 6].name,
+        model.joint_names[joint // 6][joint % 6],
+        sample,
+        float(carry.parameter[sample]),
+    )
 
 
 def fastest_timing(model: TimingModel, x: Array) -> Timing:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -97,15 +98,21 @@ class TimingModel:
         def make() -> Any:
             # Only a first use builds expressions; CasADi and Pinocchio are heavy to import.
             from symbolic.cell_model import build_cell_model
-            from symbolic.path_motion import path_motion_function
-            from symbolic.payload_load import load_function
+            from symbolic.path_motion import arm_derivative_function, path_motion_function
+            from symbolic.payload_load import load_function, uncertain_load_function
 
             model = build_cell_model(workcell)
             return {
                 "path_motion": path_motion_function(model, samples),
                 "load": load_function(workcell),
-                "inverse_dynamics_1": model.robots[0].inverse_dynamics,
-                "inverse_dynamics_2": model.robots[1].inverse_dynamics,
+                "uncertain_load": uncertain_load_function(workcell),
+                **{f"inverse_dynamics_{i + 1}": model.robots[i].inverse_dynamics for i in (0, 1)},
+                **{
+                    f"arm_{i + 1}": arm_derivative_function(
+                        workcell.robots[i], model.robots[i], workcell.contacts[i], f"arm_{i + 1}"
+                    )
+                    for i in (0, 1)
+                },
             }
 
         if workcell.digest:
@@ -125,13 +132,33 @@ class TimingModel:
         n = len(out["pose"])
         values = {name: out[name] for name in _BOX}
         for name in _ARMS:
-            values[name] = np.concatenate([out[f"{name}_1"], out[f"{name}_2"]], axis=1)
+            both = [out[f"{name}_{arm}"].reshape(n, -1) for arm in (1, 2)]
+            values[name] = np.concatenate(both, axis=1)
         values["wrench_torque"] = values["wrench_torque"].reshape(n, 2, 6, 6)
         return PathMotion(parameter=np.linspace(0.0, 1.0, n), **values)
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
         """`symbolic.payload_load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
         return self._functions["load"].batch(pose, rate, second_rate)
+
+    def uncertain_load(
+        self, carry: TimedCarry, friction: Array, centre_of_mass: Array
+    ) -> dict[str, Array]:
+        """Loads of a carry with other friction coefficients (2,) and centre of mass (3,) [m]."""
+        return self._functions["uncertain_load"].batch(
+            carry.pose, carry.rate, carry.second_rate, friction, centre_of_mass
+        )
+
+    def wrench_torque(self, q: Array, pose: Array) -> Array:
+        """(n, 2, 6, 6) from contact wrenches to joint torques, at joints (n, 12) and box poses."""
+        still = np.zeros_like(pose)
+        matrices = [
+            self._functions[f"arm_{i + 1}"].batch(
+                np.ascontiguousarray(q[:, 6 * i : 6 * i + 6]), pose, still, still
+            )["wrench_torque"]
+            for i in (0, 1)
+        ]
+        return np.stack(matrices, axis=1).reshape(len(q), 2, 6, 6)
 
     def drive(self, motion: PathMotion, speed: Array, acceleration: Array) -> dict[str, Array]:
         """Loads of a path driven with u' and u'' (n,) per sample; see also `contact_torque`."""
@@ -158,7 +185,7 @@ class TimingModel:
             q_rate=motion.q_first * v,
             q_second=motion.q_second * w + motion.q_first * a,
             **_loads(load),
-            contact_torque=contact_torque(motion, load),
+            contact_torque=contact_torque(motion.wrench_torque, load),
             own_torque=own + motion.torque_at_rest,
         )
 
@@ -207,10 +234,15 @@ def joint_names(robot: Robot) -> tuple[str, ...]:
     return tuple(arm_model(robot).names)[1:]
 
 
-def contact_torque(motion: PathMotion, load: dict[str, Array]) -> Array:
-    """(n, 12) joint torques of the contact wrenches [N m]."""
+def contact_torque(wrench_torque: Array, load: Mapping[str, Array]) -> Array:
+    """(n, 12) joint torques of the contact wrenches [N m].
+
+    Args:
+        wrench_torque: (n, 2, 6, 6) from wrenches to torques.
+        load: outputs of `symbolic.payload_load`.
+    """
     wrench = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
-    torque: Array = np.einsum("nijk,nik->nij", motion.wrench_torque, wrench)
+    torque: Array = np.einsum("nijk,nik->nij", wrench_torque, wrench)
     return torque.reshape(len(torque), 12)
 
 
