@@ -27,9 +27,9 @@ TRACK_OUTPUTS = ("q", "ik_residual", "lost", "limit_margin", "manipulability", "
 """Outputs of `track_function` after the state.
 
 q (6,) [rad], held at the last reached sample once the path is lost. ik_residual: pose residual
-of q [m, rad]. lost: 0 while this and all earlier samples were reached without a jump, else 1. limit_margin: least distance to a joint limit, negative
-beyond it [rad]. manipulability: |det J| of the flange [m^3]. joint_torque (6,): torque that
-exerts the contact wrench [N m].
+of q [m, rad]. lost: 0 while this and all earlier samples were reached without a jump, else 1.
+limit_margin: least distance to a joint limit, negative beyond it [rad]. manipulability: |det J|
+of the flange [m^3]. joint_torque (6,): torque that exerts the contact wrench [N m].
 """
 
 
