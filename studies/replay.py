@@ -1,0 +1,159 @@
+"""Re-evaluate a stored trajectory from its file alone: `python -m studies.replay FILE`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from hybrid_opt.export import FORMATS, export_trajectory, sample_trajectory
+from hybrid_opt.replay import Replay, replay
+from hybrid_opt.robustness import payload_sensitivity, robustness_margins
+from hybrid_opt.timing import (
+    TimingModel,
+    duration_against_force_limit,
+    report_timing,
+)
+from hybrid_opt.trajectory_file import StoredTrajectory, read_trajectory
+from studies.timing_text import timing_json, timing_text, timings
+from symbolic.errors import DualArmError, SettingsError
+
+TIMINGS = {"closest": "closest to reference", "fastest": "fastest", "force": "force limited"}
+
+EXIT_DIFFERENT = 1
+EXIT_BAD_INPUT = 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.replay",
+        description="Re-evaluate a stored trajectory from its file alone and compare its figures; "
+        "time it for real robots and export it. Exit code 1 where a figure differs.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("file", metavar="FILE", help="a trajectory file")
+    parser.add_argument(
+        "--timing", action="store_true", help="report timings that robots can drive, and margins"
+    )
+    parser.add_argument(
+        "--force-limit",
+        type=float,
+        metavar="N",
+        help="largest normal force of each robot [N], adds the fastest timing below it",
+    )
+    parser.add_argument(
+        "--force-curve",
+        type=int,
+        metavar="POINTS",
+        help="durations at this many force limits",
+    )
+    parser.add_argument("--export", choices=list(FORMATS), help="write the timed trajectory")
+    parser.add_argument(
+        "--use", choices=list(TIMINGS), default="closest", help="which timing to export"
+    )
+    parser.add_argument("--step", type=float, metavar="S", help="time step of the export [s]")
+    parser.add_argument("--output", default=".", metavar="DIR", help="folder of the export")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of text")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Replay one file; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        return _run(options)
+    except DualArmError as error:
+        print(error, file=sys.stderr)
+        return EXIT_BAD_INPUT
+
+
+def _run(options: argparse.Namespace) -> int:
+    stored = read_trajectory(options.file)
+    with TemporaryDirectory() as folder:
+        replayed = replay(stored, Path(folder))
+        document: dict[str, Any] = _replay_json(stored, replayed)
+        text = [_replay_text(stored, replayed)]
+        wants_timing = options.timing or options.force_limit or options.force_curve
+        if wants_timing or options.export:
+            document["timing"], timing = _time(stored, replayed, options)
+            text += ["", timing]
+    if options.json:
+        print(json.dumps(document, indent=1, allow_nan=False))
+    else:
+        print("\n".join(text))
+    return 0 if replayed.reproduced else EXIT_DIFFERENT
+
+
+def _time(
+    stored: StoredTrajectory, replayed: Replay, options: argparse.Namespace
+) -> tuple[dict[str, Any], str]:
+    model = TimingModel(replayed.workcell)
+    if options.use == "force" and options.export and options.force_limit is None:
+        raise SettingsError("--use force needs --force-limit")
+    report = report_timing(model, stored.x, options.force_limit)
+    curve = None
+    if options.force_curve is not None:
+        curve = duration_against_force_limit(model, stored.x, options.force_curve)
+    payload = {
+        name: payload_sensitivity(model, timing.carry)
+        for name, timing in timings(report).items()
+        if timing.carry is not None
+    }
+    closest = report.closest.carry
+    margins = () if closest is None else robustness_margins(model, closest)
+    parts = (report, payload, margins, curve, replayed.workcell)
+    document, text = timing_json(*parts), timing_text(*parts)
+    if options.export:
+        timing = timings(report)[TIMINGS[options.use]]
+        step = options.step if options.step is not None else DEFAULT_STEP[options.export]
+        paths = export_trajectory(
+            sample_trajectory(model, timing, step),
+            options.export,
+            options.output,
+            Path(options.file).stem,
+        )
+        document["exported"] = [str(path) for path in paths]
+        text += "\n\nExported " + ", ".join(str(path) for path in paths)
+    return document, text
+
+
+DEFAULT_STEP = {"csv": 0.01, "json": 0.01, "ros2": 0.02, "rapid": 0.1}
+"""Time step [s] where none is given."""
+
+
+def _replay_json(stored: StoredTrajectory, replayed: Replay) -> dict[str, Any]:
+    return {
+        "workcell": replayed.workcell.name,
+        "digest": replayed.workcell.digest,
+        "reproduced": replayed.reproduced,
+        "start_difference": replayed.start_difference,
+        "figures": {
+            figure.name: {
+                "stored": figure.stored,
+                "recomputed": figure.recomputed,
+                "same": figure.same,
+            }
+            for figure in replayed.figures
+        },
+        "provenance": dict(stored.provenance),
+    }
+
+
+def _replay_text(stored: StoredTrajectory, replayed: Replay) -> str:
+    lines = [f"{replayed.workcell.name}, {len(stored.x)} variables"]
+    lines += [f"  {'':<32}{'stored':>16}{'recomputed':>16}"]
+    for figure in replayed.figures:
+        recomputed = "-" if figure.recomputed is None else f"{figure.recomputed:.9g}"
+        mark = "" if figure.same else "  DIFFERS"
+        lines.append(f"  {figure.name:<32}{figure.stored:>16.9g}{recomputed:>16}{mark}")
+    lines.append(f"  start postures differ by at most {replayed.start_difference:.2e} rad")
+    lines.append("reproduced" if replayed.reproduced else "NOT reproduced")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
