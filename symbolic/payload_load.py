@@ -55,6 +55,20 @@ def load_function(workcell: Workcell) -> ca.Function:
     )
 
 
+def resultant_force(
+    mass: float, offset: ca.SX, omega: ca.SX, alpha: ca.SX, acceleration: ca.SX
+) -> ca.SX:
+    """Resultant force (3,) on a turning and accelerating box, world frame (Eq. 34) [N].
+
+    Args:
+        offset: (3,) from the box centre to its centre of mass [m].
+        omega, alpha: (3,) angular velocity and acceleration [rad/s, rad/s^2].
+        acceleration: (3,) of the box centre [m/s^2].
+    """
+    turning = ca.cross(alpha, offset) + ca.cross(omega, ca.cross(omega, offset))
+    return required_force(mass, acceleration + turning)
+
+
 def uncertain_load_function(workcell: Workcell) -> ca.Function:
     """`load_function` with further inputs for what is known least.
 
@@ -69,8 +83,7 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
     alpha = angular_acceleration(pose[3:], rate[3:], second[3:])
 
     offset = ca.mtimes(rotation, centre_of_mass)
-    acceleration = second[:3] + ca.cross(alpha, offset) + ca.cross(omega, ca.cross(omega, offset))
-    force = required_force(payload.mass, acceleration)
+    force = resultant_force(payload.mass, offset, omega, alpha, second[:3])
     normal = ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, 2]))
     forces = allocate(force, normal, (friction[0], friction[1]))
 
