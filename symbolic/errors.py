@@ -42,3 +42,7 @@ class SettingsError(DualArmError):
 
 class ResultsError(DualArmError):
     """Stored results are missing, damaged, or belong to another configuration."""
+
+
+class WorkerError(DualArmError):
+    """Processes or machines that work for this one were lost or do not fit."""

@@ -1,0 +1,108 @@
+"""The results folder of a campaign, held by one process while it works."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from hybrid_opt.campaign.files import locked, read_json, storing, sync_folder, write_json
+from hybrid_opt.campaign.identity import identity, require_equal
+from hybrid_opt.campaign.layout import CONFIGURATION, WORKCELL
+from hybrid_opt.campaign.settings import CampaignSettings, ExecutionSettings
+from hybrid_opt.cell_archive import CellArchive, archive_cell, unpack_cell
+from symbolic.errors import ResultsError
+from symbolic.workcell import Workcell
+from symbolic.workcell_file import load
+
+
+@dataclass(frozen=True)
+class CampaignFolder:
+    """An open results folder.
+
+    Attributes:
+        root: the folder.
+        settings: what is computed.
+        execution: how.
+        workcell: as read from the folder's own copy.
+        archive: the workcell's files.
+    """
+
+    root: Path
+    settings: CampaignSettings
+    execution: ExecutionSettings
+    workcell: Workcell
+    archive: CellArchive
+
+
+@contextmanager
+def open_folder(
+    settings: CampaignSettings, execution: ExecutionSettings, workcell: Workcell
+) -> Iterator[CampaignFolder]:
+    """Start or continue a campaign in its results folder, locked for the `with` block.
+
+    Raises:
+        ResultsError: the folder is in use, holds something else, or is to be continued but was
+            made from another workcell, with other settings or other software.
+    """
+    root = execution.output
+    archive = archive_cell(workcell)
+    with storing(root):
+        root.mkdir(parents=True, exist_ok=True)
+    with locked(root):
+        configuration = root / CONFIGURATION
+        exists = configuration.exists()
+        _check_use(root, exists, execution.resume)
+        if exists:
+            stored = read_json(configuration)
+            digest = stored.get("workcell", {}).get("digest") if isinstance(stored, dict) else None
+            if digest == archive.digest:
+                require_equal(
+                    stored, identity(settings, root, _stored_cell(root, archive)), str(root)
+                )
+            else:
+                raise ResultsError(
+                    f"{root}: holds results of another workcell, or of this one before a change; "
+                    "choose another --output"
+                )
+        copy = _stored_cell(root, archive)
+        if not exists:
+            write_json(configuration, identity(settings, root, copy))
+        yield CampaignFolder(root, settings, execution, copy, archive)
+
+
+def _check_use(root: Path, exists: bool, resume: bool) -> None:
+    if exists and not resume:
+        raise ResultsError(
+            f"{root}: holds a campaign already; continue it with --resume, or choose another "
+            "--output"
+        )
+    strays = [entry.name for entry in root.iterdir() if entry.name not in (".lock", WORKCELL)]
+    strays = [name for name in strays if not name.startswith(".")]
+    if not exists and strays:
+        raise ResultsError(
+            f"{root}: is no results folder, but not empty ({', '.join(sorted(strays)[:3])}); "
+            "choose another --output"
+        )
+
+
+def _stored_cell(root: Path, archive: CellArchive) -> Workcell:
+    """The folder's copy of the workcell, made where it is missing."""
+    folder = root / WORKCELL
+    if not folder.exists():
+        draft = root / f".{WORKCELL}"
+        with storing(folder):
+            shutil.rmtree(draft, ignore_errors=True)
+            draft.mkdir()
+            unpack_cell(archive, draft)
+            os.replace(draft, folder)
+            sync_folder(root)
+    workcell = load(folder / archive.workcell)
+    if workcell.digest != archive.digest:
+        raise ResultsError(
+            f"{folder}: was changed after the campaign began; choose another --output"
+        )
+    return workcell

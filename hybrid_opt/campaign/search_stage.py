@@ -1,0 +1,133 @@
+"""The first stage of a study: every algorithm's replicas, spread over the workers."""
+
+from __future__ import annotations
+
+from hybrid_opt.campaign.dask_executor import DaskExecutor
+from hybrid_opt.campaign.executor import Executor, Job, local_executor
+from hybrid_opt.campaign.files import read_json, sha256, write_atomically, write_json
+from hybrid_opt.campaign.folder import CampaignFolder
+from hybrid_opt.campaign.identity import environment, identity, replica_identity
+from hybrid_opt.campaign.journal import Journal, candidates_in
+from hybrid_opt.campaign.layout import DONE, EVALUATIONS, FRONT, JOURNAL, replica_folder
+from hybrid_opt.campaign.progress import Advance, Progress
+from hybrid_opt.campaign.replica import (
+    CellEvaluatorSource,
+    EvaluatorSource,
+    ReplicaOutcome,
+    ReplicaTask,
+    run_replica,
+)
+from hybrid_opt.campaign.settings import ExecutionSettings
+from hybrid_opt.campaign.stages import Stage
+
+
+def search_stage(source: EvaluatorSource | None = None) -> Stage:
+    """The stage that runs all replicas.
+
+    Args:
+        source: makes the evaluator; None for that of the folder's workcell.
+    """
+
+    def run(folder: CampaignFolder, progress: Progress) -> None:
+        maker = source or CellEvaluatorSource.of(folder.archive, folder.settings.objectives)
+        _Search(folder, maker).run(executor_for(folder.execution), progress)
+
+    return Stage("search", run)
+
+
+def executor_for(execution: ExecutionSettings) -> Executor:
+    """The executor that the settings ask for."""
+    if execution.executor == "dask":
+        assert execution.scheduler is not None
+        return DaskExecutor(execution.scheduler, environment(), environment)
+    return local_executor(execution.jobs)
+
+
+class _Search:
+    """The replicas that are not done, and the journals of those that are being worked on."""
+
+    def __init__(self, folder: CampaignFolder, source: EvaluatorSource) -> None:
+        self._folder = folder
+        self._job = Job(source, run_replica)
+        self._identity = identity(folder.settings, folder.root, folder.workcell)
+        every = [
+            (algorithm, replica)
+            # Replica by replica, so that an early look finds every algorithm.
+            for replica in range(folder.settings.replicas)
+            for algorithm in folder.settings.algorithms
+        ]
+        self._open = [key for key in every if not self._is_done(*key)]
+        self._done = (len(every) - len(self._open)) * folder.settings.evaluations
+        self._journals: dict[int, Journal] = {}
+
+    def run(self, executor: Executor, progress: Progress) -> None:
+        """Run all open replicas."""
+        settings = self._folder.settings
+        recorded = self._done + sum(self._begin(index) for index in range(len(self._open)))
+        total = len(settings.algorithms) * settings.replicas * settings.evaluations
+        try:
+            if self._open:
+                # Compiles what is missing here, once, instead of in every worker.
+                self._job.make_context()
+            with progress.stage("search", total, "evaluations", recorded) as self._advance:
+                executor.run(self._job, len(self._open), self._task, self._record, self._finish)
+        finally:
+            for journal in self._journals.values():
+                journal.close()
+
+    _advance: Advance
+
+    def _is_done(self, algorithm: str, replica: int) -> bool:
+        """Whether a replica is finished and its files are whole; damaged ones are made again."""
+        folder = replica_folder(self._folder.root, algorithm, replica)
+        if not (folder / DONE).exists():
+            return False
+        marker = read_json(folder / DONE)
+        return all(
+            (folder / name).exists() and sha256((folder / name).read_bytes()) == digest
+            for name, digest in marker["sha256"].items()
+        )
+
+    def _begin(self, index: int) -> int:
+        """Open a replica's journal; the evaluations that it holds."""
+        algorithm, replica = self._open[index]
+        path = replica_folder(self._folder.root, algorithm, replica) / JOURNAL
+        if not path.exists():
+            return 0
+        journal = self._journal(index)
+        return sum(candidates_in(payload) for payload in journal.payloads)
+
+    def _journal(self, index: int) -> Journal:
+        if index not in self._journals:
+            algorithm, replica = self._open[index]
+            path = replica_folder(self._folder.root, algorithm, replica) / JOURNAL
+            identity_of = replica_identity(self._identity, algorithm, replica)
+            self._journals[index] = Journal(path, identity_of)
+        return self._journals[index]
+
+    def _task(self, index: int) -> ReplicaTask:
+        journal = self._journal(index)
+        return ReplicaTask(self._folder.settings, *self._open[index], tuple(journal.payloads))
+
+    def _record(self, index: int, payload: bytes) -> None:
+        self._journal(index).append(payload)
+        self._advance(candidates_in(payload))
+
+    def _finish(self, index: int, outcome: ReplicaOutcome) -> None:
+        algorithm, replica = self._open[index]
+        folder = replica_folder(self._folder.root, algorithm, replica)
+        files = {EVALUATIONS: outcome.evaluations, FRONT: outcome.front}
+        for name, content in files.items():
+            write_atomically(folder / name, content)
+        # Written last: with it, the replica is done.
+        write_json(
+            folder / DONE,
+            {
+                "algorithm": algorithm,
+                "replica": replica,
+                "evaluations": outcome.count,
+                "seconds": outcome.seconds,
+                "sha256": {name: sha256(content) for name, content in files.items()},
+            },
+        )
+        self._journals.pop(index).discard()

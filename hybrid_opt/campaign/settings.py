@@ -1,0 +1,139 @@
+"""What a campaign computes, how it is carried out, and where its randomness comes from."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from hybrid_opt import algorithms
+from hybrid_opt.objectives import PAPER_OBJECTIVES, select_objectives
+from hybrid_opt.problem import ConstraintHandling
+from symbolic.errors import SettingsError
+
+ExecutorName = Literal["processes", "dask"]
+
+_SIZE_KEYS = ("population", "swarm", "batch")
+"""How the algorithms' settings call the candidates of one generation."""
+
+
+@dataclass(frozen=True)
+class CampaignSettings:
+    """What decides a campaign's results, besides the workcell.
+
+    Attributes:
+        algorithms: names known to `hybrid_opt.algorithms`, each once.
+        evaluations: budget of every replica.
+        replicas: independent runs per algorithm.
+        seed: the campaign's seed; every replica derives its own from it.
+        objectives: names known to `hybrid_opt.objectives`, each once.
+        constraint_handling: 'penalty' (the paper's) or 'constraints'.
+        populations: (algorithm, candidates per generation) where not the algorithm's default.
+    """
+
+    algorithms: tuple[str, ...] = ("nsga2", "mopso")
+    evaluations: int = 1000
+    replicas: int = 10
+    seed: int = 1
+    objectives: tuple[str, ...] = PAPER_OBJECTIVES
+    constraint_handling: ConstraintHandling = "penalty"
+    populations: tuple[tuple[str, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            SettingsError: with the value, and what is allowed.
+        """
+        _require_whole("evaluations", self.evaluations, 1, 10**9)
+        _require_whole("replicas", self.replicas, 1, 10_000)
+        _require_whole("seed", self.seed, 0, 2**63 - 1)
+        select_objectives(self.objectives)
+        if self.constraint_handling not in get_args(ConstraintHandling):
+            raise SettingsError(
+                f"constraint handling {self.constraint_handling!r}; known are "
+                f"{', '.join(get_args(ConstraintHandling))}"
+            )
+        if not self.algorithms or len(set(self.algorithms)) != len(self.algorithms):
+            raise SettingsError(f"algorithms {self.algorithms}: name at least one, each once")
+        sized = [name for name, _ in self.populations]
+        strays = [name for name in sized if name not in self.algorithms]
+        if strays or len(set(sized)) != len(sized):
+            raise SettingsError(
+                f"populations for {', '.join(sized)}: name each algorithm of the campaign "
+                f"({', '.join(self.algorithms)}) at most once"
+            )
+        for name in self.algorithms:
+            algorithms.settings_of(name, self.overrides(name))
+
+    def overrides(self, algorithm: str) -> dict[str, object]:
+        """The settings of an algorithm that differ from its defaults."""
+        size = dict(self.populations).get(algorithm)
+        if size is None:
+            return {}
+        known = {field.name for field in fields(algorithms.settings_of(algorithm))}
+        return {key: size for key in _SIZE_KEYS if key in known}
+
+    def effective(self) -> dict[str, Any]:
+        """Every setting as JSON values, the algorithms' own ones spelt out."""
+        values = asdict(self)
+        del values["populations"]
+        values["algorithms"] = {
+            name: asdict(algorithms.settings_of(name, self.overrides(name)))
+            for name in self.algorithms
+        }
+        values["objectives"] = list(self.objectives)
+        return values
+
+    def replica_rng(self, algorithm: str, replica: int) -> np.random.Generator:
+        """The only source of randomness of one replica.
+
+        It depends on the campaign's seed, the algorithm's name and the replica's number alone:
+        not on other algorithms, on the number of replicas, or on the order of work.
+        """
+        key = (zlib.crc32(algorithm.encode()), replica)
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
+
+
+@dataclass(frozen=True)
+class ExecutionSettings:
+    """How a campaign is carried out; nothing here changes its results.
+
+    Attributes:
+        output: the results folder.
+        jobs: worker processes, 0 for one per core that this process may use.
+        executor: 'processes' of this machine, or 'dask' for a cluster.
+        scheduler: address of the Dask scheduler, only with 'dask'.
+        resume: continue what the results folder holds.
+    """
+
+    output: Path
+    jobs: int = 0
+    executor: ExecutorName = "processes"
+    scheduler: str | None = None
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            SettingsError: with the value, and what is allowed.
+        """
+        _require_whole("jobs", self.jobs, 0, 4096)
+        if self.executor not in get_args(ExecutorName):
+            raise SettingsError(
+                f"executor {self.executor!r}; known are {', '.join(get_args(ExecutorName))}"
+            )
+        if (self.executor == "dask") != bool(self.scheduler):
+            raise SettingsError(
+                "the executor 'dask' needs a scheduler's address, and only it takes one: "
+                "--executor dask --scheduler tcp://HOST:8786"
+            )
+
+
+def _require_whole(name: str, value: object, low: int, high: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise SettingsError(f"{name} is {value!r}; allowed are whole numbers {low} to {high}")

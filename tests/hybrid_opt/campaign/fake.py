@@ -1,0 +1,135 @@
+"""A cheap problem with the evaluator's interface, and a program that runs a campaign on it."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_opt.campaign import (
+    CampaignSettings,
+    ExecutionSettings,
+    Progress,
+    Stage,
+    open_folder,
+    run_stages,
+    search_stage,
+)
+from hybrid_opt.evaluation import FEASIBLE, REASONS, Evaluations
+from symbolic.errors import DualArmError
+from symbolic.workcell import Array
+from symbolic.workcell_file import load
+
+ROOT = Path(__file__).parents[3]
+RACK = ROOT / "studies/workcells/rack.toml"
+OBJECTIVES = ("peak_force_1", "peak_force_2")
+
+
+def verdicts(x: Array) -> Evaluations:
+    """Two paraboloids with feasible x_1 + x_2 > 0.4 and x_3 < 0.9, NaN in a stripe of x_1."""
+    values = np.column_stack([(x**2).mean(axis=1), ((x - 1.0) ** 2).mean(axis=1)])
+    values[(x[:, 0] > 0.30) & (x[:, 0] < 0.33)] = np.nan
+    violation = np.zeros((len(x), len(REASONS)))
+    violation[:, 0] = np.maximum(0.4 - x[:, 0] - x[:, 1], 0.0)
+    violation[:, REASONS.index("collision")] = np.maximum(x[:, 2] - 0.9, 0.0)
+    feasible = ~(violation > 0.0).any(axis=1)
+    reason = np.where(feasible, FEASIBLE, np.argmax(violation > 0.0, axis=1)).astype(np.int8)
+    share = np.minimum(violation, 1.0)
+    penalised = np.where(feasible[:, None], values, 1.0 + share.sum(axis=1)[:, None])
+    position = np.where(feasible, np.nan, x[:, 1])
+    return Evaluations(x, values, penalised, feasible, reason, position, violation, share)
+
+
+class FakeEvaluator:
+    objective_names = OBJECTIVES
+    n_var = 4
+    lower = np.zeros(4)
+    upper = np.ones(4)
+
+    def __init__(self, source: FakeSource) -> None:
+        self._source = source
+
+    def evaluate(self, x: Array) -> Evaluations:
+        time.sleep(self._source.delay)
+        if self._source.log:
+            # One write per call, so that several processes can share the file.
+            with open(self._source.log, "ab", buffering=0) as log:
+                log.write(x.tobytes())
+        if self._source.dies_once and not Path(self._source.dies_once).exists():
+            Path(self._source.dies_once).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self._source.always_dies:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return verdicts(x)
+
+
+@dataclass(frozen=True)
+class FakeSource:
+    """delay: seconds per call. log: file that every evaluated x is appended to. dies_once: the
+    worker kills itself unless this file exists."""
+
+    delay: float = 0.0
+    log: str = ""
+    dies_once: str = ""
+    always_dies: bool = False
+
+    def __call__(self) -> FakeEvaluator:
+        return FakeEvaluator(self)
+
+
+def logged(path: Path) -> Array:
+    """(n, 4) every decision vector that was evaluated."""
+    return np.frombuffer(path.read_bytes()).reshape(-1, FakeEvaluator.n_var)
+
+
+def run_search(
+    settings: CampaignSettings,
+    execution: ExecutionSettings,
+    source: FakeSource | None = None,
+    further: tuple[Stage, ...] = (),
+) -> Path:
+    """Run the search stage on the fake problem; returns the results folder."""
+    with open_folder(settings, execution, load(RACK)) as folder:
+        stages = [search_stage(source or FakeSource()), *further]
+        run_stages(folder, stages, Progress(shown=False))
+    return execution.output
+
+
+def files_of(root: Path) -> dict[str, bytes]:
+    """The results of all replicas by path, without what depends on time."""
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for pattern in ("evaluations.csv.gz", "front.csv")
+        for path in sorted(root.glob(f"replicas/*/*/{pattern}"))
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--delay", type=float, default=0.0)
+    parser.add_argument("--log", default="")
+    parser.add_argument("--evaluations", type=int, default=200)
+    options = parser.parse_args()
+    settings = CampaignSettings(evaluations=options.evaluations, replicas=2)
+    try:
+        run_search(
+            settings,
+            ExecutionSettings(options.output, options.jobs, resume=True),
+            FakeSource(options.delay, options.log),
+        )
+    except DualArmError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

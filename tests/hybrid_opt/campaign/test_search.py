@@ -1,0 +1,330 @@
+"""A campaign's results depend on its settings alone, and no interruption changes them."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress, open_folder
+from hybrid_opt.results import read_campaign
+from symbolic.errors import DualArmError, ResultsError, WorkerError
+from symbolic.workcell_file import load
+from tests.hybrid_opt.campaign.fake import (
+    RACK,
+    ROOT,
+    FakeSource,
+    files_of,
+    logged,
+    run_search,
+    verdicts,
+)
+
+SETTINGS = CampaignSettings(evaluations=200, replicas=2)
+PROGRAM = [sys.executable, "-m", "tests.hybrid_opt.campaign.fake"]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return files_of(
+        run_search(SETTINGS, ExecutionSettings(tmp_path_factory.mktemp("plain") / "a", jobs=1))
+    )
+
+
+def start(output: Path, *options: str, limit: int | None = None) -> subprocess.Popen[str]:
+    def limited() -> None:
+        if limit is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    return subprocess.Popen(
+        [*PROGRAM, str(output), *options],
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=limited,
+        start_new_session=True,
+    )
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+
+def has_seen(log: Path, size: int) -> bool:
+    return log.exists() and log.stat().st_size >= size
+
+
+def test_results_hold_every_candidate_in_order(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    settings = replace(SETTINGS, algorithms=("mopso",), replicas=1)
+    root = run_search(settings, ExecutionSettings(tmp_path / "a", 1), FakeSource(log=str(log)))
+    (replica,) = read_campaign(root).replicas
+    expected = verdicts(logged(log))
+    np.testing.assert_array_equal(replica.evaluations.x, expected.x)
+    finite = np.isfinite(expected.objectives).all(axis=1)
+    assert not finite.all()
+    np.testing.assert_array_equal(replica.evaluations.feasible, expected.feasible & finite)
+    np.testing.assert_array_equal(
+        replica.evaluations.objectives[finite], expected.objectives[finite]
+    )
+    np.testing.assert_array_equal(replica.evaluations.violation[finite], expected.violation[finite])
+    assert replica.generation.tolist() == sorted(replica.generation.tolist())
+    assert np.bincount(replica.generation).tolist() == [0, 40, 40, 40, 40, 40]
+
+
+def test_replicas_differ(undisturbed: dict[str, bytes]) -> None:
+    assert len(undisturbed) == 8
+    assert len(set(undisturbed.values())) == 8
+
+
+def test_other_algorithms_and_replicas_do_not_matter(
+    tmp_path: Path, undisturbed: dict[str, bytes]
+) -> None:
+    settings = replace(SETTINGS, algorithms=("random", "mopso"), replicas=1)
+    found = files_of(run_search(settings, ExecutionSettings(tmp_path / "a", 1)))
+    common = found.keys() & undisturbed.keys()
+    assert len(common) == 2
+    assert all(found[name] == undisturbed[name] for name in common)
+
+
+def test_jobs_do_not_matter(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
+    assert files_of(run_search(SETTINGS, ExecutionSettings(tmp_path / "a", 3))) == undisturbed
+
+
+def test_seed_matters(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
+    found = files_of(run_search(replace(SETTINGS, seed=2), ExecutionSettings(tmp_path / "a", 1)))
+    assert found.keys() == undisturbed.keys()
+    assert not set(found.values()) & set(undisturbed.values())
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_killed_at_any_moment_and_resumed(
+    tmp_path: Path, jobs: str, undisturbed: dict[str, bytes]
+) -> None:
+    output, log = tmp_path / "a", tmp_path / "log"
+    options = ["--jobs", jobs, "--delay", "0.05", "--log", str(log)]
+    kept = 0
+    for generations in (2, 9, 13):
+        process = start(output, *options)
+        seen = 40 * 4 * 8 * generations
+        wait_for(partial(has_seen, log, seen))
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        recorded = sum(path.stat().st_size for path in output.glob("replicas/*/*/*"))
+        assert recorded >= kept
+        kept = recorded
+    process = start(output, *options)
+    assert process.wait(120) == 0, process.communicate()[1]
+    assert files_of(output) == undisturbed
+    assert not list(output.glob("replicas/*/*/journal.bin"))
+    evaluated = logged(log)
+    distinct = np.unique(evaluated, axis=0)
+    assert len(distinct) == 4 * 200
+    # Only what was evaluated but not yet recorded at one of three kills may have been repeated:
+    # at most one generation per worker.
+    assert len(evaluated) - len(distinct) <= 3 * 40 * int(jobs)
+
+
+def test_resume_of_a_complete_campaign_evaluates_nothing(tmp_path: Path) -> None:
+    execution = ExecutionSettings(tmp_path / "a", 1)
+    settings = replace(SETTINGS, evaluations=80, replicas=1)
+    before = files_of(run_search(settings, execution))
+    log = tmp_path / "log"
+    run_search(settings, replace(execution, resume=True), FakeSource(log=str(log)))
+    assert not log.exists()
+    assert files_of(execution.output) == before
+
+
+def test_damaged_results_are_made_again(tmp_path: Path) -> None:
+    execution = ExecutionSettings(tmp_path / "a", 1, resume=True)
+    settings = replace(SETTINGS, evaluations=80, replicas=1)
+    before = files_of(run_search(settings, execution))
+    damaged = execution.output / "replicas/mopso/00/evaluations.csv.gz"
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2] ^= 1
+    damaged.write_bytes(content)
+    with pytest.raises(ResultsError, match=r"damaged, its checksum differs"):
+        read_campaign(execution.output)
+    (execution.output / "stages/search.json").unlink()
+    assert files_of(run_search(settings, execution)) == before
+
+
+def test_a_killed_worker_is_replaced(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
+    log, marker = tmp_path / "log", tmp_path / "dead"
+    source = FakeSource(log=str(log), dies_once=str(marker))
+    root = run_search(SETTINGS, ExecutionSettings(tmp_path / "a", 2), source)
+    assert marker.exists()
+    assert files_of(root) == undisturbed
+
+
+def test_workers_that_keep_dying_end_the_campaign(tmp_path: Path) -> None:
+    with pytest.raises(WorkerError, match=r"died 3 times over one task .* --resume"):
+        run_search(SETTINGS, ExecutionSettings(tmp_path / "a", 2), FakeSource(always_dies=True))
+
+
+def test_full_disk_loses_nothing(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
+    output = tmp_path / "a"
+    # Large enough for the workcell's copy, too small for a journal of 200 candidates.
+    process = start(output, limit=40_000)
+    message = process.communicate(timeout=60)[1]
+    assert process.returncode == 2
+    assert message.count("\n") == 1
+    assert "no space left to write" in message
+    assert "--resume" in message
+    assert list(output.glob("replicas/*/*/journal.bin"))
+    process = start(output)
+    assert process.wait(60) == 0
+    assert files_of(output) == undisturbed
+
+
+def test_workers_end_with_the_campaign(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    process = start(tmp_path / "a", "--jobs", "2", "--delay", "0.05", "--log", str(log))
+    wait_for(log.exists)
+    process.kill()
+    process.wait()
+
+    def all_gone() -> bool:
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            return True
+        return False
+
+    wait_for(all_gone)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 2}, r"settings.seed: stored 1, now 2"),
+        ({"evaluations": 201}, r"settings.evaluations: stored 200, now 201"),
+        ({"replicas": 3}, r"settings.replicas: stored 2, now 3"),
+        ({"constraint_handling": "constraints"}, r'stored "penalty", now "constraints"'),
+        ({"populations": (("mopso", 30),)}, r"settings.algorithms.mopso.swarm: stored 40, now 30"),
+        ({"objectives": ("duration", "mean_force")}, r"settings.objectives: stored"),
+    ],
+)
+def test_other_settings_are_never_mixed(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    execution = ExecutionSettings(tmp_path, 1, resume=True)
+    with open_folder(SETTINGS, execution, load(RACK)):
+        pass
+    with (
+        pytest.raises(ResultsError, match=message),
+        open_folder(replace(SETTINGS, **change), execution, load(RACK)),
+    ):
+        pytest.fail("was opened")
+
+
+def changed_cell(folder: Path) -> Path:
+    shutil.copytree(RACK.parents[1] / "robots", folder / "robots")
+    path = folder / "cells/cell.toml"
+    path.parent.mkdir()
+    path.write_text(RACK.read_text().replace("mass = 10.0", "mass = 10.5"))
+    return path
+
+
+def test_other_workcell_is_never_mixed(tmp_path: Path) -> None:
+    execution = ExecutionSettings(tmp_path / "a", 1, resume=True)
+    with open_folder(SETTINGS, execution, load(RACK)):
+        pass
+    with (
+        pytest.raises(ResultsError, match="holds results of another workcell"),
+        open_folder(SETTINGS, execution, load(changed_cell(tmp_path))),
+    ):
+        pytest.fail("was opened")
+
+
+@pytest.mark.parametrize("key", ["numpy", "sources"])
+def test_other_software_is_never_mixed(tmp_path: Path, key: str) -> None:
+    execution = ExecutionSettings(tmp_path, 1, resume=True)
+    with open_folder(SETTINGS, execution, load(RACK)):
+        pass
+    path = tmp_path / "configuration.json"
+    stored = json.loads(path.read_text())
+    stored["environment"][key] = "0.1"
+    path.write_text(json.dumps(stored))
+    with (
+        pytest.raises(ResultsError, match=rf'environment.{key}: stored "0.1", now'),
+        open_folder(SETTINGS, execution, load(RACK)),
+    ):
+        pytest.fail("was opened")
+
+
+def test_the_stored_workcell_does_not_follow_the_file(tmp_path: Path) -> None:
+    cell = changed_cell(tmp_path)
+    execution = ExecutionSettings(tmp_path / "a", 1)
+    with open_folder(SETTINGS, execution, load(cell)) as folder:
+        cell.unlink()
+        assert folder.workcell.payload.mass == 10.5
+        assert folder.workcell.source.is_relative_to(tmp_path / "a")
+        assert load(folder.workcell.source).digest == folder.workcell.digest
+
+
+def test_a_folder_serves_one_process(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    process = start(tmp_path / "a", "--delay", "0.1", "--log", str(log))
+    wait_for(log.exists)
+    with pytest.raises(ResultsError, match=rf"in use by another process \(id {process.pid}\)"):
+        run_search(SETTINGS, ExecutionSettings(tmp_path / "a", 1, resume=True))
+    process.kill()
+    process.communicate()
+    run_search(SETTINGS, ExecutionSettings(tmp_path / "a", 1, resume=True))
+
+
+def test_existing_results_are_not_touched_without_resume(tmp_path: Path) -> None:
+    execution = ExecutionSettings(tmp_path / "a", 1)
+    run_search(replace(SETTINGS, evaluations=40, replicas=1), execution)
+    with pytest.raises(ResultsError, match="holds a campaign already; continue it with --resume"):
+        run_search(replace(SETTINGS, evaluations=40, replicas=1), execution)
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_other_folders_are_not_touched(tmp_path: Path, resume: bool) -> None:
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(ResultsError, match=r"not empty \(thesis.tex\)"):
+        run_search(SETTINGS, ExecutionSettings(tmp_path, 1, resume=resume))
+
+
+def test_unfinished_results_are_told(tmp_path: Path) -> None:
+    with open_folder(SETTINGS, ExecutionSettings(tmp_path, 1), load(RACK)):
+        pass
+    with pytest.raises(ResultsError, match="nsga2 replica 0 is not finished"):
+        read_campaign(tmp_path)
+    with pytest.raises(ResultsError, match="is no results folder"):
+        read_campaign(tmp_path / "replicas")
+
+
+def test_nothing_is_shown_when_not_wanted(capsys: pytest.CaptureFixture[str]) -> None:
+    for shown in (False, True):
+        with Progress(shown).stage("search", 3, "evaluations", 1) as advance:
+            advance(2)
+        assert ("search: 3 of 3 evaluations" in capsys.readouterr().err) is shown
+
+
+def test_errors_of_the_workers_arrive(tmp_path: Path) -> None:
+    with pytest.raises(DualArmError, match="no such evaluator"):
+        run_search(SETTINGS, ExecutionSettings(tmp_path / "a", 2), BrokenSource())
+
+
+class BrokenSource(FakeSource):
+    def __call__(self) -> Any:
+        raise DualArmError("no such evaluator")
