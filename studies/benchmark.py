@@ -1,0 +1,313 @@
+"""What one candidate costs: compiled, interpreted and written plainly.
+
+`python -m studies.benchmark [WORKCELL]` measures milliseconds per candidate on one core, in the
+thread's own processor time, so that waiting for a busy machine does not count. The three ways
+take turns on the same candidates, and a ratio is the median over the rounds of the ratio within
+a round. The plain way is the reference implementation of the tests, which needs a checkout.
+
+The cost against the number of samples and of free waypoints is measured on cells derived from the
+given one: same start, goal and robots, the free waypoints spread along the hand-made trajectory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codegen.build import compile_function
+from codegen.compiled import CompiledFunction
+from codegen.interpreted import InterpretedFunction
+from codegen.source import dense
+from symbolic.cell_model import CellModel, build_cell_model
+from symbolic.errors import CodegenError, DualArmError, SettingsError
+from symbolic.evaluator import candidate_function
+from symbolic.workcell import Array, Task, Waypoint, Workcell
+from symbolic.workcell_file import load
+
+Evaluate = Callable[[Array], object]
+
+SAMPLES = (25, 50, 100, 200, 400)
+WAYPOINTS = (1, 2, 3, 4, 5, 6, 7, 8)
+
+SLICE = 0.005
+"""Least time of one way in one round [s]; fast ways repeat the candidate to fill it."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit code: 0, or 2 on bad input."""
+    options = _parser().parse_args(arguments)
+    try:
+        result = benchmark(
+            _workcell(options.workcell), options.candidates, options.repeats, options.seed
+        )
+    except DualArmError as error:
+        print(f"benchmark: {error}", file=sys.stderr)
+        return 2
+    print(json.dumps(result, indent=2) if options.json else _report(result))
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.benchmark",
+        description="Milliseconds per candidate: compiled, interpreted and written plainly.",
+    )
+    parser.add_argument(
+        "workcell", nargs="?", type=Path, help="workcell file (default: the rack cell)"
+    )
+    parser.add_argument(
+        "--candidates", type=int, default=10, help="random candidates (default: 10)"
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=3, help="rounds with each candidate (default: 3)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the candidates (default: 0)")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    return parser
+
+
+def _workcell(path: Path | None) -> Workcell:
+    if path is not None:
+        return load(path)
+    with as_file(files("studies")) as folder:
+        return load(folder / "workcells" / "rack.toml")
+
+
+def benchmark(
+    workcell: Workcell, candidates: int = 10, repeats: int = 3, seed: int = 0
+) -> dict[str, Any]:
+    """Measure one cell; every time is in milliseconds per candidate.
+
+    Args:
+        candidates: number of decision vectors, uniform within the bounds.
+        repeats: rounds with each of them.
+        seed: of the decision vectors.
+
+    Raises:
+        SettingsError: a number is not positive, or there is no checkout with the plain reference.
+        CodegenError: there is no compiler.
+        DualArmError: the cell has no model.
+    """
+    for name, value in (("candidates", candidates), ("repeats", repeats)):
+        if value < 1:
+            raise SettingsError(f"--{name} is {value}; give 1 or more")
+    if seed < 0:
+        raise SettingsError(f"--seed is {seed}; give 0 or more")
+    make_plain = _plain_reference()
+    _progress(f"{workcell.name}: reading the robots, choosing start branches")
+    model = build_cell_model(workcell)
+    x = _candidates(workcell.task, candidates, seed)
+    _progress("building the evaluator")
+    ways: dict[str, Evaluate] = {
+        "compiled": _compiled(model),
+        "interpreted": InterpretedFunction(dense(candidate_function(model))),
+        "plain": make_plain(workcell, model.start),
+    }
+    _progress(f"{candidates * repeats} rounds: {', '.join(ways)}")
+    return {
+        "workcell": workcell.name,
+        "digest": workcell.digest,
+        "samples": workcell.task.samples,
+        "free_waypoints": len(workcell.task.free_indices),
+        "candidates": candidates,
+        "repeats": repeats,
+        "seed": seed,
+        "machine": {
+            "processor": _processor(),
+            "cores": os.cpu_count(),
+            "system": platform.platform(),
+            "python": platform.python_version(),
+        },
+        **summary(interleaved(ways, dict.fromkeys(ways, x), repeats)),
+        "scaling": _scaling(model, candidates, repeats, seed),
+    }
+
+
+def interleaved(
+    ways: Mapping[str, Evaluate], x: Mapping[str, Array], repeats: int
+) -> dict[str, Array]:
+    """Seconds per candidate of every way in every round (rounds,); the ways take turns.
+
+    Args:
+        ways: functions of one decision vector, by name.
+        x: per way its decision vectors (n, n_var), the same number for all.
+        repeats: rounds with each decision vector.
+    """
+    counts = {}
+    for name, evaluate in ways.items():
+        evaluate(x[name][0])
+        counts[name] = max(1, int(np.ceil(SLICE / _seconds(evaluate, x[name][0], 1))))
+    n = len(next(iter(x.values())))
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for round_ in range(n * repeats):
+        # Every other round backwards: what comes first has no advantage.
+        for name in list(ways)[:: 1 if round_ % 2 == 0 else -1]:
+            times[name].append(_seconds(ways[name], x[name][round_ % n], counts[name]))
+    return {name: np.array(values) for name, values in times.items()}
+
+
+def _seconds(evaluate: Evaluate, x: Array, count: int) -> float:
+    start = time.thread_time()
+    for _ in range(count):
+        evaluate(x)
+    return (time.thread_time() - start) / count
+
+
+def summary(times: Mapping[str, Array]) -> dict[str, float]:
+    """Medians [ms] of every way and medians of the ratios within a round.
+
+    Args:
+        times: seconds per candidate (rounds,) of 'compiled', 'interpreted' and 'plain'.
+    """
+    ratios = {
+        f"{name}_over_compiled": float(np.median(times[name] / times["compiled"]))
+        for name in ("plain", "interpreted")
+    }
+    return {f"{name}_ms": 1e3 * float(np.median(value)) for name, value in times.items()} | ratios
+
+
+def _scaling(model: CellModel, candidates: int, repeats: int, seed: int) -> dict[str, Any]:
+    """Compiled cost against the numbers of samples and of free waypoints."""
+    task = model.workcell.task
+    by_samples = {n: replace(task, samples=n) for n in SAMPLES}
+    by_waypoints = {n: with_free_waypoints(task, n) for n in WAYPOINTS}
+    samples = _costs(model, by_samples, candidates, repeats, seed, "samples")
+    waypoints = _costs(model, by_waypoints, candidates, repeats, seed, "free waypoints")
+    # The line goes through costs relative to the middle one, which turns taken make comparable;
+    # relative weights let 25 samples count as much as 400.
+    middle = SAMPLES[len(SAMPLES) // 2]
+    n = np.array(SAMPLES)
+    relative = np.array([np.median(samples[k] / samples[middle]) for k in SAMPLES])
+    slope, offset = np.polyfit(n, relative, 1, w=1.0 / relative)
+    unit = 1e3 * float(np.median(samples[middle]))
+    deviation = np.abs((slope * n + offset) / relative - 1.0).max()
+    return {
+        "samples": _entries("samples", samples),
+        "samples_line": {
+            "ms_per_sample": unit * float(slope),
+            "fixed_ms": unit * float(offset),
+            "largest_relative_deviation": float(deviation),
+        },
+        "waypoints": _entries("waypoints", waypoints),
+    }
+
+
+def _entries(name: str, costs: Mapping[int, Array]) -> list[dict[str, float]]:
+    return [{name: n, "compiled_ms": 1e3 * float(np.median(cost))} for n, cost in costs.items()]
+
+
+def _costs(
+    model: CellModel,
+    tasks: Mapping[int, Task],
+    candidates: int,
+    repeats: int,
+    seed: int,
+    what: str,
+) -> dict[int, Array]:
+    """Seconds per candidate (rounds,) of the compiled evaluator for each task, taken in turns."""
+    ways: dict[str, Evaluate] = {}
+    x: dict[str, Array] = {}
+    for n, task in tasks.items():
+        _progress(f"building the evaluator with {n} {what}")
+        ways[str(n)] = _compiled(replace(model, workcell=replace(model.workcell, task=task)))
+        x[str(n)] = _candidates(task, candidates, seed)
+    return {int(name): value for name, value in interleaved(ways, x, repeats).items()}
+
+
+def with_free_waypoints(task: Task, count: int) -> Task:
+    """The task with another number of free waypoints between its start and goal.
+
+    They lie evenly along the polygon of the hand-made trajectory; each may deviate as far as the
+    narrowest of the original ones.
+    """
+    points = np.array([waypoint.lower for waypoint in task.waypoints])
+    points[list(task.free_indices)] = task.initial
+    knots = np.arange(len(points), dtype=float)
+    at = np.linspace(0.0, knots[-1], count + 2)[1:-1]
+    centres = np.column_stack([np.interp(at, knots, column) for column in points.T])
+    half = np.min(np.reshape(task.upper - task.lower, (-1, 6)), axis=0) / 2.0
+    return replace(
+        task,
+        waypoints=(
+            task.waypoints[0],
+            *(Waypoint(centre - half, centre + half) for centre in centres),
+            task.waypoints[-1],
+        ),
+        initial=centres,
+    )
+
+
+def _candidates(task: Task, count: int, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(task.lower, task.upper, (count, task.n_var))
+
+
+def _compiled(model: CellModel) -> CompiledFunction:
+    function = compile_function(candidate_function(model))
+    if not isinstance(function, CompiledFunction):
+        raise CodegenError("there is no C compiler to compare with; install one, e.g. gcc")
+    return function
+
+
+def _plain_reference() -> Callable[[Workcell, tuple[Array, Array]], Evaluate]:
+    try:
+        from tests.plain.candidate import PlainEvaluator
+    except ModuleNotFoundError as error:
+        raise SettingsError(
+            "the plain reference is part of the tests and is not installed; run the benchmark "
+            f"in the folder of a checkout of the project ({error})"
+        ) from error
+    return PlainEvaluator
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor())
+
+
+def _progress(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _report(result: Mapping[str, Any]) -> str:
+    machine, line = result["machine"], result["scaling"]["samples_line"]
+    rows = [
+        f"{result['workcell']}: {result['samples']} samples, "
+        f"{result['free_waypoints']} free waypoints",
+        f"{machine['processor']}, Python {machine['python']}; one core, medians of "
+        f"{result['candidates']} candidates x {result['repeats']} rounds, seed {result['seed']}",
+        "",
+        "way          ms per candidate  over compiled",
+        f"compiled     {result['compiled_ms']:16.3f}  {1.0:13.1f}",
+        f"interpreted  {result['interpreted_ms']:16.3f}  "
+        f"{result['interpreted_over_compiled']:13.1f}",
+        f"plain        {result['plain_ms']:16.3f}  {result['plain_over_compiled']:13.1f}",
+        "",
+        "samples      ms per candidate",
+        *(f"{e['samples']:7d}  {e['compiled_ms']:20.3f}" for e in result["scaling"]["samples"]),
+        f"line: {1e3 * line['ms_per_sample']:.2f} us per sample + {1e3 * line['fixed_ms']:.1f} us, "
+        f"off by at most {100 * line['largest_relative_deviation']:.0f} %",
+        "",
+        "waypoints    ms per candidate",
+        *(f"{e['waypoints']:7d}  {e['compiled_ms']:20.3f}" for e in result["scaling"]["waypoints"]),
+    ]
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
