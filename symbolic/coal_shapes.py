@@ -6,6 +6,8 @@ candidates is python-fcl's.
 
 from __future__ import annotations
 
+from functools import cache
+
 import coal
 import numpy as np
 
@@ -27,9 +29,14 @@ def coal_geometry(piece: Piece) -> tuple[coal.CollisionGeometry, coal.Transform3
         case Capsule():
             return coal.Capsule(shape.radius, shape.length), pose
         case Hull():
-            points = coal.StdVec_Vec3s()
-            points.extend([np.asarray(vertex) for vertex in shape.vertices])
-            return coal.Convex.convexHull(points, False, ""), pose
+            return _convex(shape), pose
+
+
+@cache
+def _convex(hull: Hull) -> coal.CollisionGeometry:
+    points = coal.StdVec_Vec3s()
+    points.extend([np.asarray(vertex) for vertex in hull.vertices])
+    return coal.Convex.convexHull(points, False, "")
 
 
 def coal_distance(first: tuple[Piece, ...], second: tuple[Piece, ...]) -> float:

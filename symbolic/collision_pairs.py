@@ -207,7 +207,8 @@ def _never_meet(
         first = low.frame.joint + 1
         swept = _zone(high, arm, first)
         reach = farthest_from_axis(swept, np.zeros(3), arm.axes[first])
-        ranges = [(float(arm.lower[first]), float(arm.upper[first]))]
+        turn = min(float(arm.upper[first] - arm.lower[first]), 2.0 * np.pi)
+        ranges = [(float(arm.lower[first]), float(arm.lower[first]) + turn)]
         least = np.inf
         while ranges:
             start, end = ranges.pop()

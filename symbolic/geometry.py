@@ -31,7 +31,7 @@ class Capsule:
     length: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Hull:
     """The convex hull of vertices: (n, 3) [m]; faces: (m, 3) triangles, outward."""
 

@@ -80,7 +80,7 @@ def _load(path: Path, scale: Array) -> trimesh.Trimesh:
     if not path.is_file():
         raise CollisionModelError(f"{path}: mesh file not found; correct its path")
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh raises whatever its many readers raise
         raise CollisionModelError(
             f"{path}: cannot be read as a mesh ({error}); give an STL, OBJ or PLY file"
