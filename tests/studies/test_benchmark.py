@@ -1,0 +1,110 @@
+"""The benchmark: honest ratios, sensible derived cells, the promised speed."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from studies import benchmark
+from symbolic.errors import SettingsError
+from symbolic.workcell import Array
+from tests.symbolic.cells import RACK, hand_cell
+
+PROMISED_RATIO = 200.0
+"""How many times faster than the plain version the compiled evaluator has to be."""
+
+
+def busy(milliseconds: float) -> benchmark.Evaluate:
+    """A way that uses the processor for a given time."""
+
+    def evaluate(_: Array) -> None:
+        end = time.thread_time() + 1e-3 * milliseconds
+        while time.thread_time() < end:
+            pass
+
+    return evaluate
+
+
+def test_ratios_are_those_of_the_ways() -> None:
+    x = np.zeros((3, 2))
+    ways = {"compiled": busy(0.5), "interpreted": busy(2.0), "plain": busy(10.0)}
+    result = benchmark.summary(benchmark.interleaved(ways, dict.fromkeys(ways, x), 3))
+    assert result["plain_over_compiled"] == pytest.approx(20.0, rel=0.1)
+    assert result["interpreted_over_compiled"] == pytest.approx(4.0, rel=0.1)
+    assert result["compiled_ms"] == pytest.approx(0.5, rel=0.1)
+
+
+def test_every_way_sees_every_candidate_in_every_round() -> None:
+    seen: dict[str, list[float]] = {"a": [], "b": []}
+
+    def recorder(name: str) -> benchmark.Evaluate:
+        def evaluate(x: Array) -> None:
+            seen[name].append(float(x[0]))
+            busy(6.0)(x)  # longer than a slice: once per round
+
+        return evaluate
+
+    x = np.arange(4.0)[:, None]
+    times = benchmark.interleaved({n: recorder(n) for n in seen}, dict.fromkeys(seen, x), 2)
+    for name, values in seen.items():
+        # Two evaluations come before the rounds: a first one, and one to choose the repetitions.
+        assert values[2:] == [0.0, 1.0, 2.0, 3.0] * 2
+        assert times[name].shape == (8,)
+
+
+@pytest.mark.parametrize("count", range(1, 9))
+def test_derived_tasks_keep_the_ends_and_stay_on_the_trajectory(count: int) -> None:
+    task = hand_cell().task
+    derived = benchmark.with_free_waypoints(task, count)
+    assert derived.n_var == 6 * count
+    assert derived.waypoints[0] is task.waypoints[0]
+    assert derived.waypoints[-1] is task.waypoints[-1]
+    middle = (derived.lower + derived.upper) / 2.0
+    np.testing.assert_allclose(middle, derived.initial.reshape(-1), atol=1e-15)
+    if count == len(task.initial):
+        np.testing.assert_allclose(derived.initial, task.initial, atol=1e-15)
+
+
+def test_measures_the_rack_and_keeps_its_promises(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark, "SAMPLES", (25, 50, 100))
+    monkeypatch.setattr(benchmark, "WAYPOINTS", (1, 3))
+    arguments = [str(RACK), "--json", "--candidates", "5", "--repeats", "2"]
+    assert benchmark.main(arguments) == 0
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert result["plain_over_compiled"] > PROMISED_RATIO
+    assert result["interpreted_over_compiled"] > 1.0
+    assert result["compiled_ms"] < result["interpreted_ms"] < result["plain_ms"]
+    scaling = result["scaling"]
+    assert [entry["samples"] for entry in scaling["samples"]] == [25, 50, 100]
+    assert [entry["waypoints"] for entry in scaling["waypoints"]] == [1, 3]
+    assert scaling["samples_line"]["largest_relative_deviation"] < 0.25
+    assert benchmark._report(result).startswith(result["workcell"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--candidates", "0"], "--candidates is 0"),
+        (["--repeats", "-1"], "--repeats is -1"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["missing.toml"], "missing.toml"),
+    ],
+)
+def test_bad_input_gives_one_message_and_a_code(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert benchmark.main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_without_a_checkout_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tests.plain.candidate", None)
+    with pytest.raises(SettingsError, match="checkout"):
+        benchmark.benchmark(hand_cell())
