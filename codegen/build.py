@@ -134,7 +134,11 @@ def build(
 
 
 def load_or_build(
-    key: str, make: Callable[[], Mapping[str, ca.Function]], cache: Cache | None = None
+    key: str,
+    make: Callable[[], Mapping[str, ca.Function]],
+    cache: Cache | None = None,
+    *,
+    levels: Mapping[str, int] | None = None,
 ) -> dict[str, NumericFunction]:
     """A set of functions by the key of what they are made from.
 
@@ -145,6 +149,7 @@ def load_or_build(
         key: changes with everything that `make` depends on, except the version of CasADi.
         make: makes the functions.
         cache: where libraries are kept; by default the user's.
+        levels: optimisation level per name, where the default by size is not wanted.
 
     Raises:
         CodegenError: see `compile_function`; and whatever `make` raises.
@@ -158,7 +163,9 @@ def load_or_build(
         return found
     with cache.lock(_set_key(key, compiler)):
         found = _load_set(key, compiler, cache)
-        return found if found is not None else build_set(key, make(), cache).functions
+        if found is None:
+            found = build_set(key, make(), cache, levels=levels).functions
+        return found
 
 
 def build_set(

@@ -18,18 +18,22 @@ if TYPE_CHECKING:
 
 
 class InterpretedFunction(NumericFunction):
-    """A CasADi function evaluated by CasADi's interpreter: the same results, slower."""
+    """A CasADi function evaluated by CasADi's interpreter: the same results, slower.
+
+    Attributes:
+        function: what it wraps.
+    """
 
     def __init__(self, function: ca.Function) -> None:
         """Wrap a function whose inputs and outputs are dense (`codegen.source.dense`)."""
         super().__init__(Signature.of(function))
-        self._function = function
+        self.function = function
 
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
         self._evaluate_into(inputs, [block[name] for name in self.output_names])
 
     def _evaluate_into(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
-        buffer, evaluate = self._function.buffer()
+        buffer, evaluate = self.function.buffer()
         for i, array in enumerate(inputs):
             buffer.set_arg(i, array.data)
         for i, array in enumerate(outputs):
