@@ -20,6 +20,11 @@ SPEED_CEILING = 1e4
 """Largest squared path speed that toppra's solver admits, in its scaled path coordinate."""
 
 
+RESCALINGS = (1.0, 0.4, 2.5)
+"""Factors on the path coordinate, tried in turn: toppra's linear programs use absolute tolerances
+and now and then call a feasible stage infeasible."""
+
+
 @dataclass(frozen=True)
 class StageRows:
     """Linear limits on a path's timing: by stage i and row k, a u'' + b u'^2 <= bound.
@@ -53,6 +58,16 @@ def fastest_speed(rows: StageRows, grid: Array) -> Array | SolverFailure:
     Returns:
         (stages + 1,) squared path speed at the grid points, zero at both ends, or a failure.
     """
+    found: Array | SolverFailure = SolverFailure("not tried", 0)
+    for factor in RESCALINGS:
+        scaled = StageRows(rows.a / factor, rows.b / factor**2, rows.bound)
+        found = _solve(scaled, factor * grid)
+        if not isinstance(found, SolverFailure):
+            return found / factor**2
+    return found
+
+
+def _solve(rows: StageRows, grid: Array) -> Array | SolverFailure:
     # Imported late: toppra pulls in plotting.
     from toppra.algorithm import TOPPRA
     from toppra.constraint import LinearConstraint

@@ -8,7 +8,7 @@ import numpy as np
 
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_check import path_failure
-from hybrid_opt.timing.point_limits import nominal_duration
+from hybrid_opt.timing.point_limits import duration_at_speed_limits
 from hybrid_opt.timing.records import Place, TimedCarry, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, joint_use, limit_use, worst
@@ -196,7 +196,9 @@ def report_timing(model: TimingModel, x: Array, force: float | None = None) -> T
         timings["force limited"] = limited
     return TimingReport(
         judged=judged,
-        nominal_duration=nominal_duration(model, model.path_motion(x)),
+        nominal_duration=duration_at_speed_limits(
+            model, model.path_motion(x), TimingLimits(reference_speed=True)
+        ),
         fastest=fastest,
         closest=closest,
         force_limited=limited,

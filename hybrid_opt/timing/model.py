@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.build import build, load_or_build
+from codegen.build import build, compile_function, load_or_build
 from codegen.cache import Cache, digest
+from codegen.function import NumericFunction
 from codegen.workcell_functions import workcell_functions, workcell_key
 from hybrid_opt.timing.records import TimedCarry
 from symbolic.errors import SettingsError
 from symbolic.urdf_model import arm_model
 from symbolic.workcell import Array, Robot, Workcell
+
+if TYPE_CHECKING:  # CasADi and Pinocchio are heavy to import; only a first use needs them
+    from symbolic.cell_model import CellModel
 
 STAGES = 200
 """Pieces of constant path acceleration."""
@@ -80,9 +85,20 @@ class TimingModel:
     """
 
     def __init__(
-        self, workcell: Workcell, stages: int = STAGES, cache: Cache | None = None
+        self,
+        workcell: Workcell,
+        stages: int = STAGES,
+        cache: Cache | None = None,
+        cell_model: CellModel | None = None,
     ) -> None:
         """Load or build the compiled functions.
+
+        Args:
+            workcell: the cell.
+            stages: pieces of constant path acceleration.
+            cache: where compiled functions are kept; by default the user's.
+            cell_model: the cell's symbolic model, where other start postures than the stated
+                criterion's are wanted; the functions are then built from it.
 
         Raises:
             SettingsError: the number of stages is out of range.
@@ -93,34 +109,20 @@ class TimingModel:
         self.workcell = workcell
         self.stages = stages
         self.joint_names = (joint_names(workcell.robots[0]), joint_names(workcell.robots[1]))
+        self._cache = cache
+        self._cell_model = cell_model
         samples = REFINEMENT * stages + 1
 
         def make() -> Any:
-            # Only a first use builds expressions; CasADi and Pinocchio are heavy to import.
-            from symbolic.cell_model import build_cell_model
-            from symbolic.path_motion import arm_derivative_function, path_motion_function
-            from symbolic.payload_load import load_function, uncertain_load_function
+            from symbolic.timing_functions import timing_functions
 
-            model = build_cell_model(workcell)
-            return {
-                "path_motion": path_motion_function(model, samples),
-                "load": load_function(workcell),
-                "uncertain_load": uncertain_load_function(workcell),
-                **{f"inverse_dynamics_{i + 1}": model.robots[i].inverse_dynamics for i in (0, 1)},
-                **{
-                    f"arm_{i + 1}": arm_derivative_function(
-                        workcell.robots[i], model.robots[i], workcell.contacts[i], f"arm_{i + 1}"
-                    )
-                    for i in (0, 1)
-                },
-            }
+            return timing_functions(workcell, samples, cell_model)
 
-        if workcell.digest:
+        if workcell.digest and cell_model is None:
             key = digest("timing", workcell_key(workcell), str(samples))
             self._functions = load_or_build(key, make, cache)
-        else:  # not read from a file: nothing identifies it but the functions themselves
+        else:  # nothing identifies these functions but themselves
             self._functions = build(make(), cache).functions
-        self._cache = cache
 
     def path_motion(self, x: Array) -> PathMotion:
         """The geometry at `REFINEMENT` samples per stage, uniform in u.
@@ -196,7 +198,7 @@ class TimingModel:
         the box's (one-sided at the ends).
         """
         x = self._checked(x)
-        out = workcell_functions(self.workcell, self._cache)["candidate"](x)
+        out = self._candidate(x)
         time = out["time"].reshape(-1)
         q = np.concatenate([out["q_1"], out["q_2"]], axis=1)
         q_rate = np.gradient(q, time, axis=0, edge_order=2)
@@ -220,6 +222,14 @@ class TimingModel:
             contact_torque=np.concatenate([out["joint_torque_1"], out["joint_torque_2"]], axis=1),
             own_torque=np.concatenate(own, axis=1),
         )
+
+    @cached_property
+    def _candidate(self) -> NumericFunction:
+        if self._cell_model is None:
+            return workcell_functions(self.workcell, self._cache)["candidate"]
+        from symbolic.evaluator import candidate_function
+
+        return compile_function(candidate_function(self._cell_model), self._cache)
 
     def _checked(self, x: Array) -> Array:
         x = np.ascontiguousarray(x, dtype=float)

@@ -23,7 +23,7 @@ class PointLimits:
 
     Attributes:
         points: the path's geometry there.
-        scale: the solver's path coordinate is scale times u [s].
+        scale: the solver's path coordinate is scale times u, so that speeds are around one [s].
         grid: (stages + 1,) the solver's path coordinate at the stages' ends.
         rest: (points, k) `ratios` standing still.
     """
@@ -35,7 +35,7 @@ class PointLimits:
         offsets = np.array([round(REFINEMENT * share) for share in STAGE_POINTS])
         self._index = (REFINEMENT * np.arange(stages)[:, None] + offsets).reshape(-1)
         self.points = motion.at(self._index)
-        self.scale = nominal_duration(model, motion)
+        self.scale = duration_at_speed_limits(model, motion, limits)
         self.grid = np.linspace(0.0, self.scale, stages + 1)
         still = np.zeros(len(self._index))
         self.rest = self.ratios(still, still)
@@ -141,9 +141,8 @@ class PointLimits:
         )
 
 
-def nominal_duration(model: TimingModel, motion: PathMotion) -> float:
-    """Duration of a path at the task's reference speeds [s], without ramps."""
-    limits = TimingLimits(reference_speed=True)
+def duration_at_speed_limits(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> float:
+    """Duration of a path driven at its speed limits alone, without ramps [s]."""
     squared = rows_of.squared_speed_limit(motion, model.workcell, limits)
     slowness = 1.0 / np.sqrt(np.minimum(squared, 1e8))
     return float(np.trapezoid(slowness, motion.parameter))

@@ -1,0 +1,52 @@
+"""Timing models of hand-written cells, built once per test process."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from hybrid_opt.timing import TimingModel
+from symbolic.workcell import Array, Workcell
+from tests.symbolic.cells import hand_cell, hand_model
+
+STAGES = 200
+
+
+@cache
+def hand_timing(stages: int = STAGES) -> TimingModel:
+    """The hand-written cell, to be timed."""
+    return timing_of(hand_cell(), stages)
+
+
+def timing_of(cell: Workcell, stages: int = STAGES) -> TimingModel:
+    """A cell of the hand-written kind, to be timed."""
+    return TimingModel(cell, stages, cell_model=hand_model(cell))
+
+
+def with_robots(cell: Workcell, **factors: float) -> Workcell:
+    """The cell with some of its robots' limits multiplied."""
+    first, second = (
+        replace(robot, **{name: getattr(robot, name) * f for name, f in factors.items()})
+        for robot in cell.robots
+    )
+    return replace(cell, robots=(first, second))
+
+
+def initial() -> Array:
+    """(n_var,) the hand-made trajectory."""
+    return hand_cell().task.initial.reshape(-1)
+
+
+def near_initial(rng: np.random.Generator, count: int, size: float = 1.0) -> Array:
+    """(count, n_var) random trajectories around the hand-made one that both arms can follow."""
+    model = hand_timing()
+    found: list[Array] = []
+    spread = size * np.tile([0.04, 0.02, 0.04, 0.06, 0.06, 0.06], 3)
+    while len(found) < count:
+        x = initial() + spread * rng.uniform(-1.0, 1.0, len(spread))
+        motion = model.path_motion(x)
+        if not motion.lost.any() and motion.manipulability.min() > 0.01:
+            found.append(x)
+    return np.array(found)

@@ -1,0 +1,64 @@
+"""toppra behind its adapter: closed-form answers, and failures as records without a log line."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+from hybrid_opt.timing.adapter import SolverFailure, StageRows, fastest_speed
+
+
+def rows(n: int, *limits: tuple[float, float, float]) -> StageRows:
+    """The same rows a u'' + b u'^2 <= bound on every stage."""
+    a, b, bound = (np.tile(column, (n, 1)) for column in np.array(limits).T)
+    return StageRows(a, b, bound)
+
+
+def duration(squared: np.ndarray, grid: np.ndarray) -> float:
+    speed = np.sqrt(squared)
+    return float(np.sum(2.0 * np.diff(grid) / (speed[:-1] + speed[1:])))
+
+
+def test_bounded_acceleration_takes_the_time_of_a_triangle() -> None:
+    grid = np.linspace(0.0, 2.0, 201)
+    found = fastest_speed(rows(200, (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0)), grid)
+    assert isinstance(found, np.ndarray)
+    assert duration(found, grid) == pytest.approx(2.0 * np.sqrt(2.0 / 3.0), rel=1e-4)
+
+
+def test_bounded_speed_takes_the_time_of_a_trapezoid() -> None:
+    grid = np.linspace(0.0, 2.0, 401)
+    limits = rows(400, (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0), (0.0, 1.0, 1.0))
+    found = fastest_speed(limits, grid)
+    assert isinstance(found, np.ndarray)
+    assert duration(found, grid) == pytest.approx(2.0 + 1.0 / 3.0, rel=1e-3)
+
+
+def test_contradicting_rows_fail_at_their_stage(
+    caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    limits = rows(50, (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0))
+    limits.bound[20, 0] = -4.0  # at most -4 and at least -3
+    with caplog.at_level(logging.DEBUG):
+        found = fastest_speed(limits, np.linspace(0.0, 1.0, 51))
+    assert isinstance(found, SolverFailure)
+    assert found.stage == 20
+    assert "no speed" in found.reason
+    assert caplog.records == []
+    assert capfd.readouterr().err == ""
+
+
+def test_a_path_that_cannot_be_left_is_a_failure() -> None:
+    limits = rows(50, (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0), (0.0, -1.0, -0.5))
+    found = fastest_speed(limits, np.linspace(0.0, 1.0, 51))
+    assert isinstance(found, SolverFailure)
+
+
+def test_the_logger_is_left_as_it_was() -> None:
+    logger = logging.getLogger("toppra")
+    logger.setLevel(logging.INFO)
+    fastest_speed(rows(20, (1.0, 0.0, 1.0), (-1.0, 0.0, 1.0)), np.linspace(0.0, 1.0, 21))
+    assert logger.level == logging.INFO
+    logger.setLevel(logging.NOTSET)

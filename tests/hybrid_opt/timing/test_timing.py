@@ -1,0 +1,279 @@
+"""Timings held against their limits, their statuses and their laws."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybrid_opt.timing import (
+    Timing,
+    TimingLimits,
+    TimingModel,
+    TimingStatus,
+    closest_to_reference_timing,
+    duration_against_force_limit,
+    fastest_timing,
+    force_limited_timing,
+    judge_timing,
+    report_timing,
+    time_path,
+)
+from hybrid_opt.timing.use import limit_ratios
+from symbolic.errors import SettingsError
+from symbolic.workcell import Array
+from tests.hybrid_opt.timing.cells import (
+    hand_timing,
+    initial,
+    near_initial,
+    timing_of,
+    with_robots,
+)
+from tests.symbolic.cells import fixed, hand_cell, with_payload, with_task
+
+WEIGHT = 98.1
+STATIC = WEIGHT / 2.0
+
+
+def worst_ratios(model: TimingModel, timing: Timing, limits: TimingLimits) -> Array:
+    """Largest use of any limit but friction on each stage of the refined samples."""
+    assert timing.carry is not None
+    ratios = limit_ratios(timing.carry, model.workcell, limits)
+    del ratios["friction"]
+    use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
+    worst: Array = use.reshape(model.stages, -1).max(axis=1)
+    return worst
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        TimingLimits(),
+        TimingLimits(reference_speed=True),
+        TimingLimits(force=1.01 * STATIC),
+        TimingLimits(force=1.3 * STATIC),
+    ],
+)
+@pytest.mark.parametrize("factor", [1.0, 0.6])
+def test_limits_hold_between_the_grid_points_and_are_reached(
+    limits: TimingLimits, factor: float
+) -> None:
+    model = timing_of(with_robots(hand_cell(), torque_max=factor, acceleration_max=0.8))
+    timing = time_path(model, initial(), limits)
+    assert timing.ok, timing.reason
+    use = worst_ratios(model, timing, limits)
+    assert use.max() <= 1.005
+    # Time-optimal motion has a limit active everywhere; where it changes sides, a stage may not.
+    assert np.mean(use > 0.98) > 0.95
+
+
+def test_random_trajectories_hold_their_limits() -> None:
+    model = hand_timing()
+    for x in near_initial(np.random.default_rng(11), 12):
+        for limits in (TimingLimits(), TimingLimits(reference_speed=True)):
+            timing = time_path(model, x, limits)
+            assert timing.ok, timing.reason
+            assert worst_ratios(model, timing, limits).max() <= 1.005
+            assert timing.use["friction"].ratio <= 1.0 + 1e-6
+
+
+def test_a_carry_starts_and_ends_at_rest_and_its_rates_integrate() -> None:
+    carry = fastest_timing(hand_timing(), initial()).carry
+    assert carry is not None
+    for end in (0, -1):
+        np.testing.assert_allclose(carry.q_rate[end], 0.0, atol=1e-9)
+    step = np.diff(carry.time)[:, None]
+    assert (step >= 0.0).all()
+    for value, rate in ((carry.q, carry.q_rate), (carry.q_rate, carry.q_second)):
+        integral = np.sum(step * (rate[1:] + rate[:-1]) / 2.0, axis=0)
+        np.testing.assert_allclose(integral, value[-1] - value[0], atol=2e-3)
+
+
+def test_contact_forces_balance_the_box_under_real_timing() -> None:
+    cell = hand_cell()
+    for x in near_initial(np.random.default_rng(5), 3):
+        carry = fastest_timing(hand_timing(), x).carry
+        assert carry is not None
+        needed = cell.payload.mass * (carry.second_rate[:, :3] + [0.0, 0.0, 9.81])
+        np.testing.assert_allclose(carry.contact_force.sum(axis=1), needed, atol=1e-8)
+        assert carry.friction_margin(cell).min() > -1e-7
+
+
+def test_force_limit_is_reached_and_never_exceeded() -> None:
+    model = hand_timing()
+    for share in (1.005, 1.02, 1.1):
+        timing = force_limited_timing(model, initial(), share * STATIC)
+        assert timing.ok, timing.reason
+        assert timing.carry is not None
+        assert timing.carry.normal_force.max() == pytest.approx(share * STATIC, rel=1e-4)
+
+
+def test_duration_falls_with_the_force_limit() -> None:
+    curve = duration_against_force_limit(hand_timing(), initial(), points=6)
+    assert curve.static_force == pytest.approx(STATIC, rel=1e-9)
+    assert all(status is TimingStatus.OK for status in curve.status)
+    assert (np.diff(curve.force) > 0.0).all()
+    assert (np.diff(curve.duration) < 1e-6).all()
+    free = fastest_timing(hand_timing(), initial()).duration
+    assert curve.duration[-1] == pytest.approx(free, rel=1e-3)
+    with pytest.raises(SettingsError, match="at least 2"):
+        duration_against_force_limit(hand_timing(), initial(), points=1)
+
+
+def test_the_static_force_itself_is_no_timing() -> None:
+    timing = force_limited_timing(hand_timing(), initial(), STATIC)
+    assert timing.status is TimingStatus.INFEASIBLE_AT_REST
+    assert timing.place is not None
+    assert timing.place.constraint == "normal force"
+    assert timing.duration == float("inf")
+
+
+def test_weak_joints_name_constraint_robot_joint_and_place() -> None:
+    timing = fastest_timing(timing_of(with_robots(hand_cell(), torque_max=0.3)), initial())
+    assert timing.status is TimingStatus.INFEASIBLE_AT_REST
+    assert timing.place is not None
+    assert timing.place.constraint == "joint torque"
+    assert timing.place.robot in ("first", "second")
+    assert timing.place.joint.startswith("joint_")
+    assert 0.0 <= timing.place.parameter <= 1.0
+    assert timing.place.joint in timing.reason
+
+
+def test_a_centre_of_mass_beyond_the_patch_cannot_be_held() -> None:
+    cell = with_payload(hand_cell(), centre_of_mass=np.array([0.04, 0.0, 0.0]))
+    timing = fastest_timing(timing_of(cell), initial())
+    assert timing.status is TimingStatus.INFEASIBLE_AT_REST
+    assert timing.place is not None
+    assert timing.place.constraint == "pressure shift"
+    free = time_path(timing_of(cell), initial(), TimingLimits(pressure=False))
+    assert free.ok
+
+
+def test_ten_times_the_reference_speed_is_judged_and_kept_within_limits() -> None:
+    cell = hand_cell()
+    fast = with_task(cell, reference_speed=10.0 * cell.task.reference_speed)
+    model = timing_of(fast)
+    judged = judge_timing(model, initial()).timing
+    assert judged.status is TimingStatus.EXCEEDED
+    assert max(excess.ratio for excess in judged.use.values()) > 2.0
+    assert judged.place is not None
+    closest = closest_to_reference_timing(model, initial())
+    assert closest.ok
+    # So fast a reference never binds.
+    assert closest.duration == pytest.approx(fastest_timing(model, initial()).duration, rel=1e-4)
+
+
+def test_the_search_timing_starts_at_speed_and_is_told_so() -> None:
+    judged = judge_timing(hand_timing(), initial())
+    assert judged.timing.status is TimingStatus.EXCEEDED
+    assert judged.timing.place is not None
+    assert judged.timing.place.constraint == "start from rest"
+    assert np.abs(judged.start_speed).max() > 0.05
+    assert judged.joint_use["joint torque"].shape == (12,)
+
+
+def test_the_closest_timing_cruises_at_the_reference_speed() -> None:
+    cell = hand_cell()
+    report = report_timing(hand_timing(), initial())
+    closest = report.closest
+    assert closest.ok
+    assert closest.carry is not None
+    speed = np.linalg.norm(closest.carry.rate[:, :3], axis=1)
+    assert speed.max() <= cell.task.reference_speed * 1.0001
+    assert np.mean(speed > 0.99 * cell.task.reference_speed) > 0.9
+    assert report.nominal_duration < closest.duration < 1.1 * report.nominal_duration
+    assert set(report.objectives) == {"search", "fastest", "closest to reference"}
+    search = report.objectives["search"]
+    assert (report.objectives["fastest"] > search).all()
+
+
+def test_a_path_without_motion() -> None:
+    cell = hand_cell()
+    pose = cell.task.waypoints[0].lower
+    still = with_task(cell, waypoints=(fixed(pose), fixed(pose)), initial=np.zeros((0, 6)))
+    timing = fastest_timing(timing_of(still, 20), np.zeros(0))
+    assert timing.status is TimingStatus.NO_MOTION
+
+
+def test_a_zero_length_segment_is_passed() -> None:
+    cell = hand_cell()
+    points = list(cell.task.waypoints)
+    middle = fixed(cell.task.initial[1])
+    twice = with_task(
+        cell, waypoints=(*points[:2], middle, middle, *points[3:]), initial=cell.task.initial[::2]
+    )
+    timing = fastest_timing(timing_of(twice), twice.task.initial.reshape(-1))
+    assert timing.ok, timing.reason
+    assert np.isfinite(timing.duration)
+
+
+def test_a_pure_rotation_takes_the_time_it_needs() -> None:
+    cell = hand_cell()
+    pose = cell.task.initial[1]
+    turned = np.array([*pose[:5], 0.2])
+    start = with_task(cell, waypoints=(fixed(pose), fixed(turned)), initial=np.zeros((0, 6)))
+    timing = closest_to_reference_timing(timing_of(start, 60), np.zeros(0))
+    assert timing.ok, timing.reason
+    assert timing.duration > 0.2 / cell.task.reference_angular_speed
+    assert timing.use["path speed"].ratio == pytest.approx(1.0, abs=0.005)
+
+
+def test_a_path_near_a_singular_posture_is_refused_with_its_place() -> None:
+    cell = hand_cell()
+    first, second = (replace(robot, min_manipulability=1.0) for robot in cell.robots)
+    strict = replace(cell, robots=(first, second))
+    timing = fastest_timing(timing_of(strict), initial())
+    assert timing.status is TimingStatus.NEAR_SINGULAR
+    assert timing.place is not None
+    assert timing.place.robot == "first"
+
+
+def test_an_arm_that_loses_the_path_is_named() -> None:
+    x = initial()
+    x[6] = -2.5  # far out of reach
+    timing = fastest_timing(hand_timing(), x)
+    assert timing.status is TimingStatus.OFF_PATH
+    assert "loses the path" in timing.reason
+
+
+def test_leaving_a_joint_range_is_named() -> None:
+    cell = hand_cell()
+    model = hand_timing()
+    q = model.path_motion(initial()).q[:, :6]
+    narrow = replace(
+        cell.robots[0],
+        position_upper=np.minimum(cell.robots[0].position_upper, q.max(axis=0) - 0.05),
+    )
+    timing = fastest_timing(timing_of(replace(cell, robots=(narrow, cell.robots[1]))), initial())
+    assert timing.status is TimingStatus.JOINT_LIMITS
+
+
+@pytest.mark.parametrize("force", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_force_limit_has_to_be_a_force(force: float) -> None:
+    with pytest.raises(SettingsError, match="positive force"):
+        TimingLimits(force=force)
+
+
+def test_decision_vectors_and_stages_are_checked() -> None:
+    with pytest.raises(SettingsError, match="finite numbers"):
+        fastest_timing(hand_timing(), np.full(18, np.nan))
+    with pytest.raises(SettingsError, match="stages"):
+        TimingModel(hand_cell(), stages=5)
+
+
+def test_scaling_all_rates_scales_the_time() -> None:
+    """Twice the speeds and four times the accelerations halve the time; no gravity is involved."""
+    cell = hand_cell()
+    payload = replace(
+        cell.payload,
+        velocity_max=2.0 * cell.payload.velocity_max,
+        acceleration_max=4.0 * cell.payload.acceleration_max,
+        angular_velocity_max=2.0 * cell.payload.angular_velocity_max,
+        angular_acceleration_max=4.0 * cell.payload.angular_acceleration_max,
+    )
+    quick = replace(with_robots(cell, velocity_max=2.0, acceleration_max=4.0), payload=payload)
+    limits = TimingLimits(torque=False, pressure=False)
+    slow_time = time_path(hand_timing(), initial(), limits).duration
+    quick_time = time_path(timing_of(quick), initial(), limits).duration
+    assert quick_time == pytest.approx(slow_time / 2.0, rel=1e-3)
