@@ -38,16 +38,16 @@ def verdicts(x: Array) -> Evaluations:
     violation = np.zeros((len(x), len(REASONS)))
     violation[:, 0] = np.maximum(0.4 - x[:, 0] - x[:, 1], 0.0)
     violation[:, REASONS.index("collision")] = np.maximum(x[:, 2] - 0.9, 0.0)
-    feasible = ~(violation > 0.0).any(axis=1)
-    reason = np.where(feasible, FEASIBLE, np.argmax(violation > 0.0, axis=1)).astype(np.int8)
+    allowed = violation.max(axis=1) <= 0.0
+    reason = np.where(allowed, FEASIBLE, np.argmax(violation > 0.0, axis=1)).astype(np.int8)
     share = np.minimum(violation, 1.0)
-    penalised = np.where(feasible[:, None], values, 1.0 + share.sum(axis=1)[:, None])
-    position = np.where(feasible, np.nan, x[:, 1])
-    return Evaluations(x, values, penalised, feasible, reason, position, violation, share)
+    penalised = np.where(allowed[:, None], values, 1.0 + share.sum(axis=1)[:, None])
+    position = np.where(allowed, np.nan, x[:, 1])
+    return Evaluations(x, values, penalised, allowed, reason, position, violation, share)
 
 
 class FakeEvaluator:
-    objective_names = OBJECTIVES
+    objective_names: tuple[str, ...] = OBJECTIVES
     n_var = 4
     lower = np.zeros(4)
     upper = np.ones(4)

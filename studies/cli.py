@@ -1,0 +1,162 @@
+"""The options that all campaign programs share."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn, get_args
+
+from hybrid_opt import algorithms
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
+from hybrid_opt.campaign.settings import ExecutorName
+from hybrid_opt.objectives import OBJECTIVES
+from hybrid_opt.problem import ConstraintHandling
+from symbolic.errors import SettingsError
+
+_DEFAULT = CampaignSettings()
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that says in one line what is wrong with a command."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the message and end the program with code 2."""
+        self.exit(2, f"{self.prog}: {message}; see --help\n")
+
+
+def campaign_parser(program: str, description: str) -> Parser:
+    """A parser with the options of a campaign."""
+    parser = Parser(prog=program, description=description, allow_abbrev=False)
+    search = parser.add_argument_group("search (decides the results)")
+    search.add_argument(
+        "--evaluations",
+        type=int,
+        metavar="N",
+        default=_DEFAULT.evaluations,
+        help="candidates that each replica may evaluate (default: %(default)s)",
+    )
+    search.add_argument(
+        "--replicas",
+        type=int,
+        metavar="N",
+        default=_DEFAULT.replicas,
+        help="independent runs per algorithm (default: %(default)s)",
+    )
+    search.add_argument(
+        "--algorithm",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help=f"which of {', '.join(algorithms.names())} (default: {' '.join(_DEFAULT.algorithms)})",
+    )
+    search.add_argument(
+        "--population",
+        nargs="+",
+        action="extend",
+        type=_population,
+        metavar="NAME=N",
+        help="candidates per generation of an algorithm (default: each algorithm's own)",
+    )
+    search.add_argument(
+        "--objective",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help=f"what to minimise, of {', '.join(OBJECTIVES)} "
+        f"(default: {' '.join(_DEFAULT.objectives)})",
+    )
+    search.add_argument(
+        "--constraint-handling",
+        choices=get_args(ConstraintHandling),
+        default=_DEFAULT.constraint_handling,
+        help="how the search learns of infeasibility: by the paper's penalised objectives, or by "
+        "constraint domination (default: %(default)s)",
+    )
+    search.add_argument(
+        "--seed",
+        type=int,
+        metavar="N",
+        default=_DEFAULT.seed,
+        help="the same seed gives the same results to the bit (default: %(default)s)",
+    )
+    work = parser.add_argument_group("work (does not change the results)")
+    work.add_argument(
+        "--output", type=Path, metavar="DIR", help="results folder (default: %(default)s)"
+    )
+    work.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue what the results folder holds (default: refuse to touch it)",
+    )
+    work.add_argument(
+        "--jobs",
+        type=int,
+        metavar="N",
+        default=0,
+        help="worker processes, 0 for one per core (default: %(default)s)",
+    )
+    work.add_argument(
+        "--executor",
+        choices=get_args(ExecutorName),
+        default="processes",
+        help="where replicas run: on this machine or on a Dask cluster (default: %(default)s)",
+    )
+    work.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of Dask, as tcp://HOST:8786 (default: none)"
+    )
+    work.add_argument(
+        "--quiet", action="store_true", help="no progress on standard error (default: shown)"
+    )
+    return parser
+
+
+def campaign_settings(options: argparse.Namespace) -> CampaignSettings:
+    """The settings that the options give.
+
+    Raises:
+        SettingsError: a value is not allowed.
+    """
+    return CampaignSettings(
+        algorithms=_once(options.algorithm, _DEFAULT.algorithms),
+        evaluations=options.evaluations,
+        replicas=options.replicas,
+        seed=options.seed,
+        objectives=_once(options.objective, _DEFAULT.objectives),
+        constraint_handling=options.constraint_handling,
+        populations=tuple(options.population or ()),
+    )
+
+
+def execution_settings(options: argparse.Namespace, output: Path) -> ExecutionSettings:
+    """How the options want the work done.
+
+    Args:
+        options: as parsed.
+        output: the results folder where the options name none.
+
+    Raises:
+        SettingsError: a value is not allowed.
+    """
+    return ExecutionSettings(
+        output=options.output or output,
+        jobs=options.jobs,
+        executor=options.executor,
+        scheduler=options.scheduler,
+        resume=options.resume,
+    )
+
+
+def _once(given: Sequence[str] | None, default: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(given) if given else default
+
+
+def _population(text: str) -> tuple[str, int]:
+    name, separator, size = text.partition("=")
+    if not separator or not size.isdecimal():
+        raise argparse.ArgumentTypeError(f"found {text!r}; allowed is NAME=N, as nsga2=40")
+    if name not in algorithms.names():
+        raise SettingsError(
+            f"unknown algorithm '{name}'; known are {', '.join(algorithms.names())}"
+        )
+    return name, int(size)

@@ -1,0 +1,94 @@
+"""Run a whole study of a workcell: search, then everything that is made from its results."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from hybrid_opt.campaign import (
+    CampaignSettings,
+    ExecutionSettings,
+    Progress,
+    Stage,
+    open_folder,
+    run_stages,
+    search_stage,
+)
+from hybrid_opt.results import read_summary
+from studies.cli import campaign_parser, campaign_settings, execution_settings
+from studies.summary import summary_stage
+from studies.terminal_summary import terminal_summary
+from symbolic.errors import DualArmError
+from symbolic.workcell_file import load
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells use it."""
+
+
+def stages() -> tuple[Stage, ...]:
+    """The stages of a study, in order."""
+    return (search_stage(), summary_stage())
+
+
+def run_study(
+    workcell: Path,
+    settings: CampaignSettings,
+    execution: ExecutionSettings,
+    progress: Progress,
+    with_paper: bool = False,
+) -> str:
+    """Carry out all stages that are not done, and return the figures as text.
+
+    Args:
+        workcell: the workcell file.
+        settings: what to compute.
+        execution: how.
+        progress: where to show it.
+        with_paper: whether the figures stand beside those that the paper states.
+
+    Raises:
+        DualArmError: the workcell, a setting or the results folder is wrong, or work failed.
+    """
+    with open_folder(settings, execution, load(workcell)) as folder:
+        run_stages(folder, stages(), progress)
+        return terminal_summary(read_summary(folder.root), with_paper)
+
+
+def main(
+    arguments: Sequence[str] | None = None,
+    workcell: Path | None = None,
+    program: str = "python -m studies.run",
+) -> int:
+    """Run the program; returns the exit code.
+
+    Args:
+        arguments: the command line, None for the process's own.
+        workcell: the cell of a program that has one; None to take it from the command line.
+        program: its name in messages.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    parser = campaign_parser(program, "Search for the least-force carries of a dual-arm workcell.")
+    if workcell is None:
+        parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
+    try:
+        options = parser.parse_args(arguments)
+        cell: Path = options.workcell if workcell is None else workcell
+        settings = campaign_settings(options)
+        execution = execution_settings(options, Path("results") / cell.stem)
+        print(run_study(cell, settings, execution, Progress(not options.quiet), bool(workcell)))
+        print(f"\nResults: {execution.output}")
+    except KeyboardInterrupt:
+        again = [part for part in arguments if part != "--resume"]
+        command = " ".join([program, shlex.join([*again, "--resume"])])
+        print(f"\ninterrupted, nothing is lost; continue with: {command}", file=sys.stderr)
+        return INTERRUPTED
+    except DualArmError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

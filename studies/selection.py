@@ -1,0 +1,78 @@
+"""The balanced solution of a front: the least mean of both robots' peak normal forces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybrid_opt.evaluation import CandidateEvaluator
+from hybrid_opt.metrics import excess_above_static
+from hybrid_opt.results import Replica
+from hybrid_opt.static_hold import StaticHold
+from hybrid_opt.trajectory_figures import trajectory_figures
+from symbolic.workcell import Array
+
+_CHUNK = 256
+"""Candidates evaluated at once; every sample of each is held in memory."""
+
+
+@dataclass(frozen=True)
+class Selected:
+    """A front's balanced solution.
+
+    Attributes:
+        row: its row among the replica's evaluations.
+        x: (n_var,) decision vector.
+        objectives: (n_obj,).
+        peak_normal_force, minimum_normal_force: (2,) of each robot along the carry [N].
+        excess_above_static: (2,) of the peaks above the static hold [%].
+        mean_excess_above_static: of the mean of both peaks above that of the static hold [%].
+        figures: those that are stored with its trajectory.
+    """
+
+    row: int
+    x: Array
+    objectives: Array
+    peak_normal_force: Array
+    minimum_normal_force: Array
+    excess_above_static: Array
+    mean_excess_above_static: float
+    figures: Mapping[str, float]
+
+
+def balanced(peak_normal_force: Array) -> int:
+    """Index of the least mean of both robots' peak forces (k, 2), the first of equals."""
+    return int(np.argmin(peak_normal_force.mean(axis=1)))
+
+
+def select(evaluator: CandidateEvaluator, replica: Replica, static: StaticHold) -> Selected | None:
+    """The balanced solution of a replica's front, None where the front is empty."""
+    if len(replica.front_rows) == 0:
+        return None
+    chosen = balanced(peak_normal_forces(evaluator, replica.front_x))
+    row = int(replica.front_rows[chosen])
+    x = replica.evaluations.x[row]
+    normal = evaluator.outputs(x[None])["normal_force"][0]
+    peak = normal.max(axis=0)
+    return Selected(
+        row,
+        x,
+        replica.evaluations.objectives[row],
+        peak,
+        normal.min(axis=0),
+        excess_above_static(peak, static.normal_force),
+        float(excess_above_static(peak.mean(), static.normal_force.mean())),
+        trajectory_figures(evaluator, x),
+    )
+
+
+def peak_normal_forces(evaluator: CandidateEvaluator, x: Array) -> Array:
+    """(n, 2) peak normal force of each robot [N] for decision vectors (n, n_var)."""
+    return np.concatenate(
+        [
+            evaluator.outputs(x[begin : begin + _CHUNK])["normal_force"].max(axis=1)
+            for begin in range(0, len(x), _CHUNK)
+        ]
+    )

@@ -1,0 +1,248 @@
+"""The figures of a campaign: summary.json, fronts, and the selected trajectories."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt import metrics
+from hybrid_opt.attainment import attainment_surfaces
+from hybrid_opt.campaign import CampaignFolder, Progress, Stage
+from hybrid_opt.campaign.files import storing, write_atomically, write_json
+from hybrid_opt.campaign.layout import (
+    FRONTS,
+    SUMMARY,
+    reference_front_file,
+    selected_file,
+)
+from hybrid_opt.evaluation import REASONS, CandidateEvaluator
+from hybrid_opt.results import CampaignResults, Replica, read_campaign
+from hybrid_opt.static_hold import StaticHold, static_hold
+from hybrid_opt.statistics import corrected, rank_test, summarise
+from hybrid_opt.trajectory_file import write_trajectory
+from studies.selection import Selected, select
+from symbolic.workcell import Array
+
+FIGURES = (
+    "feasible",
+    "feasible_share",
+    "non_dominated",
+    "hypervolume",
+    "igd",
+    "igd_plus",
+    "spacing",
+    "seconds",
+    "mean_excess_above_static",
+    "payload_limit",
+)
+"""Figures of a replica that are summarised over the replicas."""
+
+TESTED = tuple(name for name in FIGURES if name not in ("feasible", "seconds"))
+"""Figures that the algorithms are compared by; the count says the same as its share."""
+
+PERCENTILES = (25.0, 50.0, 75.0, 100.0)
+
+
+def summary_stage() -> Stage:
+    """The stage that computes the figures of a finished search."""
+    return Stage("summary", _run)
+
+
+def reference_front(replicas: Sequence[Replica]) -> Array:
+    """(k, n_obj) non-dominated union of all fronts, the campaign's reference for IGD."""
+    return metrics.front_of(np.concatenate([replica.front for replica in replicas]))
+
+
+def replica_figures(
+    replica: Replica, reference: Array, selected: Selected | None, file: str | None
+) -> dict[str, Any]:
+    """One replica's entry in the summary; figures that do not exist are NaN or infinite."""
+    found = replica.evaluations
+    front, feasible = replica.front, found.feasible
+    corner = reference_point(found.objectives.shape[1])
+    reasons = {
+        name: int(np.count_nonzero(found.reason == index)) for index, name in enumerate(REASONS)
+    }
+    return {
+        "replica": replica.replica,
+        "evaluations": len(found),
+        "feasible": metrics.feasible_count(feasible),
+        "feasible_share": metrics.feasible_share(feasible),
+        "non_dominated": len(front),
+        "hypervolume": metrics.hypervolume(front, corner),
+        "igd": metrics.igd(front, reference),
+        "igd_plus": metrics.igd_plus(front, reference),
+        "spacing": metrics.spacing(front),
+        "seconds": replica.seconds,
+        "mean_excess_above_static": selected.mean_excess_above_static if selected else math.nan,
+        "payload_limit": selected.figures["payload_limit"] if selected else math.nan,
+        "infeasible_by_reason": {name: count for name, count in reasons.items() if count},
+        "best_so_far": best_steps(metrics.best_so_far(found.objectives, feasible)),
+        "selected": _selected_entry(selected, file),
+    }
+
+
+def reference_point(n_obj: int) -> tuple[float, ...]:
+    """The paper's reference point of the hypervolume, for any number of objectives."""
+    return (metrics.REFERENCE_POINT[0],) * n_obj
+
+
+def best_steps(history: Array) -> list[list[float]]:
+    """The evaluations at which the best of an objective changed: [evaluation, best, ...]."""
+    known = history[~np.isnan(history).any(axis=1)]
+    first = len(history) - len(known)
+    changes = np.flatnonzero((np.diff(known, axis=0) != 0.0).any(axis=1)) + 1
+    return [[first + row + 1, *known[row].tolist()] for row in [0, *changes.tolist()] if len(known)]
+
+
+def _selected_entry(selected: Selected | None, file: str | None) -> dict[str, Any] | None:
+    if selected is None:
+        return None
+    return {
+        "evaluation": selected.row + 1,
+        "file": file,
+        "objectives": selected.objectives.tolist(),
+        "peak_normal_force": selected.peak_normal_force.tolist(),
+        "minimum_normal_force": selected.minimum_normal_force.tolist(),
+        "excess_above_static": selected.excess_above_static.tolist(),
+        "payload_limit": selected.figures["payload_limit"],
+        "duration": selected.figures["duration"],
+    }
+
+
+def campaign_summary(
+    results: CampaignResults,
+    reference: Array,
+    static: StaticHold,
+    entries: Mapping[str, Sequence[Mapping[str, Any]]],
+) -> dict[str, Any]:
+    """The whole summary as JSON values; figures that are not finite become null.
+
+    Args:
+        results: the campaign.
+        reference: its reference front.
+        static: forces of the payload held still.
+        entries: per algorithm those of `replica_figures`.
+    """
+    document = {
+        "workcell": results.configuration["workcell"],
+        "settings": results.configuration["settings"],
+        "environment": results.configuration["environment"],
+        "objectives": list(results.objectives),
+        "reference_force": results.workcell.task.reference_force.tolist(),
+        "static_hold": {
+            "normal_force": static.normal_force.tolist(),
+            "contact_force": static.contact_force.tolist(),
+            "payload_limit": static.payload_limit,
+        },
+        "reference_front": {
+            "file": reference_front_file(results.root).relative_to(results.root).as_posix(),
+            "points": len(reference),
+            "hypervolume": metrics.hypervolume(reference, reference_point(len(results.objectives))),
+        },
+        "algorithms": {
+            name: {
+                "representative": _representative(rows),
+                "statistics": {
+                    figure: asdict(summarise([row[figure] for row in rows])) for figure in FIGURES
+                },
+                "replicas": list(rows),
+            }
+            for name, rows in entries.items()
+        },
+        "tests": _tests(entries),
+    }
+    cleaned: dict[str, Any] = _without_nan(document)
+    return cleaned
+
+
+def _representative(rows: Sequence[Mapping[str, Any]]) -> int | None:
+    """The replica with the largest hypervolume, the paper's 'best-performing run'."""
+    best = max(rows, key=lambda row: row["hypervolume"])
+    return int(best["replica"]) if best["selected"] else None
+
+
+def _tests(entries: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Rank tests of every pair of algorithms in every figure, Holm-corrected as one family."""
+    pairs = [(figure, *pair) for pair in itertools.combinations(entries, 2) for figure in TESTED]
+    tests = [
+        rank_test(
+            [row[figure] for row in entries[first]],
+            [row[figure] for row in entries[second]],
+            (first, second),
+        )
+        for figure, first, second in pairs
+    ]
+    return [
+        {"figure": figure, **asdict(test)}
+        for (figure, _, _), test in zip(pairs, corrected(tests), strict=True)
+    ]
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _run(folder: CampaignFolder, progress: Progress) -> None:
+    results = read_campaign(folder.root)
+    evaluator = CandidateEvaluator(folder.workcell, folder.settings.objectives)
+    static = static_hold(folder.workcell)
+    reference = reference_front(results.replicas)
+    entries: dict[str, list[dict[str, Any]]] = {name: [] for name in results.algorithms}
+    with progress.stage("summary", len(results.replicas), "replicas") as advance:
+        for replica in results.replicas:
+            selected = select(evaluator, replica, static)
+            file = None if selected is None else _store_selected(folder, replica, selected)
+            entry = replica_figures(replica, reference, selected, file)
+            entries[replica.algorithm].append(entry)
+            advance(1)
+    _write_points(folder, "reference", results.objectives, reference)
+    for name in results.algorithms:
+        union = reference_front(results.of(name))
+        _write_points(folder, name, results.objectives, union)
+        if len(results.objectives) in (2, 3):
+            _write_attainment(folder, name, results)
+    write_json(folder.root / SUMMARY, campaign_summary(results, reference, static, entries))
+
+
+def _store_selected(folder: CampaignFolder, replica: Replica, selected: Selected) -> str:
+    path = selected_file(folder.root, replica.algorithm, replica.replica)
+    with storing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    provenance = {
+        "algorithm": replica.algorithm,
+        "replica": replica.replica,
+        "evaluation": selected.row + 1,
+        "settings": folder.settings.effective(),
+    }
+    write_trajectory(path, folder.workcell, selected.x, selected.figures, provenance)
+    return path.relative_to(folder.root).as_posix()
+
+
+def _write_points(
+    folder: CampaignFolder, name: str, objectives: Sequence[str], points: Array
+) -> None:
+    lines = [",".join(objectives), *(",".join(map(repr, row)) for row in points.tolist())]
+    path = reference_front_file(folder.root).with_name(f"{name}.csv")
+    write_atomically(path, ("\n".join(lines) + "\n").encode())
+
+
+def _write_attainment(folder: CampaignFolder, name: str, results: CampaignResults) -> None:
+    surfaces = attainment_surfaces([replica.front for replica in results.of(name)], PERCENTILES)
+    lines = [",".join(["percentile", *results.objectives])]
+    lines += [
+        ",".join([f"{surface.percentile:g}", *map(repr, row)])
+        for surface in surfaces
+        for row in surface.points.tolist()
+    ]
+    path = folder.root / FRONTS / f"{name}-attainment.csv"
+    write_atomically(path, ("\n".join(lines) + "\n").encode())

@@ -1,0 +1,205 @@
+"""A campaign's figures as text: the paper's Tables 1 and 2, and beside them what it states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+TITLES = {
+    "nsga2": "NSGA-II",
+    "mopso": "MOPSO",
+    "mopso-turbulent": "MOPSO, turbulent",
+    "sms-emoa": "SMS-EMOA",
+    "random": "random search",
+}
+"""How the algorithms are called in print."""
+
+
+@dataclass(frozen=True)
+class PaperFigures:
+    """What the paper's text states of an algorithm on its rack; its tables are not reproduced.
+
+    Attributes:
+        feasible: feasible candidates of 1000 (Section 7).
+        payload_limit: payload at which the selected trajectory reaches 12 kgf [kg] (Section 6.3).
+    """
+
+    feasible: int
+    payload_limit: float
+
+
+PAPER = {"nsga2": PaperFigures(694, 16.71), "mopso": PaperFigures(296, 16.06)}
+
+_TABLE_1 = (
+    ("feasible", "feasible", 0),
+    ("feasible_share", "feasible %", 1),
+    ("non_dominated", "front", 1),
+    ("hypervolume", "hypervolume", 4),
+    ("igd", "IGD", 5),
+    ("spacing", "spacing", 5),
+)
+_SELECTED = (
+    ("mean_excess_above_static", "above static %", 2),
+    ("payload_limit", "payload kg", 3),
+    ("seconds", "seconds", 2),
+)
+
+
+def title(algorithm: str) -> str:
+    """An algorithm's name in print."""
+    return TITLES.get(algorithm, algorithm)
+
+
+def terminal_summary(summary: Mapping[str, Any], with_paper: bool) -> str:
+    """The figures of a summary.json as text.
+
+    Args:
+        summary: as from `hybrid_opt.results.read_summary`.
+        with_paper: whether to print what the paper states, which is of its rack cell.
+    """
+    settings = summary["settings"]
+    parts = [
+        f"{summary['workcell']['name']}: {settings['replicas']} replicas of "
+        f"{settings['evaluations']} evaluations, seed {settings['seed']}",
+        _table_1(summary["algorithms"]),
+        _reasons(summary["algorithms"]),
+        _table_2(summary),
+        _over_replicas(summary["algorithms"]),
+        _tests(summary["tests"]),
+    ]
+    if with_paper:
+        parts.append(_paper(summary["algorithms"]))
+    return "\n\n".join(part for part in parts if part)
+
+
+def _table_1(algorithms: Mapping[str, Any]) -> str:
+    rows = [["mean +- std over replicas", *(heading for _, heading, _ in _TABLE_1)]]
+    for name, entry in algorithms.items():
+        cells = []
+        for figure, _, digits in _TABLE_1:
+            scale = 100.0 if figure == "feasible_share" else 1.0
+            statistics = entry["statistics"][figure]
+            mean, std = (_number(statistics[key], digits, scale) for key in ("mean", "std"))
+            cells.append(f"{mean} +- {std}")
+        rows.append([title(name), *cells])
+    note = (
+        "Fronts of all evaluated candidates. Hypervolume: reference 1.1 in every objective. IGD: "
+        "to the\nnon-dominated union of the campaign. Spacing: Schott's."
+    )
+    return f"Table 1. Quality of the search\n{_grid(rows)}\n{note}"
+
+
+def _reasons(algorithms: Mapping[str, Any]) -> str:
+    lines = ["What made candidates infeasible, in percent of all"]
+    for name, entry in algorithms.items():
+        total = sum(row["evaluations"] for row in entry["replicas"])
+        counts: dict[str, int] = {}
+        for row in entry["replicas"]:
+            for reason, count in row["infeasible_by_reason"].items():
+                counts[reason] = counts.get(reason, 0) + count
+        ranked = sorted(counts.items(), key=lambda item: -item[1])
+        shares = [f"{reason} {100.0 * count / total:.1f}" for reason, count in ranked]
+        lines.append(f"  {title(name)}: {', '.join(shares) or 'nothing'}")
+    return "\n".join(lines)
+
+
+def _table_2(summary: Mapping[str, Any]) -> str:
+    heading = ["N", "least 1", "least 2", "peak 1", "peak 2", "above static %", "payload kg"]
+    rows = [heading]
+    static = summary["static_hold"]
+    still = [_number(force, 2) for force in static["normal_force"]]
+    for name, entry in summary["algorithms"].items():
+        if entry["representative"] is None:
+            rows.append([f"{title(name)}: no feasible candidate", *[""] * (len(heading) - 1)])
+            continue
+        row = entry["replicas"][entry["representative"]]
+        selected = row["selected"]
+        forces = [*selected["minimum_normal_force"], *selected["peak_normal_force"]]
+        rows.append(
+            [
+                f"{title(name)}, replica {entry['representative']}",
+                *(_number(force, 2) for force in forces),
+                _number(row["mean_excess_above_static"], 2),
+                _number(selected["payload_limit"], 2),
+            ]
+        )
+    rows.append(["held still", *still, *still, "0.00", _number(static["payload_limit"], 2)])
+    return (
+        "Table 2. Normal forces of robots 1 and 2 along the selected trajectories (least mean "
+        f"peak\nforce of the replica with the largest hypervolume)\n{_grid(rows)}"
+    )
+
+
+def _over_replicas(algorithms: Mapping[str, Any]) -> str:
+    rows = [["median [quartiles]", *(heading for _, heading, _ in _SELECTED)]]
+    for name, entry in algorithms.items():
+        cells = []
+        for figure, _, digits in _SELECTED:
+            keys = ("median", "quartile1", "quartile3")
+            values = [_number(entry["statistics"][figure][key], digits) for key in keys]
+            cells.append("{} [{}, {}]".format(*values))
+        rows.append([title(name), *cells])
+    return f"Selected solutions of all replicas, and what a replica took\n{_grid(rows)}"
+
+
+def _tests(tests: Sequence[Mapping[str, Any]]) -> str:
+    if not tests:
+        return ""
+    rows = [["exact Mann-Whitney", "figure", "A12", "effect", "p", "p (Holm)"]]
+    rows += [
+        [
+            f"{title(test['first'])} / {title(test['second'])}",
+            test["figure"],
+            _number(test["a12"], 2),
+            test["magnitude"],
+            _number(test["p"], 5),
+            _number(test["p_holm"], 5),
+        ]
+        for test in tests
+    ]
+    return (
+        "Comparison over replicas. A12: chance that the first algorithm has the larger figure\n"
+        + _grid(rows)
+    )
+
+
+def _paper(algorithms: Mapping[str, Any]) -> str:
+    rows = [["median of ours / stated by the paper", "feasible %", "payload kg"]]
+    for name, stated in PAPER.items():
+        if name in algorithms:
+            statistics = algorithms[name]["statistics"]
+            share = _number(statistics["feasible_share"]["median"], 1, 100.0)
+            payload = _number(statistics["payload_limit"]["median"], 2)
+            rows.append(
+                [
+                    title(name),
+                    f"{share} / {stated.feasible / 10.0:.1f}",
+                    f"{payload} / {stated.payload_limit:.2f}",
+                ]
+            )
+    if len(rows) == 1:
+        return ""
+    return (
+        "Beside the paper, whose rack has the same boards and robots, but unstated details\n"
+        + _grid(rows)
+    )
+
+
+def _number(value: float | None, digits: int, scale: float = 1.0) -> str:
+    """A figure in print; '-' where there is none."""
+    return "-" if value is None or not math.isfinite(value) else f"{value * scale:.{digits}f}"
+
+
+def _grid(rows: Sequence[Sequence[str]]) -> str:
+    """Rows in columns, the first flush left, the others flush right, a line below the head."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = [
+        "  ".join(
+            cell.ljust(width) if k == 0 else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
