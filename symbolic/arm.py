@@ -14,7 +14,7 @@ from symbolic.robot_model import RobotModel
 from symbolic.rotation import rotation_matrix
 from symbolic.workcell import Array, Contact, Robot
 
-NEWTON_STEPS = 2
+NEWTON_STEPS = 3
 """Newton steps per sample; extrapolation brings the start within their basin."""
 
 REACH_TOLERANCE = 1e-6
