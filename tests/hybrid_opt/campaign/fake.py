@@ -54,6 +54,7 @@ class FakeEvaluator:
 
     def __init__(self, source: FakeSource) -> None:
         self._source = source
+        self._count = 0
 
     def evaluate(self, x: Array) -> Evaluations:
         time.sleep(self._source.delay)
@@ -61,26 +62,34 @@ class FakeEvaluator:
             # One write per call, so that several processes can share the file.
             with open(self._source.log, "ab", buffering=0) as log:
                 log.write(x.tobytes())
-        if self._source.dies_once and not Path(self._source.dies_once).exists():
-            Path(self._source.dies_once).touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        if self._source.always_dies:
+        self._count += len(x)
+        if self._count > self._source.dies_at and self._source.must_die():
             os.kill(os.getpid(), signal.SIGKILL)
         return verdicts(x)
 
 
 @dataclass(frozen=True)
 class FakeSource:
-    """delay: seconds per call. log: file that every evaluated x is appended to. dies_once: the
-    worker kills itself unless this file exists."""
+    """Makes fake evaluators.
+
+    delay: seconds per call. log: file that every evaluated x is appended to. An evaluator kills
+    its process after dies_at evaluations, if it always_dies or if the file dies_once is missing.
+    """
 
     delay: float = 0.0
     log: str = ""
+    dies_at: int = 0
     dies_once: str = ""
     always_dies: bool = False
 
     def __call__(self) -> FakeEvaluator:
         return FakeEvaluator(self)
+
+    def must_die(self) -> bool:
+        if self.dies_once and not Path(self.dies_once).exists():
+            Path(self.dies_once).touch()
+            return True
+        return self.always_dies
 
 
 def logged(path: Path) -> Array:
