@@ -23,6 +23,7 @@ class CellCollector:
         self._files: dict[str, bytes] = {}
         self._folders: list[str] = []
         self._moved = 0
+        self._places: dict[str, str] = {}
 
     def collect(self, workcell: Workcell) -> None:
         """Add every file that the workcell names."""
@@ -61,7 +62,9 @@ class CellCollector:
         """The place of a reference of the workcell file, relative to that file."""
         if not posixpath.isabs(reference):
             return posixpath.normpath(reference)
-        moved = self._new_place(reference)
+        if reference in self._places:  # both robots may name one file
+            return self._places[reference]
+        moved = self._places[reference] = self._new_place(reference)
         self._text = _replaced(self._text, reference, moved, self._source.name)
         return moved
 
