@@ -77,8 +77,8 @@ def _run(options: argparse.Namespace) -> int:
         replayed = replay(stored, Path(folder))
         document: dict[str, Any] = _replay_json(stored, replayed)
         text = [_replay_text(stored, replayed)]
-        wants_timing = options.timing or options.force_limit or options.force_curve
-        if wants_timing or options.export:
+        asked = (options.force_limit, options.force_curve, options.export)
+        if options.timing or any(option is not None for option in asked):
             document["timing"], timing = _time(stored, replayed, options)
             text += ["", timing]
     if options.json:
