@@ -2,7 +2,7 @@
 
 A stage reads what earlier stages left in the results folder and writes files of its own. Its
 marker, `stages/NAME.json`, is written when it begins and again when it is done. If a marker is
-missing or says 'running', the stage runs (again), so a stage that takes long keeps what it
+missing or does not say 'done', the stage runs (again), so a stage that takes long keeps what it
 achieved in files of its own and continues from them. When a stage runs, all later ones do too.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from hybrid_opt.campaign.files import read_json, write_json
@@ -42,29 +43,51 @@ def run_stages(folder: CampaignFolder, stages: Sequence[Stage], progress: Progre
         ResultsError: a stage began with other settings.
         DualArmError: what a stage raises.
     """
-    stale = False
     for stage in stages:
-        path = folder.root / STAGES / f"{stage.name}.json"
-        marker = read_json(path) if path.exists() else {}
-        if not isinstance(marker, dict):
-            raise ResultsError(f"{path}: damaged; delete it to run the stage again")
-        settings = dict(stage.settings)
-        if marker and marker.get("settings") != settings:
-            raise ResultsError(
-                f"{folder.root}: the stage '{stage.name}' was run with {marker.get('settings')}, "
-                f"now asked for is {settings}; choose another --output"
-            )
-        if marker.get("status") == "done" and not stale:
+        _check_settings(folder, stage)
+    for number, stage in enumerate(stages):
+        marker = _marker(folder, stage)
+        if marker.get("status") == "done":
             continue
-        stale = True
-        spent = float(marker.get("seconds", 0.0)) if marker.get("status") == "running" else 0.0
-        write_json(path, {"status": "running", "settings": settings, "seconds": spent})
+        # First of all, so that no moment exists at which they look done and are out of date.
+        for later in stages[number + 1 :]:
+            if _marker(folder, later).get("status") == "done":
+                _mark(folder, later, "outdated", 0.0)
+        spent = float(marker["seconds"]) if marker.get("status") == "running" else 0.0
+        _mark(folder, stage, "running", spent)
         begin = time.perf_counter()
         try:
             stage.run(folder, progress)
         except BaseException:
-            spent += time.perf_counter() - begin
-            write_json(path, {"status": "running", "settings": settings, "seconds": spent})
+            _mark(folder, stage, "running", spent + time.perf_counter() - begin)
             raise
-        spent += time.perf_counter() - begin
-        write_json(path, {"status": "done", "settings": settings, "seconds": spent})
+        _mark(folder, stage, "done", spent + time.perf_counter() - begin)
+
+
+def _path(folder: CampaignFolder, stage: Stage) -> Path:
+    return folder.root / STAGES / f"{stage.name}.json"
+
+
+def _marker(folder: CampaignFolder, stage: Stage) -> dict[str, Any]:
+    """What is remembered of a stage; empty where it never began."""
+    path = _path(folder, stage)
+    if not path.exists():
+        return {}
+    marker = read_json(path)
+    if not isinstance(marker, dict) or not {"status", "settings", "seconds"} <= marker.keys():
+        raise ResultsError(f"{path}: damaged; delete it to run the stage again")
+    return marker
+
+
+def _mark(folder: CampaignFolder, stage: Stage, status: str, seconds: float) -> None:
+    document = {"status": status, "settings": dict(stage.settings), "seconds": seconds}
+    write_json(_path(folder, stage), document)
+
+
+def _check_settings(folder: CampaignFolder, stage: Stage) -> None:
+    marker = _marker(folder, stage)
+    if marker and marker["settings"] != dict(stage.settings):
+        raise ResultsError(
+            f"{folder.root}: the stage '{stage.name}' was run with {marker['settings']}, now asked "
+            f"for is {dict(stage.settings)}; choose another --output"
+        )

@@ -1,0 +1,97 @@
+"""Files of candidates give back the same bits, and can be read without this project."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode, encode, encode_front
+from hybrid_opt.evaluation import REASONS, Evaluations
+from symbolic.errors import ResultsError
+from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
+
+PATH = Path("evaluations.csv.gz")
+
+
+def table(count: int = 30) -> EvaluationTable:
+    x = np.random.default_rng(3).random((count, 4))
+    x[::7, 0] = 0.31
+    return EvaluationTable(verdicts(x), np.arange(count, dtype=np.int64) // 8 + 1, OBJECTIVES)
+
+
+def test_table_survives_to_the_bit() -> None:
+    before = table()
+    after = decode(encode(before), PATH)
+    assert after.objective_names == OBJECTIVES
+    np.testing.assert_array_equal(after.generation, before.generation)
+    for field in fields(Evaluations):
+        old = getattr(before.evaluations, field.name)
+        new = getattr(after.evaluations, field.name)
+        assert (old.dtype, old.shape, old.tobytes()) == (new.dtype, new.shape, new.tobytes())
+
+
+@settings(max_examples=50)
+@given(hnp.arrays(np.float64, (2, 4), elements=st.floats(allow_nan=False)))
+def test_any_number_survives(x: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> None:
+    found = verdicts(np.full((2, 4), 0.5))
+    arrays = {f.name: getattr(found, f.name) for f in fields(Evaluations)} | {"x": x}
+    names = EvaluationTable(Evaluations(**arrays), np.ones(2, dtype=np.int64), OBJECTIVES)
+    assert decode(encode(names), PATH).evaluations.x.tobytes() == x.tobytes()
+
+
+def test_columns_mean_what_they_say() -> None:
+    before = table()
+    rows = list(csv.DictReader(io.StringIO(gzip.decompress(encode(before)).decode())))
+    found = before.evaluations
+    assert [int(row["evaluation"]) for row in rows] == list(range(1, 31))
+    for k, row in enumerate(rows):
+        assert row["feasible"] == str(int(found.feasible[k]))
+        assert row["reason"] == ("" if found.feasible[k] else REASONS[found.reason[k]])
+        assert float(row["x_4"]) == found.x[k, 3]
+        if not np.isnan(found.penalised[k, 1]):
+            assert float(row["penalised_peak_force_2"]) == found.penalised[k, 1]
+        collision = REASONS.index("collision")
+        assert float(row["violation_collision"]) == found.violation[k, collision]
+        assert float(row["violation_time_collision"]) == found.violation_time[k, collision]
+
+
+def test_same_table_same_bytes() -> None:
+    assert encode(table()) == encode(table())
+
+
+def test_front_names_its_evaluations() -> None:
+    before = table()
+    text = encode_front(before, np.array([4, 2])).decode()
+    rows = list(csv.DictReader(io.StringIO(text)))
+    assert [row["evaluation"] for row in rows] == ["5", "3"]
+    assert float(rows[0]["x_1"]) == before.evaluations.x[4, 0]
+    assert float(rows[1]["peak_force_2"]) == before.evaluations.objectives[2, 1]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda content: content[:-20],
+        lambda content: b"not gzip",
+        lambda content: gzip.compress(b""),
+        lambda content: gzip.compress(gzip.decompress(content).replace(b"x_1", b"y_1")),
+        lambda content: gzip.compress(
+            gzip.decompress(content).replace(b"collision,", b"luck,", 99)
+        ),
+        lambda content: gzip.compress(gzip.decompress(content).replace(b"\n3,", b"\n4,")),
+        lambda content: gzip.compress(gzip.decompress(content).replace(b"0.", b"zero", 40)),
+    ],
+)
+def test_damage_is_told(spoil: object) -> None:
+    assert callable(spoil)
+    with pytest.raises(ResultsError, match=r"evaluations.csv.gz: damaged"):
+        decode(spoil(encode(table())), PATH)

@@ -1,0 +1,73 @@
+"""Settings are checked where they are made, and replicas draw from streams of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
+from symbolic.errors import SettingsError
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"evaluations": 0}, "evaluations is 0; allowed are whole numbers 1 to"),
+        ({"evaluations": 10.0}, r"evaluations is 10\.0"),
+        ({"replicas": True}, "replicas is True"),
+        ({"seed": -1}, "seed is -1; allowed are whole numbers 0 to"),
+        ({"algorithms": ()}, "name at least one, each once"),
+        ({"algorithms": ("nsga2", "nsga2")}, "name at least one, each once"),
+        ({"algorithms": ("nsga3",)}, "unknown algorithm 'nsga3'; known are"),
+        ({"objectives": ("speed",)}, "unknown objective speed; known are"),
+        ({"constraint_handling": "hope"}, "'hope'; known are penalty, constraints"),
+        ({"populations": (("random", 10),)}, r"of the campaign \(nsga2, mopso\)"),
+        ({"populations": (("nsga2", 10), ("nsga2", 20))}, "at most once"),
+        ({"populations": (("nsga2", 1),)}, "population is 1; allowed is 4 to"),
+    ],
+)
+def test_wrong_settings_are_told(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        CampaignSettings(**change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"jobs": -1}, "jobs is -1"),
+        ({"executor": "slurm"}, "'slurm'; known are processes, dask"),
+        ({"executor": "dask"}, "needs a scheduler's address"),
+        ({"scheduler": "tcp://host:8786"}, "needs a scheduler's address"),
+    ],
+)
+def test_wrong_execution_is_told(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        ExecutionSettings(Path("results"), **change)
+
+
+def test_effective_settings_spell_out_the_algorithms() -> None:
+    settings = CampaignSettings(
+        algorithms=("mopso", "random"), populations=(("mopso", 30), ("random", 7))
+    )
+    effective = settings.effective()
+    assert effective["algorithms"]["mopso"]["swarm"] == 30
+    assert effective["algorithms"]["mopso"]["inertia"] == 0.4
+    assert effective["algorithms"]["random"] == {"batch": 7}
+
+
+def test_streams_differ_and_repeat() -> None:
+    settings = CampaignSettings()
+    streams = {
+        (seed, name, replica): tuple(
+            replace(settings, seed=seed).replica_rng(name, replica).integers(2**63, size=2)
+        )
+        for seed in (0, 1)
+        for name in ("nsga2", "mopso", "random")
+        for replica in range(20)
+    }
+    assert len(set(streams.values())) == len(streams)
+    other = CampaignSettings(algorithms=("mopso",), replicas=3, evaluations=5)
+    assert tuple(other.replica_rng("mopso", 2).integers(2**63, size=2)) == streams[1, "mopso", 2]
