@@ -25,8 +25,14 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}; see --help\n")
 
 
-def campaign_parser(program: str, description: str) -> Parser:
-    """A parser with the options of a campaign."""
+def campaign_parser(program: str, description: str, output: str) -> Parser:
+    """A parser with the options of a campaign.
+
+    Args:
+        program: how it is called.
+        description: what it does.
+        output: the results folder where none is given, for the help.
+    """
     parser = Parser(prog=program, description=description, allow_abbrev=False)
     search = parser.add_argument_group("search (decides the results)")
     search.add_argument(
@@ -82,7 +88,7 @@ def campaign_parser(program: str, description: str) -> Parser:
     )
     work = parser.add_argument_group("work (does not change the results)")
     work.add_argument(
-        "--output", type=Path, metavar="DIR", help="results folder (default: %(default)s)"
+        "--output", type=Path, metavar="DIR", help=f"results folder (default: {output})"
     )
     work.add_argument(
         "--resume",

@@ -69,7 +69,9 @@ def main(
         program: its name in messages.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    parser = campaign_parser(program, "Search for the least-force carries of a dual-arm workcell.")
+    description = "Search for the least-force carries of a dual-arm workcell."
+    output = f"results/{'WORKCELL' if workcell is None else workcell.stem}"
+    parser = campaign_parser(program, description, output)
     if workcell is None:
         parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
     try:

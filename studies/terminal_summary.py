@@ -36,7 +36,7 @@ _TABLE_1 = (
     ("feasible", "feasible", 0),
     ("feasible_share", "feasible %", 1),
     ("non_dominated", "front", 1),
-    ("hypervolume", "hypervolume", 4),
+    ("hypervolume", "HV", 4),
     ("igd", "IGD", 5),
     ("spacing", "spacing", 5),
 )
@@ -75,7 +75,7 @@ def terminal_summary(summary: Mapping[str, Any], with_paper: bool) -> str:
 
 
 def _table_1(algorithms: Mapping[str, Any]) -> str:
-    rows = [["mean +- std over replicas", *(heading for _, heading, _ in _TABLE_1)]]
+    rows = [["mean +- std", *(heading for _, heading, _ in _TABLE_1)]]
     for name, entry in algorithms.items():
         cells = []
         for figure, _, digits in _TABLE_1:
@@ -85,8 +85,8 @@ def _table_1(algorithms: Mapping[str, Any]) -> str:
             cells.append(f"{mean} +- {std}")
         rows.append([title(name), *cells])
     note = (
-        "Fronts of all evaluated candidates. Hypervolume: reference 1.1 in every objective. IGD: "
-        "to the\nnon-dominated union of the campaign. Spacing: Schott's."
+        "Over replicas; fronts of all evaluated candidates. HV: hypervolume to 1.1 in every objective."
+        "\nIGD: to the non-dominated union of the campaign. Spacing: Schott's."
     )
     return f"Table 1. Quality of the search\n{_grid(rows)}\n{note}"
 

@@ -157,7 +157,13 @@ class _Worker:
         self._process: SpawnProcess = spawn.Process(
             target=_serve, args=(theirs, job), name="campaign worker", daemon=True
         )
-        self._process.start()
+        # Ctrl-C reaches the whole group, but the parent alone decides what it means. The mask is
+        # inherited, so that it holds from the worker's first moment.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
 
     def give(self, index: int, task: object) -> None:
@@ -174,8 +180,6 @@ class _Worker:
 
 def _serve(connection: Connection, job: Job[Any, Any, Any]) -> None:
     """A worker's life: ends with its pipe, that is at the latest with the parent."""
-    # Ctrl-C reaches the whole group; the parent decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     context: Any = None
     made = False
     with suppress(EOFError, OSError):

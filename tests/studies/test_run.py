@@ -1,0 +1,179 @@
+"""The programs that people start: whole studies, their messages and exit codes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_opt import metrics
+from hybrid_opt.results import read_campaign, read_summary
+from hybrid_opt.trajectory_file import read_trajectory
+from studies import rack, run
+from studies.cli import campaign_parser, campaign_settings
+from tests.hybrid_opt.campaign.fake import RACK, ROOT
+
+CELL = str(RACK.with_name("transfer.toml"))
+SMALL = ["--evaluations", "120", "--replicas", "2", "--jobs", "1"]
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A small study by the program itself: its results folder and what it printed."""
+    root = tmp_path_factory.mktemp("study") / "a"
+    command = [sys.executable, "-m", "studies.run", CELL, "--output", str(root), *SMALL]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "240 of 480" in done.stderr or "480 of 480" in done.stderr
+    assert "left]" in done.stderr
+    return root, done.stdout
+
+
+def test_study_leaves_everything_behind(study: tuple[Path, str]) -> None:
+    root, printed = study
+    summary = read_summary(root)
+    results = read_campaign(root)
+    assert [found.algorithm for found in results.replicas] == ["nsga2"] * 2 + ["mopso"] * 2
+    for replica in results.replicas:
+        entry = summary["algorithms"][replica.algorithm]["replicas"][replica.replica]
+        found = replica.evaluations
+        assert len(found) == entry["evaluations"] == 120
+        assert entry["feasible"] == int(found.feasible.sum()) > 0
+        assert entry["feasible"] + sum(entry["infeasible_by_reason"].values()) == 120
+        # Dominance by its definition, point by point.
+        alive = found.objectives[found.feasible]
+        best = [p for p in alive if not any((q <= p).all() and (q < p).any() for q in alive)]
+        assert entry["non_dominated"] == len(np.unique(best, axis=0)) == len(replica.front)
+        assert entry["hypervolume"] == metrics.hypervolume(replica.front)
+        stored = read_trajectory(root / entry["selected"]["file"])
+        np.testing.assert_array_equal(stored.x, found.x[entry["selected"]["evaluation"] - 1])
+        assert stored.figures["payload_limit"] == entry["payload_limit"]
+        assert entry["payload_limit"] < summary["static_hold"]["payload_limit"]
+        rows = list(csv.reader((root / f"fronts/{replica.algorithm}.csv").open()))
+        assert rows[0] == ["peak_force_1", "peak_force_2"]
+    assert "Table 1" in printed
+    assert "Table 2" in printed
+    assert str(root) in printed
+    assert "paper" not in printed.lower()
+
+
+def test_reference_front_file_is_the_union(study: tuple[Path, str]) -> None:
+    root, _ = study
+    rows = np.loadtxt(root / "fronts/reference.csv", delimiter=",", skiprows=1, ndmin=2)
+    union = np.concatenate([replica.front for replica in read_campaign(root).replicas])
+    np.testing.assert_array_equal(rows, metrics.front_of(union))
+    levels = np.loadtxt(root / "fronts/mopso-attainment.csv", delimiter=",", skiprows=1, ndmin=2)
+    assert set(levels[:, 0]) == {25.0, 50.0, 75.0, 100.0}
+
+
+def test_a_stored_study_can_be_repeated_from_its_own_workcell(
+    study: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, _ = study
+    configuration = json.loads((root / "configuration.json").read_text())
+    cell = str(root / configuration["workcell"]["file"])
+    arguments = [cell, "--output", str(tmp_path / "b"), *SMALL, "--quiet"]
+    assert run.main(arguments) == 0
+    assert capsys.readouterr().err == ""
+    for name in ("mopso", "nsga2"):
+        file = f"replicas/{name}/01/evaluations.csv.gz"
+        assert (tmp_path / "b" / file).read_bytes() == (root / file).read_bytes()
+
+
+def test_resuming_a_finished_study_only_tells(
+    study: tuple[Path, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, printed = study
+    before = {path: path.stat().st_mtime_ns for path in root.rglob("*.*") if path.name != ".lock"}
+    assert run.main([CELL, "--output", str(root), *SMALL, "--resume"]) == 0
+    assert capsys.readouterr().out == printed
+    assert before == {p: p.stat().st_mtime_ns for p in root.rglob("*.*") if p.name != ".lock"}
+
+
+def test_interrupt_tells_how_to_go_on(tmp_path: Path) -> None:
+    root = tmp_path / "my results"
+    command = [sys.executable, "-m", "studies.run", CELL, "--output", str(root)]
+    command += ["--evaluations", "20000", "--replicas", "1", "--jobs", "2", "--seed", "5"]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    end = time.monotonic() + 120
+    while not any(path.stat().st_size > 40 for path in root.glob("replicas/*/*/journal.bin")):
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    message = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    last = message.strip().splitlines()[-1]
+    assert last.startswith("interrupted, nothing is lost; continue with: python -m studies.run ")
+    assert f"--output '{root}'" in last
+    assert last.endswith("--seed 5 --resume")
+    assert "Traceback" not in message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--evaluation", "5"], "unrecognized arguments: --evaluation"),
+        (["--evaluations", "many"], "argument --evaluations: invalid int value: 'many'"),
+        (["--evaluations", "0"], "evaluations is 0; allowed are whole numbers 1 to"),
+        (["--algorithm", "nsga3"], "unknown algorithm 'nsga3'; known are nsga2, mopso"),
+        (["--objective", "speed"], "unknown objective speed; known are peak_force_1"),
+        (["--constraint-handling", "hope"], "invalid choice: 'hope'"),
+        (["--population", "nsga2"], "found 'nsga2'; allowed is NAME=N"),
+        (["--population", "nsga3=4"], "unknown algorithm 'nsga3'"),
+        (["--executor", "dask"], "needs a scheduler's address"),
+        (["--jobs", "-2"], "jobs is -2"),
+    ],
+)
+def test_wrong_options_get_one_message(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = rack.main(["--output", str(tmp_path / "a"), *arguments])
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else -1
+    assert code == 2
+    told = capsys.readouterr()
+    assert message in told.err
+    assert told.err.startswith("python -m studies.rack: ")
+    assert told.err.count("\n") == 1
+    assert told.out == ""
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_missing_workcell_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run.main([str(tmp_path / "no.toml"), "--output", str(tmp_path / "a")]) == 2
+    assert "no.toml: 1 problem" in capsys.readouterr().err
+
+
+def test_help_explains_every_option_with_its_default() -> None:
+    text = campaign_parser("program", "what it does", "results/rack").format_help()
+    options = re.split(r"\n(?=  --)", text)[1:]
+    assert len(options) == 13
+    for option in options:
+        assert re.search(r"\(default:", option), option
+
+
+def test_options_become_settings() -> None:
+    arguments = (
+        "--algorithm mopso --algorithm random --population mopso=30 --objective duration "
+        "--constraint-handling constraints --seed 7 --evaluations 50 --replicas 3"
+    )
+    options = campaign_parser("program", "", "").parse_args(arguments.split())
+    settings = campaign_settings(options)
+    assert settings.algorithms == ("mopso", "random")
+    assert settings.populations == (("mopso", 30),)
+    assert settings.objectives == ("duration",)
+    assert settings.constraint_handling == "constraints"
+    assert (settings.seed, settings.evaluations, settings.replicas) == (7, 50, 3)
