@@ -16,6 +16,7 @@ def trajectory_figures(evaluator: CandidateEvaluator, x: Array) -> dict[str, flo
     """Figures of one decision vector (n_var,) under the search's timing, SI units.
 
     `feasible` is 1 or 0; `objective_<name>` are without penalty; means are over time.
+    Counts as one evaluation of the evaluator.
     """
     evaluation = evaluator.evaluate(x[None])
     outputs = {name: value[0] for name, value in evaluator.outputs(x[None]).items()}

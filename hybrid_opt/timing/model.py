@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,12 @@ from codegen.cache import Cache, digest
 from codegen.function import NumericFunction
 from codegen.workcell_functions import workcell_functions, workcell_key
 from hybrid_opt.timing.records import TimedCarry
+from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
+from symbolic.evaluator import candidate_function
+from symbolic.timing_functions import timing_functions
 from symbolic.urdf_model import arm_model
 from symbolic.workcell import Array, Robot, Workcell
-
-if TYPE_CHECKING:  # CasADi and Pinocchio are heavy to import; only a first use needs them
-    from symbolic.cell_model import CellModel
 
 STAGES = 200
 """Pieces of constant path acceleration."""
@@ -114,8 +114,6 @@ class TimingModel:
         samples = REFINEMENT * stages + 1
 
         def make() -> Any:
-            from symbolic.timing_functions import timing_functions
-
             return timing_functions(workcell, samples, cell_model)
 
         if workcell.digest and cell_model is None:
@@ -227,8 +225,6 @@ class TimingModel:
     def _candidate(self) -> NumericFunction:
         if self._cell_model is None:
             return workcell_functions(self.workcell, self._cache)["candidate"]
-        from symbolic.evaluator import candidate_function
-
         return compile_function(candidate_function(self._cell_model), self._cache)
 
     def _checked(self, x: Array) -> Array:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 
-import clarabel  # type: ignore[import-untyped]
+import clarabel
 import numpy as np
 from scipy import sparse
 
