@@ -37,8 +37,8 @@ _TABLE_1 = (
     ("feasible_share", "feasible %", 1),
     ("non_dominated", "front", 1),
     ("hypervolume", "HV", 4),
-    ("igd", "IGD", 5),
-    ("spacing", "spacing", 5),
+    ("igd", "IGD", 4),
+    ("spacing", "spacing", 4),
 )
 _SELECTED = (
     ("mean_excess_above_static", "above static %", 2),
@@ -75,18 +75,18 @@ def terminal_summary(summary: Mapping[str, Any], with_paper: bool) -> str:
 
 
 def _table_1(algorithms: Mapping[str, Any]) -> str:
-    rows = [["mean +- std", *(heading for _, heading, _ in _TABLE_1)]]
+    rows = [["mean ± std", *(heading for _, heading, _ in _TABLE_1)]]
     for name, entry in algorithms.items():
         cells = []
         for figure, _, digits in _TABLE_1:
             scale = 100.0 if figure == "feasible_share" else 1.0
             statistics = entry["statistics"][figure]
             mean, std = (_number(statistics[key], digits, scale) for key in ("mean", "std"))
-            cells.append(f"{mean} +- {std}")
+            cells.append(f"{mean} ± {std}")
         rows.append([title(name), *cells])
     note = (
-        "Over replicas; fronts of all evaluated candidates. HV: hypervolume to 1.1 in every objective."
-        "\nIGD: to the non-dominated union of the campaign. Spacing: Schott's."
+        "Over replicas; fronts of all evaluated candidates. HV: hypervolume to 1.1 in every\n"
+        "objective. IGD: to the non-dominated union of the campaign. Spacing: Schott's."
     )
     return f"Table 1. Quality of the search\n{_grid(rows)}\n{note}"
 

@@ -161,7 +161,7 @@ def test_terminal_summary_shows_the_tables() -> None:
     text = terminal_summary(summary(), with_paper=True)
     assert all(len(line) <= 100 for line in text.splitlines())
     lines = {line.split("  ")[0]: line for line in text.splitlines()}
-    assert "0.5000 +- 0.1000" in text
+    assert "0.5000 ± 0.1000" in text
     figures = ["40.00", "41.00", "50.00", "51.25", "0.50", "16.50"]
     assert lines["NSGA-II, replica 1"].split()[3:] == figures
     assert "NSGA-II: collision 30.0, reach_1 10.0" in text
