@@ -102,24 +102,26 @@ def check_piece(piece: Piece, owner: str) -> None:
 def support(piece: Piece, directions: Array) -> Array:
     """Largest u.x over the piece, exact, for each row u of directions (n, 3); returns (n,)."""
     u = np.atleast_2d(directions)
-    local = u @ piece.rotation
-    shape = piece.shape
+    return np.asarray(u @ piece.centre + reach(piece.shape, u @ piece.rotation), dtype=float)
+
+
+def reach(shape: ConvexShape, directions: Array) -> Array:
+    """Largest u.x over a shape in its own frame, exact, per row u of (n, 3); returns (n,)."""
+    u = directions
     match shape:
         case Box():
-            reach = np.abs(local) @ (np.asarray(shape.size) / 2.0)
+            found = np.abs(u) @ (np.asarray(shape.size) / 2.0)
         case Cylinder():
-            reach = np.abs(local[:, 2]) * (shape.length / 2.0) + shape.radius * np.hypot(
-                local[:, 0], local[:, 1]
-            )
+            axial = np.abs(u[:, 2]) * (shape.length / 2.0)
+            found = axial + shape.radius * np.hypot(u[:, 0], u[:, 1])
         case Sphere():
-            reach = shape.radius * np.linalg.norm(u, axis=1)
+            found = shape.radius * np.linalg.norm(u, axis=1)
         case Capsule():
-            reach = np.abs(local[:, 2]) * (shape.length / 2.0) + shape.radius * np.linalg.norm(
-                u, axis=1
-            )
+            axial = np.abs(u[:, 2]) * (shape.length / 2.0)
+            found = axial + shape.radius * np.linalg.norm(u, axis=1)
         case Hull():
-            reach = np.max(local @ shape.vertices.T, axis=1)
-    return np.asarray(u @ piece.centre + reach, dtype=float)
+            found = np.max(u @ shape.vertices.T, axis=1)
+    return np.asarray(found, dtype=float)
 
 
 def box_corners(size: Array) -> Array:

@@ -5,8 +5,8 @@ A pair that is c_a and c_b apart at the two ends of an interval keeps a distance
   (c_a + c_b - D) / 2 - K / 8       and of at least       max(c_a, c_b) - D - K / 8
 
 inside it, with D and K the chords and bends of both bodies (`symbolic.motion`). Where neither
-exceeds the tolerance, the interval is halved; where the compiled clearance does not suffice,
-FCL's distance takes its place.
+exceeds the tolerance, the interval is halved; where the compiled clearance does not suffice, a
+distance proven along FCL's nearest points takes its place.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Status = Literal["free", "collision", "undecided"]
 SEARCH_DEPTH = 5
 """Halvings of an interval in a search."""
 
-HALVING_WINS = 0.25
-"""Share of the chord that a clearance must exceed for two halvings to be likely enough."""
+HALVING_WINS = 0.06
+"""Share of the chord that a clearance must exceed for halving to be cheaper than measuring."""
 
 PROOF_DEPTH = 12
 """Halvings of an interval in a proof."""
@@ -159,7 +159,7 @@ class _Sweep:
             examined += len(work.index)
             work = self._uncleared(work)
             for end, fraction in ((work.a, 0.0), (work.b, 1.0)):
-                hit = self._measure(work, end)
+                hit = self._measure(work, end, level == depth)
                 for row in np.flatnonzero(hit >= 0).tolist():
                     unsafe[work.index[row]] = True
                     hits.append(self._contact(work, row, int(hit[row]), fraction))
@@ -206,13 +206,13 @@ class _Sweep:
         left: NDArray[np.bool_] = np.any(pending, axis=1)
         return replace(work, pending=pending)[left]
 
-    def _measure(self, work: _Intervals, end: _End) -> NDArray[np.intp]:
-        """Raise bounds to FCL's distance where halving alone would take too long.
+    def _measure(self, work: _Intervals, end: _End, last: bool) -> NDArray[np.intp]:
+        """Raise bounds to a proven distance where halving alone would take too long.
 
         Returns (m,) the first colliding pair of each configuration, or -1.
         """
         hopeless = ~(end.clearance - self.required > HALVING_WINS * work.chord)
-        wanted = work.pending & hopeless & ~end.measured
+        wanted = work.pending & (hopeless | last) & ~end.measured
         end.measured[wanted] = True
         return self.checker.measure(*_split(end.configuration), end.clearance, wanted)
 

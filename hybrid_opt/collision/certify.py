@@ -19,8 +19,8 @@ Configuration = Callable[[Array], tuple[Array, Array, Array]]
 STRAIGHTNESS = 1e-4
 """Default for how far two bodies together may be off straight motion between grid points [m]."""
 
-MOST_POINTS = 100_000
-"""Grid points beyond which a path counts as not smooth."""
+MOST_ROUNDS = 14
+"""Halvings of the grid after which a path counts as not smooth."""
 
 
 @dataclass(frozen=True)
@@ -66,22 +66,23 @@ def certify(
         SettingsError: the path does not become straight on any grid.
     """
     u = np.asarray(parameters, dtype=float)
-    while True:
+    for _ in range(MOST_ROUNDS):
         grid = configuration(u)
         middle = configuration((u[:-1] + u[1:]) / 2.0)
         straight = tuple((array[:-1] + array[1:]) / 2.0 for array in grid)
         chords = checker.motion(middle, (straight[0], straight[1], straight[2])).chord
-        off = np.max(chords, axis=1)
+        off = np.max(chords, axis=1, initial=0.0)
         deviation = float(np.max(off))
         if deviation <= straightness:
             break
-        if len(u) > MOST_POINTS:
-            raise SettingsError(
-                f"the path is {deviation:g} m off straight motion between {len(u)} grid points; "
-                "it jumps or its straightness is set too small"
-            )
         split = off > straightness
         u = np.sort(np.concatenate([u, ((u[:-1] + u[1:]) / 2.0)[split]]))
+    else:
+        raise SettingsError(
+            f"the path is still {deviation:g} m off straight motion in an interval of length "
+            f"{float(np.min(np.diff(u))):g}; it jumps or the straightness of {straightness:g} m "
+            "is too small"
+        )
     clearance = checker.bounds(*grid)
     verdict = checker.check(*grid, u, clearance)
     if verdict.first_contact is not None:

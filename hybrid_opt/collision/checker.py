@@ -69,7 +69,8 @@ class CollisionChecker:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, 6) joint positions [rad].
         """
-        return self._functions["clearance"].batch(pose, q_1, q_2)["clearance"]
+        found = self._functions["clearance"].batch(pose, q_1, q_2)["clearance"]
+        return found.reshape(len(pose), len(self._pairs))
 
     def check(
         self,
@@ -132,7 +133,8 @@ class CollisionChecker:
     def motion(self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]) -> Motion:
         """Bounds of every pair's motion between configurations (pose, q_1, q_2), each (n, 6)."""
         bounds = self._functions["motion"].batch(*start, *end)
-        return Motion(bounds["chord"], bounds["bend"])
+        shape = (len(start[0]), len(self._pairs))
+        return Motion(bounds["chord"].reshape(shape), bounds["bend"].reshape(shape))
 
     def measure(
         self,
@@ -142,9 +144,9 @@ class CollisionChecker:
         clearance: Array,
         wanted: NDArray[np.bool_],
     ) -> NDArray[np.intp]:
-        """Replace the bounds (n, n_pairs) of wanted pairs, in place, by FCL's distance [m].
+        """Raise the bounds (n, n_pairs) of wanted pairs, in place, to a proven distance [m].
 
-        FCL's resolution is subtracted; a bound that is higher already stays. For a payload that
+        See `Judge.separation`; a bound that is higher already stays. For a payload that
         may rest on a body, the distance of the payload smaller by the resting tolerance counts.
 
         Returns:
@@ -154,6 +156,19 @@ class CollisionChecker:
         rows = np.flatnonzero(wanted.any(axis=1))
         if not len(rows):
             return hits
+        self._place(pose[rows], q_1[rows], q_2[rows])
+        for local, k in enumerate(rows.tolist()):
+            resting_pairs = self._resting_pairs(pose[k, :3])
+            for pair in np.flatnonzero(wanted[k]).tolist():
+                resting = pair in resting_pairs
+                i, j = self._pairs[pair]
+                first = self.judge.shrunk_payload if resting else i
+                apart = self.judge.separation(local, first, j)
+                if apart <= self._free_beyond and self._judge_pair(local, pair, resting):
+                    hits[k] = pair
+                    break
+                clearance[k, pair] = np.fmax(clearance[k, pair], apart)
+        return hits
         self._place(pose[rows], q_1[rows], q_2[rows])
         for local, k in enumerate(rows.tolist()):
             resting_pairs = self._resting_pairs(pose[k, :3])

@@ -11,11 +11,11 @@ import numpy as np
 
 from symbolic.collision_bodies import BOX, PAYLOAD, CollisionBody
 from symbolic.collision_pairs import CellGeometry
-from symbolic.geometry import SMALLEST_SIZE, Capsule, Hull, Piece
+from symbolic.geometry import SMALLEST_SIZE, Capsule, ConvexShape, Hull, Piece, reach
 from symbolic.workcell import Array, Box, Cylinder, Sphere
 
 FCL_RESOLUTION = 1e-5
-"""What FCL resolves [m]: its iterative solvers stop within 1e-6 of the truth; ten times that."""
+"""What FCL resolves [m]: intersections and, downwards, distances; ten times its tolerance."""
 
 
 class Judge:
@@ -33,6 +33,7 @@ class Judge:
         self.calls = 0
         self.updates = 0
         self._request = fcl.CollisionRequest()
+        self._nearest = fcl.DistanceRequest(enable_nearest_points=True)
         firsts = np.cumsum([0] + [len(body.pieces) for body in geometry.bodies])
         self._bodies = [
             _Objects(body, int(first))
@@ -77,10 +78,48 @@ class Judge:
         return any(fcl.collide(a, b, self._request) for a in first for b in second)
 
     def distance(self, sample: int, i: int, j: int) -> float:
-        """Distance of bodies i and j; 0 where they intersect [m]."""
+        """FCL's distance of bodies i and j; 0 where they intersect [m].
+
+        At most a few micrometres below the truth, but in rare cases some tenths of a millimetre
+        above it: `separation` is the proven bound.
+        """
         first, second = self._placed(sample, i), self._placed(sample, j)
         self.calls += len(first) * len(second)
         return max(0.0, min(float(fcl.distance(a, b)) for a in first for b in second))
+
+    def separation(self, sample: int, i: int, j: int) -> float:
+        """A distance [m] that bodies i and j surely keep, at most their distance; 0 if unknown.
+
+        FCL's distance may stop early, above the truth. Its nearest points only propose a
+        direction here; the gap between the bodies along it is computed from their shapes.
+        """
+        first, second = self._placed(sample, i), self._placed(sample, j)
+        self.calls += len(first) * len(second)
+        return min(
+            self._gap(a, shape_a, b, shape_b)
+            for a, shape_a in zip(first, self._bodies[i].shapes, strict=True)
+            for b, shape_b in zip(second, self._bodies[j].shapes, strict=True)
+        )
+
+    def _gap(
+        self,
+        a: fcl.CollisionObject,
+        shape_a: ConvexShape,
+        b: fcl.CollisionObject,
+        shape_b: ConvexShape,
+    ) -> float:
+        result = fcl.DistanceResult()
+        distance = fcl.distance(a, b, self._nearest, result)
+        if distance <= 0.0:
+            return 0.0
+        between = np.subtract(result.nearest_points[1], result.nearest_points[0])
+        length = float(np.linalg.norm(between))
+        if length < SMALLEST_SIZE:
+            return 0.0
+        u = between / length
+        near = u @ a.getTranslation() + reach(shape_a, (u @ a.getRotation())[None])[0]
+        far = u @ b.getTranslation() - reach(shape_b, (-u @ b.getRotation())[None])[0]
+        return max(0.0, float(far - near))
 
     def _placed(self, sample: int, index: int) -> list[fcl.CollisionObject]:
         body = self._bodies[index]
@@ -101,6 +140,7 @@ class _Objects:
         self.first_piece = first_piece
         self.sample = -1
         self.objects = [fcl_object(piece) for piece in body.pieces]
+        self.shapes = [piece.shape for piece in body.pieces]
 
 
 def fcl_object(piece: Piece) -> fcl.CollisionObject:

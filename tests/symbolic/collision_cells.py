@@ -38,15 +38,11 @@ def obstacle_cell(folder: Path) -> Workcell:
     """Turned bases and one obstacle of every shape, a hollow mesh included."""
     folder.mkdir(parents=True, exist_ok=True)
     hollow = folder / "angle.stl"
-    profile = trimesh.util.concatenate(
-        [
-            trimesh.creation.box((0.3, 0.3, 0.02)),
-            trimesh.creation.box(
-                (0.02, 0.3, 0.3), trimesh.transformations.translation_matrix([0.16, 0, 0.14])
-            ),
-        ]
-    )
-    profile.export(hollow)
+    shelf = trimesh.creation.box((0.3, 0.3, 0.02))
+    wall = trimesh.creation.box((0.02, 0.3, 0.3))
+    wall.vertices = wall.vertices + np.array([0.16, 0.0, 0.14])
+    mesh = trimesh.util.concatenate([shelf, wall])
+    hollow.write_bytes(trimesh.exchange.stl.export_stl(mesh))
     turned = pose_matrix([0.55, 0.1, 0.5], [0.3, 0.2, 0.7])
     environment = (
         Body("ground", Box(np.array([4.0, 4.0, 0.1])), pose_matrix([0, 0, -0.05], [0, 0, 0])),
@@ -88,8 +84,14 @@ def ur10_cell() -> Workcell:
 @cache
 def geometry_of(name: str, folder: Path = Path()) -> CellGeometry:
     """The geometry of 'rack', 'obstacles' or 'ur10', built once per session."""
-    cells = {"rack": rack, "obstacles": lambda: obstacle_cell(folder), "ur10": ur10_cell}
-    return build_geometry(cells[name]())
+    match name:
+        case "rack":
+            cell = rack()
+        case "obstacles":
+            cell = obstacle_cell(folder)
+        case _:
+            cell = ur10_cell()
+    return build_geometry(cell)
 
 
 def functions_of(geometry: CellGeometry, softness: Softness = EXACT) -> dict[str, ca.Function]:
