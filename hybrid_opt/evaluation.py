@@ -135,7 +135,8 @@ class CandidateEvaluator:
         violation_time = np.zeros((n, len(REASONS)))
         violation[:, :n_constraints] = outputs["violation"]
         violation_time[:, :n_constraints] = outputs["violation_time"]
-        broken = ~np.isfinite(values).all(axis=1) | ~np.isfinite(violation).all(axis=1)
+        judged = np.column_stack([values, violation])
+        broken = np.asarray(~np.isfinite(judged).all(axis=1), dtype=np.bool_)
         violation[broken] = 0.0
         violation_time[broken] = 0.0
         violation[broken, REASONS.index(NOT_FINITE)] = 1.0

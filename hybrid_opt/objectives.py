@@ -41,7 +41,7 @@ PAPER_OBJECTIVES = ("peak_force_1", "peak_force_2")
 def _peak_force(robot: int) -> Callable[[Outputs, Workcell], Array]:
     def evaluate(outputs: Outputs, workcell: Workcell) -> Array:
         peak: Array = outputs["normal_force"][:, :, robot].max(axis=1)
-        return peak / workcell.task.reference_force[robot]
+        return peak / float(workcell.task.reference_force[robot])
 
     return evaluate
 
@@ -54,8 +54,8 @@ def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
 
 def _duration(outputs: Outputs, workcell: Workcell) -> Array:
     """Duration over twice the time that the initial trajectory's polygon takes."""
-    duration: Array = outputs["time"][:, -1]
-    return duration / (2.0 * _polygon_time(workcell))
+    duration = outputs["time"][:, -1] / (2.0 * _polygon_time(workcell))
+    return np.asarray(duration, dtype=float)
 
 
 def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:

@@ -1,16 +1,14 @@
 """Every inverse-kinematics branch of an arm at a pose, and the ranking of start branches.
 
-A six-joint arm reaches a pose in up to sixteen ways, and joints with more than one turn repeat
-each of them. No closed form covers every arm (the GoFa's wrist is offset), so Newton's method is
-run from a low-discrepancy set of starts over the whole joint range, all at once, and the distinct
-solutions are collected; each one's residual is checked.
+A six-joint arm reaches a pose in up to sixteen ways. No closed form covers every arm (the GoFa's
+wrist is offset), so Newton's method is run from a low-discrepancy set of starts over the whole
+joint range, all at once, and the distinct solutions are collected; each one's residual is checked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
 
 import casadi as ca
 import numpy as np
@@ -76,31 +74,41 @@ class StartBranch:
 def inverse_kinematics(
     robot: Robot, model: RobotModel, T_root_flange: Array, n_starts: int = N_STARTS
 ) -> Array:
-    """All joint positions found for a flange pose, within the joint limits.
+    """All joint positions found for a flange pose, full turns of a joint counted once.
 
     Args:
         T_root_flange: (4, 4) wanted flange placement in the robot's root frame.
         n_starts: number of starts of the search, a power of two.
 
     Returns:
-        (m, 6) [rad], sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`;
-        joints with more than one turn give a row for every turn within the limits.
+        (m, 6) [rad], sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`
+        and each joint on the turn that is nearest the middle of its range; postures with a joint
+        that no turn brings within its limits are left out.
     """
-    sobol = qmc.Sobol(6, scramble=False).random(n_starts)
-    q = robot.position_lower + sobol * (robot.position_upper - robot.position_lower)
+    centre = (robot.position_lower + robot.position_upper) / 2.0
+    half = np.minimum((robot.position_upper - robot.position_lower) / 2.0, np.pi)
+    q = centre + (2.0 * qmc.Sobol(6, scramble=False).random(n_starts) - 1.0) * half
+    solved = [np.empty((0, 6))]
     for _ in range(MAX_ITERATIONS):
         error, jacobian, residual = _batch_error(model, q, T_root_flange)
-        if np.all(residual < SOLUTION_TOLERANCE / 10.0):
+        arrived = residual < SOLUTION_TOLERANCE
+        solved.append(q[arrived])
+        q, error, jacobian, residual = (
+            values[~arrived] for values in (q, error, jacobian, residual)
+        )
+        if len(q) == 0:
             break
         # Slight damping keeps singular postures finite and vanishes near a solution.
-        damping = (1e-3 * np.minimum(residual, 1.0) ** 2)[:, None, None] * np.eye(6)
-        normal = np.einsum("nki,nkj->nij", jacobian, jacobian) + damping + 1e-14 * np.eye(6)
+        damping = (1e-3 * np.minimum(residual, 1.0) ** 2 + 1e-14)[:, None, None] * np.eye(6)
+        normal = np.einsum("nki,nkj->nij", jacobian, jacobian) + damping
         step = np.linalg.solve(normal, np.einsum("nki,nk->ni", jacobian, error)[..., None])[..., 0]
         largest = np.maximum(np.abs(step).max(axis=1, keepdims=True), STEP_LIMIT)
         q = q + step * (STEP_LIMIT / largest)
-    residual = _batch_error(model, q, T_root_flange)[2]
-    distinct = _distinct(np.remainder(q[residual < SOLUTION_TOLERANCE] + np.pi, 2 * np.pi) - np.pi)
-    return _all_turns(robot, distinct)
+    distinct = _distinct(np.concatenate(solved))
+    central = distinct + _central_turns(robot, distinct, distinct)
+    within = (central >= robot.position_lower) & (central <= robot.position_upper)
+    possible = central[within.all(axis=1)]
+    return possible[np.lexsort(np.round(possible, 6).T[::-1])]
 
 
 def _batch_error(model: RobotModel, q: Array, target: Array) -> tuple[Array, Array, Array]:
@@ -129,20 +137,11 @@ def _distinct(q: Array) -> Array:
     return np.array(kept).reshape(-1, 6)
 
 
-def _all_turns(robot: Robot, q: Array) -> Array:
-    """Every full-turn repetition of each row that lies within the joint limits."""
-    rows = []
-    for row in q:
-        choices = []
-        for value, lower, upper in zip(
-            row, robot.position_lower, robot.position_upper, strict=True
-        ):
-            first = int(np.ceil((lower - value) / (2 * np.pi)))
-            last = int(np.floor((upper - value) / (2 * np.pi)))
-            choices.append([value + 2 * np.pi * k for k in range(first, last + 1)])
-        rows.extend(product(*choices))
-    found = np.array(rows, dtype=float).reshape(-1, 6)
-    return found[np.lexsort(np.round(found, 6).T[::-1])]
+def _central_turns(robot: Robot, least: Array, greatest: Array) -> Array:
+    """Full turns [rad] that move a joint range nearest to the middle of the joint's limits."""
+    middle = (robot.position_lower + robot.position_upper) / 2.0
+    turns = np.round((middle - (least + greatest) / 2.0) / (2.0 * np.pi))
+    return np.asarray(2.0 * np.pi * turns, dtype=np.float64)
 
 
 def start_branches(
@@ -153,7 +152,8 @@ def start_branches(
 ) -> tuple[StartBranch, ...]:
     """All branches of one arm at the first waypoint, best first (see `StartBranch.rank`).
 
-    Each branch is followed along the hand-made initial trajectory.
+    Each branch is followed along the hand-made initial trajectory; a joint that may turn more
+    than once starts on the turn that keeps it farthest from its limits there.
 
     Args:
         arm: 0 or 1.
@@ -168,14 +168,17 @@ def start_branches(
     for q in inverse_kinematics(robot, model, target):
         tracked = follow(q, poses.T, np.zeros((6, len(poses))))
         result = {name: np.array(value) for name, value in zip(TRACK_OUTPUTS, tracked, strict=True)}
-        margin, measure = result["limit_margin"][0], result["manipulability"][0]
+        tracked_path = result["q"].T
+        turns = _central_turns(robot, tracked_path.min(axis=0), tracked_path.max(axis=0))
+        path = np.ascontiguousarray(tracked_path + turns)
+        to_limits = np.minimum(path - robot.position_lower, robot.position_upper - path)
+        margin, measure = to_limits.min(axis=1), result["manipulability"][0]
         good = (result["lost"][0] == 0.0) & (margin >= 0.0) & (measure >= robot.min_manipulability)
         kept = int(np.argmin(good)) if not good.all() else len(poses)
-        path = np.ascontiguousarray(result["q"].T)
         span = slice(0, max(kept, 1))
         branches.append(
             StartBranch(
-                q=q,
+                q=q + turns,
                 kept=kept,
                 clearance=clearance(poses[span], path[span]) if clearance else float("inf"),
                 limit_margin=float(margin[span].min()),

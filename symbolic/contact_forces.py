@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-Expression = ca.SX | ca.MX
+from symbolic.expression import Expression
 
 GRAVITY = (0.0, 0.0, -9.81)
 """Gravity in the world frame [m/s^2] (paper, below Eq. 34)."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-Expression = ca.SX | ca.MX
+from symbolic.expression import Expression
 
 RELATIVE_DAMPING = 1e-8
 """Damping of the normal equations relative to their trace.

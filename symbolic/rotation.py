@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-Expression = ca.SX | ca.MX
+from symbolic.expression import Expression
 
 
 def rotation_matrix(rpy: Expression) -> Expression:
