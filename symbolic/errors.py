@@ -46,3 +46,7 @@ class ResultsError(DualArmError):
 
 class WorkerError(DualArmError):
     """Processes or machines that work for this one were lost or do not fit."""
+
+
+class ReportError(DualArmError):
+    """A report, picture or animation cannot be made."""

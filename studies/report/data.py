@@ -1,0 +1,130 @@
+"""Gathers what a report shows from a results folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.evaluation import CandidateEvaluator
+from hybrid_opt.objectives import OBJECTIVES, PAPER_OBJECTIVES
+from hybrid_opt.results import CampaignResults, Replica, read_campaign, read_summary
+from hybrid_opt.robustness import payload_sensitivity, robustness_margins
+from hybrid_opt.timing import TimingModel, duration_against_force_limit, report_timing
+from studies.report.reach import reach_map
+from studies.report.records import (
+    AlgorithmRuns,
+    Carry,
+    Front,
+    ReportData,
+    Run,
+    TimedSelection,
+)
+from studies.selection import balanced, peak_normal_forces
+from studies.terminal_summary import title
+from symbolic.collision_pairs import build_geometry
+from symbolic.workcell import Array
+
+INITIAL_LABEL = "hand-made"
+REACH_SEED = 0
+"""Of the postures that the reach is drawn from; no result depends on it."""
+
+
+def gather(root: Path) -> ReportData:
+    """Read a results folder and evaluate what is drawn in detail.
+
+    Raises:
+        ResultsError: the folder is not complete or damaged.
+        DualArmError: the workcell's functions cannot be built.
+    """
+    results = read_campaign(root)
+    summary = read_summary(root)
+    workcell = results.workcell
+    maker = _CarryMaker(results)
+    geometry = build_geometry(workcell)
+    algorithms = tuple(
+        _algorithm(index, name, results, summary["algorithms"][name], maker)
+        for index, name in enumerate(results.algorithms)
+    )
+    initial = maker.carry(workcell.task.initial.reshape(-1), INITIAL_LABEL)
+    best = [algorithm.best for algorithm in algorithms]
+    carries = (initial, *(carry for carry in best if carry is not None))
+    return ReportData(
+        workcell=workcell,
+        geometry=geometry,
+        summary=summary,
+        objective_titles=tuple(OBJECTIVES[name].title for name in results.objectives),
+        static=_static(results, summary),
+        algorithms=algorithms,
+        initial=initial,
+        timings=tuple(maker.timing(carry) for carry in carries),
+        reach=reach_map(geometry, np.random.default_rng(REACH_SEED)),
+    )
+
+
+class _CarryMaker:
+    """Evaluates trajectories of one campaign in detail."""
+
+    def __init__(self, results: CampaignResults) -> None:
+        self.evaluator = CandidateEvaluator(results.workcell, results.objectives)
+        self.model = TimingModel(results.workcell)
+
+    def carry(self, x: Array, label: str) -> Carry:
+        timed = self.model.search_carry(x)
+        found = self.evaluator.evaluate(x[None])
+        sensitivity = payload_sensitivity(self.model, timed)
+        return Carry(label, x, found.objectives[0], timed, sensitivity, bool(found.feasible[0]))
+
+    def balanced(self, front: Front, label: str) -> Carry:
+        """The trajectory of least mean peak force of a front."""
+        row = balanced(peak_normal_forces(self.evaluator, front.x))
+        return self.carry(front.x[row], label)
+
+    def timing(self, carry: Carry) -> TimedSelection:
+        report = report_timing(self.model, carry.x)
+        judged = report.closest.carry or carry.timed
+        return TimedSelection(
+            carry.label,
+            report,
+            duration_against_force_limit(self.model, carry.x),
+            robustness_margins(self.model, judged),
+        )
+
+
+def _algorithm(
+    index: int,
+    name: str,
+    results: CampaignResults,
+    entry: Mapping[str, Any],
+    maker: _CarryMaker,
+) -> AlgorithmRuns:
+    runs = tuple(
+        _run(replica, figures)
+        for replica, figures in zip(results.of(name), entry["replicas"], strict=True)
+    )
+    known = entry["representative"]
+    representative = 0 if known is None else int(known)
+    front = runs[representative].front
+    return AlgorithmRuns(
+        name=name,
+        title=title(name),
+        index=index,
+        runs=runs,
+        representative=representative,
+        selected=maker.balanced(front, title(name)) if len(front) else None,
+        hybrid_selected=None,
+    )
+
+
+def _run(replica: Replica, figures: Mapping[str, Any]) -> Run:
+    front = Front(replica.front_x, replica.front)
+    return Run(replica.replica, replica.evaluations, front, None, figures, {})
+
+
+def _static(results: CampaignResults, summary: Mapping[str, Any]) -> Array:
+    """Objectives of the level payload at rest."""
+    still = np.array(summary["static_hold"]["normal_force"]) / np.array(summary["reference_force"])
+    known = dict(zip(PAPER_OBJECTIVES, still, strict=True))
+    return np.array([known.get(name, np.nan) for name in results.objectives])

@@ -1,0 +1,243 @@
+"""Figures of the cell: reachable regions, the environment, the arm, motion sequences."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from studies.report.drawing import (
+    FRONT,
+    ISOMETRIC,
+    SIDE,
+    Faces,
+    View,
+    aspect,
+    box_corners,
+    cut_faces,
+    draw_box_edges,
+    draw_cell,
+    draw_path,
+    frame_axes,
+)
+from studies.report.records import Carry, ReachMap
+from studies.report.solids import cell_solids, extent_points
+from studies.report.style import ARMS, FULL_WIDTH, new_figure, panel_label
+from symbolic.collision_pairs import CellGeometry
+from symbolic.workcell import Array
+
+_PLAN = View(np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), "y [m]", "x [m]", mirrored=True)
+"""From above, the front below."""
+
+SHARES = (0.0, 0.33, 0.66, 1.0)
+"""Of a carry's duration, as in the paper's Figures 14 and 15."""
+
+
+def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> Figure:
+    """Both arms' reach, the common region and the restricted workspace (paper Figure 4)."""
+    figure = new_figure(FULL_WIDTH, 0.52 * FULL_WIDTH)
+    left, right = figure.subplots(1, 2)
+    middle = _bounds_of_waypoints(geometry).mean(axis=0)
+    for axes, view, across, letter, text in (
+        (left, FRONT, 0, "a", f"front view, slice at x = {middle[0]:.2f} m"),
+        (right, SIDE, 1, "b", f"side view, slice at y = {middle[1]:.2f} m"),
+    ):
+        _draw_reach(axes, reach, view, across, float(middle[across]))
+        draw_cell(axes, geometry, _fixed_faces(geometry), view, *_start(carry), hidden=("box",))
+        for lower, upper in _free_bounds(geometry):
+            draw_box_edges(axes, view, lower, upper, colors="#b00020", linewidths=0.9)
+        panel_label(axes, letter, text)
+        frame_axes(axes, view, box_corners(*_reach_bounds(reach)), margin=0.0)
+    names = [robot.name for robot in geometry.workcell.robots]
+    handles = [
+        Patch(facecolor=ARMS[0], alpha=0.35, hatch="////", label=f"pad of {names[0]} reaches"),
+        Patch(facecolor=ARMS[1], alpha=0.35, hatch="\\\\\\\\", label=f"pad of {names[1]} reaches"),
+        Patch(facecolor="#2a8f4d", alpha=0.55, label="common region of the box centre"),
+        Line2D([], [], color="#b00020", linewidth=0.9, label="bounds of the free waypoints"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    return figure
+
+
+def environment(geometry: CellGeometry, carry: Carry) -> Figure:
+    """The cell with the payload at its start: front, side and oblique (paper Figure 5)."""
+    figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
+    solids = cell_solids(geometry)
+    faces = cut_faces(solids)
+    pose, q = _start(carry)
+    points = extent_points(geometry, solids, pose[None], q[None])
+    views = (FRONT, SIDE, ISOMETRIC)
+    panels = figure.subplots(1, 3, width_ratios=[aspect(view, points) for view in views])
+    for axes, view, letter, text in zip(
+        panels, views, "abc", ("front", "side", "oblique"), strict=True
+    ):
+        draw_cell(axes, geometry, faces, view, pose, q)
+        panel_label(axes, letter, text)
+        frame_axes(axes, view, points)
+    return figure
+
+
+def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> Figure:
+    """The first arm at the start and the region that its pad reaches (paper Figure 6)."""
+    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    left, right = figure.subplots(1, 2)
+    robot = geometry.workcell.robots[0]
+    arm = tuple(s for s in cell_solids(geometry) if s.group == "robot 1")
+    pose, q = _start(carry)
+    draw_cell(left, geometry, cut_faces(arm), ISOMETRIC, pose, q)
+    frame_axes(left, ISOMETRIC, extent_points(geometry, arm, pose[None], q[None]))
+    panel_label(left, "a", f"arm {robot.name!r} at the start")
+    base = robot.T_world_base[:3, 3]
+    index = int((base[0] - reach.lower[0]) / reach.step)
+    _fill(right, reach, reach.pads[0][index], (1, 2), FRONT, ARMS[0], "////", 0.35)
+    draw_cell(right, geometry, cut_faces(arm), FRONT, pose, q)
+    bounds = _reach_bounds(reach)
+    occupied = np.flatnonzero(reach.pads[0].any(axis=(0, 2)))
+    bounds[:, 1] = reach.lower[1] + reach.step * np.array([occupied[0] - 1, occupied[-1] + 2])
+    frame_axes(right, FRONT, box_corners(*bounds), margin=0.0)
+    panel_label(right, "b", f"reach of its pad, slice at x = {base[0]:.2f} m")
+    return figure
+
+
+def motion_sequence(geometry: CellGeometry, carry: Carry, columns: int = 2) -> Figure:
+    """The cell at 0, 33, 66 and 100 % of a carry (paper Figures 14 and 15)."""
+    rows = -(-len(SHARES) // columns)
+    points = motion_points(geometry, carry)
+    faces = cut_faces(cell_solids(geometry))
+    figure = new_figure(FULL_WIDTH, 0.37 * FULL_WIDTH * rows)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    samples = sample_at(carry, np.array(SHARES))
+    for axes, share, sample, letter in zip(panels, SHARES, samples, "abcd", strict=True):
+        draw_cell(axes, geometry, faces, ISOMETRIC, carry.timed.pose[sample], carry.timed.q[sample])
+        draw_path(
+            axes, ISOMETRIC, carry.timed.pose[: sample + 1, :3], color="#b00020", linewidth=1.0
+        )
+        moment = carry.timed.time[sample]
+        panel_label(axes, letter, f"{100 * share:.0f} % of the time, t = {moment:.2f} s")
+        frame_axes(axes, ISOMETRIC, points)
+    figure.suptitle(carry.label, fontsize=8)
+    return figure
+
+
+def paths(geometry: CellGeometry, carries: tuple[tuple[Carry, str, object], ...]) -> Figure:
+    """Paths of the box centre: y-z, x-y and oblique (paper Figure 13).
+
+    Args:
+        carries: trajectory, colour and line style of each.
+    """
+    faces = _fixed_faces(geometry)
+    points = np.concatenate([carry.timed.pose[:, :3] for carry, _, _ in carries])
+    half = geometry.workcell.payload.size / 2.0
+    near = box_corners(points.min(axis=0) - half, points.max(axis=0) + half)
+    views = (FRONT, _PLAN, ISOMETRIC)
+    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    panels = figure.subplots(1, 3, width_ratios=[aspect(view, near) for view in views])
+    for axes, view, letter, text in zip(
+        panels, views, "abc", ("y–z plane", "x–y plane", "oblique"), strict=True
+    ):
+        draw_cell(axes, geometry, faces, view, *_start(carries[0][0]), hidden=("box", "link"))
+        for carry, colour, line in carries:
+            draw_path(
+                axes, view, carry.timed.pose[:, :3], color=colour, linestyle=line, label=carry.label
+            )
+        ends = view.flat(carries[0][0].timed.pose[[0, -1], :3])
+        axes.plot(*ends[0], "o", color="black", zorder=5, label="start")
+        axes.plot(*ends[1], "*", color="black", markersize=7, zorder=5, label="goal")
+        panel_label(axes, letter, text)
+        frame_axes(axes, view, near)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+    return figure
+
+
+def motion_points(geometry: CellGeometry, carry: Carry) -> Array:
+    """(k, 3) what a picture of a whole carry has to show, see `extent_points`."""
+    every = slice(None, None, max(1, len(carry.timed.time) // 12))
+    return extent_points(
+        geometry, cell_solids(geometry), carry.timed.pose[every], carry.timed.q[every]
+    )
+
+
+def sample_at(carry: Carry, shares: Array) -> list[int]:
+    """The samples nearest to shares of the duration."""
+    moments = carry.timed.time[0] + shares * carry.timed.duration
+    return [int(np.argmin(np.abs(carry.timed.time - moment))) for moment in moments]
+
+
+def _start(carry: Carry) -> tuple[Array, Array]:
+    return carry.timed.pose[0], carry.timed.q[0]
+
+
+def _fixed_faces(geometry: CellGeometry) -> tuple[Faces, ...]:
+    fixed = tuple(solid for solid in cell_solids(geometry) if solid.frame.kind == "world")
+    return cut_faces(fixed)
+
+
+def _free_bounds(geometry: CellGeometry) -> list[tuple[Array, Array]]:
+    task = geometry.workcell.task
+    free = [task.waypoints[i] for i in task.free_indices]
+    return [(waypoint.lower[:3], waypoint.upper[:3]) for waypoint in free]
+
+
+def _bounds_of_waypoints(geometry: CellGeometry) -> Array:
+    pairs = _free_bounds(geometry)
+    return np.array([np.min([p[0] for p in pairs], axis=0), np.max([p[1] for p in pairs], axis=0)])
+
+
+def _reach_bounds(reach: ReachMap) -> Array:
+    shape = np.array(reach.common.shape)
+    bounds = np.array([reach.lower, reach.lower + shape * reach.step])
+    bounds[0, 2] = max(bounds[0, 2], -0.15)
+    return bounds
+
+
+def _draw_reach(axes: Axes, reach: ReachMap, view: View, across: int, at: float) -> None:
+    """Slices of the reach across a world axis; along the line between the arms only what both
+    reach together, because their own regions would hide it."""
+    index = int((at - reach.lower[across]) / reach.step)
+    kept = tuple(a for a in range(3) if a != across)
+    layers = [(reach.common, "#2a8f4d", "", 0.55)]
+    if across == 0:
+        hatches = ("////", "\\\\\\\\")
+        layers = [
+            *(
+                (pads, colour, hatch, 0.35)
+                for pads, colour, hatch in zip(reach.pads, ARMS, hatches, strict=True)
+            ),
+            *layers,
+        ]
+    for mask, colour, hatch, alpha in layers:
+        _fill(axes, reach, np.take(mask, index, axis=across), kept, view, colour, hatch, alpha)
+
+
+def _fill(
+    axes: Axes,
+    reach: ReachMap,
+    mask: Array,
+    kept: tuple[int, ...],
+    view: View,
+    colour: str,
+    hatch: str,
+    alpha: float,
+) -> None:
+    """A slice of the grid as a filled region; mask over the two kept world axes."""
+    if not mask.any():
+        return
+    centres = [
+        reach.lower[a] + (np.arange(mask.shape[k]) + 0.5) * reach.step for k, a in enumerate(kept)
+    ]
+    sign = float(np.sign(view.right[kept[0]]))
+    filled = axes.contourf(
+        sign * centres[0],
+        centres[1],
+        mask.T.astype(float),
+        levels=(0.5, 1.5),
+        colors=[colour],
+        alpha=alpha,
+        hatches=[hatch],
+        zorder=0.5,
+    )
+    filled.set_edgecolor(colour)
+    filled.set_linewidth(0.0)

@@ -1,0 +1,74 @@
+"""Writes a report into a results folder: figures, tables and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from hybrid_opt.campaign import CampaignFolder, Progress, Stage
+from hybrid_opt.campaign.files import storing, write_atomically
+from hybrid_opt.timing import TimingModel
+from studies.report.data import gather
+from studies.report.figures import report_figures
+from studies.report.page import render_page
+from studies.report.page_data import PageData
+from studies.report.records import ReportData
+from studies.report.style import save
+from studies.report.tables import report_tables
+
+PAGE = "report.html"
+FIGURES = "figures"
+TABLES = "tables"
+
+
+def report_stage(with_paper: bool) -> Stage:
+    """The stage that writes the report.
+
+    Args:
+        with_paper: whether figures that the paper states of its rack stand beside ours.
+    """
+
+    def run(folder: CampaignFolder, progress: Progress) -> None:
+        data = gather(folder.root)
+        count = len(list(report_figures(data))) + 1
+        with progress.stage("report", count, "figures") as advance:
+            write_report(folder.root, data, with_paper, lambda: advance(1))
+
+    return Stage("report", run, {"with_paper": with_paper})
+
+
+def write_report(
+    root: Path, data: ReportData, with_paper: bool, done: Callable[[], None] = lambda: None
+) -> Path:
+    """Write all files of the report; returns the page.
+
+    Args:
+        root: the results folder.
+        data: from `studies.report.data.gather`.
+        with_paper: see `report_stage`.
+        done: called after every figure and after the page.
+
+    Raises:
+        ResultsError: the folder cannot be written.
+        ReportError: the page cannot be made.
+    """
+    folder = root / FIGURES
+    with storing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        pictures = []
+        for figure in report_figures(data):
+            pictures.append((save(figure.draw(), folder, figure.name)[0], figure.caption))
+            done()
+    tables = report_tables(data, with_paper)
+    for table in tables:
+        for suffix, text in (
+            ("csv", table.csv()),
+            ("md", table.markdown()),
+            ("tex", table.latex()),
+        ):
+            write_atomically(root / TABLES / f"{table.name}.{suffix}", text.encode())
+    document = PageData(data, TimingModel(data.workcell)).document()
+    page = root / PAGE
+    write_atomically(page, render_page(data, document, tables, pictures).encode())
+    done()
+    return page

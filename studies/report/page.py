@@ -1,0 +1,158 @@
+"""The self-contained page: one HTML file with data, pictures and libraries, no network.
+
+Every text of the workcell is escaped, data is JSON that no markup can leave, and a content
+security policy allows exactly the page's own scripts (by their hashes) and no request at all.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import zipfile
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import trimesh
+from studies.report.records import ReportData
+from studies.report.tables import Table, number
+from symbolic.errors import ReportError
+
+_OWN_SCRIPTS = ("scene.js", "page.js")
+
+
+def render_page(
+    data: ReportData,
+    document: dict[str, Any],
+    tables: tuple[Table, ...],
+    pictures: list[tuple[Path, str]],
+) -> str:
+    """The page's text.
+
+    Args:
+        data: the report's data.
+        document: what the scripts show, from `page_data`.
+        tables: shown in this order.
+        pictures: PNG file and caption of every figure.
+
+    Raises:
+        ReportError: an installed library does not hold the script that the page embeds.
+    """
+    texts = files("studies.report") / "page"
+    scripts = [plotly_js(), three_js(), *((texts / n).read_text("utf-8") for n in _OWN_SCRIPTS)]
+    settings = {key: data.summary[key] for key in ("workcell", "settings", "environment")}
+    return Template((texts / "page.html").read_text("utf-8")).substitute(
+        policy=_policy(scripts),
+        title=html.escape(data.workcell.name),
+        lead=html.escape(_lead(data)),
+        facts=_facts(data),
+        style=(texts / "page.css").read_text("utf-8"),
+        tables="".join(table.html() for table in tables),
+        figures="".join(_picture(path, caption) for path, caption in pictures),
+        configuration=html.escape(json.dumps(settings, indent=2, ensure_ascii=False)),
+        workcell=html.escape(data.workcell.source.read_text("utf-8")),
+        data=embedded_json(document),
+        scripts="\n".join(f"<script>{_unclosed(script)}</script>" for script in scripts),
+    )
+
+
+def plotly_js() -> str:
+    """plotly.js as the plotly package carries it.
+
+    Raises:
+        ReportError: the installed plotly has no such file.
+    """
+    try:
+        return (files("plotly") / "package_data" / "plotly.min.js").read_text("utf-8")
+    except (OSError, ModuleNotFoundError) as error:
+        raise ReportError(f"plotly.js cannot be read ({error}); install plotly anew") from error
+
+
+def three_js() -> str:
+    """three.js as trimesh's viewer carries it, with its licence line.
+
+    Raises:
+        ReportError: the installed trimesh has no such file.
+    """
+    path = Path(trimesh.__file__).parent / "resources" / "templates" / "viewer.zip"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            text = archive.read("viewer.html.template").decode("utf-8")
+    except (OSError, KeyError, zipfile.BadZipFile) as error:
+        raise ReportError(f"trimesh {trimesh.__version__}: no viewer template ({error})") from error
+    library = max(text.splitlines(), key=len)
+    if "THREE={}" not in library:
+        raise ReportError(
+            f"trimesh {trimesh.__version__}: its viewer carries three.js in another form than this "
+            "project knows; install a version that constraints.txt names"
+        )
+    return "/* three.js, Copyright 2010-2022 Three.js Authors, MIT licence */\n" + library
+
+
+def embedded_json(document: Any) -> str:
+    """JSON for a script element: no text in it can end the element or open another."""
+    text = json.dumps(document, allow_nan=False, separators=(",", ":"))
+    for letter in "<>&\u2028\u2029":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return text
+
+
+def _unclosed(script: str) -> str:
+    return script.replace("</script", "<\\/script")
+
+
+def _policy(scripts: list[str]) -> str:
+    """Only these inline scripts; styles and pictures of the page itself; no request."""
+    hashes = [
+        base64.b64encode(hashlib.sha256(_unclosed(script).encode()).digest()).decode()
+        for script in scripts
+    ]
+    allowed = " ".join(f"'sha256-{value}'" for value in hashes)
+    return (
+        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
+        "img-src data: blob:; base-uri 'none'; form-action 'none'"
+    )
+
+
+def _lead(data: ReportData) -> str:
+    payload, task = data.workcell.payload, data.workcell.task
+    settings = data.summary["settings"]
+    names = ", ".join(algorithm.title for algorithm in data.algorithms)
+    return (
+        f"Two arms carry a box of {payload.mass:g} kg along {len(task.waypoints)} poses, "
+        f"{len(task.free_indices)} of them free. {names}: {settings['replicas']} replicas of "
+        f"{settings['evaluations']} evaluations each, seed {settings['seed']}."
+    )
+
+
+def _facts(data: ReportData) -> str:
+    facts = []
+    still = data.summary["static_hold"]
+    for algorithm in data.algorithms:
+        if algorithm.best is None:
+            facts.append(("none feasible", algorithm.title))
+            continue
+        peak = float(algorithm.best.timed.normal_force.max(axis=0).mean())
+        rest = sum(still["normal_force"]) / 2.0
+        facts.append(
+            (f"{100.0 * (peak / rest - 1.0):.2f} %", f"above the force at rest, {algorithm.title}")
+        )
+        limit = algorithm.best.sensitivity.payload_limit
+        facts.append((f"{limit:.2f} kg", f"payload at the limit, {algorithm.title}"))
+    facts.append((f"{number(still['payload_limit'])} kg", "payload at the limit, at rest"))
+    return "".join(
+        f"<li><b>{html.escape(value)}</b><span>{html.escape(text)}</span></li>"
+        for value, text in facts
+    )
+
+
+def _picture(path: Path, caption: str) -> str:
+    content = base64.b64encode(path.read_bytes()).decode("ascii")
+    text = html.escape(caption)
+    return (
+        f'<figure><img loading="lazy" decoding="async" alt="{text}" '
+        f'src="data:image/png;base64,{content}"><figcaption>{text}</figcaption></figure>'
+    )

@@ -1,0 +1,171 @@
+"use strict";
+/* The cell in three dimensions: nested joint frames, z up, orbit by pointer. */
+(function () {
+  const COLOURS = { "robot 1": 0x3b6ea8, "robot 2": 0xa8733b, payload: 0xc9a227,
+    environment: 0x9aa3ab, ground: 0xdedfd8 };
+
+  function matrix(rows) {
+    return new THREE.Matrix4().set(...rows);
+  }
+
+  function fixedGroup(rows) {
+    const group = new THREE.Group();
+    group.matrixAutoUpdate = false;
+    group.matrix.copy(matrix(rows));
+    return group;
+  }
+
+  class CellScene {
+    constructor(element, data, decode) {
+      this.element = element;
+      this.data = data;
+      this.renderer = new THREE.WebGLRenderer({ antialias: true });
+      this.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
+      element.appendChild(this.renderer.domElement);
+      this.scene = new THREE.Scene();
+      this.scene.background = new THREE.Color(0xeef1f3);
+      this.scene.add(new THREE.HemisphereLight(0xffffff, 0x9a9a92, 0.75));
+      const sun = new THREE.DirectionalLight(0xffffff, 0.55);
+      sun.position.set(-2.5, 1.8, 4);
+      this.scene.add(sun);
+      this.camera = new THREE.PerspectiveCamera(35, 1, 0.05, 60);
+      this.camera.up.set(0, 0, 1);
+      this.box = new THREE.Group();
+      this.scene.add(this.box);
+      this.arms = data.arms.map((arm) => this.makeArm(arm));
+      data.solids.forEach((solid) => this.addSolid(solid, decode));
+      this.path = new THREE.Line(new THREE.BufferGeometry(),
+        new THREE.LineBasicMaterial({ color: 0xb00020 }));
+      this.path.frustumCulled = false;
+      this.scene.add(this.path);
+      this.resetView();
+      this.listen();
+      new ResizeObserver(() => this.resize()).observe(element);
+      this.resize();
+    }
+
+    makeArm(arm) {
+      const root = fixedGroup(arm.root);
+      this.scene.add(root);
+      let parent = root;
+      return arm.origins.map((origin, j) => {
+        const fixed = fixedGroup(origin);
+        const turning = new THREE.Group();
+        parent.add(fixed);
+        fixed.add(turning);
+        parent = turning;
+        return { turning, axis: new THREE.Vector3(...arm.axes[j]) };
+      });
+    }
+
+    addSolid(solid, decode) {
+      const positions = decode(solid.vertices, Float32Array);
+      const geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+      geometry.setIndex(new THREE.BufferAttribute(decode(solid.faces, Uint16Array), 1));
+      const flat = geometry.toNonIndexed();
+      flat.computeVertexNormals();
+      const colour = COLOURS[solid.ground ? "ground" : solid.group];
+      const mesh = new THREE.Mesh(flat, new THREE.MeshLambertMaterial({ color: colour }));
+      if (solid.kind === "world") this.scene.add(mesh);
+      else if (solid.kind === "box") this.box.add(mesh);
+      else this.arms[solid.robot][solid.joint].turning.add(mesh);
+    }
+
+    /* pose: x y z roll pitch yaw; q: twelve joints. */
+    place(pose, q) {
+      this.box.position.set(pose[0], pose[1], pose[2]);
+      this.box.rotation.set(pose[3], pose[4], pose[5], "ZYX");
+      this.arms.forEach((arm, i) => arm.forEach((joint, j) =>
+        joint.turning.quaternion.setFromAxisAngle(joint.axis, q[6 * i + j])));
+      this.render();
+    }
+
+    showPath(points) {
+      this.path.geometry.dispose();
+      this.path.geometry = new THREE.BufferGeometry();
+      this.path.geometry.setAttribute("position", new THREE.BufferAttribute(points, 3));
+    }
+
+    resetView() {
+      const { centre, radius } = this.data.view;
+      this.target = new THREE.Vector3(...centre);
+      this.distance = 1.2 * radius / Math.tan((this.camera.fov * Math.PI) / 360);
+      this.azimuth = (-152 * Math.PI) / 180;
+      this.elevation = (24 * Math.PI) / 180;
+      this.render();
+    }
+
+    resize() {
+      const width = Math.max(1, this.element.clientWidth);
+      const height = Math.max(1, this.element.clientHeight);
+      this.renderer.setSize(width, height);
+      this.camera.aspect = width / height;
+      this.camera.updateProjectionMatrix();
+      this.render();
+    }
+
+    render() {
+      const reach = this.distance * Math.max(1, 1.25 / Math.max(this.camera.aspect, 0.3));
+      const flat = reach * Math.cos(this.elevation);
+      this.camera.position.set(
+        this.target.x + flat * Math.cos(this.azimuth),
+        this.target.y + flat * Math.sin(this.azimuth),
+        this.target.z + reach * Math.sin(this.elevation));
+      this.camera.lookAt(this.target);
+      this.renderer.render(this.scene, this.camera);
+    }
+
+    orbit(dx, dy) {
+      this.azimuth -= 0.008 * dx;
+      this.elevation = Math.min(1.55, Math.max(-1.2, this.elevation + 0.008 * dy));
+      this.render();
+    }
+
+    pan(dx, dy) {
+      const step = (this.distance * 1.2) / this.element.clientHeight / 2;
+      const right = new THREE.Vector3().setFromMatrixColumn(this.camera.matrix, 0);
+      const up = new THREE.Vector3().setFromMatrixColumn(this.camera.matrix, 1);
+      this.target.addScaledVector(right, -dx * step).addScaledVector(up, dy * step);
+      this.render();
+    }
+
+    zoom(factor) {
+      this.distance = Math.min(40, Math.max(0.3, this.distance * factor));
+      this.render();
+    }
+
+    listen() {
+      const pointers = new Map();
+      const spread = () => {
+        const [a, b] = [...pointers.values()];
+        return Math.hypot(a.x - b.x, a.y - b.y);
+      };
+      const canvas = this.renderer.domElement;
+      canvas.addEventListener("pointerdown", (event) => {
+        canvas.setPointerCapture(event.pointerId);
+        pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+      });
+      canvas.addEventListener("pointermove", (event) => {
+        const last = pointers.get(event.pointerId);
+        if (!last) return;
+        const before = pointers.size === 2 ? spread() : 0;
+        const [dx, dy] = [event.clientX - last.x, event.clientY - last.y];
+        pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+        if (before > 0) this.zoom(before / Math.max(1, spread()));
+        else if (event.buttons & 2 || event.shiftKey) this.pan(dx, dy);
+        else this.orbit(dx, dy);
+      });
+      const release = (event) => pointers.delete(event.pointerId);
+      canvas.addEventListener("pointerup", release);
+      canvas.addEventListener("pointercancel", release);
+      canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+      canvas.addEventListener("wheel", (event) => {
+        event.preventDefault();
+        this.zoom(Math.exp(0.001 * event.deltaY));
+      }, { passive: false });
+    }
+  }
+
+  window.CellScene = CellScene;
+})();

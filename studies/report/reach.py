@@ -1,0 +1,73 @@
+"""Where two arms reach, and where a box between them can be (paper Figure 4 and Eq. 61)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from studies.report.records import ReachMap
+from studies.report.solids import joint_placements
+from symbolic.collision_bodies import ArmGeometry
+from symbolic.collision_pairs import CellGeometry
+from symbolic.workcell import Array
+
+STEP = 0.05
+"""Edge of the cubes [m]: what a drawing of two metres shows."""
+
+POSTURES = 300_000
+"""Random postures per arm; some ten per cube of the reach of an arm of 1.3 m."""
+
+_BATCH = 50_000
+
+
+def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
+    """Sample both arms' pads over their joint limits.
+
+    Sampling leaves single cubes out; holes of a few cubes are closed.
+    """
+    clouds = [_pad_points(geometry, i, rng) for i in (0, 1)]
+    both = np.concatenate(clouds)
+    lower = np.floor(both.min(axis=0) / STEP - 3.0) * STEP
+    shape = tuple(np.ceil((both.max(axis=0) - lower) / STEP).astype(int) + 4)
+    pads = []
+    for cloud in clouds:
+        reached = np.zeros(shape, dtype=bool)
+        index = ((cloud - lower) / STEP).astype(int)
+        reached[index[:, 0], index[:, 1], index[:, 2]] = True
+        pads.append(ndimage.binary_closing(reached, iterations=2))
+    return ReachMap(lower, STEP, (pads[0], pads[1]), _common(geometry, pads))
+
+
+def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> Array:
+    """(POSTURES, 3) pad positions in the world."""
+    arm, contact = geometry.arms[i], geometry.workcell.contacts[i]
+    pad = (arm.T_joint_box @ contact.T_box_pad)[:3, 3]
+    return np.concatenate([_last_points(arm, pad, rng) for _ in range(POSTURES // _BATCH)])
+
+
+def _last_points(arm: ArmGeometry, point: Array, rng: np.random.Generator) -> Array:
+    """World positions of a point of the last joint's frame in a batch of random postures."""
+    q = rng.uniform(arm.lower, arm.upper, (_BATCH, 6))
+    T = joint_placements(arm, q)[:, 5]
+    return np.asarray(T[:, :3, :3] @ point + T[:, :3, 3])
+
+
+def _common(geometry: CellGeometry, pads: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Box centres for which both shifted pad cubes are reached."""
+    common = np.ones(pads[0].shape, dtype=bool)
+    for reached, contact in zip(pads, geometry.workcell.contacts, strict=True):
+        shift = np.round(contact.T_box_pad[:3, 3] / STEP).astype(int)
+        common &= _shifted(reached, shift)
+    return common
+
+
+def _shifted(mask: NDArray[np.bool_], shift: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """mask[k + shift] at every k, False beyond the grid."""
+    result = np.zeros_like(mask)
+    source = tuple(slice(max(s, 0), n + min(s, 0)) for s, n in zip(shift, mask.shape, strict=True))
+    target = tuple(
+        slice(max(-s, 0), n + min(-s, 0)) for s, n in zip(shift, mask.shape, strict=True)
+    )
+    result[target] = mask[source]
+    return result

@@ -1,0 +1,182 @@
+"""What a report shows, gathered once and frozen. Figures and tables are functions of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from hybrid_opt.evaluation import Evaluations
+from hybrid_opt.robustness import Margin, PayloadSensitivity
+from hybrid_opt.timing import ForceCurve, TimedCarry, TimingReport
+from symbolic.collision_pairs import CellGeometry
+from symbolic.workcell import Array, Workcell
+
+
+@dataclass(frozen=True)
+class Carry:
+    """One trajectory with everything that is drawn of it.
+
+    Attributes:
+        label: for legends, e.g. the algorithm's title.
+        x: (n_var,) decision vector.
+        objectives: (n_obj,) of the campaign, without penalty.
+        timed: every quantity along it, under the search's timing.
+        sensitivity: its forces against the payload's mass.
+        feasible: the evaluator's verdict.
+    """
+
+    label: str
+    x: Array
+    objectives: Array
+    timed: TimedCarry
+    sensitivity: PayloadSensitivity
+    feasible: bool
+
+
+@dataclass(frozen=True)
+class Front:
+    """Non-dominated feasible trajectories: x (k, n_var), objectives (k, n_obj)."""
+
+    x: Array
+    objectives: Array
+
+    def __len__(self) -> int:
+        return len(self.objectives)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One replica of one algorithm.
+
+    Attributes:
+        replica: its number, from 0.
+        evaluations: every candidate that the search evaluated.
+        front: what the search found.
+        hybrid: what the polish made of it, None without a polish.
+        figures, hybrid_figures: indicators by name, as in summary.json.
+    """
+
+    replica: int
+    evaluations: Evaluations
+    front: Front
+    hybrid: Front | None
+    figures: Mapping[str, Any]
+    hybrid_figures: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class AlgorithmRuns:
+    """All replicas of one algorithm.
+
+    Attributes:
+        name, title: on the command line, and for people.
+        index: its place in the campaign, which decides its look.
+        runs: the replicas.
+        representative: position in `runs` of the one with the largest hypervolume, which the
+            figures of single runs show (the paper's 'best-performing run').
+        selected: of that run's front, the trajectory of least mean force of the two robots;
+            None if the algorithm found no feasible candidate.
+        hybrid_selected: the same of its polished front, None without a polish.
+    """
+
+    name: str
+    title: str
+    index: int
+    runs: tuple[Run, ...]
+    representative: int
+    selected: Carry | None
+    hybrid_selected: Carry | None
+
+    @property
+    def shown(self) -> Run:
+        """The representative run."""
+        return self.runs[self.representative]
+
+    @property
+    def best(self) -> Carry | None:
+        """The polished selected trajectory where there is one, else the search's."""
+        return self.hybrid_selected or self.selected
+
+
+@dataclass(frozen=True)
+class TimedSelection:
+    """What real timing makes of one selected trajectory.
+
+    Attributes:
+        label: whose it is.
+        report: the search's timing and the drivable ones.
+        curve: duration against force limit.
+        margins: how wrong the assumptions may be.
+    """
+
+    label: str
+    report: TimingReport
+    curve: ForceCurve
+    margins: tuple[Margin, ...]
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """Everything that a report shows.
+
+    Attributes:
+        workcell: the cell.
+        geometry: its collision bodies and pairs.
+        summary: the content of summary.json.
+        objective_titles: for axes.
+        static: (n_obj,) the objectives of the level payload at rest, NaN where an objective has
+            no such value.
+        algorithms: in the campaign's order.
+        initial: the hand-made trajectory.
+        timings: of the hand-made and the selected trajectories, in the order of `carries`.
+        reach: where the arms reach.
+    """
+
+    workcell: Workcell
+    geometry: CellGeometry
+    summary: Mapping[str, Any]
+    objective_titles: tuple[str, ...]
+    static: Array
+    algorithms: tuple[AlgorithmRuns, ...]
+    initial: Carry
+    timings: tuple[TimedSelection, ...]
+    reach: ReachMap
+
+    @property
+    def solved(self) -> tuple[AlgorithmRuns, ...]:
+        """The algorithms that found a feasible candidate."""
+        return tuple(a for a in self.algorithms if a.selected is not None)
+
+    @property
+    def carries(self) -> tuple[Carry, ...]:
+        """The initial trajectory and each algorithm's best selected one."""
+        best = [algorithm.best for algorithm in self.algorithms]
+        return (self.initial, *(carry for carry in best if carry is not None))
+
+    @property
+    def has_hybrid(self) -> bool:
+        """Whether the fronts were polished."""
+        return any(run.hybrid is not None for a in self.algorithms for run in a.runs)
+
+
+@dataclass(frozen=True)
+class ReachMap:
+    """Where the arms' pads and the box can be, on a grid of cubes, positions only.
+
+    A cube is reached if a sampled posture within the joint limits puts the pad there.
+
+    Attributes:
+        lower: (3,) corner of the grid in the world [m].
+        step: edge of the cubes [m].
+        pads: per arm a boolean (nx, ny, nz).
+        common: boolean (nx, ny, nz), box centres from which a level box has both its pads in
+            cubes that their arms reach.
+    """
+
+    lower: Array
+    step: float
+    pads: tuple[NDArray[Any], NDArray[Any]]
+    common: NDArray[Any]

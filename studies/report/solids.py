@@ -1,0 +1,135 @@
+"""The cell's bodies as triangle meshes, and where they are along a carry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from symbolic.collision_bodies import ArmGeometry, Frame
+from symbolic.collision_pairs import CellGeometry
+from symbolic.geometry import Capsule, Hull, Piece
+from symbolic.workcell import Array, Box, Cylinder, Sphere
+
+SECTIONS = 24
+"""Facets around a cylinder."""
+
+GROUND_SIZE = 2.5
+"""Fixed bodies at least this long and wide are ground: drawn behind everything [m]."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A body as triangles in the frame that it is fixed to.
+
+    Attributes:
+        name, group: of the collision body.
+        frame: what it is fixed to.
+        vertices: (n, 3) [m].
+        faces: (m, 3) indices, outward.
+        is_ground: whether it is a large fixed plate.
+    """
+
+    name: str
+    group: str
+    frame: Frame
+    vertices: Array
+    faces: NDArray[np.int64]
+    is_ground: bool
+
+
+def cell_solids(geometry: CellGeometry) -> tuple[Solid, ...]:
+    """Every collision body of a cell as triangles."""
+    solids = []
+    for body in geometry.bodies:
+        meshes = [_mesh(piece) for piece in body.pieces]
+        vertices = np.concatenate([np.asarray(mesh.vertices, np.float64) for mesh in meshes])
+        first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+        faces = np.concatenate(
+            [np.asarray(m.faces, np.int64) + k for m, k in zip(meshes, first[:-1], strict=True)]
+        )
+        extent = np.sort(np.ptp(vertices, axis=0))[::-1]
+        ground = body.frame.kind == "world" and bool(extent[1] >= GROUND_SIZE)
+        solids.append(Solid(body.name, body.group, body.frame, vertices, faces, ground))
+    return tuple(solids)
+
+
+def _mesh(piece: Piece) -> trimesh.Trimesh:
+    mesh: trimesh.Trimesh
+    shape = piece.shape
+    match shape:
+        case Box():
+            mesh = trimesh.creation.box(extents=np.asarray(shape.size))
+        case Cylinder():
+            mesh = trimesh.creation.cylinder(shape.radius, shape.length, sections=SECTIONS)
+        case Sphere():
+            mesh = trimesh.creation.icosphere(subdivisions=2, radius=shape.radius)
+        case Capsule():
+            mesh = trimesh.creation.capsule(
+                height=shape.length, radius=shape.radius, count=(SECTIONS, SECTIONS // 2)
+            )
+            centre = (mesh.bounds[0] + mesh.bounds[1]) / 2.0
+            mesh.apply_translation(-centre)
+        case Hull():
+            mesh = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+    mesh.apply_transform(piece.pose)
+    return mesh
+
+
+def joint_placements(arm: ArmGeometry, q: Array) -> Array:
+    """(n, 6, 4, 4) of an arm's joint frames in the world at joints q (n, 6) [rad]."""
+    placed = np.empty((len(q), 6, 4, 4))
+    T = np.broadcast_to(arm.T_world_root, (len(q), 4, 4))
+    for j in range(6):
+        turn = np.zeros((len(q), 4, 4))
+        turn[:, :3, :3] = Rotation.from_rotvec(np.outer(q[:, j], arm.axes[j])).as_matrix()
+        turn[:, 3, 3] = 1.0
+        T = T @ arm.origins[j] @ turn
+        placed[:, j] = T
+    return placed
+
+
+def box_placements(pose: Array) -> Array:
+    """(n, 4, 4) of the box in the world from poses (n, 6) [m, rad]."""
+    T = np.zeros((len(pose), 4, 4))
+    # Rz(yaw) Ry(pitch) Rx(roll), as `symbolic.rotation` has it.
+    T[:, :3, :3] = Rotation.from_euler("xyz", pose[:, 3:]).as_matrix()
+    T[:, :3, 3] = pose[:, :3]
+    T[:, 3, 3] = 1.0
+    return T
+
+
+def frame_placements(geometry: CellGeometry, pose: Array, q: Array) -> dict[Frame, Array]:
+    """(n, 4, 4) of every frame in the world along n samples: pose (n, 6), q (n, 12)."""
+    placed = {
+        Frame("world"): np.broadcast_to(np.eye(4), (len(pose), 4, 4)),
+        Frame("box"): box_placements(pose),
+    }
+    for i, arm in enumerate(geometry.arms):
+        joints = joint_placements(arm, q[:, 6 * i : 6 * i + 6])
+        placed |= {Frame("link", i, j): joints[:, j] for j in range(6)}
+    return placed
+
+
+def extent_points(
+    geometry: CellGeometry, solids: tuple[Solid, ...], pose: Array, q: Array
+) -> Array:
+    """(k, 3) corners of every solid's own bounding box at n samples, the ground left out.
+
+    They frame what a picture has to show: pose (n, 6), q (n, 12).
+    """
+    placed = frame_placements(geometry, pose, q)
+    points = []
+    for solid in solids:
+        if solid.is_ground:
+            continue
+        lower, upper = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
+        corners = np.array(list(product(*zip(lower, upper, strict=True))))
+        T = placed[solid.frame]
+        moved = corners @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        points.append(moved.reshape(-1, 3))
+    return np.concatenate(points)

@@ -1,0 +1,120 @@
+"""One style for every figure: print sizes, colours that survive grey and colour blindness."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+MM = 1.0 / 25.4
+FULL_WIDTH = 180.0 * MM
+"""Text width of a journal page [inch]."""
+
+HALF_WIDTH = 88.0 * MM
+"""One column [inch]."""
+
+PNG_DPI = 200
+
+RC: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.0,
+    "axes.titlesize": 8.0,
+    "axes.labelsize": 8.0,
+    "legend.fontsize": 7.0,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "axes.linewidth": 0.6,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.linewidth": 0.4,
+    "grid.color": "#d9d9d9",
+    "lines.linewidth": 1.3,
+    "lines.markersize": 4.0,
+    "legend.frameon": True,
+    "legend.framealpha": 0.9,
+    "legend.edgecolor": "#cccccc",
+    "legend.fancybox": False,
+    "patch.linewidth": 0.6,
+    "text.parse_math": False,
+    "pdf.fonttype": 42,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "dual-arm-carry",
+    "figure.dpi": 100.0,
+}
+
+
+@dataclass(frozen=True)
+class LineStyle:
+    """How one trajectory or algorithm is drawn everywhere."""
+
+    colour: str
+    line: Any
+    marker: str
+    hatch: str
+
+
+INITIAL = LineStyle("#555555", ":", "s", "....")
+"""Of the hand-made trajectory."""
+
+SERIES = (
+    LineStyle("#0072B2", "-", "o", ""),
+    LineStyle("#E69F00", "--", "^", "////"),
+    LineStyle("#009E73", "-.", "D", "xxxx"),
+    LineStyle("#CC79A7", (0, (5, 1, 1, 1, 1, 1)), "v", "\\\\\\\\"),
+    LineStyle("#D55E00", (0, (1, 1)), "P", "++++"),
+)
+"""Of the algorithms in order (Okabe and Ito's colours: apart for the colour-blind and in grey)."""
+
+ARMS = ("#3b6ea8", "#a8733b")
+"""Of the two robots in pictures of the cell."""
+
+PAYLOAD = "#c9a227"
+OBSTACLE = "#9aa3ab"
+GROUND = "#e8e8e4"
+
+
+def series(index: int) -> LineStyle:
+    """Style of the algorithm at a position."""
+    return SERIES[index % len(SERIES)]
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of this size [inch]; draw it inside `in_style`."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+@contextmanager
+def in_style() -> Iterator[None]:
+    """Whatever is drawn in the `with` block has the common style."""
+    with mpl.rc_context(RC):
+        yield
+
+
+def panel_label(axes: Axes, letter: str, text: str) -> None:
+    """'(a) text' above a panel's left corner."""
+    axes.set_title(f"({letter}) {text}", loc="left")
+
+
+def save(figure: Figure, folder: Path, name: str) -> tuple[Path, ...]:
+    """Write a figure as PDF, SVG and PNG; returns the files.
+
+    Layout is fixed by the first, so that all three show the same.
+    """
+    paths = []
+    with in_style():
+        for suffix, metadata in (
+            ("png", {"Software": None}),
+            ("pdf", {"CreationDate": None}),
+            ("svg", {"Date": None}),
+        ):
+            path = folder / f"{name}.{suffix}"
+            figure.savefig(path, dpi=PNG_DPI, metadata=metadata)
+            figure.set_layout_engine("none")
+            paths.append(path)
+    return tuple(paths)

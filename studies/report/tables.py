@@ -1,0 +1,320 @@
+"""The report's tables as records, and their texts as CSV, Markdown, LaTeX and HTML."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.statistics import summarise
+from studies.report.records import AlgorithmRuns, Carry, ReportData
+from studies.terminal_summary import PAPER
+
+NOTHING = "–"
+"""Where there is no figure."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts.
+
+    Attributes:
+        name: of its files, without suffix.
+        title: above it.
+        header, rows: cells; the first column names the row.
+        note: below it.
+    """
+
+    name: str
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str
+
+    def csv(self) -> str:
+        """Comma-separated values, without title and note."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(self.header)
+        writer.writerows(self.rows)
+        return text.getvalue()
+
+    def markdown(self) -> str:
+        """A Markdown table with title and note."""
+        lines = [self.header, tuple(["---"] + ["---:"] * (len(self.header) - 1)), *self.rows]
+        body = "\n".join("| " + " | ".join(_markdown(cell) for cell in row) + " |" for row in lines)
+        return f"**{_markdown(self.title)}**\n\n{body}\n\n{_markdown(self.note)}\n"
+
+    def latex(self) -> str:
+        """A LaTeX table with booktabs rules."""
+        columns = "l" + "r" * (len(self.header) - 1)
+        rows = [" & ".join(_latex(cell) for cell in row) + r" \\" for row in self.rows]
+        head = " & ".join(_latex(cell) for cell in self.header) + r" \\"
+        return "\n".join(
+            [
+                "% needs \\usepackage{booktabs}",
+                r"\begin{table}",
+                rf"\caption{{{_latex(self.title)} {_latex(self.note)}}}",
+                rf"\begin{{tabular}}{{{columns}}}",
+                r"\toprule",
+                head,
+                r"\midrule",
+                *rows,
+                r"\bottomrule",
+                r"\end{tabular}",
+                r"\end{table}",
+                "",
+            ]
+        )
+
+    def html(self) -> str:
+        """An HTML table; every text is escaped."""
+        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in self.header)
+        body = "".join(
+            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
+            for row in self.rows
+        )
+        return (
+            f"<h3>{html.escape(self.title)}</h3><div class='scroll'><table><thead><tr>{head}</tr>"
+            f"</thead><tbody>{body}</tbody></table></div><p class='note'>{html.escape(self.note)}"
+            "</p>"
+        )
+
+
+def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
+    """All tables of a report.
+
+    Args:
+        with_paper: whether figures that the paper states of its own rack stand beside ours.
+    """
+    tables = [quality(data, with_paper), selected(data, with_paper)]
+    if len(data.summary["tests"]) > 0:
+        tables.append(rank_tests(data))
+    if data.timings:
+        tables += [timings(data), margins(data)]
+    return tuple(tables)
+
+
+_QUALITY = (
+    ("feasible", "feasible", 0, 1.0),
+    ("feasible_share", "feasible [%]", 1, 100.0),
+    ("non_dominated", "non-dominated", 1, 1.0),
+    ("hypervolume", "hypervolume", 4, 1.0),
+    ("igd", "IGD", 5, 1.0),
+    ("spacing", "spacing", 5, 1.0),
+)
+
+
+def quality(data: ReportData, with_paper: bool) -> Table:
+    """Indicators over the replicas (paper Table 1)."""
+    rows = []
+    for algorithm in data.algorithms:
+        rows.append((algorithm.title, *_means([run.figures for run in algorithm.runs])))
+        polished = [run.hybrid_figures for run in algorithm.runs if run.hybrid is not None]
+        if polished:
+            rows.append((f"{algorithm.title} + polish", *_means(polished)))
+        if with_paper and algorithm.name in PAPER:
+            stated = PAPER[algorithm.name]
+            cells = [str(stated.feasible), f"{stated.feasible / 10.0:.1f}"]
+            rows.append((f"{algorithm.title}, paper", *cells, *[NOTHING] * 4))
+    settings = data.summary["settings"]
+    return Table(
+        "table1_quality",
+        "Table 1. Quality of the search.",
+        ("algorithm", *(heading for _, heading, _, _ in _QUALITY)),
+        tuple(rows),
+        f"Mean ± standard deviation of {settings['replicas']} replicas of "
+        f"{settings['evaluations']} evaluations. Hypervolume: reference 1.1 in every objective. "
+        "IGD: mean distance to the non-dominated union of the campaign. Spacing: Schott's."
+        + (" The paper's rows hold what its text states." if with_paper else ""),
+    )
+
+
+def _means(figures: Sequence[Mapping[str, Any]]) -> list[str]:
+    cells = []
+    for name, _, digits, scale in _QUALITY:
+        known = [row[name] for row in figures if row.get(name) is not None]
+        if not known:
+            cells.append(NOTHING)
+            continue
+        summary = summarise(np.array(known, dtype=float) * scale)
+        cells.append(f"{number(summary.mean, digits)} ± {number(summary.std, digits)}")
+    return cells
+
+
+def selected(data: ReportData, with_paper: bool) -> Table:
+    """Normal forces of the selected trajectories (paper Table 2)."""
+    rows = [_forces(data, data.initial, data.initial.label)]
+    for algorithm in data.algorithms:
+        rows += [_forces(data, carry, label) for label, carry in _selections(algorithm)]
+        if with_paper and algorithm.name in PAPER:
+            limit = f"{PAPER[algorithm.name].payload_limit:.2f}"
+            rows.append((f"{algorithm.title}, paper", *[NOTHING] * 6, limit))
+    still = data.summary["static_hold"]
+    force = [number(value, 2) for value in still["normal_force"]]
+    rows.append(
+        ("level payload at rest", *force, *force, "0.00", NOTHING, number(still["payload_limit"]))
+    )
+    left, right = (robot.name for robot in data.workcell.robots)
+    return Table(
+        "table2_selected",
+        "Table 2. Normal contact forces of the selected trajectories.",
+        (
+            "trajectory",
+            f"least, {left} [N]",
+            f"least, {right} [N]",
+            f"peak, {left} [N]",
+            f"peak, {right} [N]",
+            "above rest [%]",
+            "duration [s]",
+            "payload at the limit [kg]",
+        ),
+        tuple(rows),
+        "Selected: least mean peak force of the replica with the largest hypervolume. Above rest: "
+        "mean of both peaks over that of the level payload at rest. Payload: at which the first "
+        "robot's whole contact force reaches its reference force.",
+    )
+
+
+def _selections(algorithm: AlgorithmRuns) -> list[tuple[str, Carry]]:
+    found = []
+    if algorithm.selected is not None:
+        found.append((algorithm.title, algorithm.selected))
+    if algorithm.hybrid_selected is not None:
+        found.append((f"{algorithm.title} + polish", algorithm.hybrid_selected))
+    return found
+
+
+def _forces(data: ReportData, carry: Carry, label: str) -> tuple[str, ...]:
+    normal = carry.timed.normal_force
+    least, peak = normal.min(axis=0), normal.max(axis=0)
+    still = float(np.mean(data.summary["static_hold"]["normal_force"]))
+    excess = 100.0 * (float(peak.mean()) / still - 1.0)
+    name = label if carry.feasible else f"{label} (infeasible)"
+    return (
+        name,
+        *(number(value) for value in least),
+        *(number(value) for value in peak),
+        number(excess),
+        number(carry.timed.duration),
+        number(carry.sensitivity.payload_limit),
+    )
+
+
+def rank_tests(data: ReportData) -> Table:
+    """Mann-Whitney tests between algorithms."""
+    titles = {algorithm.name: algorithm.title for algorithm in data.algorithms}
+    rows = tuple(
+        (
+            f"{titles[test['first']]} / {titles[test['second']]}",
+            str(test["figure"]).replace("_", " "),
+            number(test["a12"]),
+            str(test["magnitude"]),
+            number(test["p"], 5),
+            number(test["p_holm"], 5),
+        )
+        for test in data.summary["tests"]
+    )
+    return Table(
+        "tests",
+        "Comparison over replicas.",
+        ("pair", "figure", "A12", "effect", "p", "p (Holm)"),
+        rows,
+        "Exact Mann-Whitney tests. A12: chance that the first of the pair has the larger figure.",
+    )
+
+
+def timings(data: ReportData) -> Table:
+    """Durations and forces under the search's timing and under drivable ones."""
+    rows = []
+    for selection in data.timings:
+        report = selection.report
+        for name, timing in (
+            ("search's own", report.judged.timing),
+            ("closest to the reference speed", report.closest),
+            ("fastest", report.fastest),
+        ):
+            peak = timing.carry.normal_force.max(axis=0) if timing.carry else np.full(2, np.nan)
+            rows.append(
+                (
+                    f"{selection.label}: {name}",
+                    number(timing.duration),
+                    *(number(value) for value in peak),
+                    str(timing.status),
+                    timing.reason,
+                )
+            )
+    left, right = (robot.name for robot in data.workcell.robots)
+    return Table(
+        "timing",
+        "What real timing makes of the selected trajectories.",
+        (
+            "trajectory and timing",
+            "duration [s]",
+            f"peak, {left} [N]",
+            f"peak, {right} [N]",
+            "status",
+            "why",
+        ),
+        tuple(rows),
+        "Judged against joint speed, acceleration and torque, payload speed and acceleration, "
+        "friction and pressure shift; drivable timings start and end at rest.",
+    )
+
+
+def margins(data: ReportData) -> Table:
+    """How wrong the model's assumptions may be, under the drivable timing."""
+    labels = [selection.label for selection in data.timings]
+    rows = []
+    for k, margin in enumerate(data.timings[0].margins):
+        unit = f" [{margin.unit}]" if margin.unit else ""
+        cells = [
+            f"{selection.margins[k].limit:.4g}"
+            + (f" ({selection.margins[k].fails})" if selection.margins[k].fails else "")
+            for selection in data.timings
+        ]
+        rows.append((f"{margin.quantity}{unit}", f"{margin.nominal:.4g}", *cells))
+    return Table(
+        "margins",
+        "How far assumptions may be off before a carry fails.",
+        ("assumption", "nominal", *labels),
+        tuple(rows),
+        "Under the timing closest to the reference speed. In brackets: what fails beyond that.",
+    )
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A figure in print."""
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    return f"{value:.{digits}f}"
+
+
+def _markdown(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;").replace("\n", " ")
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+    "–": "--",
+}
+
+
+def _latex(text: str) -> str:
+    return "".join(_LATEX.get(letter, letter) for letter in text)
