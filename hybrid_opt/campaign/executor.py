@@ -61,7 +61,9 @@ class Executor(Protocol):
             job: what to do.
             count: number of tasks.
             task_of: a task by its number, asked for whenever it is given out.
-            on_message: takes each message of a task, in order and none twice.
+            on_message: takes the messages of each task in order. A task that is given out again
+                emits what the task then asked for emits; where it was not asked for again, what
+                came before is left out.
             on_result: takes each task's result; no message of that task follows.
 
         Raises:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -210,75 +208,6 @@ def test_workers_end_with_the_campaign(tmp_path: Path) -> None:
     wait_for(all_gone)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"seed": 2}, r"settings.seed: stored 1, now 2"),
-        ({"evaluations": 201}, r"settings.evaluations: stored 200, now 201"),
-        ({"replicas": 3}, r"settings.replicas: stored 2, now 3"),
-        ({"constraint_handling": "constraints"}, r'stored "penalty", now "constraints"'),
-        ({"populations": (("mopso", 30),)}, r"settings.algorithms.mopso.swarm: stored 40, now 30"),
-        ({"objectives": ("duration", "mean_force")}, r"settings.objectives: stored"),
-    ],
-)
-def test_other_settings_are_never_mixed(
-    tmp_path: Path, change: dict[str, Any], message: str
-) -> None:
-    execution = ExecutionSettings(tmp_path, 1, resume=True)
-    with open_folder(SETTINGS, execution, load(RACK)):
-        pass
-    with (
-        pytest.raises(ResultsError, match=message),
-        open_folder(replace(SETTINGS, **change), execution, load(RACK)),
-    ):
-        pytest.fail("was opened")
-
-
-def changed_cell(folder: Path) -> Path:
-    shutil.copytree(RACK.parents[1] / "robots", folder / "robots")
-    path = folder / "cells/cell.toml"
-    path.parent.mkdir()
-    path.write_text(RACK.read_text().replace("mass = 10.0", "mass = 10.5"))
-    return path
-
-
-def test_other_workcell_is_never_mixed(tmp_path: Path) -> None:
-    execution = ExecutionSettings(tmp_path / "a", 1, resume=True)
-    with open_folder(SETTINGS, execution, load(RACK)):
-        pass
-    with (
-        pytest.raises(ResultsError, match="holds results of another workcell"),
-        open_folder(SETTINGS, execution, load(changed_cell(tmp_path))),
-    ):
-        pytest.fail("was opened")
-
-
-@pytest.mark.parametrize("key", ["numpy", "sources"])
-def test_other_software_is_never_mixed(tmp_path: Path, key: str) -> None:
-    execution = ExecutionSettings(tmp_path, 1, resume=True)
-    with open_folder(SETTINGS, execution, load(RACK)):
-        pass
-    path = tmp_path / "configuration.json"
-    stored = json.loads(path.read_text())
-    stored["environment"][key] = "0.1"
-    path.write_text(json.dumps(stored))
-    with (
-        pytest.raises(ResultsError, match=rf'environment.{key}: stored "0.1", now'),
-        open_folder(SETTINGS, execution, load(RACK)),
-    ):
-        pytest.fail("was opened")
-
-
-def test_the_stored_workcell_does_not_follow_the_file(tmp_path: Path) -> None:
-    cell = changed_cell(tmp_path)
-    execution = ExecutionSettings(tmp_path / "a", 1)
-    with open_folder(SETTINGS, execution, load(cell)) as folder:
-        cell.unlink()
-        assert folder.workcell.payload.mass == 10.5
-        assert folder.workcell.source.is_relative_to(tmp_path / "a")
-        assert load(folder.workcell.source).digest == folder.workcell.digest
-
-
 def test_a_folder_serves_one_process(tmp_path: Path) -> None:
     log = tmp_path / "log"
     process = start(tmp_path / "a", "--delay", "0.1", "--log", str(log))
@@ -288,20 +217,6 @@ def test_a_folder_serves_one_process(tmp_path: Path) -> None:
     process.kill()
     process.communicate()
     run_search(SETTINGS, ExecutionSettings(tmp_path / "a", 1, resume=True))
-
-
-def test_existing_results_are_not_touched_without_resume(tmp_path: Path) -> None:
-    execution = ExecutionSettings(tmp_path / "a", 1)
-    run_search(replace(SETTINGS, evaluations=40, replicas=1), execution)
-    with pytest.raises(ResultsError, match="holds a campaign already; continue it with --resume"):
-        run_search(replace(SETTINGS, evaluations=40, replicas=1), execution)
-
-
-@pytest.mark.parametrize("resume", [False, True])
-def test_other_folders_are_not_touched(tmp_path: Path, resume: bool) -> None:
-    (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(ResultsError, match=r"not empty \(thesis.tex\)"):
-        run_search(SETTINGS, ExecutionSettings(tmp_path, 1, resume=resume))
 
 
 def test_unfinished_results_are_told(tmp_path: Path) -> None:
