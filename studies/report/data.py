@@ -72,10 +72,7 @@ class _CarryMaker:
         self.model = TimingModel(results.workcell)
 
     def carry(self, x: Array, label: str) -> Carry:
-        timed = self.model.search_carry(x)
-        found = self.evaluator.evaluate(x[None])
-        sensitivity = payload_sensitivity(self.model, timed)
-        return Carry(label, x, found.objectives[0], timed, sensitivity, bool(found.feasible[0]))
+        return carry_of(self.evaluator, self.model, x, label)
 
     def balanced(self, front: Front, label: str) -> Carry:
         """The trajectory of least mean peak force of a front."""
@@ -91,6 +88,14 @@ class _CarryMaker:
             duration_against_force_limit(self.model, carry.x),
             robustness_margins(self.model, judged),
         )
+
+
+def carry_of(evaluator: CandidateEvaluator, model: TimingModel, x: Array, label: str) -> Carry:
+    """One trajectory (n_var,) in detail."""
+    found = evaluator.evaluate(x[None])
+    timed = model.search_carry(x)
+    sensitivity = payload_sensitivity(model, timed)
+    return Carry(label, x, found.objectives[0], timed, sensitivity, bool(found.feasible[0]))
 
 
 def _algorithm(

@@ -17,6 +17,7 @@ from string import Template
 from typing import Any
 
 import trimesh
+
 from studies.report.records import ReportData
 from studies.report.tables import Table, number
 from symbolic.errors import ReportError

@@ -43,8 +43,6 @@ RC: dict[Any, Any] = {
     "patch.linewidth": 0.6,
     "text.parse_math": False,
     "pdf.fonttype": 42,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "dual-arm-carry",
     "figure.dpi": 100.0,
 }
 
@@ -102,16 +100,15 @@ def panel_label(axes: Axes, letter: str, text: str) -> None:
 
 
 def save(figure: Figure, folder: Path, name: str) -> tuple[Path, ...]:
-    """Write a figure as PDF, SVG and PNG; returns the files.
+    """Write a figure as PNG and PDF; returns the files.
 
-    Layout is fixed by the first, so that all three show the same.
+    Layout is fixed by the first, so that both show the same.
     """
     paths = []
     with in_style():
         for suffix, metadata in (
             ("png", {"Software": None}),
             ("pdf", {"CreationDate": None}),
-            ("svg", {"Date": None}),
         ):
             path = folder / f"{name}.{suffix}"
             figure.savefig(path, dpi=PNG_DPI, metadata=metadata)

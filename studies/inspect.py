@@ -1,0 +1,116 @@
+"""Look at a workcell before a study: what it is, what is feasible in it, what it can win.
+
+Prints the cell's facts, the postures at the start, the static bound, the verdicts on the
+hand-made trajectory and on the straight line, the feasibility of random candidates by
+constraint and the collision pairs with the reasons for those left out; draws the cell and both
+arms' reach.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from studies.inspection import Branch, Inspection, Judged, inspect
+from symbolic.errors import DualArmError, SettingsError
+from symbolic.workcell_file import load
+
+PROGRAM = "python -m studies.inspect"
+
+
+def as_text(found: Inspection) -> str:
+    """An inspection for people."""
+    lines = [found.name, ""]
+    lines += [f"  {heading}: {text}" for heading, text in found.facts.items()]
+    lines += ["", "Postures at the start, best first (* used), along the hand-made trajectory"]
+    for robot, branches in found.branches.items():
+        lines.append(f"  {robot}")
+        lines += [f"  {'*' if b.chosen else ' '} {_branch_text(b)}" for b in branches]
+    still = ", ".join(f"{force:.2f}" for force in found.static_normal_force)
+    share = ", ".join(f"{value:.4f}" for value in found.static_objectives)
+    lines += [
+        "",
+        f"At rest, level: normal forces {still} N, objectives {share}; payload at the reference "
+        f"force {found.static_payload_limit:.2f} kg",
+        f"Hand-made trajectory: {_judged_text(found.initial)}",
+        f"Straight line: {_judged_text(found.straight_line)}",
+        "",
+        f"{found.candidates} random candidates within the bounds (seed {found.seed}): "
+        f"{100.0 * found.feasible_share:.1f} % feasible",
+    ]
+    lines += [
+        f"  {name.replace('_', ' ')}: {count} ({100.0 * count / found.candidates:.1f} %)"
+        for name, count in found.infeasible_by_reason.items()
+    ]
+    lines += ["", f"Collision pairs: {len(found.active_pairs)} checked"]
+    lines += [f"  {first} – {second}" for first, second in found.active_pairs]
+    lines.append(f"{len(found.excluded_pairs)} left out")
+    lines += [f"  {first} – {second}: {why}" for first, second, why in found.excluded_pairs]
+    if found.files:
+        lines += ["", "Pictures: " + ", ".join(found.files)]
+    return "\n".join(lines)
+
+
+def _branch_text(branch: Branch) -> str:
+    joints = " ".join(f"{angle:7.1f}" for angle in branch.joints_deg)
+    near = "unknown" if branch.clearance_mm is None else f"{branch.clearance_mm:.0f} mm"
+    return (
+        f"[{joints}] deg: keeps {branch.kept_samples} samples, clearance {near}, limits "
+        f"{branch.limit_margin_deg:.0f} deg, manipulability {branch.manipulability:.3f} m^3"
+    )
+
+
+def _judged_text(judged: Judged) -> str:
+    forces = ", ".join(f"{value:.4f}" for value in judged.objectives)
+    if judged.position is None:
+        return f"feasible, objectives {forces}"
+    where = f"at {100.0 * judged.position:.0f} % of the path"
+    return f"infeasible, {judged.reason.replace('_', ' ')} {where}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; returns the exit code."""
+    parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
+    parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
+    parser.add_argument(
+        "--candidates",
+        type=int,
+        default=1000,
+        metavar="N",
+        help="random candidates to judge (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=1, metavar="N", help="of their randomness (default: 1)"
+    )
+    parser.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="folder for the pictures (default: inspect/NAME of the workcell file)",
+    )
+    parser.add_argument("--no-pictures", action="store_true", help="draw nothing")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of text")
+    options = parser.parse_args(arguments)
+    try:
+        if options.seed < 0:
+            raise SettingsError(f"--seed is {options.seed}; allowed are whole numbers from 0")
+        output = options.output or Path("inspect") / options.workcell.stem
+        found = inspect(
+            load(options.workcell),
+            options.candidates,
+            options.seed,
+            None if options.no_pictures else output,
+        )
+    except DualArmError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return 2
+    print(json.dumps(asdict(found), indent=2) if options.json else as_text(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,112 @@
+"""A carry as an animation file: GIF through Pillow, MP4 through imageio's ffmpeg."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from studies.report.drawing import ISOMETRIC, cut_faces, draw_cell, draw_path, frame_axes
+from studies.report.figures_cell import motion_points
+from studies.report.records import Carry
+from studies.report.solids import cell_solids
+from studies.report.style import in_style
+from symbolic.collision_pairs import CellGeometry
+from symbolic.errors import ReportError
+from symbolic.workcell import Array
+
+FRAMES_PER_SECOND = 15
+SIZE = (6.4, 4.0)
+"""Of a frame [inch]."""
+
+DPI = 100
+HOLD_SECONDS = 0.7
+"""The last frame stays so long before a GIF begins anew."""
+
+COLOURS = 128
+"""Of a GIF's palette."""
+
+
+def write_animation(geometry: CellGeometry, carry: Carry, path: Path) -> None:
+    """Write a carry in real time; the suffix decides the format, .gif or .mp4.
+
+    Raises:
+        ReportError: the suffix is another, or the MP4 writer is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in (".gif", ".mp4"):
+        raise ReportError(f"animation {path.name!r}: the name must end in .gif or .mp4")
+    writer = _write_gif if suffix == ".gif" else _write_mp4
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer(frames(geometry, carry), path)
+
+
+def frames(geometry: CellGeometry, carry: Carry) -> Iterator[NDArray[np.uint8]]:
+    """(height, width, 3) pictures, evenly spaced in time."""
+    faces = cut_faces(cell_solids(geometry))
+    points = motion_points(geometry, carry)
+    timed = carry.timed
+    count = max(2, round(timed.duration * FRAMES_PER_SECOND) + 1)
+    moments = np.linspace(timed.time[0], timed.time[-1], count)
+    pose, q = _at(moments, timed.time, timed.pose), _at(moments, timed.time, timed.q)
+    for k, moment in enumerate(moments):
+        with in_style():
+            figure = Figure(figsize=SIZE, dpi=DPI)
+            axes = figure.add_axes((0.0, 0.0, 1.0, 0.93))
+            draw_cell(axes, geometry, faces, ISOMETRIC, pose[k], q[k])
+            draw_path(axes, ISOMETRIC, pose[: k + 1, :3], color="#b00020", linewidth=1.2)
+            frame_axes(axes, ISOMETRIC, points)
+            text = f"{carry.label}    t = {moment - timed.time[0]:5.2f} s"
+            figure.text(0.02, 0.95, text, fontsize=10)
+            yield _pixels(figure)
+
+
+def _at(moments: Array, time: Array, values: Array) -> Array:
+    """Values (n, k) at times (n,) interpolated to moments (m,)."""
+    return np.stack([np.interp(moments, time, column) for column in values.T], axis=1)
+
+
+def _pixels(figure: Figure) -> NDArray[np.uint8]:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    return np.ascontiguousarray(pixels[:, :, :3])
+
+
+def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path) -> None:
+    images = [Image.fromarray(pixels) for pixels in pictures]
+    # One palette for all frames, so that colours do not flicker.
+    palette = images[len(images) // 2].quantize(COLOURS, Image.Quantize.MEDIANCUT)
+    coded = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    step = round(1000 / FRAMES_PER_SECOND)
+    durations = [step] * (len(coded) - 1) + [step + round(1000 * HOLD_SECONDS)]
+    coded[0].save(
+        path, save_all=True, append_images=coded[1:], duration=durations, loop=0, optimize=False
+    )
+
+
+def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path) -> None:
+    try:
+        import imageio_ffmpeg  # type: ignore[import-untyped]
+    except ModuleNotFoundError as error:
+        raise ReportError(
+            'MP4 needs imageio-ffmpeg: pip install "dual-arm-carry[video]", or write a .gif'
+        ) from error
+    first = next(pictures)
+    height, width = first.shape[:2]
+    writer: Any = imageio_ffmpeg.write_frames(
+        str(path), (width, height), fps=FRAMES_PER_SECOND, macro_block_size=2
+    )
+    writer.send(None)
+    try:
+        writer.send(first)
+        for pixels in pictures:
+            writer.send(pixels)
+    finally:
+        writer.close()
