@@ -16,7 +16,7 @@ from symbolic.collision_pairs import CellGeometry
 from symbolic.geometry import Piece
 from symbolic.motion import motion_function
 from symbolic.rotation import rotation_matrix
-from symbolic.scene import Scene, clean, quaternion, world_placements
+from symbolic.scene import Scene, clean, world_placements
 from symbolic.softness import EXACT, Softness
 
 
@@ -87,3 +87,26 @@ def _piece_pose(R: ca.SX, p: ca.SX, piece: Piece) -> tuple[ca.SX, ca.SX]:
     """Unit quaternion (4,) and position (3,) in the world of a piece of a placed body."""
     rotation = ca.mtimes(R, ca.SX(clean(piece.rotation)))
     return quaternion(rotation), ca.mtimes(R, ca.SX(clean(piece.centre))) + p
+
+
+def quaternion(R: ca.SX) -> ca.SX:
+    """The unit quaternion (4,), w x y z, of a rotation (3, 3), stable for every angle.
+
+    Each column below is the quaternion times one of its own components (times 4); the column of
+    the largest component is the accurate one (Shepperd 1978).
+    """
+    trace = ca.trace(R)
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    squares = [1.0 + trace] + [1.0 + 2.0 * R[k, k] - trace for k in range(3)]
+    columns = [
+        ca.vertcat(squares[0], x, y, z),
+        ca.vertcat(x, squares[1], xy, xz),
+        ca.vertcat(y, xy, squares[2], yz),
+        ca.vertcat(z, xz, yz, squares[3]),
+    ]
+    best, largest = columns[0], squares[0]
+    for column, square in zip(columns[1:], squares[1:], strict=True):
+        best = ca.if_else(square > largest, column, best)
+        largest = ca.fmax(largest, square)
+    return best / ca.norm_2(best)

@@ -179,12 +179,11 @@ def bounding_box(pieces: tuple[Piece, ...], rotation: Array) -> Piece:
     return Piece(Box(upper - lower), pose)
 
 
-def slenderness(pieces: tuple[Piece, ...]) -> float:
-    """Length over width of the pieces' bounding box along the frame's axes."""
+def edges(pieces: tuple[Piece, ...]) -> Array:
+    """(3,) edge lengths, ascending, of the pieces' bounding box along the frame's axes [m]."""
     box = bounding_box(pieces, np.eye(3))
     assert isinstance(box.shape, Box)
-    _, width, length = np.sort(box.shape.size)
-    return float(length / width)
+    return np.asarray(np.sort(box.shape.size))
 
 
 def contains(cover: Piece, piece: Piece, tolerance: float = 1e-12) -> bool:

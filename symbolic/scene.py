@@ -14,15 +14,19 @@ import numpy as np
 from symbolic.collision_bodies import CollisionBody, Frame
 from symbolic.collision_pairs import CellGeometry
 from symbolic.covers import chain_cover, close_pairs, slab_cover
-from symbolic.geometry import Capsule, Piece, SphereChain, axes_with_z, slenderness, support
+from symbolic.geometry import Capsule, Piece, SphereChain, axes_with_z, edges, support
 from symbolic.softness import Softness
 from symbolic.workcell import Array, Box, Cylinder, Sphere
 
 Interval = tuple[ca.SX, ca.SX]
 """Least and largest coordinate along a direction."""
 
-LONG = 2.0
-"""Bodies this many times as long as wide are also compared along their own axes."""
+LONG = 0.25
+"""Bodies longer than wide by more than this [m] are also compared along their own axes: across
+the world's axes, a slanted body seems wider by up to that much."""
+
+VAST = 2.0
+"""Obstacles this many times as wide as a body is long (a floor) need no such comparison."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +205,7 @@ class Scene:
         axes = self._axes_of(piece)
         fixed = _fixed_intervals(piece, np.array(ca.DM(axes.A)))
         pairs = list(zip(self._interval(index, axes), fixed, strict=True))
-        if body.frame.kind == "box" or slenderness(body.pieces) > LONG:
+        if body.frame.kind == "box" or _slanted_matters(body, piece):
             own = self._own_axes(body.frame)
             cover = slab_cover(CollisionBody("", "environment", Frame("world"), (piece,)))[0]
             still = self._piece_interval(own.A, ca.SX.zeros(3), cover)
@@ -252,34 +256,17 @@ def world_placements(
     ]
 
 
-def quaternion(R: ca.SX) -> ca.SX:
-    """The unit quaternion (4,), w x y z, of a rotation (3, 3), stable for every angle.
-
-    Each column below is the quaternion times one of its own components (times 4); the column of
-    the largest component is the accurate one (Shepperd 1978).
-    """
-    trace = ca.trace(R)
-    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
-    squares = [1.0 + trace] + [1.0 + 2.0 * R[k, k] - trace for k in range(3)]
-    columns = [
-        ca.vertcat(squares[0], x, y, z),
-        ca.vertcat(x, squares[1], xy, xz),
-        ca.vertcat(y, xy, squares[2], yz),
-        ca.vertcat(z, xz, yz, squares[3]),
-    ]
-    best, largest = columns[0], squares[0]
-    for column, square in zip(columns[1:], squares[1:], strict=True):
-        best = ca.if_else(square > largest, column, best)
-        largest = ca.fmax(largest, square)
-    return best / ca.norm_2(best)
-
-
 def clean(matrix: Array) -> Array:
     """Entries within 1e-15 of -1, 0 or 1 made exact, so that expressions simplify."""
     rounded = np.round(matrix)
     near = (np.abs(matrix - rounded) < 1e-15) & (np.abs(rounded) <= 1.0)
     return np.where(near, rounded, matrix)
+
+
+def _slanted_matters(body: CollisionBody, obstacle: Piece) -> bool:
+    """Whether a body is long, and the obstacle no plane for it."""
+    _, width, length = edges(body.pieces)
+    return bool(length - width > LONG and edges((obstacle,))[1] < VAST * length)
 
 
 def _between_bases(geometry: CellGeometry) -> _Axes | None:

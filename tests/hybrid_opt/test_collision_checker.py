@@ -171,7 +171,8 @@ def test_the_least_distance_is_found_past_the_bounds() -> None:
 def above_board(gaps: list[float]) -> Configurations:
     """The box level above the middle board, both arms stretched upwards."""
     n = len(gaps)
-    pose = np.array([[0.0, 0.0, 0.725 + gap, 0.0, 0.0, 0.0] for gap in gaps])
+    pose = np.zeros((n, 6))
+    pose[:, 2] = 0.725 + np.array(gaps)
     return pose, np.zeros((n, 6)), np.zeros((n, 6))
 
 
@@ -264,6 +265,14 @@ def test_collision_time_is_what_the_colliding_samples_stand_for() -> None:
     )
     assert not verdict.is_free
     assert verdict.min_clearance == pytest.approx(-0.1)
+
+
+def test_no_samples_are_free_of_collisions() -> None:
+    """An arm that loses the path at once leaves nothing to check."""
+    verdict = checker("rack").check(*above_board([]), np.zeros(0))
+    assert verdict.is_free
+    assert (verdict.collision_time, verdict.fcl_calls) == (0.0, 0)
+    assert verdict.min_clearance == np.inf
 
 
 def test_unknown_bounds_go_to_fcl() -> None:

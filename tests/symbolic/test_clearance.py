@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from symbolic.clearance import quaternion
 from symbolic.pose import pose_matrix
 from symbolic.rotation import rotation_matrix
-from symbolic.scene import clean, quaternion
+from symbolic.scene import clean
 from symbolic.softness import EXACT, Softness
 from symbolic.workcell import Array
 from tests.symbolic.collision_cells import (
