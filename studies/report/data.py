@@ -24,7 +24,7 @@ from studies.report.records import (
 )
 from studies.selection import balanced, peak_normal_forces
 from studies.terminal_summary import title
-from symbolic.collision_pairs import build_geometry
+from symbolic.collision_pairs import CellGeometry, build_geometry
 from symbolic.workcell import Array
 
 INITIAL_LABEL = "hand-made"
@@ -44,13 +44,8 @@ def gather(root: Path) -> ReportData:
     workcell = results.workcell
     maker = _CarryMaker(results)
     geometry = build_geometry(workcell)
-    algorithms = tuple(
-        _algorithm(index, name, results, summary["algorithms"][name], maker)
-        for index, name in enumerate(results.algorithms)
-    )
-    initial = maker.carry(workcell.task.initial.reshape(-1), INITIAL_LABEL)
-    best = [algorithm.best for algorithm in algorithms]
-    carries = (initial, *(carry for carry in best if carry is not None))
+    algorithms = _algorithms(results, summary, maker)
+    carries = _best(results, algorithms, maker)
     return ReportData(
         workcell=workcell,
         geometry=geometry,
@@ -58,10 +53,39 @@ def gather(root: Path) -> ReportData:
         objective_titles=tuple(OBJECTIVES[name].title for name in results.objectives),
         static=_static(results, summary),
         algorithms=algorithms,
-        initial=initial,
+        initial=carries[0],
         timings=tuple(maker.timing(carry) for carry in carries),
         reach=reach_map(geometry, np.random.default_rng(REACH_SEED)),
     )
+
+
+def gather_carries(root: Path) -> tuple[CellGeometry, tuple[Carry, ...]]:
+    """The cell, the hand-made trajectory and every algorithm's best selected one.
+
+    Raises:
+        ResultsError: the folder is not complete or damaged.
+    """
+    results, summary = read_campaign(root), read_summary(root)
+    maker = _CarryMaker(results)
+    algorithms = _algorithms(results, summary, maker)
+    return build_geometry(results.workcell), _best(results, algorithms, maker)
+
+
+def _algorithms(
+    results: CampaignResults, summary: Mapping[str, Any], maker: _CarryMaker
+) -> tuple[AlgorithmRuns, ...]:
+    return tuple(
+        _algorithm(index, name, results, summary["algorithms"][name], maker)
+        for index, name in enumerate(results.algorithms)
+    )
+
+
+def _best(
+    results: CampaignResults, algorithms: tuple[AlgorithmRuns, ...], maker: _CarryMaker
+) -> tuple[Carry, ...]:
+    initial = maker.carry(results.workcell.task.initial.reshape(-1), INITIAL_LABEL)
+    best = [algorithm.best for algorithm in algorithms]
+    return (initial, *(carry for carry in best if carry is not None))
 
 
 class _CarryMaker:

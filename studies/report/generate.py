@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from hybrid_opt.campaign import CampaignFolder, Progress, Stage
 from hybrid_opt.campaign.files import storing, write_atomically
 from hybrid_opt.timing import TimingModel
-from studies.report.data import gather
 from studies.report.figures import report_figures
 from studies.report.page import render_page
 from studies.report.page_data import PageData
@@ -21,22 +19,6 @@ FIGURES = "figures"
 TABLES = "tables"
 
 
-def report_stage(with_paper: bool) -> Stage:
-    """The stage that writes the report.
-
-    Args:
-        with_paper: whether figures that the paper states of its rack stand beside ours.
-    """
-
-    def run(folder: CampaignFolder, progress: Progress) -> None:
-        data = gather(folder.root)
-        count = len(list(report_figures(data))) + 1
-        with progress.stage("report", count, "figures") as advance:
-            write_report(folder.root, data, with_paper, lambda: advance(1))
-
-    return Stage("report", run, {"with_paper": with_paper})
-
-
 def write_report(
     root: Path, data: ReportData, with_paper: bool, done: Callable[[], None] = lambda: None
 ) -> Path:
@@ -45,7 +27,7 @@ def write_report(
     Args:
         root: the results folder.
         data: from `studies.report.data.gather`.
-        with_paper: see `report_stage`.
+        with_paper: whether figures that the paper states of its rack stand beside ours.
         done: called after every figure and after the page.
 
     Raises:

@@ -1,0 +1,40 @@
+"""Write a study's report anew, animate its trajectory, or watch it.
+
+`python -m studies.report RESULTS` needs nothing but the results folder of a study.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from hybrid_opt.campaign import Progress
+from studies.report.stage import add_report_options, follow_report_options, rewrite
+from symbolic.errors import DualArmError
+
+PROGRAM = "python -m studies.report"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; returns the exit code."""
+    parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
+    parser.add_argument("results", type=Path, metavar="RESULTS", help="results folder of a study")
+    parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
+    add_report_options(parser)
+    options = parser.parse_args(arguments)
+    try:
+        if options.animation or options.view:
+            follow_report_options(options.results, options)
+        else:
+            rewrite(options.results, Progress(not options.quiet))
+            print(f"Report: {options.results / 'report.html'}")
+    except DualArmError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""The report as the last stage of a study, and what a user may ask for besides."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from hybrid_opt.campaign import CampaignFolder, Progress, Stage
+
+# Drawing libraries are heavy: they are imported when something is drawn.
+
+
+def report_stage(with_paper: bool) -> Stage:
+    """The stage that writes figures, tables and the page into the results folder.
+
+    Args:
+        with_paper: whether figures that the paper states of its rack stand beside ours.
+    """
+
+    def run(folder: CampaignFolder, progress: Progress) -> None:
+        _write(folder.root, with_paper, progress)
+
+    return Stage("report", run, {"with_paper": with_paper})
+
+
+def add_report_options(parser: argparse.ArgumentParser) -> None:
+    """Options for an animation file and the live view."""
+    group = parser.add_argument_group("looking at a trajectory")
+    group.add_argument(
+        "--animation",
+        type=Path,
+        metavar="FILE",
+        help="write the selected trajectory as FILE.gif or FILE.mp4 (default: none)",
+    )
+    group.add_argument(
+        "--view",
+        action="store_true",
+        help='show the trajectories live in a browser; needs pip install "dual-arm-carry[view]"',
+    )
+    group.add_argument(
+        "--port", type=int, default=8080, metavar="N", help="of --view (default: %(default)s)"
+    )
+
+
+def follow_report_options(root: Path, options: argparse.Namespace) -> None:
+    """Do what `add_report_options` lets a user ask for; the live view ends with Ctrl-C.
+
+    Raises:
+        DualArmError: the results or an optional library are missing.
+    """
+    if not options.animation and not options.view:
+        return
+    from studies.report.look import animate, watch
+
+    if options.animation:
+        animate(root, options.animation)
+    if options.view:
+        watch(root, options.port)
+
+
+def _write(root: Path, with_paper: bool, progress: Progress) -> None:
+    from studies.report.data import gather
+    from studies.report.figures import report_figures
+    from studies.report.generate import write_report
+
+    data = gather(root)
+    count = len(list(report_figures(data))) + 1
+    with progress.stage("report", count, "pictures") as advance:
+        write_report(root, data, with_paper, lambda: advance(1))
+
+
+def rewrite(root: Path, progress: Progress) -> None:
+    """Write the report of a results folder anew, as its study did.
+
+    Raises:
+        DualArmError: the folder is not complete.
+    """
+    from hybrid_opt.campaign.files import read_json
+    from hybrid_opt.campaign.layout import STAGES
+
+    marker = root / STAGES / "report.json"
+    stored = read_json(marker) if marker.exists() else {}
+    settings = stored.get("settings", {}) if isinstance(stored, dict) else {}
+    _write(root, bool(settings.get("with_paper")), progress)
