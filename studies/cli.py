@@ -9,7 +9,7 @@ from typing import NoReturn, get_args
 
 from hybrid_opt import algorithms
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
-from hybrid_opt.campaign.settings import ExecutorName
+from hybrid_opt.campaign.settings import ExecutorName, FirstGeneration
 from hybrid_opt.objectives import OBJECTIVES
 from hybrid_opt.problem import ConstraintHandling
 from symbolic.errors import SettingsError
@@ -73,6 +73,13 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         f"(default: {' '.join(_DEFAULT.objectives)})",
     )
     search.add_argument(
+        "--first-generation",
+        choices=get_args(FirstGeneration),
+        default=_DEFAULT.first_generation,
+        help="what searches start from: random candidates and the workcell's hand-made initial "
+        "trajectory, or random ones alone (default: %(default)s)",
+    )
+    search.add_argument(
         "--constraint-handling",
         choices=get_args(ConstraintHandling),
         default=_DEFAULT.constraint_handling,
@@ -130,6 +137,7 @@ def campaign_settings(options: argparse.Namespace) -> CampaignSettings:
         seed=options.seed,
         objectives=_once(options.objective, _DEFAULT.objectives),
         constraint_handling=options.constraint_handling,
+        first_generation=options.first_generation,
         populations=tuple(options.population or ()),
     )
 

@@ -57,12 +57,14 @@ class ReplicaTask:
     Attributes:
         settings: the campaign's.
         algorithm, replica: which one.
+        initial: (n_var,) the workcell's hand-made trajectory.
         recorded: the journal's blocks of an earlier, interrupted attempt.
     """
 
     settings: CampaignSettings
     algorithm: str
     replica: int
+    initial: Array
     recorded: tuple[bytes, ...] = ()
 
 
@@ -102,13 +104,15 @@ def run_replica(
     settings = task.settings
     recording = _Recording(evaluator, task, emit)
     problem = CarryProblem(recording, settings.constraint_handling)
-    algorithm = algorithms.make(task.algorithm, settings.overrides(task.algorithm))
+    start = task.initial[None] if settings.starts_from_initial(task.algorithm) else None
+    algorithm = algorithms.make(task.algorithm, settings.overrides(task.algorithm), start)
     rng = settings.replica_rng(task.algorithm, task.replica)
     algorithms.search(problem, algorithm, settings.evaluations, rng)
     generation = np.repeat(
         np.arange(1, len(problem.batches) + 1), [len(batch) for batch in problem.batches]
     )
-    table = EvaluationTable(problem.evaluations, generation, evaluator.objective_names)
+    evaluations = evaluator.certified(problem.evaluations)
+    table = EvaluationTable(evaluations, generation, evaluator.objective_names)
     front = front_rows(table.evaluations)
     return ReplicaOutcome(
         encode(table), encode_front(table, front), len(generation), sum(recording.seconds)

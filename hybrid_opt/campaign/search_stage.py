@@ -107,7 +107,11 @@ class _Search:
 
     def _task(self, index: int) -> ReplicaTask:
         journal = self._journal(index)
-        return ReplicaTask(self._folder.settings, *self._open[index], tuple(journal.payloads))
+        initial = self._folder.workcell.task.initial.ravel()
+        algorithm, replica = self._open[index]
+        return ReplicaTask(
+            self._folder.settings, algorithm, replica, initial, tuple(journal.payloads)
+        )
 
     def _record(self, index: int, payload: bytes) -> None:
         self._journal(index).append(payload)

@@ -14,6 +14,9 @@ from hybrid_opt.objectives import PAPER_OBJECTIVES, select_objectives
 from hybrid_opt.problem import ConstraintHandling
 from symbolic.errors import SettingsError
 
+FirstGeneration = Literal["initial", "random"]
+"""'initial': uniformly random but for the workcell's hand-made trajectory; 'random': all."""
+
 ExecutorName = Literal["processes", "dask"]
 
 _SIZE_KEYS = ("population", "swarm", "batch")
@@ -31,6 +34,7 @@ class CampaignSettings:
         seed: the campaign's seed; every replica derives its own from it.
         objectives: names known to `hybrid_opt.objectives`, each once.
         constraint_handling: 'penalty' (the paper's) or 'constraints'.
+        first_generation: what the searches start from; uniform random search is always all random.
         populations: (algorithm, candidates per generation) where not the algorithm's default.
     """
 
@@ -40,6 +44,7 @@ class CampaignSettings:
     seed: int = 1
     objectives: tuple[str, ...] = PAPER_OBJECTIVES
     constraint_handling: ConstraintHandling = "penalty"
+    first_generation: FirstGeneration = "initial"
     populations: tuple[tuple[str, int], ...] = ()
 
     def __post_init__(self) -> None:
@@ -56,6 +61,11 @@ class CampaignSettings:
             raise SettingsError(
                 f"constraint handling {self.constraint_handling!r}; known are "
                 f"{', '.join(get_args(ConstraintHandling))}"
+            )
+        if self.first_generation not in get_args(FirstGeneration):
+            raise SettingsError(
+                f"first generation {self.first_generation!r}; known are "
+                f"{', '.join(get_args(FirstGeneration))}"
             )
         if not self.algorithms or len(set(self.algorithms)) != len(self.algorithms):
             raise SettingsError(f"algorithms {self.algorithms}: name at least one, each once")
@@ -76,6 +86,10 @@ class CampaignSettings:
             return {}
         known = {field.name for field in fields(algorithms.settings_of(algorithm))}
         return {key: size for key in _SIZE_KEYS if key in known}
+
+    def starts_from_initial(self, algorithm: str) -> bool:
+        """Whether an algorithm's first generation holds the hand-made trajectory."""
+        return self.first_generation == "initial" and algorithm != "random"
 
     def effective(self) -> dict[str, Any]:
         """Every setting as JSON values, the algorithms' own ones spelt out."""

@@ -20,6 +20,7 @@ from hybrid_opt.results import read_campaign, read_summary
 from hybrid_opt.trajectory_file import read_trajectory
 from studies import rack, run
 from studies.cli import campaign_parser, campaign_settings
+from symbolic.workcell_file import load
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
 
 CELL = str(RACK.with_name("transfer.toml"))
@@ -64,6 +65,13 @@ def test_study_leaves_everything_behind(study: tuple[Path, str]) -> None:
     assert "Table 2" in printed
     assert str(root) in printed
     assert "paper" not in printed.lower()
+
+
+def test_searches_start_from_the_initial_trajectory(study: tuple[Path, str]) -> None:
+    for replica in read_campaign(study[0]).replicas:
+        initial = load(Path(CELL)).task.initial.ravel()
+        assert (replica.evaluations.x[0] == initial).all()
+        assert not (replica.evaluations.x[1:40] == initial).all(axis=1).any()
 
 
 def test_reference_front_file_is_the_union(study: tuple[Path, str]) -> None:
@@ -130,6 +138,7 @@ def test_interrupt_tells_how_to_go_on(tmp_path: Path) -> None:
         (["--algorithm", "nsga3"], "unknown algorithm 'nsga3'; known are nsga2, mopso"),
         (["--objective", "speed"], "unknown objective speed; known are peak_force_1"),
         (["--constraint-handling", "hope"], "invalid choice: 'hope'"),
+        (["--first-generation", "lucky"], "invalid choice: 'lucky'"),
         (["--population", "nsga2"], "found 'nsga2'; allowed is NAME=N"),
         (["--population", "nsga3=4"], "unknown algorithm 'nsga3'"),
         (["--executor", "dask"], "needs a scheduler's address"),
@@ -160,7 +169,7 @@ def test_a_missing_workcell_is_told(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_help_explains_every_option_with_its_default() -> None:
     text = campaign_parser("program", "what it does", "results/rack").format_help()
     options = re.split(r"\n(?=  --)", text)[1:]
-    assert len(options) == 13
+    assert len(options) == 14
     for option in options:
         assert re.search(r"\(default:", option), option
 
@@ -168,7 +177,8 @@ def test_help_explains_every_option_with_its_default() -> None:
 def test_options_become_settings() -> None:
     arguments = (
         "--algorithm mopso --algorithm random --population mopso=30 --objective duration "
-        "--constraint-handling constraints --seed 7 --evaluations 50 --replicas 3"
+        "--first-generation random --constraint-handling constraints --seed 7 --evaluations 50 "
+        "--replicas 3"
     )
     options = campaign_parser("program", "", "").parse_args(arguments.split())
     settings = campaign_settings(options)
@@ -176,4 +186,5 @@ def test_options_become_settings() -> None:
     assert settings.populations == (("mopso", 30),)
     assert settings.objectives == ("duration",)
     assert settings.constraint_handling == "constraints"
+    assert settings.first_generation == "random"
     assert (settings.seed, settings.evaluations, settings.replicas) == (7, 50, 3)

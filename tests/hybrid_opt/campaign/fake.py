@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -103,7 +103,11 @@ def run_search(
     source: FakeSource | None = None,
     further: tuple[Stage, ...] = (),
 ) -> Path:
-    """Run the search stage on the fake problem; returns the results folder."""
+    """Run the search stage on the fake problem; returns the results folder.
+
+    The fake problem is not the workcell's, so the workcell's initial trajectory is left out.
+    """
+    settings = replace(settings, first_generation="random")
     with open_folder(settings, execution, load(RACK)) as folder:
         stages = [search_stage(source or FakeSource()), *further]
         run_stages(folder, stages, Progress(shown=False))

@@ -24,6 +24,7 @@ from symbolic.errors import SettingsError
         ({"algorithms": ("nsga3",)}, "unknown algorithm 'nsga3'; known are"),
         ({"objectives": ("speed",)}, "unknown objective speed; known are"),
         ({"constraint_handling": "hope"}, "'hope'; known are penalty, constraints"),
+        ({"first_generation": "lucky"}, "'lucky'; known are initial, random"),
         ({"populations": (("random", 10),)}, r"of the campaign \(nsga2, mopso\)"),
         ({"populations": (("nsga2", 10), ("nsga2", 20))}, "at most once"),
         ({"populations": (("nsga2", 1),)}, "population is 1; allowed is 4 to"),
@@ -46,6 +47,12 @@ def test_wrong_settings_are_told(change: dict[str, Any], message: str) -> None:
 def test_wrong_execution_is_told(change: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         ExecutionSettings(Path("results"), **change)
+
+
+def test_random_search_stays_random() -> None:
+    assert CampaignSettings().starts_from_initial("nsga2")
+    assert not CampaignSettings().starts_from_initial("random")
+    assert not CampaignSettings(first_generation="random").starts_from_initial("nsga2")
 
 
 def test_effective_settings_spell_out_the_algorithms() -> None:
