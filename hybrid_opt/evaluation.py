@@ -8,14 +8,22 @@ The same evaluation also returns each constraint's violation for constraint domi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from codegen.workcell_functions import workcell_functions
+from hybrid_opt.certification import (
+    LostPathError,
+    SampledPath,
+    certificate,
+    waypoints_of,
+)
+from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.collision.verdict import Verdict
+from hybrid_opt.metrics import non_dominated
 from hybrid_opt.objectives import PAPER_OBJECTIVES, select_objectives
 from symbolic.collision_pairs import build_geometry
 from symbolic.errors import SettingsError
@@ -23,10 +31,12 @@ from symbolic.evaluator import CONSTRAINTS
 from symbolic.workcell import Array, Workcell
 
 COLLISION = "collision"
+BETWEEN_SAMPLES = "between_samples"
 NOT_FINITE = "not_finite"
-REASONS = (*CONSTRAINTS, COLLISION, NOT_FINITE)
+REASONS = (*CONSTRAINTS, COLLISION, BETWEEN_SAMPLES, NOT_FINITE)
 """What can make a candidate infeasible; `Evaluations.reason` indexes it.
 
+between_samples: not proven free of collisions between the samples; only fronts are certified.
 not_finite: an objective is NaN or infinite (a solver or model failure, never a front member).
 """
 
@@ -41,13 +51,14 @@ class Evaluations:
     Attributes:
         x: (n, n_var) decision vectors.
         objectives: (n, m) values without penalty; only meaningful where feasible.
-        penalised: (n, m) objectives with the paper's penalty, always finite.
+        penalised: (n, m) objectives with the paper's penalty, always finite; what a search sees.
         feasible: (n,).
         reason: (n,) index into `REASONS` of the constraint violated first along the path, or
             `FEASIBLE`.
         position: (n,) path parameter in [0, 1] of the first violation; NaN where feasible.
         violation: (n, len(REASONS)) violation of each constraint, 0 where satisfied; the unit
-            is the constraint's (`symbolic.evaluator.CONSTRAINTS`), time share for collision.
+            is the constraint's (`symbolic.evaluator.CONSTRAINTS`), time share for collision,
+            1 for those that follow it.
         violation_time: (n, len(REASONS)) time in violation over the duration.
     """
 
@@ -73,6 +84,7 @@ class CandidateEvaluator:
     Attributes:
         workcell: the cell.
         objective_names: the selected objectives.
+        functions: the cell's compiled functions by name.
         checker: FCL's verdict on samples.
         n_var, lower, upper: size and bounds of the decision vector.
         count: candidates evaluated so far.
@@ -94,9 +106,9 @@ class CandidateEvaluator:
         self.objective_names = objectives
         self._objectives = select_objectives(objectives)
         self._threads = threads
-        functions = workcell_functions(workcell)
-        self._candidate = functions["candidate"]
-        self.checker = CollisionChecker(build_geometry(workcell), functions)
+        self.functions = workcell_functions(workcell)
+        self._candidate = self.functions["candidate"]
+        self.checker = CollisionChecker(build_geometry(workcell), self.functions)
         self.n_var = workcell.task.n_var
         self.lower = workcell.task.lower
         self.upper = workcell.task.upper
@@ -116,6 +128,56 @@ class CandidateEvaluator:
         outputs = self.outputs(x)
         self.count += len(x)
         return self._judge(x, outputs)
+
+    def certificate(self, x: Array) -> Certificate:
+        """The continuous verdict on one decision vector (n_var,).
+
+        Raises:
+            LostPathError: an arm loses the path, on its samples or between them.
+        """
+        outputs = self.outputs(x)
+        if outputs["lost_1"].any() or outputs["lost_2"].any():
+            raise LostPathError("an arm loses the path; no more can be said of its collisions")
+        waypoints = waypoints_of(self.workcell.task, self._checked(x)[0])
+        path = SampledPath(waypoints, outputs["q_1"][0], outputs["q_2"][0])
+        return certificate(self.checker, self.functions["posture"], path)
+
+    def certified(self, evaluations: Evaluations) -> Evaluations:
+        """The evaluations with their feasible front proven free between the samples.
+
+        Members of the front that are not proven free become infeasible for the reason
+        `between_samples`; what only they dominated is certified in turn, until the front stands.
+        """
+        feasible, reason = evaluations.feasible.copy(), evaluations.reason.copy()
+        position, violation = evaluations.position.copy(), evaluations.violation.copy()
+        proven = np.zeros(len(evaluations), dtype=bool)
+        while True:
+            front = non_dominated(evaluations.objectives, feasible)
+            unproven = np.flatnonzero(front & ~proven)
+            if len(unproven) == 0:
+                break
+            for row in unproven.tolist():
+                failure = self._failure_between_samples(evaluations.x[row])
+                proven[row] = failure is None
+                if failure is not None:
+                    feasible[row], position[row] = False, failure
+                    reason[row] = REASONS.index(BETWEEN_SAMPLES)
+                    violation[row, reason[row]] = 1.0
+        return replace(
+            evaluations,
+            feasible=feasible,
+            reason=reason,
+            position=position,
+            violation=violation,
+        )
+
+    def _failure_between_samples(self, x: Array) -> float | None:
+        """Path parameter where a carry is not proven free, None where it is throughout."""
+        try:
+            verdict = self.certificate(x)
+        except LostPathError:
+            return 0.0
+        return None if verdict.is_free else verdict.at_parameter
 
     def _checked(self, x: Array) -> Array:
         x = np.ascontiguousarray(np.atleast_2d(x), dtype=float)

@@ -32,6 +32,9 @@ class Evaluator(Protocol):
     def evaluate(self, x: Array) -> Evaluations:
         """Verdicts on decision vectors (n, n_var)."""
 
+    def certified(self, evaluations: Evaluations) -> Evaluations:
+        """The evaluations with their feasible front proven free between the samples."""
+
 
 def disarmed(evaluations: Evaluations) -> Evaluations:
     """The evaluations with every candidate that has a figure that is not finite made infeasible.

@@ -14,6 +14,10 @@ from symbolic.robot_model import RobotModel
 from symbolic.rotation import rotation_matrix
 from symbolic.workcell import Array, Contact, Robot
 
+Arms = tuple[Robot, Robot]
+Models = tuple[RobotModel, RobotModel]
+Contacts = tuple[Contact, Contact]
+
 NEWTON_STEPS = 3
 """Newton steps per sample; extrapolation brings the start within their basin."""
 
@@ -194,3 +198,29 @@ def _prediction_function(
     for _ in range(NEWTON_STEPS):
         q = newton_step(model, q, R_target, p_target)
     return ca.Function(name, [start, pose], ca.cse([q]), ["start", "pose"], ["q"])
+
+
+def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Function:
+    """Both arms' postures at one box pose, from nearby joint positions.
+
+    Inputs: pose (6,) of the box; guess_1, guess_2 (6,) [rad]. Outputs: q_1, q_2 (6,) after
+    `NEWTON_STEPS`; residual_1, residual_2, their pose residuals [m, rad].
+    """
+    pose = ca.SX.sym("pose", 6)
+    guesses = ca.SX.sym("guess_1", 6), ca.SX.sym("guess_2", 6)
+    rotation = rotation_matrix(pose[3:])
+    postures, residuals = [], []
+    for robot, model, contact, q in zip(robots, models, contacts, guesses, strict=True):
+        R_target, p_target = flange_target(robot, contact, pose[:3], rotation)
+        for _ in range(NEWTON_STEPS):
+            q = newton_step(model, q, R_target, p_target)
+        R, p = model.placement(q)
+        postures.append(q)
+        residuals.append(pose_error(R_target, p_target, R, p)[1])
+    return ca.Function(
+        "posture",
+        [pose, *guesses],
+        ca.cse([*postures, *residuals]),
+        ["pose", "guess_1", "guess_2"],
+        ["q_1", "q_2", "residual_1", "residual_2"],
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
+from symbolic.arm import posture_function
 from symbolic.cell_model import build_cell_model
 from symbolic.clearance import screening_functions
 from symbolic.evaluator import candidate_function
@@ -14,6 +15,7 @@ def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
     """The functions by name.
 
     candidate: the evaluator of a whole candidate (`symbolic.evaluator.candidate_function`).
+    posture: both arms at one box pose (`symbolic.arm.posture_function`).
     clearance, frames: collision bounds and placements of one sample
     (`symbolic.clearance.screening_functions`).
 
@@ -24,5 +26,6 @@ def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
     placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
     return {
         "candidate": candidate_function(model),
+        "posture": posture_function(model.workcell.robots, model.robots, model.workcell.contacts),
         **screening_functions(model.geometry, placements),
     }
