@@ -67,6 +67,9 @@ class FakeEvaluator:
             os.kill(os.getpid(), signal.SIGKILL)
         return verdicts(x)
 
+    def certified(self, evaluations: Evaluations) -> Evaluations:
+        return evaluations
+
 
 @dataclass(frozen=True)
 class FakeSource:
