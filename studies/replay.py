@@ -12,14 +12,10 @@ from typing import Any
 
 from hybrid_opt.export import FORMATS, export_trajectory, sample_trajectory
 from hybrid_opt.replay import Replay, replay
-from hybrid_opt.robustness import payload_sensitivity, robustness_margins
-from hybrid_opt.timing import (
-    TimingModel,
-    duration_against_force_limit,
-    report_timing,
-)
+from hybrid_opt.timing import TimingModel
 from hybrid_opt.trajectory_file import StoredTrajectory, read_trajectory
-from studies.timing_text import timing_json, timing_text, timings
+from studies.timing_stage import timed_trajectory
+from studies.timing_text import timings
 from symbolic.errors import DualArmError, SettingsError
 
 TIMINGS = {"closest": "closest to reference", "fastest": "fastest", "force": "force limited"}
@@ -94,21 +90,10 @@ def _time(
     model = TimingModel(replayed.workcell)
     if options.use == "force" and options.export and options.force_limit is None:
         raise SettingsError("--use force needs --force-limit")
-    report = report_timing(model, stored.x, options.force_limit)
-    curve = None
-    if options.force_curve is not None:
-        curve = duration_against_force_limit(model, stored.x, options.force_curve)
-    payload = {
-        name: payload_sensitivity(model, timing.carry)
-        for name, timing in timings(report).items()
-        if timing.carry is not None
-    }
-    closest = report.closest.carry
-    margins = () if closest is None else robustness_margins(model, closest)
-    parts = (report, payload, margins, curve, replayed.workcell)
-    document, text = timing_json(*parts), timing_text(*parts)
+    timed = timed_trajectory(model, stored.x, options.force_limit, options.force_curve)
+    document, text = timed.document(), timed.text()
     if options.export:
-        timing = timings(report)[TIMINGS[options.use]]
+        timing = timings(timed.report)[TIMINGS[options.use]]
         step = options.step if options.step is not None else DEFAULT_STEP[options.export]
         paths = export_trajectory(
             sample_trajectory(model, timing, step),
