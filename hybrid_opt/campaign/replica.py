@@ -76,7 +76,8 @@ class ReplicaOutcome:
         evaluations: content of its file of candidates, see `evaluations_file`.
         front: content of its file of non-dominated candidates.
         count: evaluated candidates.
-        seconds: time that the search took, without what was repeated from a journal.
+        seconds: time that the search and the certification of its front took, without what was
+            repeated from a journal.
     """
 
     evaluations: bytes
@@ -111,12 +112,12 @@ def run_replica(
     generation = np.repeat(
         np.arange(1, len(problem.batches) + 1), [len(batch) for batch in problem.batches]
     )
+    begin = time.perf_counter()
     evaluations = evaluator.certified(problem.evaluations)
+    seconds = sum(recording.seconds) + time.perf_counter() - begin
     table = EvaluationTable(evaluations, generation, evaluator.objective_names)
     front = front_rows(table.evaluations)
-    return ReplicaOutcome(
-        encode(table), encode_front(table, front), len(generation), sum(recording.seconds)
-    )
+    return ReplicaOutcome(encode(table), encode_front(table, front), len(generation), seconds)
 
 
 def front_rows(evaluations: Evaluations) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
