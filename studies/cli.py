@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn, get_args
@@ -15,6 +16,9 @@ from hybrid_opt.problem import ConstraintHandling
 from symbolic.errors import SettingsError
 
 _DEFAULT = CampaignSettings()
+
+QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 3
+"""Of a small but complete study."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -36,18 +40,22 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
     parser = Parser(prog=program, description=description, allow_abbrev=False)
     search = parser.add_argument_group("search (decides the results)")
     search.add_argument(
+        "--quick",
+        action="store_true",
+        help=f"a small but complete study: {QUICK_REPLICAS} replicas of {QUICK_EVALUATIONS} "
+        "evaluations where no other numbers are given (default: off)",
+    )
+    search.add_argument(
         "--evaluations",
         type=int,
         metavar="N",
-        default=_DEFAULT.evaluations,
-        help="candidates that each replica may evaluate (default: %(default)s)",
+        help=f"candidates that each replica may evaluate (default: {_DEFAULT.evaluations})",
     )
     search.add_argument(
         "--replicas",
         type=int,
         metavar="N",
-        default=_DEFAULT.replicas,
-        help="independent runs per algorithm (default: %(default)s)",
+        help=f"independent runs per algorithm (default: {_DEFAULT.replicas})",
     )
     search.add_argument(
         "--algorithm",
@@ -93,6 +101,19 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         default=_DEFAULT.seed,
         help="the same seed gives the same results to the bit (default: %(default)s)",
     )
+    after = parser.add_argument_group("after the search (decides what is made of the results)")
+    after.add_argument(
+        "--force-limit",
+        type=_force,
+        metavar="N",
+        help="also find the fastest timing with both normal forces below N newtons (default: none)",
+    )
+    after.add_argument(
+        "--report",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="write figures, tables and report.html (default: yes)",
+    )
     work = parser.add_argument_group("work (does not change the results)")
     work.add_argument(
         "--output", type=Path, metavar="DIR", help=f"results folder (default: {output})"
@@ -130,10 +151,15 @@ def campaign_settings(options: argparse.Namespace) -> CampaignSettings:
     Raises:
         SettingsError: a value is not allowed.
     """
+    evaluations, replicas = options.evaluations, options.replicas
+    if evaluations is None:
+        evaluations = QUICK_EVALUATIONS if options.quick else _DEFAULT.evaluations
+    if replicas is None:
+        replicas = QUICK_REPLICAS if options.quick else _DEFAULT.replicas
     return CampaignSettings(
         algorithms=_once(options.algorithm, _DEFAULT.algorithms),
-        evaluations=options.evaluations,
-        replicas=options.replicas,
+        evaluations=evaluations,
+        replicas=replicas,
         seed=options.seed,
         objectives=_once(options.objective, _DEFAULT.objectives),
         constraint_handling=options.constraint_handling,
@@ -174,3 +200,13 @@ def _population(text: str) -> tuple[str, int]:
             f"unknown algorithm '{name}'; known are {', '.join(algorithms.names())}"
         )
     return name, int(size)
+
+
+def _force(text: str) -> float:
+    try:
+        force = float(text)
+    except ValueError:
+        force = math.nan
+    if not 0.0 < force < math.inf:
+        raise argparse.ArgumentTypeError(f"found {text!r}; allowed is a positive force in newtons")
+    return force

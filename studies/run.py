@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from hybrid_opt.campaign import (
@@ -18,18 +19,39 @@ from hybrid_opt.campaign import (
 )
 from hybrid_opt.results import read_summary
 from studies.cli import campaign_parser, campaign_settings, execution_settings
+from studies.report.stage import add_report_options, follow_report_options, report_stage
 from studies.summary import summary_stage
 from studies.terminal_summary import terminal_summary
+from studies.timing_stage import timing_stage
 from symbolic.errors import DualArmError
 from symbolic.workcell_file import load
+
+PAGE = "report.html"
+"""The report in a results folder."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells use it."""
 
 
-def stages() -> tuple[Stage, ...]:
+@dataclass(frozen=True)
+class StudySettings:
+    """What is made of a search's results.
+
+    Attributes:
+        force_limit: normal force [N] of an additional timing, None for none.
+        report: whether figures, tables and the page are written.
+        with_paper: whether the figures stand beside those that the paper states.
+    """
+
+    force_limit: float | None = None
+    report: bool = True
+    with_paper: bool = False
+
+
+def stages(study: StudySettings) -> tuple[Stage, ...]:
     """The stages of a study, in order."""
-    return (search_stage(), summary_stage())
+    every = (search_stage(), summary_stage(), timing_stage(study.force_limit))
+    return (*every, report_stage(study.with_paper)) if study.report else every
 
 
 def run_study(
@@ -37,7 +59,7 @@ def run_study(
     settings: CampaignSettings,
     execution: ExecutionSettings,
     progress: Progress,
-    with_paper: bool = False,
+    study: StudySettings,
 ) -> str:
     """Carry out all stages that are not done, and return the figures as text.
 
@@ -46,14 +68,14 @@ def run_study(
         settings: what to compute.
         execution: how.
         progress: where to show it.
-        with_paper: whether the figures stand beside those that the paper states.
+        study: what is made of the results.
 
     Raises:
         DualArmError: the workcell, a setting or the results folder is wrong, or work failed.
     """
     with open_folder(settings, execution, load(workcell)) as folder:
-        run_stages(folder, stages(), progress)
-        return terminal_summary(read_summary(folder.root), with_paper)
+        run_stages(folder, stages(study), progress)
+        return terminal_summary(read_summary(folder.root), study.with_paper)
 
 
 def main(
@@ -72,6 +94,7 @@ def main(
     description = "Search for the least-force carries of a dual-arm workcell."
     output = f"results/{'WORKCELL' if workcell is None else workcell.stem}"
     parser = campaign_parser(program, description, output)
+    add_report_options(parser)
     if workcell is None:
         parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
     try:
@@ -79,8 +102,12 @@ def main(
         cell: Path = options.workcell if workcell is None else workcell
         settings = campaign_settings(options)
         execution = execution_settings(options, Path("results") / cell.stem)
-        print(run_study(cell, settings, execution, Progress(not options.quiet), bool(workcell)))
+        study = StudySettings(options.force_limit, options.report, bool(workcell))
+        print(run_study(cell, settings, execution, Progress(not options.quiet), study))
         print(f"\nResults: {execution.output}")
+        if options.report:
+            print(f"Report: {execution.output / PAGE}")
+        follow_report_options(execution.output, options)
     except KeyboardInterrupt:
         again = [part for part in arguments if part != "--resume"]
         command = " ".join([program, shlex.join([*again, "--resume"])])
