@@ -113,7 +113,7 @@ def run_replica(
         np.arange(1, len(problem.batches) + 1), [len(batch) for batch in problem.batches]
     )
     begin = time.perf_counter()
-    evaluations = evaluator.certified(problem.evaluations)
+    evaluations = recording.certified(problem.evaluations)
     seconds = sum(recording.seconds) + time.perf_counter() - begin
     table = EvaluationTable(evaluations, generation, evaluator.objective_names)
     front = front_rows(table.evaluations)
@@ -160,3 +160,6 @@ class _Recording:
         self.seconds.append(seconds)
         self._since = time.perf_counter()
         return generation
+
+    def certified(self, evaluations: Evaluations) -> Evaluations:
+        return self._evaluator.certified(evaluations)
