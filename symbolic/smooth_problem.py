@@ -158,14 +158,13 @@ def _mix(workcell: Workcell, order: NDArray[np.int64], force_rows: tuple[ForceRo
     coefficients = branch_coefficients(workcell)
     column = np.empty(len(order), dtype=int)
     column[order] = np.arange(len(order))
-    mix = ca.DM(len(force_rows), 2 * len(order))
-    for row, (robot, branch, sample) in enumerate(force_rows):
-        reference = float(workcell.task.reference_force[robot])
-        for part in (0, 1):
-            value = coefficients[robot, branch, part] / reference
-            if value:
-                mix[row, int(2 * column[sample] + part)] = value
-    return mix
+    robots, branches, samples = np.array(force_rows, dtype=int).T
+    values = coefficients[robots, branches] / workcell.task.reference_force[robots, None]
+    rows = np.repeat(np.arange(len(force_rows)), 2)
+    columns = (2 * column[samples][:, None] + np.arange(2)).ravel()
+    return ca.DM.triplet(
+        rows.tolist(), columns.tolist(), ca.DM(values.ravel()), len(force_rows), 2 * len(order)
+    )
 
 
 class _Payload:

@@ -12,7 +12,7 @@ which holds at a solution of F only: no derivative is taken through the Newton s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Literal
@@ -21,15 +21,16 @@ import casadi as ca
 
 from symbolic.arm import flange_target, manipulability, newton_step, pose_error
 from symbolic.cell_model import CellModel
-from symbolic.clearance import clearance_expressions
 from symbolic.rotation import rotation_matrix
+from symbolic.scene import Scene
 from symbolic.softness import Softness
 
 SOLVE_STEPS = 7
 """Newton steps from the reference joints; the last ones square an error below 1e-4."""
 
-WIDTH = 2e-4
-"""Width of the smoothed kinks of clearances [m]."""
+WIDTH = float(__import__("os").environ.get("WID", "2e-4"))
+"""Width of the smoothed kinks of clearances [m]: sharper kinks cost the solver iterations, and what
+the smooth bounds fall short is made up for by measured distances (`hybrid_opt.polish.active`)."""
 
 
 @dataclass(frozen=True, order=True)
@@ -38,7 +39,8 @@ class RowKind:
 
     clearance: smooth lower bound of the distance of the active pair `index` [m].
     lower, upper: distance of joint `index` of robot `arm` to its limit [rad].
-    singularity: |det J| of robot `arm` over its least value, minus 1.
+    singularity: |det J| of robot `arm` over its least value, squared, minus 1: at the edge of the
+    reach the determinant falls like a root of the distance, its square evenly.
     """
 
     kind: Literal["clearance", "lower", "upper", "singularity"]
@@ -68,30 +70,49 @@ class RowFunctions:
     Each takes pose, q_1, q_2 (6,) [m, rad], where the joints hold the box at the pose.
     """
 
-    def __init__(self, model: CellModel, width: float = WIDTH) -> None:
-        """width [m]: of the smoothed kinks of clearances."""
+    def __init__(self, model: CellModel, compiled: Mapping[str, ca.Function] | None = None) -> None:
+        """compiled: functions of `frequent` that were compiled, by name."""
         self._model = model
-        self._width = width
+        self._compiled = compiled or {}
         self._pose = ca.SX.sym("pose", 6)
         self._q = (ca.SX.sym("q_1", 6), ca.SX.sym("q_2", 6))
         self.value = lru_cache(maxsize=None)(self._value)
         self.gradient = lru_cache(maxsize=None)(self._gradient)
         self.hessian = lru_cache(maxsize=None)(self._hessian)
 
+    def frequent(self) -> dict[str, ca.Function]:
+        """The functions of the rows that most solves need, by name, to be compiled: clearances of
+        the payload from the environment, and the singularity of both arms."""
+        bodies = self._model.geometry.bodies
+        kinds = [RowKind("singularity", -1, arm) for arm in (0, 1)] + [
+            RowKind("clearance", index)
+            for index, pair in enumerate(self._model.geometry.active)
+            if {bodies[pair.first].group, bodies[pair.second].group} == {"payload", "environment"}
+        ]
+        makers = (self.value, self.gradient, self.hessian)
+        functions = [make(kind) for kind in kinds for make in makers]
+        return {function.name(): function for function in functions}
+
     def _value(self, kind: RowKind) -> ca.Function:
         """pose, q_1, q_2 -> value."""
-        return self._function("value", kind, [], self._expression(kind))
+        return self._function("value", kind, lambda: ([], self._expression(kind)))
 
     def _gradient(self, kind: RowKind) -> ca.Function:
         """pose, q_1, q_2 -> gradient (6,) with respect to the pose."""
+        return self._function("gradient", kind, lambda: ([], self._pose_gradient(kind)))
+
+    def _hessian(self, kind: RowKind) -> ca.Function:
+        """pose, q_1, q_2, weight -> weight times the Hessian (6, 6) with respect to the pose."""
+        return self._function("hessian", kind, lambda: self._pose_hessian(kind))
+
+    def _pose_gradient(self, kind: RowKind) -> ca.SX:
         row = self._expression(kind)
         gradient = ca.gradient(row, self._pose)
         for arm in self._arms(row):
             gradient += ca.mtimes(self._follow(arm).T, ca.gradient(row, self._q[arm]))
-        return self._function("gradient", kind, [], gradient)
+        return gradient
 
-    def _hessian(self, kind: RowKind) -> ca.Function:
-        """pose, q_1, q_2, weight -> weight times the Hessian (6, 6) with respect to the pose."""
+    def _pose_hessian(self, kind: RowKind) -> tuple[list[ca.SX], ca.SX]:
         row, weight = self._expression(kind), ca.SX.sym("weight")
         arms = self._arms(row)
         lagrangian = row
@@ -110,24 +131,29 @@ class RowFunctions:
             else ca.hessian(lagrangian, unknowns)[0]
         )
         T = ca.vertcat(*follow)
-        return self._function("hessian", kind, [weight], weight * ca.mtimes([T.T, full, T]))
+        return [weight], weight * ca.mtimes([T.T, full, T])
 
     def _function(
-        self, what: str, kind: RowKind, further: Sequence[ca.SX], result: ca.SX
+        self, what: str, kind: RowKind, make: Callable[[], tuple[list[ca.SX], ca.SX]]
     ) -> ca.Function:
+        """The compiled function, or one of pose, joints and further inputs that `make` gives."""
         label = f"{what}_{kind.kind}_{kind.index + 1}_{kind.arm + 1}"
+        if label in self._compiled:
+            return self._compiled[label]
+        further, result = make()
         return ca.Function(label, [self._pose, *self._q, *further], ca.cse([ca.densify(result)]))
 
     def _expression(self, kind: RowKind) -> ca.SX:
         if kind.kind == "clearance":
-            return self._clearances[kind.index]
+            pair = self._model.geometry.active[kind.index]
+            return self._scene.bound(pair.first, pair.second)
         robot, q = self._model.workcell.robots[kind.arm], self._q[kind.arm]
         if kind.kind == "lower":
             return q[kind.index] - float(robot.position_lower[kind.index])
         if kind.kind == "upper":
             return float(robot.position_upper[kind.index]) - q[kind.index]
         measure = manipulability(self._model.robots[kind.arm].jacobian(q))
-        return measure / robot.min_manipulability - 1.0
+        return (measure / robot.min_manipulability) ** 2 - 1.0
 
     def _arms(self, row: ca.SX) -> list[int]:
         return [arm for arm in (0, 1) if ca.depends_on(row, self._q[arm])]
@@ -152,13 +178,12 @@ class RowFunctions:
         return first, second
 
     @cached_property
-    def _clearances(self) -> ca.SX:
-        placements = [self._model.robots[arm].joint_placements(self._q[arm]) for arm in (0, 1)]
-        return clearance_expressions(
+    def _scene(self) -> Scene:
+        first, second = (self._model.robots[i].joint_placements(self._q[i]) for i in (0, 1))
+        return Scene(
             self._model.geometry,
             rotation_matrix(self._pose[3:]),
             self._pose[:3],
-            placements[0],
-            placements[1],
-            Softness(self._width),
+            (first, second),
+            Softness(WIDTH),
         )

@@ -1,0 +1,138 @@
+"""IPOPT on one assembled program, and the residuals of what it returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from hybrid_opt.polish.records import UNKNOWN, PolishSettings, Residuals
+from symbolic.smooth_problem import SmoothProblem
+from symbolic.workcell import Array
+
+IPOPT: dict[str, Any] = {
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "print_time": False,
+    # A metaheuristic's point is near the solution but has no multipliers: a small barrier, little
+    # push off the bounds (docs/polish.md has the comparison).
+    "ipopt.mu_init": 1e-3,
+    "ipopt.bound_push": 1e-4,
+    "ipopt.bound_frac": 1e-4,
+    "ipopt.slack_bound_push": 1e-4,
+    "ipopt.mu_linear_decrease_factor": 0.5,
+    "ipopt.mu_superlinear_decrease_power": 1.2,
+    "ipopt.tol": 1e-6,
+    "ipopt.honor_original_bounds": "yes",
+    "no_nlp_grad": True,
+    "calc_lam_p": False,
+    "calc_lam_x": False,
+    "calc_f": False,
+    "calc_g": False,
+    "error_on_fail": False,
+}
+
+
+@dataclass(frozen=True)
+class Program:
+    """The numbers of a program: start z, parameters p, bounds of z and of the constraints."""
+
+    start: Array
+    parameters: Array
+    low: Array
+    high: Array
+    below: Array
+    above: Array
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What IPOPT returned.
+
+    Attributes:
+        x: (n_var,) decision vector within its bounds.
+        message: IPOPT's status.
+        converged: whether it claims an optimum.
+        usable: whether x is finite.
+        residuals: recomputed here.
+        iterations: IPOPT's.
+    """
+
+    x: Array
+    message: str
+    converged: bool
+    usable: bool
+    residuals: Residuals
+    iterations: int
+
+
+def ipopt(problem: SmoothProblem, settings: PolishSettings) -> ca.Function:
+    """IPOPT for a program."""
+    options = IPOPT | {
+        "grad_f": problem.grad_f,
+        "jac_g": problem.jac_g,
+        "hess_lag": problem.hess_lag,
+        "ipopt.max_iter": settings.max_iterations,
+        "ipopt.max_wall_time": settings.max_seconds,
+    }
+    return ca.nlpsol("polish", "ipopt", problem.nlp, options)
+
+
+def run(problem: SmoothProblem, solver: ca.Function, program: Program) -> Answer:
+    """Solve a program."""
+    n = len(problem.scale)
+    try:
+        found = solver(
+            x0=program.start,
+            p=program.parameters,
+            lbx=program.low,
+            ubx=program.high,
+            lbg=program.below,
+            ubg=program.above,
+        )
+    except RuntimeError as error:
+        # CasADi's way to report that a function failed outright.
+        message = str(error).strip().splitlines()[-1]
+        return Answer(np.full(n, np.nan), message, False, False, UNKNOWN, 0)
+    statistics = solver.stats()
+    z = np.asarray(found["x"].full()).ravel()
+    usable = bool(np.isfinite(z).all())
+    x = problem.centre + problem.scale * np.clip(z[:n], program.low[:n], program.high[:n])
+    multipliers = (found["lam_x"].full().ravel(), found["lam_g"].full().ravel())
+    return Answer(
+        x=x,
+        message=str(statistics["return_status"]),
+        converged=bool(statistics["success"]),
+        usable=usable,
+        residuals=residuals(problem, program, z, *multipliers) if usable else UNKNOWN,
+        iterations=int(statistics["iter_count"]),
+    )
+
+
+def residuals(
+    problem: SmoothProblem, program: Program, z: Array, lam_x: Array, lam_g: Array
+) -> Residuals:
+    """Residuals of the optimality conditions at z with the given multipliers.
+
+    In CasADi's convention: positive multipliers belong to upper bounds, negative to lower ones.
+    """
+    gradient = problem.grad_f(z, program.parameters)[1].full().ravel()
+    g, jacobian = problem.jac_g(z, program.parameters)
+    values = g.full().ravel()
+    lagrangian = gradient + ca.mtimes(jacobian.T, lam_g).full().ravel() + lam_x
+    sides = (
+        (z, program.low, program.high, lam_x),
+        (values, program.below, program.above, lam_g),
+    )
+    violation, product = 0.0, 0.0
+    for value, low, high, multiplier in sides:
+        violation = max(
+            violation, np.max(low - value, initial=0.0), np.max(value - high, initial=0.0)
+        )
+        slack = np.where(multiplier > 0.0, high - value, value - low)
+        # A multiplier of an absent bound has nothing to be complementary to: it must vanish.
+        scaled = np.where(np.isfinite(slack), np.abs(slack), 1.0)
+        product = max(product, np.max(np.abs(multiplier) * scaled, initial=0.0))
+    return Residuals(float(np.max(np.abs(lagrangian))), float(violation), float(product))
