@@ -14,7 +14,7 @@ from hybrid_opt.timing import TimingModel
 from studies.report.data import carry_of
 from studies.report.figures_cell import environment, reachable_regions
 from studies.report.reach import reach_map
-from studies.report.style import in_style, save
+from studies.report.style import in_style, save, settled
 from symbolic.branches import StartBranch
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.errors import SettingsError
@@ -221,8 +221,8 @@ def _draw(model: CellModel, initial: Array, output: Path) -> tuple[str, ...]:
     reach = reach_map(geometry, np.random.default_rng(0))
     with in_style():
         figures = {
-            "reachable_regions": reachable_regions(geometry, reach, carry),
-            "cell": environment(geometry, carry),
+            "reachable_regions": settled(reachable_regions(geometry, reach, carry)),
+            "cell": settled(environment(geometry, carry)),
         }
     return tuple(
         str(path) for name, figure in figures.items() for path in save(figure, output, name)

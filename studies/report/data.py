@@ -11,8 +11,8 @@ import numpy as np
 from hybrid_opt.evaluation import CandidateEvaluator
 from hybrid_opt.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.results import CampaignResults, Replica, read_campaign, read_summary
-from hybrid_opt.robustness import payload_sensitivity, robustness_margins
-from hybrid_opt.timing import TimingModel, duration_against_force_limit, report_timing
+from hybrid_opt.robustness import payload_sensitivity
+from hybrid_opt.timing import TimingModel
 from studies.report.reach import reach_map
 from studies.report.records import (
     AlgorithmRuns,
@@ -24,10 +24,14 @@ from studies.report.records import (
 )
 from studies.selection import balanced, peak_normal_forces
 from studies.terminal_summary import title
+from studies.timing_stage import timed_trajectory
 from symbolic.collision_pairs import CellGeometry, build_geometry
 from symbolic.workcell import Array
 
 INITIAL_LABEL = "hand-made"
+CURVE_POINTS = 12
+"""Of duration against force limit."""
+
 REACH_SEED = 0
 """Of the postures that the reach is drawn from; no result depends on it."""
 
@@ -104,14 +108,9 @@ class _CarryMaker:
         return self.carry(front.x[row], label)
 
     def timing(self, carry: Carry) -> TimedSelection:
-        report = report_timing(self.model, carry.x)
-        judged = report.closest.carry or carry.timed
-        return TimedSelection(
-            carry.label,
-            report,
-            duration_against_force_limit(self.model, carry.x),
-            robustness_margins(self.model, judged),
-        )
+        timed = timed_trajectory(self.model, carry.x, curve_points=CURVE_POINTS)
+        assert timed.curve is not None
+        return TimedSelection(carry.label, timed.report, timed.curve, timed.margins)
 
 
 def carry_of(evaluator: CandidateEvaluator, model: TimingModel, x: Array, label: str) -> Carry:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from studies.report import figures_carry, figures_cell, figures_search
 from studies.report.records import Carry, ReportData
-from studies.report.style import in_style
+from studies.report.style import in_style, settled
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class ReportFigure:
     def draw(self) -> Figure:
         """The figure in the common style."""
         with in_style():
-            return self.make()
+            return settled(self.make())
 
 
 def report_figures(data: ReportData) -> Iterator[ReportFigure]:

@@ -17,6 +17,7 @@ from studies.report.style import (
     new_figure,
     panel_label,
     series,
+    shortened,
 )
 from symbolic.workcell import Array
 
@@ -52,7 +53,7 @@ def normal_forces(data: ReportData) -> Figure:
                 label="level payload at rest",
             )
         axes.set_xlabel("time [s]")
-        panel_label(axes, "ab"[i], f"robot {robot.name!r}")
+        panel_label(axes, "ab"[i], f"robot {shortened(robot.name)!r}")
     panels[0].set_ylabel("normal contact force [N]")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
@@ -90,7 +91,7 @@ def joint_torques(data: ReportData) -> Figure:
             axes.set_rlabel_position(30.0)
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:g} %")
             letter = "abcd"[2 * row + i]
-            axes.set_title(f"({letter}) {robot.name!r}: {text} [% of maximum]", pad=12)
+            axes.set_title(f"({letter}) {shortened(robot.name)!r}: {text} [% of maximum]", pad=12)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
     return figure
@@ -118,7 +119,7 @@ def pressure_shift(data: ReportData) -> Figure:
         )
         axes.set_ylim(bottom=0.0)
         axes.set_xlabel("time [s]")
-        panel_label(axes, "ab"[i], f"robot {robot.name!r}")
+        panel_label(axes, "ab"[i], f"robot {shortened(robot.name)!r}")
     panels[0].set_ylabel("shift of the centre of pressure [mm]")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
@@ -175,7 +176,7 @@ def payload(data: ReportData) -> Figure:
         )
         axes.set_xlabel("payload mass [kg]")
         axes.set_xlim(*masses)
-        panel_label(axes, "ab"[i], f"robot {robot.name!r}")
+        panel_label(axes, "ab"[i], f"robot {shortened(robot.name)!r}")
         _note_limits(axes, data, i)
     panels[0].set_ylabel("largest contact force [kgf]")
     newton = panels[1].secondary_yaxis(

@@ -24,7 +24,7 @@ from studies.report.drawing import (
 )
 from studies.report.records import Carry, ReachMap
 from studies.report.solids import cell_solids, extent_points
-from studies.report.style import ARMS, FULL_WIDTH, new_figure, panel_label
+from studies.report.style import ARMS, FULL_WIDTH, new_figure, panel_label, shortened
 from symbolic.collision_pairs import CellGeometry
 from symbolic.workcell import Array
 
@@ -50,7 +50,7 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> 
             draw_box_edges(axes, view, lower, upper, colors="#b00020", linewidths=0.9)
         panel_label(axes, letter, text)
         frame_axes(axes, view, box_corners(*_reach_bounds(reach)), margin=0.0)
-    names = [robot.name for robot in geometry.workcell.robots]
+    names = [shortened(robot.name) for robot in geometry.workcell.robots]
     handles = [
         Patch(facecolor=ARMS[0], alpha=0.35, hatch="////", label=f"pad of {names[0]} reaches"),
         Patch(facecolor=ARMS[1], alpha=0.35, hatch="\\\\\\\\", label=f"pad of {names[1]} reaches"),
@@ -88,7 +88,7 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> Figu
     pose, q = _start(carry)
     draw_cell(left, geometry, cut_faces(arm), ISOMETRIC, pose, q)
     frame_axes(left, ISOMETRIC, extent_points(geometry, arm, pose[None], q[None]))
-    panel_label(left, "a", f"arm {robot.name!r} at the start")
+    panel_label(left, "a", f"arm {shortened(robot.name)!r} at the start")
     base = robot.T_world_base[:3, 3]
     index = int((base[0] - reach.lower[0]) / reach.step)
     _fill(right, reach, reach.pads[0][index], (1, 2), FRONT, ARMS[0], "////", 0.35)

@@ -82,6 +82,11 @@ def series(index: int) -> LineStyle:
     return SERIES[index % len(SERIES)]
 
 
+def shortened(name: str, length: int = 24) -> str:
+    """A name of the workcell that leaves room for the rest of a label."""
+    return name if len(name) <= length else f"{name[: length - 1]}\N{HORIZONTAL ELLIPSIS}"
+
+
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of this size [inch]; draw it inside `in_style`."""
     return Figure(figsize=(width, height), layout="constrained")
@@ -92,6 +97,13 @@ def in_style() -> Iterator[None]:
     """Whatever is drawn in the `with` block has the common style."""
     with mpl.rc_context(RC):
         yield
+
+
+def settled(figure: Figure) -> Figure:
+    """The figure with its layout worked out; a first pass still moves tick labels."""
+    with in_style():
+        figure.draw_without_rendering()
+    return figure
 
 
 def panel_label(axes: Axes, letter: str, text: str) -> None:

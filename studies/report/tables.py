@@ -77,8 +77,7 @@ class Table:
         """An HTML table; every text is escaped."""
         head = "".join(f"<th>{html.escape(cell)}</th>" for cell in self.header)
         body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
-            for row in self.rows
+            "<tr>" + "".join(_html_cell(cell) for cell in row) + "</tr>" for row in self.rows
         )
         return (
             f"<h3>{html.escape(self.title)}</h3><div class='scroll'><table><thead><tr>{head}</tr>"
@@ -97,7 +96,9 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
     if len(data.summary["tests"]) > 0:
         tables.append(rank_tests(data))
     if data.timings:
-        tables += [timings(data), margins(data)]
+        tables.append(timings(data))
+    if any(selection.margins for selection in data.timings):
+        tables.append(margins(data))
     return tuple(tables)
 
 
@@ -270,20 +271,19 @@ def timings(data: ReportData) -> Table:
 
 def margins(data: ReportData) -> Table:
     """How wrong the model's assumptions may be, under the drivable timing."""
-    labels = [selection.label for selection in data.timings]
+    judged = [selection for selection in data.timings if selection.margins]
     rows = []
-    for k, margin in enumerate(data.timings[0].margins):
+    for k, margin in enumerate(judged[0].margins):
         unit = f" [{margin.unit}]" if margin.unit else ""
         cells = [
-            f"{selection.margins[k].limit:.4g}"
-            + (f" ({selection.margins[k].fails})" if selection.margins[k].fails else "")
-            for selection in data.timings
+            f"{found.limit:.4g}" + (f" ({found.fails})" if found.fails else "")
+            for found in (selection.margins[k] for selection in judged)
         ]
         rows.append((f"{margin.quantity}{unit}", f"{margin.nominal:.4g}", *cells))
     return Table(
         "margins",
         "How far assumptions may be off before a carry fails.",
-        ("assumption", "nominal", *labels),
+        ("assumption", "nominal", *(selection.label for selection in judged)),
         tuple(rows),
         "Under the timing closest to the reference speed. In brackets: what fails beyond that.",
     )
@@ -294,6 +294,11 @@ def number(value: float | None, digits: int = 2) -> str:
     if value is None or not math.isfinite(value):
         return NOTHING
     return f"{value:.{digits}f}"
+
+
+def _html_cell(cell: str) -> str:
+    kind = " class='text'" if len(cell) > 40 else ""
+    return f"<td{kind}>{html.escape(cell)}</td>"
 
 
 def _markdown(text: str) -> str:

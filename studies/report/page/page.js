@@ -6,6 +6,7 @@
   const COLUMNS = { time: 0, pose: 1, q: 7, force: 19, shift: 21, width: 23 };
   const CONFIG = { responsive: true, displaylogo: false,
     modeBarButtonsToRemove: ["lasso2d", "select2d", "autoScale2d"] };
+  const PLAIN = { responsive: true, displayModeBar: false };
   const FONT = { family: "system-ui, DejaVu Sans, sans-serif", size: 12 };
 
   function decode(text, Type) {
@@ -69,10 +70,13 @@
     traces.push({ type: "scatter", mode: "markers", name: "chosen", x: [], y: [],
       hoverinfo: "skip", showlegend: false,
       marker: { color: "rgba(0,0,0,0)", size: 18, line: { color: "#b00020", width: 2.5 } } });
-    const layout = { font: FONT, margin: { l: 70, r: 15, t: 10, b: 50 }, hovermode: "closest",
+    const narrow = $("front-plot").clientWidth < 600;
+    const layout = { font: FONT, hovermode: "closest",
+      margin: { l: 70, r: 15, t: 30, b: narrow ? 170 : 100 },
       xaxis: { title: { text: plain(data.objectiveTitles[0]) + " [-]" }, range: data.ranges[0] },
       yaxis: { title: { text: plain(data.objectiveTitles[1]) + " [-]" }, range: data.ranges[1] },
-      legend: { orientation: "h", y: -0.16, font: { size: 11 } } };
+      legend: { orientation: "h", yref: "container", y: 0.01, yanchor: "bottom",
+        font: { size: 11 } } };
     Plotly.newPlot("front-plot", traces, layout, CONFIG);
     $("front-plot").on("plotly_click", (event) => {
       const point = event.points.find((p) => p.customdata !== undefined);
@@ -91,11 +95,12 @@
     limits.forEach((limit) => traces.push({ type: "scatter", mode: "lines", name: limit.label,
       x: [0, end], y: [limit.value, limit.value], hoverinfo: "name",
       line: { color: limit.colour, dash: "dot", width: 1.5 } }));
-    const layout = { font: FONT, margin: { l: 55, r: 15, t: 10, b: 45 }, showlegend: true,
+    const layout = { font: FONT, margin: { l: 60, r: 15, t: 40, b: 55 }, showlegend: true,
       xaxis: { title: { text: "time [s]" }, range: [0, end] },
       yaxis: { title: { text: title }, rangemode: "normal" },
-      legend: { orientation: "h", y: 1.14, font: { size: 10 } }, shapes: [cursor(0)] };
-    Plotly.react(id, traces, layout, CONFIG);
+      legend: { orientation: "h", yref: "container", y: 0.99, yanchor: "top",
+        font: { size: 10 } }, shapes: [cursor(0)] };
+    Plotly.react(id, traces, layout, PLAIN);
   }
 
   function cursor(time) {
@@ -116,7 +121,7 @@
       polar: { radialaxis: { rangemode: "tozero", ticksuffix: " %", angle: 30, nticks: 5,
         tickfont: { size: 10 } } },
       legend: { orientation: "h", y: -0.08, font: { size: 10 } } };
-    Plotly.react("torque-plot", traces, layout, CONFIG);
+    Plotly.react("torque-plot", traces, layout, PLAIN);
   }
 
   function select(index) {

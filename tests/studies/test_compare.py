@@ -1,0 +1,79 @@
+"""`python -m studies.compare`: figures of two campaigns, tests between them, misuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_opt import metrics
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress, open_folder
+from hybrid_opt.campaign.search_stage import search_stage
+from hybrid_opt.campaign.stages import run_stages
+from hybrid_opt.results import read_campaign
+from studies.compare import compare, main
+from studies.summary import summary_stage
+from symbolic.workcell_file import load
+from tests.studies.conftest import TRANSFER
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign with another seed and another set of algorithms."""
+    root = tmp_path_factory.mktemp("other") / "results"
+    settings = CampaignSettings(("nsga2", "random"), evaluations=80, replicas=3, seed=9)
+    execution = ExecutionSettings(root, jobs=1)
+    with open_folder(settings, execution, load(TRANSFER)) as folder:
+        run_stages(folder, (search_stage(), summary_stage()), Progress(shown=False))
+    return root
+
+
+def test_a_campaign_equals_itself(study: Path) -> None:
+    found = compare(study, study)
+    assert found.same_workcell
+    assert found.differences == ()
+    for figure in found.figures:
+        assert figure.first == figure.second or not np.isfinite(figure.first.mean)
+        if figure.test is not None:
+            assert figure.test.a12 == 0.5
+            assert figure.test.p == 1.0
+
+
+def test_figures_are_those_of_the_stored_candidates(study: Path, other: Path) -> None:
+    found = compare(study, other)
+    figures = {figure.figure: figure for figure in found.figures}
+    runs = (read_campaign(study).of("nsga2"), read_campaign(other).of("nsga2"))
+    for side, replicas in zip(("first", "second"), runs, strict=True):
+        volumes = [metrics.hypervolume(replica.front) for replica in replicas]
+        assert getattr(figures["hypervolume"], side).median == pytest.approx(np.median(volumes))
+        shares = [replica.evaluations.feasible.mean() for replica in replicas]
+        assert getattr(figures["feasible_share"], side).mean == pytest.approx(np.mean(shares))
+    assert figures["hypervolume"].test is not None
+    assert figures["hypervolume"].test.count_second == 3
+    assert {figure.algorithm for figure in found.figures} == {"nsga2"}
+    assert found.only == (("mopso",), ("random",))
+
+
+def test_tells_what_was_set_differently(study: Path, other: Path) -> None:
+    differences = {name: (a, b) for name, a, b in compare(study, other).differences}
+    assert differences["settings.seed"] == ("3", "9")
+    assert differences["settings.evaluations"] == ("120", "80")
+
+
+def test_prints_text_and_json(study: Path, other: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(study), str(other)]) == 0
+    text = capsys.readouterr().out
+    assert "NSGA-II, hypervolume" in text
+    assert "only in B: random search" in text
+    assert main([str(study), str(other), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert document["same_workcell"] is True
+
+
+def test_what_cannot_be_compared_is_told(
+    study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(study), str(tmp_path)]) == 2
+    assert "no results folder" in capsys.readouterr().err

@@ -1,0 +1,133 @@
+"""`python -m studies.inspect`, and what the second cell promises."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hybrid_opt.evaluation import REASONS, CandidateEvaluator
+from studies.inspect import main
+from studies.inspection import Inspection, inspect, straight_line
+from symbolic.workcell import Workcell
+from symbolic.workcell_file import load
+from tests.studies.conftest import TRANSFER
+from tests.symbolic.cells import RACK
+
+
+@pytest.fixture(scope="module")
+def transfer() -> Workcell:
+    return load(TRANSFER)
+
+
+@pytest.fixture(scope="module")
+def found(transfer: Workcell, tmp_path_factory: pytest.TempPathFactory) -> Inspection:
+    return inspect(transfer, 1500, 7, tmp_path_factory.mktemp("pictures"))
+
+
+def test_the_second_cell_is_worth_searching(found: Inspection) -> None:
+    assert found.initial.feasible
+    assert not found.straight_line.feasible
+    assert 0.02 <= found.feasible_share <= 0.20
+
+
+def test_the_second_cell_is_of_another_kind(transfer: Workcell) -> None:
+    rack = load(RACK)
+    assert transfer.task.time_law != rack.task.time_law
+    assert transfer.task.allowed_contacts
+    assert any(waypoint.is_fixed for waypoint in transfer.task.waypoints[1:-1])
+    assert np.any(transfer.payload.centre_of_mass)
+    kinds = {type(body.shape).__name__ for body in transfer.environment}
+    assert kinds == {"Box", "Cylinder", "Sphere"}
+    assert transfer.contacts[0].friction < rack.contacts[0].friction
+
+
+def test_counts_agree_with_the_evaluator(found: Inspection, transfer: Workcell) -> None:
+    evaluator = CandidateEvaluator(transfer)
+    x = np.random.default_rng(7).uniform(evaluator.lower, evaluator.upper, (500, evaluator.n_var))
+    again = inspect(transfer, 500, 7, None)
+    verdicts = evaluator.evaluate(x)
+    assert again.feasible_share == pytest.approx(verdicts.feasible.mean())
+    for reason, count in again.infeasible_by_reason.items():
+        assert count == (verdicts.reason == REASONS.index(reason)).sum()
+    total = sum(found.infeasible_by_reason.values()) + round(1500 * found.feasible_share)
+    assert total == 1500
+
+
+def test_the_static_bound_is_the_closed_form(found: Inspection) -> None:
+    # m g / (2 mu), and (m g / 2) sqrt(1 + 1 / mu^2) at the reference force of 117.68 N.
+    force = 8.0 * 9.81 / (2.0 * 0.8)
+    assert found.static_normal_force == pytest.approx((force, force), rel=1e-12)
+    limit = 117.68 / (9.81 / 2.0 * np.sqrt(1.0 + 1.0 / 0.8**2))
+    assert found.static_payload_limit == pytest.approx(limit, rel=1e-12)
+
+
+def test_every_pair_is_active_or_excluded_with_a_reason(found: Inspection) -> None:
+    pairs = [frozenset(pair) for pair in found.active_pairs]
+    pairs += [frozenset(pair[:2]) for pair in found.excluded_pairs]
+    bodies = frozenset().union(*pairs)
+    assert len(pairs) == len(set(pairs)) == len(bodies) * (len(bodies) - 1) // 2
+    assert all(reason for _, _, reason in found.excluded_pairs)
+    assert frozenset(("payload", "wall")) in {frozenset(pair) for pair in found.active_pairs}
+
+
+def test_one_branch_of_each_arm_is_chosen(found: Inspection) -> None:
+    assert set(found.branches) == {"north", "south"}
+    for branches in found.branches.values():
+        assert sum(branch.chosen for branch in branches) == 1
+        assert branches[0].kept_samples == max(branch.kept_samples for branch in branches)
+
+
+def test_pictures_are_drawn(found: Inspection) -> None:
+    names = sorted(Path(file).name for file in found.files)
+    assert names == [f"{n}.{s}" for n in ("cell", "reachable_regions") for s in ("pdf", "png")]
+    for file in found.files:
+        if file.endswith(".png"):
+            assert np.asarray(Image.open(file).convert("L")).std() > 10.0
+
+
+def test_the_straight_line_is_straight(transfer: Workcell) -> None:
+    rack = load(RACK)
+    for workcell in (transfer, rack):
+        start, goal = workcell.task.waypoints[0].lower, workcell.task.waypoints[-1].lower
+        rows = straight_line(workcell).reshape(-1, 6)
+        fixed = [w.lower for w in workcell.task.waypoints[1:-1] if w.is_fixed]
+        corners = [start, *fixed, goal]
+        for row in rows:
+            gaps = [
+                np.linalg.norm(row - a) + np.linalg.norm(b - row) - np.linalg.norm(b - a)
+                for a, b in pairwise(corners)
+            ]
+            assert min(gaps) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_prints_text_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [str(TRANSFER), "--candidates", "100", "--no-pictures"]
+    assert main(arguments) == 0
+    text = capsys.readouterr().out
+    assert "Transfer over a wall" in text
+    assert "random candidates" in text
+    assert main([*arguments, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["candidates"] == 100
+    assert f"{100 * document['feasible_share']:.1f} % feasible" in text
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["missing.toml"], "missing.toml"),
+        ([str(TRANSFER), "--candidates", "0"], "at least 1"),
+        ([str(TRANSFER), "--seed", "-1"], "--seed"),
+    ],
+)
+def test_misuse_is_one_message(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*arguments, "--no-pictures"]) == 2
+    assert message in capsys.readouterr().err

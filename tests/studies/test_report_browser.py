@@ -1,0 +1,246 @@
+"""The page in a real browser without a window: no errors, no requests, clicks and motion."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from selenium import webdriver
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.support.ui import WebDriverWait
+
+from studies.report.generate import write_report
+from studies.report.records import ReportData
+from tests.studies.test_report_page import HOSTILE, with_hostile_names
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+DRIVER = shutil.which("chromedriver")
+WIDE, NARROW = (1500, 1000), (420, 900)
+SECONDS = 60.0
+
+if not (BROWSER and DRIVER) and not os.environ.get("CI"):
+    pytest.skip("chromium and chromium-driver are not installed", allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def report(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_report(tmp_path_factory.mktemp("page"), data, with_paper=False)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[webdriver.Chrome]:
+    assert BROWSER, "CI has to install chromium"
+    assert DRIVER, "CI has to install chromium-driver"
+    options = webdriver.ChromeOptions()
+    options.binary_location = BROWSER
+    for argument in (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-dev-shm-usage",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--force-device-scale-factor=1",
+    ):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
+
+
+def opened(browser: webdriver.Chrome, report: Path, size: tuple[int, int] = WIDE) -> None:
+    browser.set_window_size(*size)
+    browser.get(report.as_uri())
+    until(browser, lambda: browser.execute_script("return document.documentElement.dataset.ready"))
+
+
+def until(browser: webdriver.Chrome, condition: Callable[[], Any]) -> Any:
+    return WebDriverWait(browser, SECONDS).until(lambda _: condition())
+
+
+def logged(browser: webdriver.Chrome, kind: str) -> list[dict[str, Any]]:
+    """The browser's log since it was last read."""
+    entries: list[dict[str, Any]] = browser.get_log(kind)  # type: ignore[no-untyped-call]
+    return entries
+
+
+def state(browser: webdriver.Chrome) -> dict[str, Any]:
+    found: dict[str, Any] = browser.execute_script(
+        "const s = report.state; return {selected: s.selected, share: s.share, playing: s.playing}"
+    )
+    return found
+
+
+def scene_hash(browser: webdriver.Chrome) -> str:
+    """The picture of the scene as it is drawn now."""
+    found: str = browser.execute_script(
+        "report.scene.render(); return report.scene.renderer.domElement.toDataURL()"
+    )
+    return found
+
+
+def test_loads_without_errors_or_requests(browser: webdriver.Chrome, report: Path) -> None:
+    logged(browser, "browser")
+    logged(browser, "performance")
+    opened(browser, report)
+    assert [entry for entry in logged(browser, "browser") if entry["level"] != "INFO"] == []
+    events = [json.loads(e["message"])["message"] for e in logged(browser, "performance")]
+    urls = [
+        event["params"]["request"]["url"]
+        for event in events
+        if event["method"] == "Network.requestWillBeSent"
+    ]
+    outside = [url for url in urls if not url.startswith(("data:", "blob:"))]
+    assert outside == [report.as_uri()]
+
+
+def test_is_usable_soon(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    # Ratio to what this machine needs for a fixed piece of work, so that a busy one does not fail.
+    work = browser.execute_script(
+        "const t = performance.now(); let s = 0;"
+        "for (let i = 0; i < 3e7; i += 1) s += Math.sqrt(i);"
+        "return [performance.now() - t, s][0]"
+    )
+    ready = browser.execute_script(
+        "return performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd"
+    )
+    assert ready < 2000.0 or ready < 60.0 * work
+
+
+def test_a_click_on_a_point_selects_its_trajectory(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    group = browser.execute_script("return report.data.groups[0].members")
+    trace = browser.execute_script(
+        "return document.getElementById('front-plot').data.findIndex((t) => t.customdata)"
+    )
+    wanted = group[-1]
+    assert state(browser)["selected"] != wanted
+    points = browser.find_elements(
+        By.CSS_SELECTOR, f"#front-plot .scatterlayer .trace:nth-of-type({trace + 1}) .point"
+    )
+    before = scene_hash(browser)
+    target = points[-1]
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", target)
+    ActionChains(browser).move_to_element(target).pause(0.2).click().perform()
+    until(browser, lambda: state(browser)["selected"] in group)
+    chosen = state(browser)["selected"]
+    carry = browser.execute_script("return report.data.trajectories[arguments[0]]", chosen)
+    shown = browser.find_element(By.ID, "figures-of-choice").text
+    assert f"{carry['peaks'][0]:.2f} N" in shown
+    assert f"{carry['duration']:.2f} s" in shown
+    # Its forces, torques and motion are shown.
+    force = browser.execute_script("return document.getElementById('force-plot').data[0].y")
+    assert max(force.values() if isinstance(force, dict) else force) == pytest.approx(
+        carry["peaks"][0], abs=1e-3
+    )
+    browser.execute_script("report.seek(0.5)")
+    assert scene_hash(browser) != before
+
+
+def test_the_list_selects_too(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    options = browser.find_elements(By.CSS_SELECTOR, "#chooser option")
+    count = browser.execute_script("return report.data.lists.flatMap((l) => l.members).length")
+    assert len(options) == count
+    options[0].click()
+    assert state(browser)["selected"] == 0
+
+
+def test_plays_pauses_and_scrubs(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    still = scene_hash(browser)
+    browser.find_element(By.ID, "play").click()
+    until(browser, lambda: state(browser)["share"] > 0.02)
+    browser.find_element(By.ID, "play").click()
+    assert not state(browser)["playing"]
+    stopped = state(browser)["share"]
+    time.sleep(0.3)
+    assert state(browser)["share"] == stopped
+    assert scene_hash(browser) != still
+    browser.execute_script(
+        "const s = document.getElementById('scrub'); s.value = 1000;"
+        "s.dispatchEvent(new Event('input'))"
+    )
+    end = browser.find_element(By.ID, "moment").text
+    duration = browser.execute_script(
+        "return report.data.trajectories[report.state.selected].duration"
+    )
+    assert end == f"{duration:.2f} s"
+
+
+def test_playing_ends_at_the_goal(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    browser.execute_script("report.seek(0.98); report.setPlaying(true)")
+    until(browser, lambda: not state(browser)["playing"])
+    assert state(browser)["share"] == 1.0
+
+
+def test_orbits(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    canvas = browser.find_element(By.CSS_SELECTOR, "#scene canvas")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
+    before = scene_hash(browser)
+    ActionChains(browser).click_and_hold(canvas).move_by_offset(120, 30).release().perform()
+    turned = scene_hash(browser)
+    assert turned != before
+    browser.find_element(By.ID, "reset-view").click()
+    assert scene_hash(browser) == before
+
+
+def test_joints_move_as_in_python(
+    browser: webdriver.Chrome, data: ReportData, report: Path
+) -> None:
+    """The pads' places in the browser's scene are those of the box."""
+    opened(browser, report)
+    browser.execute_script("report.seek(0.4)")
+    box = browser.execute_script("return report.scene.box.position.toArray()")
+    for i, arm in enumerate(data.geometry.arms):
+        joint = browser.execute_script(
+            "report.scene.scene.updateMatrixWorld(true);"
+            "return report.scene.arms[arguments[0]][5].turning.matrixWorld.toArray()",
+            i,
+        )
+        placed = np.array(joint).reshape(4, 4).T @ arm.T_joint_box
+        assert placed[:3, 3] == pytest.approx(box, abs=2e-3)
+
+
+@pytest.mark.parametrize("size", [WIDE, NARROW])
+def test_fits_the_window(
+    browser: webdriver.Chrome, report: Path, size: tuple[int, int], tmp_path: Path
+) -> None:
+    opened(browser, report, size)
+    width, inner = browser.execute_script(
+        "return [document.documentElement.scrollWidth, document.documentElement.clientWidth]"
+    )
+    assert width <= inner
+    for element in ("front-plot", "scene", "force-plot", "pressure-plot", "torque-plot"):
+        box = browser.execute_script(
+            "const r = document.getElementById(arguments[0]).getBoundingClientRect();"
+            "return [r.left, r.right, r.height]",
+            element,
+        )
+        assert 0 <= box[0] < box[1] <= inner
+        assert box[2] > 200
+    assert browser.save_screenshot(str(tmp_path / "page.png"))
+
+
+def test_hostile_names_are_shown_as_text(
+    browser: webdriver.Chrome, data: ReportData, tmp_path: Path
+) -> None:
+    hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False)
+    logged(browser, "browser")
+    opened(browser, hostile)
+    assert browser.execute_script("return window.broken") is None
+    assert browser.title == HOSTILE
+    assert browser.find_element(By.TAG_NAME, "h1").text == HOSTILE
+    assert browser.find_elements(By.CSS_SELECTOR, "img[onerror], img[src='x']") == []
+    assert [entry for entry in logged(browser, "browser") if entry["level"] != "INFO"] == []

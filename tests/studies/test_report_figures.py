@@ -1,0 +1,221 @@
+"""Every figure of a report: units, legends, nothing clipped, nothing empty, nothing overlapping."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+from PIL import Image
+
+from studies.report.figures import ReportFigure, report_figures
+from studies.report.records import ReportData
+from studies.report.style import ARMS, INITIAL, SERIES, in_style, save
+
+NAMES = (
+    "fig04_reachable_regions",
+    "fig05_cell",
+    "fig06_arm",
+    "fig07_fronts",
+    "fig08_best_so_far",
+    "attainment",
+    "indicators",
+    "infeasibility",
+    "fig09_normal_forces",
+    "fig10_joint_torques",
+    "fig11_pressure_shift",
+    "residual_moments",
+    "fig12_payload",
+    "fig13_paths",
+    "motion_nsga2",
+    "motion_mopso",
+    "duration_against_force",
+)
+
+
+@pytest.fixture(scope="module")
+def drawn(data: ReportData) -> dict[str, tuple[ReportFigure, Figure]]:
+    figures = {}
+    with in_style():
+        for entry in report_figures(data):
+            figure = entry.draw()
+            FigureCanvasAgg(figure).draw()  # type: ignore[no-untyped-call]
+            figures[entry.name] = (entry, figure)
+    return figures
+
+
+def visible_texts(figure: Figure) -> list[Text]:
+    """Texts that are shown, without tick labels outside of their axis' limits."""
+    texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip()]
+    hidden: set[Text] = set()
+    for axes in figure.findobj(Axes):
+        if not axes.axison:
+            hidden |= {*axes.get_xticklabels(), *axes.get_yticklabels()}
+            hidden |= {axes.xaxis.label, axes.yaxis.label}
+            continue
+        if axes.name != "rectilinear":
+            continue
+        for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+            low, high = sorted(limits)
+            slack = 1e-6 * (high - low)
+            for which in ("major", "minor"):
+                places = axis.get_ticklocs(minor=which == "minor")
+                labels = axis.get_ticklabels(which=which)
+                hidden |= {
+                    label
+                    for place, label in zip(places, labels, strict=False)
+                    if not low - slack <= place <= high + slack
+                }
+    return [text for text in texts if text not in hidden]
+
+
+def box_of(text: Text) -> Bbox:
+    return text.get_window_extent()
+
+
+def test_the_report_has_every_figure(drawn: dict[str, tuple[ReportFigure, Figure]]) -> None:
+    assert tuple(drawn) == NAMES
+
+
+def clipped(figure: Figure) -> list[str]:
+    """Texts that leave the figure."""
+    width, height = figure.bbox.width + 1, figure.bbox.height + 1
+    boxes = [(text.get_text(), box_of(text)) for text in visible_texts(figure)]
+    return [
+        name for name, box in boxes if min(box.x0, box.y0) < -1 or box.x1 > width or box.y1 > height
+    ]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_text_is_clipped(name: str, drawn: dict[str, tuple[ReportFigure, Figure]]) -> None:
+    assert clipped(drawn[name][1]) == []
+
+
+def test_a_clipped_label_would_be_found() -> None:
+    figure = Figure(figsize=(2.0, 1.0), layout="constrained")
+    figure.subplots().set_ylabel("a label that is longer than the figure is high [N m]")
+    FigureCanvasAgg(figure).draw()  # type: ignore[no-untyped-call]
+    assert len(clipped(figure)) == 1
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_titles_or_labels_overlap(
+    name: str, drawn: dict[str, tuple[ReportFigure, Figure]]
+) -> None:
+    _, figure = drawn[name]
+    marked = []
+    for axes in figure.findobj(Axes):
+        titles = [axes.title, axes._left_title]  # type: ignore[attr-defined]
+        labels = [axes.xaxis.label, axes.yaxis.label] if axes.axison else []
+        marked += [text for text in (*titles, *labels) if text.get_text().strip()]
+    legends = [box.get_window_extent() for box in figure.legends]
+    for first, second in combinations(marked, 2):
+        assert not box_of(first).overlaps(box_of(second)), (
+            f"{first.get_text()!r} overlaps {second.get_text()!r}"
+        )
+    for text in marked:
+        for legend in legends:
+            assert not box_of(text).overlaps(legend), f"{text.get_text()!r} is under the legend"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_tick_labels_do_not_overlap(
+    name: str, drawn: dict[str, tuple[ReportFigure, Figure]]
+) -> None:
+    _, figure = drawn[name]
+    shown = set(visible_texts(figure))
+    for axes in figure.findobj(Axes):
+        if axes.name != "rectilinear" or not axes.axison:
+            continue
+        for labels in (axes.get_xticklabels(), axes.get_yticklabels()):
+            boxes = [box_of(label) for label in labels if label in shown]
+            if labels and labels[0].get_rotation():
+                continue
+            for first, second in combinations(boxes, 2):
+                assert not first.overlaps(second)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_axis_says_its_unit(name: str, drawn: dict[str, tuple[ReportFigure, Figure]]) -> None:
+    _, figure = drawn[name]
+    for axes in figure.axes:
+        if axes.name == "polar":
+            assert "[% of maximum]" in axes.get_title()
+            continue
+        if not axes.axison:
+            continue
+        for label in (axes.get_xlabel(), axes.get_ylabel()):
+            assert label == "" or "[" in label
+        named = {axes.get_xlabel(), axes.get_ylabel()}
+        siblings = axes.get_shared_y_axes().get_siblings(axes)
+        assert (
+            axes.get_ylabel()
+            or any(other.get_ylabel() for other in siblings)
+            or (axes.get_yticklabels()[0].get_text().isalpha())
+        ), named
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_panel_is_empty(name: str, drawn: dict[str, tuple[ReportFigure, Figure]]) -> None:
+    _, figure = drawn[name]
+    pixels = np.asarray(figure.canvas.buffer_rgba())[:, :, :3]  # type: ignore[attr-defined]
+    for axes in figure.axes:
+        box = axes.get_window_extent()
+        height = pixels.shape[0]
+        rows = slice(int(height - box.y1) + 3, int(height - box.y0) - 3)
+        columns = slice(int(box.x0) + 3, int(box.x1) - 3)
+        panel = pixels[rows, columns].reshape(-1, 3)
+        # Grid lines and background alone are grey.
+        coloured = np.ptp(panel.astype(int), axis=1) > 25
+        assert coloured.mean() > 1e-4
+
+
+def test_saves_print_and_screen_files(
+    drawn: dict[str, tuple[ReportFigure, Figure]], tmp_path: Path
+) -> None:
+    _, figure = drawn["fig07_fronts"]
+    png, pdf = save(figure, tmp_path, "figure")
+    width, height = Image.open(png).size
+    assert width == pytest.approx(180 / 25.4 * 200, abs=2)
+    assert height > 400
+    assert pdf.read_bytes().startswith(b"%PDF")
+    assert b"/FontFile2" in pdf.read_bytes()  # real fonts, no outlines: editable text
+
+
+def test_saving_repeats_to_the_byte(data: ReportData, tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        entry = next(f for f in report_figures(data) if f.name == "fig09_normal_forces")
+        save(entry.draw(), tmp_path / folder, "figure")
+    for suffix in ("png", "pdf"):
+        first, second = (tmp_path / f / f"figure.{suffix}" for f in ("a", "b"))
+        assert first.read_bytes() == second.read_bytes()
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance (WCAG 2), 0 black to 1 white."""
+    linear = [
+        c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
+        for c in mpl.colors.to_rgb(colour)
+    ]
+    return float(np.dot([0.2126, 0.7152, 0.0722], linear))
+
+
+def test_looks_differ_without_colour() -> None:
+    looks = (INITIAL, *SERIES)
+    assert len({str(look.line) for look in looks}) == len(looks)
+    assert len({look.marker for look in looks}) == len(looks)
+
+
+def test_the_papers_two_algorithms_differ_in_grey() -> None:
+    # Contrast of 2 in luminance is seen side by side.
+    first, second = (luminance(look.colour) for look in SERIES[:2])
+    assert (second + 0.05) / (first + 0.05) > 2.0
+    assert ARMS[0] != ARMS[1]

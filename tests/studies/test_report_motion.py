@@ -1,0 +1,92 @@
+"""Animation files and the live view of a carry."""
+
+from __future__ import annotations
+
+import urllib.request
+from itertools import pairwise
+from pathlib import Path
+
+import imageio_ffmpeg  # type: ignore[import-untyped]
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from studies.report.__main__ import main
+from studies.report.animation import FRAMES_PER_SECOND, frames, write_animation
+from studies.report.live import LiveView
+from studies.report.records import Carry, ReportData
+from symbolic.errors import ReportError
+
+
+@pytest.fixture(scope="module")
+def carry(data: ReportData) -> Carry:
+    return data.initial
+
+
+def test_a_gif_plays_in_real_time(data: ReportData, carry: Carry, tmp_path: Path) -> None:
+    path = tmp_path / "made" / "carry.gif"
+    write_animation(data.geometry, carry, path)
+    image = Image.open(path)
+    durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
+    # GIF counts hundredths of a second, so a frame of 66.7 ms is written as 60 or 70.
+    assert sum(durations[:-1]) / 1000 == pytest.approx(carry.timed.duration, rel=0.12)
+    assert path.stat().st_size < 5_000_000
+    image.seek(0)
+    first = np.asarray(image.convert("RGB"), dtype=int)
+    image.seek(len(durations) // 2)
+    assert (
+        np.abs(np.asarray(image.convert("RGB"), dtype=int) - first).max(axis=2) > 40
+    ).mean() > 0.01
+
+
+def test_frames_show_the_motion_from_start_to_goal(data: ReportData, carry: Carry) -> None:
+    pictures = list(frames(data.geometry, carry))
+    assert len(pictures) == round(carry.timed.duration * FRAMES_PER_SECOND) + 1
+    assert {picture.shape for picture in pictures} == {(400, 640, 3)}
+    steps = [np.abs(a.astype(int) - b).mean() for a, b in pairwise(pictures)]
+    assert max(steps) > 0.1
+
+
+def test_an_mp4_plays_in_real_time(data: ReportData, carry: Carry, tmp_path: Path) -> None:
+    path = tmp_path / "carry.mp4"
+    write_animation(data.geometry, carry, path)
+    count, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
+    assert count == round(carry.timed.duration * FRAMES_PER_SECOND) + 1
+    assert seconds == pytest.approx(carry.timed.duration, abs=2.0 / FRAMES_PER_SECOND)
+
+
+def test_another_suffix_is_refused(data: ReportData, carry: Carry, tmp_path: Path) -> None:
+    with pytest.raises(ReportError, match=r"\.gif or \.mp4"):
+        write_animation(data.geometry, carry, tmp_path / "carry.avi")
+
+
+def test_the_program_animates_a_results_folder(study: Path, tmp_path: Path) -> None:
+    path = tmp_path / "chosen.gif"
+    assert main([str(study), "--animation", str(path)]) == 0
+    assert Image.open(path).n_frames > 10  # type: ignore[attr-defined]
+
+
+def test_the_program_tells_what_is_no_results_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(tmp_path)]) == 2
+    assert "configuration.json is missing" in capsys.readouterr().err
+
+
+def test_the_live_view_serves_and_moves(data: ReportData) -> None:
+    view = LiveView(data.geometry, data.carries, port=0)
+    try:
+        address = f"http://127.0.0.1:{view.server.get_port()}"
+        with urllib.request.urlopen(address) as answer:
+            assert answer.status == 200
+        handles = {frame.kind: handle for frame, handle in view._frames.items()}
+        chosen = data.carries[-1].timed
+        view.show(0.0)
+        np.testing.assert_allclose(handles["box"].position, chosen.pose[0, :3], atol=1e-6)
+        view.show(1.0)
+        np.testing.assert_allclose(handles["box"].position, chosen.pose[-1, :3], atol=1e-6)
+        before = float(view._share.value)
+        view.step(0.5)
+        assert float(view._share.value) == pytest.approx(before + 50.0 / chosen.duration, abs=0.2)
+    finally:
+        view.stop()

@@ -1,0 +1,106 @@
+"""The report's tables: figures of the summary, in formats that hold any text."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from studies.report.records import ReportData
+from studies.report.tables import NOTHING, Table, report_tables
+
+TEXTS = st.text(st.characters(blacklist_categories=("Cs", "Cc")), min_size=1, max_size=20)
+
+
+def named(tables: tuple[Table, ...], name: str) -> Table:
+    return next(table for table in tables if table.name == name)
+
+
+def test_table_1_repeats_the_summary(data: ReportData, study: Path) -> None:
+    table = named(report_tables(data, with_paper=False), "table1_quality")
+    summary = json.loads((study / "summary.json").read_text())
+    assert [row[0] for row in table.rows] == ["NSGA-II", "MOPSO"]
+    for row, name in zip(table.rows, ("nsga2", "mopso"), strict=True):
+        statistics = summary["algorithms"][name]["statistics"]
+        share = statistics["feasible_share"]
+        assert row[2] == f"{100 * share['mean']:.1f} ± {100 * share['std']:.1f}"
+        volume = [entry["hypervolume"] for entry in summary["algorithms"][name]["replicas"]]
+        assert row[4] == f"{np.mean(volume):.4f} ± {np.std(volume, ddof=1):.4f}"
+
+
+def test_table_2_shows_the_selected_trajectories(data: ReportData, study: Path) -> None:
+    table = named(report_tables(data, with_paper=False), "table2_selected")
+    summary = json.loads((study / "summary.json").read_text())
+    rows = {row[0]: row for row in table.rows}
+    for title, name in (("NSGA-II", "nsga2"), ("MOPSO", "mopso")):
+        entry = summary["algorithms"][name]
+        chosen = entry["replicas"][entry["representative"]]["selected"]
+        expected = [*chosen["minimum_normal_force"], *chosen["peak_normal_force"]]
+        assert rows[title][1:5] == tuple(f"{force:.2f}" for force in expected)
+        assert rows[title][7] == f"{chosen['payload_limit']:.2f}"
+    # A level box at rest needs m g / (2 mu) of each pad.
+    assert rows["level payload at rest"][1] == f"{8.0 * 9.81 / 1.6:.2f}"
+
+
+def test_the_papers_figures_are_those_that_it_states(data: ReportData) -> None:
+    with_paper, without = (report_tables(data, with_paper=flag) for flag in (True, False))
+    quality = {row[0]: row for row in named(with_paper, "table1_quality").rows}
+    assert quality["NSGA-II, paper"][1:] == ("694", "69.4", *[NOTHING] * 4)
+    assert quality["MOPSO, paper"][1:] == ("296", "29.6", *[NOTHING] * 4)
+    chosen = {row[0]: row for row in named(with_paper, "table2_selected").rows}
+    assert chosen["NSGA-II, paper"][7] == "16.71"
+    assert chosen["MOPSO, paper"][7] == "16.06"
+    assert not any("paper" in row[0] for table in without for row in table.rows)
+
+
+def test_every_row_fits_its_header(data: ReportData) -> None:
+    for table in report_tables(data, with_paper=True):
+        assert all(len(row) == len(table.header) for row in table.rows)
+        assert len(table.rows) > 0
+
+
+@given(st.lists(TEXTS, min_size=2, max_size=4))
+def test_csv_reads_back(cells: list[str]) -> None:
+    table = Table("t", "title", tuple(cells), (tuple(cells),), "note")
+    assert list(csv.reader(io.StringIO(table.csv()))) == [cells, cells]
+
+
+@given(TEXTS)
+def test_html_holds_no_markup_of_its_texts(text: str) -> None:
+    hostile = f"<script>{text}</script>\"'&"
+    page = Table("t", hostile, (hostile, "b"), ((hostile, "c"),), hostile).html()
+    assert "<script" not in page
+    assert page.count("</td>") == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a_b & 50 % #1 {x} $y$", r"a\_b \& 50 \% \#1 \{x\} \$y\$"),
+        ("C:\\x^2~", r"C:\textbackslash{}x\textasciicircum{}2\textasciitilde{}"),
+        ("1 ± 2 –", r"1 $\pm$ 2 --"),
+    ],
+)
+def test_latex_escapes_what_latex_would_read(text: str, expected: str) -> None:
+    assert expected in Table("t", text, ("a", "b"), (("c", "d"),), "").latex()
+
+
+def test_markdown_keeps_one_row_per_line() -> None:
+    text = Table("t", "x", ("a|b", "c"), (("1\n2", "<b>"),), "n").markdown()
+    assert "| a\\|b | c |" in text
+    assert "| 1 2 | &lt;b> |" in text
+
+
+def test_an_algorithm_without_a_feasible_candidate_is_told(data: ReportData) -> None:
+    failed = replace(data.algorithms[0], selected=None)
+    shown = replace(data, algorithms=(failed, *data.algorithms[1:]))
+    rows = [row[0] for row in named(report_tables(shown, with_paper=False), "table2_selected").rows]
+    assert "NSGA-II" not in rows
+    assert "MOPSO" in rows
