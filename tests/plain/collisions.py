@@ -1,0 +1,201 @@
+"""Collisions written plainly: every pair of every sample goes to FCL, nothing is screened.
+
+Which pairs can meet at all is a fact of the cell (`symbolic.collision_pairs`), and so are the
+convex pieces of a mesh. Shapes and placements are Pinocchio's own reading of the URDF.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import coal
+import fcl
+import numpy as np
+import pinocchio as pin
+
+from hybrid_opt.collision.checker import RESTING_TOLERANCE
+from symbolic.collision_pairs import build_geometry
+from symbolic.meshes import convex_pieces
+from symbolic.workcell import Array, Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
+from tests.plain.motion import rotation
+
+PAYLOAD = "payload"
+
+
+@dataclass(frozen=True)
+class PlainCollisions:
+    """What FCL says about the samples of a candidate.
+
+    Attributes:
+        colliding: (n,) samples in which some pair collides.
+        pairs: per sample the names of the pairs that collide.
+        time: time in collision [s].
+    """
+
+    colliding: Array
+    pairs: tuple[tuple[tuple[str, str], ...], ...]
+    time: float
+
+
+@dataclass
+class _Solid:
+    """An FCL object and its placement in the frame that carries it."""
+
+    object: fcl.CollisionObject
+    placement: pin.SE3
+
+    def move(self, frame: pin.SE3) -> None:
+        here = frame * self.placement
+        self.object.setTransform(fcl.Transform(here.rotation, here.translation))
+
+
+class PlainCollisionChecker:
+    """FCL objects of every body of a workcell."""
+
+    def __init__(self, workcell: Workcell) -> None:
+        self.workcell = workcell
+        self.tolerance = workcell.collision.tolerance
+        self.arms = [_Arm(robot) for robot in workcell.robots]
+        self.bodies = {name: solids for arm in self.arms for name, solids in arm.bodies.items()}
+        self.payload = _solid(Box(workcell.payload.size))
+        self.shrunk = _solid(Box(workcell.payload.size - 2.0 * RESTING_TOLERANCE))
+        self.bodies[PAYLOAD] = [self.payload]
+        for body in workcell.environment:
+            self.bodies[body.name] = _solids(body.shape, pin.SE3(body.pose))
+            for solid in self.bodies[body.name]:
+                solid.move(pin.SE3.Identity())
+        self.pairs = build_geometry(workcell).pair_names
+        self.resting = self._resting_places()
+
+    def check(self, time: Array, pose: Array, q_1: Array, q_2: Array) -> PlainCollisions:
+        """Check every pair of n samples: time (n,), box pose and joints (n, 6) each."""
+        found = []
+        for k in range(len(time)):
+            self.arms[0].move(q_1[k])
+            self.arms[1].move(q_2[k])
+            self._move_payload(pose[k])
+            allowed = self._allowed(pose[k, :3])
+            found.append(tuple(pair for pair in self.pairs if self._collides(pair, allowed)))
+        colliding = np.array([bool(pairs) for pairs in found])
+        return PlainCollisions(
+            colliding, tuple(found), float(np.trapezoid(colliding.astype(float), time))
+        )
+
+    def _collides(self, pair: tuple[str, str], allowed: set[str]) -> bool:
+        first, second = pair
+        resting = first == PAYLOAD and second in allowed
+        hit = False
+        for a in [self.shrunk] if resting else self.bodies[first]:
+            for b in self.bodies[second]:
+                result = fcl.CollisionResult()
+                fcl.collide(a.object, b.object, fcl.CollisionRequest(), result)
+                hit = hit or result.is_collision
+                if self.tolerance > 0.0 and not resting:
+                    hit = hit or fcl.distance(a.object, b.object) <= self.tolerance
+        return hit
+
+    def _move_payload(self, pose: Array) -> None:
+        world_box = pin.SE3(rotation(pose[3:]), pose[:3])
+        self.payload.move(world_box)
+        self.shrunk.move(world_box)
+
+    def _resting_places(self) -> list[tuple[str, Array, float]]:
+        """Body, place and departure of every allowed contact that a fixed pose makes."""
+        task, places = self.workcell.task, []
+        for waypoint in task.waypoints:
+            if not waypoint.is_fixed:
+                continue
+            self._move_payload(waypoint.lower)
+            for allowed in task.allowed_contacts:
+                solids = self.bodies[allowed.body]
+                gap = min(fcl.distance(self.payload.object, solid.object) for solid in solids)
+                if gap <= self.tolerance + RESTING_TOLERANCE:
+                    places.append((allowed.body, waypoint.lower[:3], allowed.departure))
+        return places
+
+    def _allowed(self, centre: Array) -> set[str]:
+        """Bodies that the payload may touch with its centre here."""
+        return {
+            body
+            for body, place, departure in self.resting
+            if np.linalg.norm(centre - place) <= departure
+        }
+
+
+class _Arm:
+    """The links and tools of a robot, moved by numeric Pinocchio."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.base = pin.SE3(robot.T_world_base)
+        full = pin.buildModelFromUrdf(str(robot.urdf))
+        folders = [str(folder) for folder in robot.package_dirs]
+        geometry = pin.buildGeomFromUrdf(
+            full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=folders
+        )
+        links = [full.frames[item.parentFrame].name for item in geometry.geometryObjects]
+        locked = [full.getJointId(name) for name, _ in robot.locked_joints]
+        q = pin.neutral(full)
+        for joint, (_, position) in zip(locked, robot.locked_joints, strict=True):
+            q[full.joints[joint].idx_q] = position
+        self.model, geometry = pin.buildReducedModel(full, geometry, locked, q)
+        self.data = self.model.createData()
+        self.bodies: dict[str, list[_Solid]] = {}
+        self.carried: list[tuple[_Solid, int]] = []
+        for link, item in zip(links, geometry.geometryObjects, strict=True):
+            self._add(f"{robot.name}/{link}", _urdf_shape(item), item.placement, item.parentJoint)
+        flange = self.model.frames[self.model.getFrameId(robot.flange)]
+        for tool in robot.tool:
+            placement = flange.placement * pin.SE3(tool.pose)
+            self._add(f"{robot.name}/{tool.name}", tool.shape, placement, flange.parentJoint)
+
+    def _add(self, name: str, shape: Shape | coal.Capsule, pose: pin.SE3, joint: int) -> None:
+        solids = _solids(shape, pose)
+        self.bodies.setdefault(name, []).extend(solids)
+        self.carried += [(solid, joint) for solid in solids]
+
+    def move(self, q: Array) -> None:
+        pin.forwardKinematics(self.model, self.data, q)
+        for solid, joint in self.carried:
+            solid.move(self.base * self.data.oMi[joint])
+
+
+def _urdf_shape(item: pin.GeometryObject) -> Shape | coal.Capsule:
+    """The shape of a link as Pinocchio read it."""
+    shape = item.geometry
+    match shape:
+        case coal.Box():
+            return Box(2.0 * shape.halfSide)
+        case coal.Cylinder():
+            return Cylinder(shape.radius, 2.0 * shape.halfLength)
+        case coal.Sphere():
+            return Sphere(shape.radius)
+        case coal.Capsule():
+            return shape
+    return Mesh(Path(item.meshPath), np.asarray(item.meshScale))
+
+
+def _solids(shape: Shape | coal.Capsule, placement: pin.SE3) -> list[_Solid]:
+    if not isinstance(shape, Mesh):
+        return [_solid(shape, placement)]
+    solids = []
+    for hull in convex_pieces(shape.path, shape.scale):
+        counted = np.array([[len(face), *face] for face in hull.faces])
+        solid = fcl.Convex(np.array(hull.vertices), len(hull.faces), counted.ravel())
+        solids.append(_Solid(fcl.CollisionObject(solid), placement))
+    return solids
+
+
+def _solid(
+    shape: Box | Cylinder | Sphere | coal.Capsule, placement: pin.SE3 | None = None
+) -> _Solid:
+    match shape:
+        case Box():
+            solid = fcl.Box(*shape.size)
+        case Cylinder():
+            solid = fcl.Cylinder(shape.radius, shape.length)
+        case Sphere():
+            solid = fcl.Sphere(shape.radius)
+        case _:
+            solid = fcl.Capsule(shape.radius, 2.0 * shape.halfLength)
+    return _Solid(fcl.CollisionObject(solid), placement or pin.SE3.Identity())
