@@ -10,7 +10,6 @@ from __future__ import annotations
 import moocore
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -112,6 +111,9 @@ def spacing(front: ArrayLike) -> float:
     Says nothing about convergence or extent, so never use it alone.
     Source: Schott 1995.
     """
+    # Not imported at the top: SciPy takes long to start, and evaluations alone do not need it.
+    from scipy.spatial import cKDTree
+
     points = np.asarray(front, dtype=np.float64)
     if len(points) < 3:
         return float("nan")

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from scipy.stats import qmc
 
 from symbolic.arm import TRACK_OUTPUTS, box_flange, follow_function
 from symbolic.path import sample_basis, waypoint_matrix
@@ -85,6 +84,9 @@ def inverse_kinematics(
         and each joint on the turn that is nearest the middle of its range; postures with a joint
         that no turn brings within its limits are left out.
     """
+    # Not imported at the top: it takes long to start, and a model from the cache needs no search.
+    from scipy.stats import qmc
+
     centre = (robot.position_lower + robot.position_upper) / 2.0
     half = np.minimum((robot.position_upper - robot.position_lower) / 2.0, np.pi)
     q = centre + (2.0 * qmc.Sobol(6, scramble=False).random(n_starts) - 1.0) * half

@@ -16,7 +16,7 @@ def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
 
     candidate: the evaluator of a whole candidate (`symbolic.evaluator.candidate_function`).
     posture: both arms at one box pose (`symbolic.arm.posture_function`).
-    clearance, frames: collision bounds and placements of one sample
+    clearance, piece_poses, motion: collision bounds, placements and bounds of the motion
     (`symbolic.clearance.screening_functions`).
 
     Raises:

@@ -12,7 +12,6 @@ import pinocchio as pin
 
 from symbolic.errors import CollisionModelError
 from symbolic.geometry import Capsule, Piece, check_piece
-from symbolic.meshes import convex_pieces
 from symbolic.urdf_model import arm_model, resolve_mesh
 from symbolic.workcell import Array, Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
 
@@ -125,6 +124,9 @@ def shape_pieces(shape: Shape | Capsule, pose: Array, owner: str) -> tuple[Piece
     """The convex pieces of a shape at a pose (4, 4)."""
     if not isinstance(shape, Mesh):
         return (Piece(shape, pose),)
+    # Not imported at the top: trimesh takes long to start, and most cells have no meshes.
+    from symbolic.meshes import convex_pieces
+
     try:
         return tuple(Piece(hull, pose) for hull in convex_pieces(shape.path, shape.scale))
     except CollisionModelError as error:

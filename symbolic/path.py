@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from symbolic.workcell import Array, Task
 
@@ -46,6 +45,9 @@ def path_basis(n_waypoints: int, parameter: Array) -> PathBasis:
         position = np.column_stack([1.0 - parameter, parameter])
         slope = np.tile([-1.0, 1.0], (len(parameter), 1))
         return _read_only(parameter, position, slope, np.zeros_like(slope))
+    # Not imported at the top: SciPy takes long to start, and compiled functions need no basis.
+    from scipy.interpolate import make_interp_spline
+
     knots = np.linspace(0.0, 1.0, n_waypoints)
     natural = [(3, np.zeros(n_waypoints)), (4, np.zeros(n_waypoints))]
     spline = make_interp_spline(knots, identity, k=5, bc_type=(natural, natural))
