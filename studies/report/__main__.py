@@ -22,10 +22,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
     parser.add_argument("results", type=Path, metavar="RESULTS", help="results folder of a study")
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
+    parser.add_argument(
+        "--into",
+        type=Path,
+        metavar="FILE",
+        help="put Tables 1 and 2 between the markers of this Markdown file (default: none)",
+    )
     add_report_options(parser)
     options = parser.parse_args(arguments)
     try:
-        if options.animation or options.view:
+        if options.into:
+            from studies.report.look import insert_tables
+
+            insert_tables(options.results, options.into)
+        elif options.animation or options.view:
             follow_report_options(options.results, options)
         else:
             rewrite(options.results, Progress(not options.quiet))

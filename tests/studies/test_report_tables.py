@@ -13,8 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from studies.report.look import BEGIN, END, insert_tables
 from studies.report.records import ReportData
 from studies.report.tables import NOTHING, Table, report_tables
+from symbolic.errors import ReportError
 
 TEXTS = st.text(st.characters(blacklist_categories=("Cs", "Cc")), min_size=1, max_size=20)
 
@@ -104,3 +106,32 @@ def test_an_algorithm_without_a_feasible_candidate_is_told(data: ReportData) -> 
     rows = [row[0] for row in named(report_tables(shown, with_paper=False), "table2_selected").rows]
     assert "NSGA-II" not in rows
     assert "MOPSO" in rows
+
+
+def test_tables_are_put_between_the_markers_of_a_document(
+    data: ReportData, own_study: Path, tmp_path: Path
+) -> None:
+    document = tmp_path / "page.md"
+    document.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    folder = own_study / "tables"
+    folder.mkdir(exist_ok=True)
+    for table in report_tables(data, with_paper=True):
+        (folder / f"{table.name}.md").write_text(table.markdown())
+    insert_tables(own_study, document)
+    text = document.read_text()
+    assert text.startswith(f"before\n{BEGIN}\n")
+    assert text.endswith(f"{END}\nafter\n")
+    assert "old" not in text
+    assert "| NSGA-II, paper | 694 | 69.4 |" in text
+    insert_tables(own_study, document)
+    assert document.read_text() == text
+
+
+def test_a_document_without_markers_is_refused(own_study: Path, tmp_path: Path) -> None:
+    (own_study / "tables").mkdir(exist_ok=True)
+    for name in ("table1_quality", "table2_selected"):
+        (own_study / "tables" / f"{name}.md").write_text("x")
+    document = tmp_path / "page.md"
+    document.write_text("no markers")
+    with pytest.raises(ReportError, match="measured: begin"):
+        insert_tables(own_study, document)

@@ -96,7 +96,7 @@
       x: [0, end], y: [limit.value, limit.value], hoverinfo: "name",
       line: { color: limit.colour, dash: "dot", width: 1.5 } }));
     const layout = { font: FONT, margin: { l: 60, r: 15, t: 40, b: 55 }, showlegend: true,
-      xaxis: { title: { text: "time [s]" }, range: [0, end] },
+      xaxis: { title: { text: "time [s]", standoff: 6 }, range: [0, end] },
       yaxis: { title: { text: title }, rangemode: "normal" },
       legend: { orientation: "h", yref: "container", y: 0.99, yanchor: "top",
         font: { size: 10 } }, shapes: [cursor(0)] };

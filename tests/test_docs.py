@@ -1,0 +1,101 @@
+"""Links, files, programs and options that the documentation names exist."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+NAMES = [str(path.relative_to(ROOT)) for path in DOCUMENTS]
+
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+COMMAND = re.compile(r"python -m ([a-z_]+(?:\.[a-z_]+)*)([^\n`#]*)")
+OPTION = re.compile(r"--[a-z][a-z-]*")
+SOURCE = re.compile(r"`((?:symbolic|codegen|hybrid_opt|studies|tests|docs)/[\w./-]+)`")
+OWN = ("symbolic", "codegen", "hybrid_opt", "studies")
+
+
+def anchors(text: str) -> set[str]:
+    """Anchors of a document's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
+    return {
+        re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings
+    }
+
+
+def broken_links(path: Path, text: str) -> list[str]:
+    """Links of a document to files or headings that do not exist."""
+    broken = []
+    for target in LINK.findall(text):
+        if target.startswith(("http://", "https://", "mailto:")):
+            continue
+        file, _, anchor = target.partition("#")
+        other = (path.parent / file).resolve() if file else path
+        known = other.exists() and (not anchor or anchor in anchors(other.read_text("utf-8")))
+        if not known:
+            broken.append(target)
+    return broken
+
+
+def commands(text: str) -> list[tuple[str, list[str]]]:
+    """Modules of this project that a document runs, with the options it gives them."""
+    return [
+        (module, OPTION.findall(rest))
+        for module, rest in COMMAND.findall(text)
+        if module.split(".")[0] in OWN
+    ]
+
+
+@cache
+def help_of(module: str) -> str:
+    finished = subprocess.run(
+        [sys.executable, "-m", module, "--help"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=ROOT,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    return finished.stdout
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_links_lead_somewhere(name: str) -> None:
+    path = ROOT / name
+    assert broken_links(path, path.read_text("utf-8")) == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_commands_exist_with_their_options(name: str) -> None:
+    for module, options in commands((ROOT / name).read_text("utf-8")):
+        assert find_spec(module) is not None, module
+        known = set(OPTION.findall(help_of(module)))
+        assert set(options) <= known | {"--help"}, (module, options)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_named_sources_exist(name: str) -> None:
+    for source in SOURCE.findall((ROOT / name).read_text("utf-8")):
+        assert (ROOT / source).exists(), source
+
+
+def test_what_is_broken_would_be_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# A heading\n\n[x](gone.md) [y](#a-heading) [z](#another)\n")
+    assert broken_links(page, page.read_text()) == ["gone.md", "#another"]
+    assert commands("`python -m studies.rack --jobs 2`") == [("studies.rack", ["--jobs"])]
+    assert "--no-such-option" not in OPTION.findall(help_of("studies.rack"))
+
+
+def test_the_index_lists_every_page() -> None:
+    index = (ROOT / "docs" / "README.md").read_text("utf-8")
+    pages = {path.name for path in ROOT.glob("docs/*.md")} - {"README.md"}
+    assert pages <= set(LINK.findall(index))
