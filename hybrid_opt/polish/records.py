@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
 import numpy as np
@@ -34,13 +34,13 @@ class PolishSettings:
         tolerance: improvement of an objective below which a point counts as optimal already.
     """
 
-    points: int = 24
+    points: int = 10
     method: Method = "pascoletti-serafini"
-    max_iterations: int = 40
+    max_iterations: int = 25
     rounds: int = 6
     max_seconds: float = 60.0
     margin: float = 1e-6
-    clearance: float = 5e-4
+    clearance: float = 8e-4
     activity: float = 0.03
     tolerance: float = 1e-6
 
@@ -166,11 +166,6 @@ class PolishedFront:
         own = [o.status for o in self.outcomes if o.aim == "point"]
         good = sum(status in ("accepted", "optimal") for status in own)
         return good / len(own) if own else float("nan")
-
-
-def with_seconds(outcome: PolishOutcome, seconds: float) -> PolishOutcome:
-    """The outcome with its total time."""
-    return replace(outcome, seconds=seconds)
 
 
 def outcome_to_json(outcome: PolishOutcome) -> dict[str, object]:

@@ -17,12 +17,12 @@ import casadi as ca
 import numpy as np
 
 from hybrid_opt.evaluation import CandidateEvaluator
-from hybrid_opt.polish.active import ActiveSet, Carry, Row
+from hybrid_opt.polish.active import ActiveSet, Row
+from hybrid_opt.polish.carry import Carry, CarryReader
 from hybrid_opt.polish.functions import PolishFunctions
 from hybrid_opt.polish.program import Answer, Program, ipopt, run
 from hybrid_opt.polish.records import UNKNOWN, PolishSettings, Residuals
 from hybrid_opt.polish.targets import Target, level, needed_level
-from symbolic.path import sample_basis
 from symbolic.smooth_problem import (
     ForceRow,
     PlaceRow,
@@ -116,7 +116,7 @@ class PolishSolver:
         self._workcell, self._task = evaluator.workcell, evaluator.workcell.task
         self._functions, self._settings = functions, settings
         self._active = ActiveSet(evaluator, functions.rows, settings)
-        self._basis = sample_basis(self._task).position
+        self._reader = CarryReader(evaluator)
         self._coefficients = branch_coefficients(self._workcell)
         half = (self._task.upper - self._task.lower) / 2.0
         self._half = np.where(half > 0.0, half, 1.0)
@@ -126,7 +126,7 @@ class PolishSolver:
     def solve(self, task: SolveTask) -> Solution:
         """Improve towards the task's target."""
         x = np.clip(task.x, self._task.lower, self._task.upper)
-        now = _Progress(x, self._active.carry(x))
+        now = _Progress(x, self._reader.read(x))
         best = Solution(x, "", False, False, UNKNOWN, 0, 0, 0)
         while (
             best.rounds < self._settings.rounds
@@ -164,7 +164,7 @@ class PolishSolver:
         if not answer.usable:
             now.radius /= 4.0
             return "refused"
-        carry = self._active.carry(answer.x)
+        carry = self._reader.read(answer.x)
         missing = set(self._active.violated(carry))
         branches = self._other_branches(carry) - now.forces
         if missing or branches or not carry.is_followed:
@@ -210,10 +210,10 @@ class PolishSolver:
         """Solve the smooth problem in the box of trust."""
         rows, carry = sorted(required), now.carry
         forces = sorted(self._cones | now.forces | self._other_branches(carry))
-        samples = sorted({sample for _, sample in rows})
-        place = {sample: index for index, sample in enumerate(samples)}
-        placed = tuple((kind, place[sample]) for kind, sample in rows)
-        problem, solver = self._problem(tuple(forces), placed, len(samples))
+        places = sorted({place for _, place in rows})
+        index = {place: k for k, place in enumerate(places)}
+        placed = tuple((kind, index[place]) for kind, place in rows)
+        problem, solver = self._problem(tuple(forces), placed, len(places))
         xi, low, high = (
             (x - problem.centre) / problem.scale
             for x in (now.x, self._task.lower, self._task.upper)
@@ -226,7 +226,10 @@ class PolishSolver:
             Program(
                 start=np.concatenate([xi, f, [needed_level(target, f) + SLACK]]),
                 parameters=problem.parameters(
-                    target.vector(), self._basis[samples], carry.q[0][samples], carry.q[1][samples]
+                    target.vector(),
+                    self._reader.basis[places],
+                    carry.q[0][places],
+                    carry.q[1][places],
                 ),
                 low=np.concatenate([np.maximum(low, xi - now.radius), [0.0, 0.0, -LEVEL_BOUND]]),
                 high=np.concatenate(
