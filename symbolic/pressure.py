@@ -19,9 +19,9 @@ Where one contact is unloaded or nothing is tangential, a direction of moment ca
 rounding over the damping is the error that remains.
 """
 
-REFINEMENTS = 4
+REFINEMENTS = 7
 """Repeated solves for what is left (iterated Tikhonov regularisation): they take the damping's
-own error to its fifth power, below rounding wherever a moment can be had at all."""
+own error to its eighth power, below rounding wherever a moment can be had at all."""
 
 
 @dataclass(frozen=True)
