@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
+from hybrid_opt.metrics import hypervolume, non_dominated
 from studies.report.data import gather
-from studies.report.records import ReportData
+from studies.report.records import Front, ReportData
 from studies.run import StudySettings, run_study
 from tests.symbolic.cells import ROOT
 
@@ -30,6 +33,26 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def data(study: Path) -> ReportData:
     """What a report of that study shows."""
     return gather(study)
+
+
+@pytest.fixture(scope="session")
+def hybrid_data(data: ReportData) -> ReportData:
+    """The same report as after a polish: every run's polished front is the best of all runs."""
+    fronts = [run.front for algorithm in data.algorithms for run in algorithm.runs]
+    x = np.concatenate([front.x for front in fronts])
+    objectives = np.concatenate([front.objectives for front in fronts])
+    best = non_dominated(objectives)
+    hybrid = Front(x[best], objectives[best])
+    figures = {"hypervolume": hypervolume(hybrid.objectives)}
+    algorithms = tuple(
+        replace(
+            algorithm,
+            runs=tuple(replace(r, hybrid=hybrid, hybrid_figures=figures) for r in algorithm.runs),
+            hybrid_selected=data.algorithms[-1].selected,
+        )
+        for algorithm in data.algorithms
+    )
+    return replace(data, algorithms=algorithms)
 
 
 @pytest.fixture

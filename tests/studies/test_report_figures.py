@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -27,6 +28,7 @@ NAMES = (
     "fig08_best_so_far",
     "attainment",
     "indicators",
+    "polish",
     "infeasibility",
     "fig09_normal_forces",
     "fig10_joint_torques",
@@ -41,10 +43,10 @@ NAMES = (
 
 
 @pytest.fixture(scope="module")
-def drawn(data: ReportData) -> dict[str, tuple[ReportFigure, Figure]]:
+def drawn(hybrid_data: ReportData) -> dict[str, tuple[ReportFigure, Figure]]:
     figures = {}
     with in_style():
-        for entry in report_figures(data):
+        for entry in report_figures(hybrid_data):
             figure = entry.draw()
             FigureCanvasAgg(figure).draw()  # type: ignore[no-untyped-call]
             figures[entry.name] = (entry, figure)
@@ -82,6 +84,20 @@ def box_of(text: Text) -> Bbox:
 
 def test_the_report_has_every_figure(drawn: dict[str, tuple[ReportFigure, Figure]]) -> None:
     assert tuple(drawn) == NAMES
+
+
+def test_without_a_polish_there_is_no_figure_of_it(data: ReportData) -> None:
+    names = [entry.name for entry in report_figures(data)]
+    assert tuple(names) == tuple(name for name in NAMES if name != "polish")
+
+
+def test_without_a_feasible_candidate_the_rest_is_drawn(data: ReportData) -> None:
+    failed = tuple(replace(algorithm, selected=None) for algorithm in data.algorithms)
+    shown = replace(data, algorithms=failed, timings=data.timings[:1])
+    names = [entry.name for entry in report_figures(shown)]
+    assert "fig07_fronts" not in names
+    for entry in report_figures(shown):
+        assert entry.draw().axes
 
 
 def clipped(figure: Figure) -> list[str]:

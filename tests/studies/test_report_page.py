@@ -24,6 +24,7 @@ from studies.report.records import ReportData
 from symbolic.errors import ReportError
 
 HOSTILE = "</title></script><script>window.broken = 1</script><img src=x onerror=alert(1)>\"'&"
+SHORT = '<b>&"</script>'
 MAX_BYTES = 15_000_000
 
 
@@ -32,8 +33,8 @@ def with_hostile_names(data: ReportData) -> ReportData:
     first, second = data.workcell.robots
     robots = (replace(first, name=HOSTILE), replace(second, name=f"{HOSTILE}2"))
     workcell = replace(data.workcell, name=HOSTILE, robots=robots)
-    algorithms = tuple(replace(entry, title=HOSTILE) for entry in data.algorithms)
-    initial = replace(data.initial, label=HOSTILE)
+    algorithms = tuple(replace(entry, title=SHORT) for entry in data.algorithms)
+    initial = replace(data.initial, label=SHORT)
     return replace(data, workcell=workcell, algorithms=algorithms, initial=initial)
 
 
@@ -125,6 +126,17 @@ def test_data_of_the_page_are_the_trajectories(data: ReportData) -> None:
     np.testing.assert_allclose(samples[0, 1:7], start, atol=1e-6)
     assert np.all(np.diff(samples[:, 0]) > 0.0)
     assert len(samples) <= 70
+
+
+def test_polished_fronts_stand_beside_the_searchs(hybrid_data: ReportData) -> None:
+    document = PageData(hybrid_data, TimingModel(hybrid_data.workcell)).document()
+    labels = [group["label"] for group in document["groups"]]
+    assert labels == [
+        f"{title}: {stage}" for title in ("NSGA-II", "MOPSO") for stage in ("search", "polished")
+    ]
+    hybrid = hybrid_data.algorithms[0].shown.hybrid
+    assert hybrid is not None
+    assert len(document["groups"][1]["members"]) == len(hybrid)
 
 
 def test_every_file_of_the_report_is_written(report: Path, text: str) -> None:

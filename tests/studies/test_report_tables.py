@@ -112,7 +112,7 @@ def test_tables_are_put_between_the_markers_of_a_document(
     data: ReportData, own_study: Path, tmp_path: Path
 ) -> None:
     document = tmp_path / "page.md"
-    document.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    document.write_text(f"before\n{BEGIN}\nformer tables\n{END}\nafter\n")
     folder = own_study / "tables"
     folder.mkdir(exist_ok=True)
     for table in report_tables(data, with_paper=True):
@@ -121,7 +121,7 @@ def test_tables_are_put_between_the_markers_of_a_document(
     text = document.read_text()
     assert text.startswith(f"before\n{BEGIN}\n")
     assert text.endswith(f"{END}\nafter\n")
-    assert "old" not in text
+    assert "former tables" not in text
     assert "| NSGA-II, paper | 694 | 69.4 |" in text
     insert_tables(own_study, document)
     assert document.read_text() == text
