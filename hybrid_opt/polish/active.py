@@ -25,8 +25,8 @@ from symbolic.workcell import Array
 Row = tuple[RowKind, int]
 """What is kept, and at which place."""
 
-BESIDE = (0, -6, 6)
-"""Places around the lowest violated clearance that get a row."""
+BESIDE = (0, 1, -6, 6)
+"""Places around the lowest violated clearance that get a row; a dip counts at two neighbours."""
 
 NEAR = 0.02
 """Bounds lower than this are compared with FCL's distance [m]."""
@@ -87,7 +87,7 @@ class ActiveSet:
         ]
         # Half of the wanted distance is left to what the solver and FCL round off.
         limit = self._wanted / 2.0
-        close = carry.clearance < limit
+        close = _dipped(carry.clearance) < limit
         if close.any():
             truth = self._measured(carry, close)
             for pair in np.flatnonzero(close.any(axis=0)).tolist():
@@ -131,12 +131,13 @@ class ActiveSet:
         return float(value(carry.pose[place], carry.q[0][place], carry.q[1][place]))
 
     def _measured(self, carry: Carry, wanted: NDArray[np.bool_]) -> Array:
-        """The bounds, those of wanted pairs raised to FCL's distance where nothing touches."""
+        """The bounds, those of wanted pairs raised to FCL's distance where nothing touches, and
+        lowered to what is to be expected beside each place."""
         bounds = carry.clearance.copy()
         k = carry.reached
         q_1, q_2 = carry.q
         self._evaluator.checker.measure(carry.pose[:k], q_1[:k], q_2[:k], bounds, wanted)
-        return bounds
+        return _dipped(bounds)
 
     def _joint_rows(self, carry: Carry, limit: float, share: float | None) -> list[Row]:
         rows: list[Row] = []
@@ -155,6 +156,24 @@ class ActiveSet:
             places = _lowest(measure, least, None if share is None else SINGULARITY_STRIDE)
             rows += [(RowKind("singularity", -1, arm), place) for place in places]
         return rows
+
+
+def _dipped(clearance: Array) -> Array:
+    """Clearances (n, k) with the dips between places: where an edge is passed, the clearance falls
+    steadily up to a kink and rises steadily from there, so the lines from both sides meet at the
+    least value in between, which then counts at both places."""
+    low = clearance.copy()
+    if len(clearance) < 4:
+        return low
+    before, left, right, after = (clearance[i : len(clearance) - 3 + i] for i in range(4))
+    falling, rising = before - left, after - right
+    both = (falling > 0.0) & (rising > 0.0)
+    slopes = np.where(both, falling + rising, 1.0)
+    share = np.where(both, (left - right + rising) / slopes, 0.0)
+    kink = np.where((share > 0.0) & (share < 1.0), left - falling * share, np.inf)
+    low[1:-2] = np.minimum(low[1:-2], kink)
+    low[2:-1] = np.minimum(low[2:-1], kink)
+    return low
 
 
 def _lowest(values: Array, limit: float, stride: int | None) -> list[int]:
