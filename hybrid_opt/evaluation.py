@@ -8,11 +8,13 @@ The same evaluation also returns each constraint's violation for constraint domi
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from codegen.function import NumericFunction
 from codegen.workcell_functions import workcell_functions
 from hybrid_opt.certification import (
     LostPathError,
@@ -95,8 +97,12 @@ class CandidateEvaluator:
         workcell: Workcell,
         objectives: tuple[str, ...] = PAPER_OBJECTIVES,
         threads: int = 1,
+        functions: Mapping[str, NumericFunction] | None = None,
     ) -> None:
         """Load or build the compiled functions.
+
+        Args:
+            functions: those of `symbolic.cell_functions`, if not to be loaded or built here.
 
         Raises:
             SettingsError: an objective is unknown.
@@ -106,7 +112,7 @@ class CandidateEvaluator:
         self.objective_names = objectives
         self._objectives = select_objectives(objectives)
         self._threads = threads
-        self.functions = workcell_functions(workcell)
+        self.functions = workcell_functions(workcell) if functions is None else functions
         self._candidate = self.functions["candidate"]
         self.checker = CollisionChecker(build_geometry(workcell), self.functions)
         self.n_var = workcell.task.n_var
@@ -224,14 +230,19 @@ class CandidateEvaluator:
 
     def _collisions(self, outputs: dict[str, Array], row: int) -> Verdict:
         """The collision verdict on the samples that both arms reach."""
-        lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
-        reached = int(np.argmax(lost)) if lost.any() else len(lost)
+        reached = reached_samples(outputs, row)
         return self.checker.check(
             outputs["pose"][row, :reached],
             outputs["q_1"][row, :reached],
             outputs["q_2"][row, :reached],
             outputs["time"][row, :reached],
         )
+
+
+def reached_samples(outputs: Mapping[str, Array], row: int) -> int:
+    """Number of samples of a candidate before an arm loses the path: those that can collide."""
+    lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
+    return int(np.argmax(lost)) if lost.any() else len(lost)
 
 
 def _first_violation(constraint: Array, verdict: Verdict) -> tuple[int, float]:

@@ -3,7 +3,8 @@
 `python -m studies.benchmark [WORKCELL]` measures milliseconds per candidate on one core, in the
 thread's own processor time, so that waiting for a busy machine does not count. The three ways
 take turns on the same candidates, and a ratio is the median over the rounds of the ratio within
-a round. The plain way is the reference implementation of the tests, which needs a checkout.
+a round. The plain way is the reference implementation of the tests, which needs a checkout. With
+collisions the same is measured on candidates of a search (`studies.benchmark_collisions`).
 
 The cost against the number of samples and of free waypoints is measured on cells derived from the
 given one: same start, goal and robots, the free waypoints spread along the hand-made trajectory.
@@ -16,7 +17,6 @@ import json
 import os
 import platform
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import as_file, files
@@ -29,19 +29,16 @@ from codegen.build import compile_function
 from codegen.compiled import CompiledFunction
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
+from studies.benchmark_collisions import with_collisions
+from studies.benchmark_turns import Evaluate, interleaved, progress, summary
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.errors import CodegenError, DualArmError, SettingsError
 from symbolic.evaluator import candidate_function
 from symbolic.workcell import Array, Task, Waypoint, Workcell
 from symbolic.workcell_file import load
 
-Evaluate = Callable[[Array], object]
-
 SAMPLES = (25, 50, 100, 200, 400)
 WAYPOINTS = (1, 2, 3, 4, 5, 6, 7, 8)
-
-SLICE = 0.005
-"""Least time of one way in one round [s]; fast ways repeat the candidate to fill it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -104,17 +101,17 @@ def benchmark(
             raise SettingsError(f"--{name} is {value}; give 1 or more")
     if seed < 0:
         raise SettingsError(f"--seed is {seed}; give 0 or more")
-    make_plain = _plain_reference()
-    _progress(f"{workcell.name}: reading the robots, choosing start branches")
+    make_plain, make_plain_judge = _plain_references()
+    progress(f"{workcell.name}: reading the robots, choosing start branches")
     model = build_cell_model(workcell)
     x = _candidates(workcell.task, candidates, seed)
-    _progress("building the evaluator")
+    progress("building the evaluator")
     ways: dict[str, Evaluate] = {
         "compiled": _compiled(model),
         "interpreted": InterpretedFunction(dense(candidate_function(model))),
         "plain": make_plain(workcell, model.start),
     }
-    _progress(f"{candidates * repeats} rounds: {', '.join(ways)}")
+    progress(f"{candidates * repeats} rounds: {', '.join(ways)}")
     return {
         "workcell": workcell.name,
         "digest": workcell.digest,
@@ -130,51 +127,11 @@ def benchmark(
             "python": platform.python_version(),
         },
         **summary(interleaved(ways, dict.fromkeys(ways, x), repeats)),
+        "with_collisions": with_collisions(
+            workcell, make_plain_judge(workcell, model.start), candidates, repeats, seed
+        ),
         "scaling": _scaling(model, candidates, repeats, seed),
     }
-
-
-def interleaved(
-    ways: Mapping[str, Evaluate], x: Mapping[str, Array], repeats: int
-) -> dict[str, Array]:
-    """Seconds per candidate of every way in every round (rounds,); the ways take turns.
-
-    Args:
-        ways: functions of one decision vector, by name.
-        x: per way its decision vectors (n, n_var), the same number for all.
-        repeats: rounds with each decision vector.
-    """
-    counts = {}
-    for name, evaluate in ways.items():
-        evaluate(x[name][0])
-        counts[name] = max(1, int(np.ceil(SLICE / _seconds(evaluate, x[name][0], 1))))
-    n = len(next(iter(x.values())))
-    times: dict[str, list[float]] = {name: [] for name in ways}
-    for round_ in range(n * repeats):
-        # Every other round backwards: what comes first has no advantage.
-        for name in list(ways)[:: 1 if round_ % 2 == 0 else -1]:
-            times[name].append(_seconds(ways[name], x[name][round_ % n], counts[name]))
-    return {name: np.array(values) for name, values in times.items()}
-
-
-def _seconds(evaluate: Evaluate, x: Array, count: int) -> float:
-    start = time.thread_time()
-    for _ in range(count):
-        evaluate(x)
-    return (time.thread_time() - start) / count
-
-
-def summary(times: Mapping[str, Array]) -> dict[str, float]:
-    """Medians [ms] of every way and medians of the ratios within a round.
-
-    Args:
-        times: seconds per candidate (rounds,) of 'compiled', 'interpreted' and 'plain'.
-    """
-    ratios = {
-        f"{name}_over_compiled": float(np.median(times[name] / times["compiled"]))
-        for name in ("plain", "interpreted")
-    }
-    return {f"{name}_ms": 1e3 * float(np.median(value)) for name, value in times.items()} | ratios
 
 
 def _scaling(model: CellModel, candidates: int, repeats: int, seed: int) -> dict[str, Any]:
@@ -219,7 +176,7 @@ def _costs(
     ways: dict[str, Evaluate] = {}
     x: dict[str, Array] = {}
     for n, task in tasks.items():
-        _progress(f"building the evaluator with {n} {what}")
+        progress(f"building the evaluator with {n} {what}")
         ways[str(n)] = _compiled(replace(model, workcell=replace(model.workcell, task=task)))
         x[str(n)] = _candidates(task, candidates, seed)
     return {int(name): value for name, value in interleaved(ways, x, repeats).items()}
@@ -260,15 +217,20 @@ def _compiled(model: CellModel) -> CompiledFunction:
     return function
 
 
-def _plain_reference() -> Callable[[Workcell, tuple[Array, Array]], Evaluate]:
+MakePlain = Callable[[Workcell, tuple[Array, Array]], Evaluate]
+
+
+def _plain_references() -> tuple[MakePlain, MakePlain]:
+    """The plain evaluators without and with collisions."""
     try:
         from tests.plain.candidate import PlainEvaluator
+        from tests.plain.verdict import PlainJudge
     except ModuleNotFoundError as error:
         raise SettingsError(
             "the plain reference is part of the tests and is not installed; run the benchmark "
             f"in the folder of a checkout of the project ({error})"
         ) from error
-    return PlainEvaluator
+    return PlainEvaluator, PlainJudge
 
 
 def _processor() -> str:
@@ -280,23 +242,25 @@ def _processor() -> str:
     return next(names, platform.processor())
 
 
-def _progress(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
 def _report(result: Mapping[str, Any]) -> str:
     machine, line = result["machine"], result["scaling"]["samples_line"]
+    collisions = result["with_collisions"]
     rows = [
         f"{result['workcell']}: {result['samples']} samples, "
         f"{result['free_waypoints']} free waypoints",
         f"{machine['processor']}, Python {machine['python']}; one core, medians of "
         f"{result['candidates']} candidates x {result['repeats']} rounds, seed {result['seed']}",
         "",
-        "way          ms per candidate  over compiled",
-        f"compiled     {result['compiled_ms']:16.3f}  {1.0:13.1f}",
-        f"interpreted  {result['interpreted_ms']:16.3f}  "
-        f"{result['interpreted_over_compiled']:13.1f}",
-        f"plain        {result['plain_ms']:16.3f}  {result['plain_over_compiled']:13.1f}",
+        *_ways(result),
+        "",
+        f"with collisions, means over candidates of a search ({collisions['evaluations']} "
+        f"evaluations, batches of {collisions['population']})",
+        *_ways(collisions),
+        *_shares(collisions),
+        "",
+        "with collisions, means over random candidates",
+        *_ways(collisions["random"]),
+        *_shares(collisions["random"]),
         "",
         "samples      ms per candidate",
         *(f"{e['samples']:7d}  {e['compiled_ms']:20.3f}" for e in result["scaling"]["samples"]),
@@ -307,6 +271,21 @@ def _report(result: Mapping[str, Any]) -> str:
         *(f"{e['waypoints']:7d}  {e['compiled_ms']:20.3f}" for e in result["scaling"]["waypoints"]),
     ]
     return "\n".join(rows)
+
+
+def _ways(figures: Mapping[str, Any]) -> list[str]:
+    return [
+        "way          ms per candidate  over compiled",
+        f"compiled     {figures['compiled_ms']:16.3f}  {1.0:13.1f}",
+        f"interpreted  {figures['interpreted_ms']:16.3f}  "
+        f"{figures['interpreted_over_compiled']:13.1f}",
+        f"plain        {figures['plain_ms']:16.3f}  {figures['plain_over_compiled']:13.1f}",
+    ]
+
+
+def _shares(figures: Mapping[str, Any]) -> list[str]:
+    parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in figures["shares"].items())
+    return [f"feasible {100 * figures['feasible_share']:.0f} %; compiled time: {parts}"]
 
 
 if __name__ == "__main__":

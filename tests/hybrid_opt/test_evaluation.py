@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -128,3 +130,23 @@ def test_the_plain_check_knows_the_allowed_contacts() -> None:
     found = plain.check(np.arange(6.0), pose, still, still)
     assert found.colliding.tolist() == [False, True, False, True, False, False]
     assert found.time == pytest.approx(2.0)
+
+
+WARM_START = """
+import sys, time
+from hybrid_opt.evaluation import CandidateEvaluator
+from symbolic.workcell_file import load
+workcell = load(sys.argv[1])
+CandidateEvaluator(workcell).evaluate(workcell.task.initial.reshape(-1))
+print(time.process_time(), *sys.modules)
+"""
+
+
+def test_a_warm_start_takes_less_than_a_second() -> None:
+    """To the first evaluation, in processor time; slow libraries wait until they are needed."""
+    evaluator(RACK)
+    command = [sys.executable, "-c", WARM_START, str(RACK)]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    seconds, *modules = run.stdout.split()
+    assert float(seconds) < 1.0
+    assert not {"scipy", "trimesh", "pymoo", "matplotlib"} & set(modules)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from studies import benchmark
+from studies import benchmark, benchmark_collisions
+from studies.benchmark_turns import Evaluate, interleaved, summary
 from symbolic.errors import SettingsError
 from symbolic.workcell import Array
 from tests.symbolic.cells import RACK, hand_cell
@@ -18,8 +19,10 @@ from tests.symbolic.cells import RACK, hand_cell
 PROMISED_RATIO = 200.0
 """How many times faster than the plain version the compiled evaluator has to be."""
 
+PROMISED_RATIO_WITH_COLLISIONS = 150.0
 
-def busy(milliseconds: float) -> benchmark.Evaluate:
+
+def busy(milliseconds: float) -> Evaluate:
     """A way that uses the processor for a given time."""
 
     def evaluate(_: Array) -> None:
@@ -33,7 +36,7 @@ def busy(milliseconds: float) -> benchmark.Evaluate:
 def test_ratios_are_those_of_the_ways() -> None:
     x = np.zeros((3, 2))
     ways = {"compiled": busy(0.5), "interpreted": busy(2.0), "plain": busy(10.0)}
-    result = benchmark.summary(benchmark.interleaved(ways, dict.fromkeys(ways, x), 3))
+    result = summary(interleaved(ways, dict.fromkeys(ways, x), 3))
     assert result["plain_over_compiled"] == pytest.approx(20.0, rel=0.1)
     assert result["interpreted_over_compiled"] == pytest.approx(4.0, rel=0.1)
     assert result["compiled_ms"] == pytest.approx(0.5, rel=0.1)
@@ -42,7 +45,7 @@ def test_ratios_are_those_of_the_ways() -> None:
 def test_every_way_sees_every_candidate_in_every_round() -> None:
     seen: dict[str, list[float]] = {"a": [], "b": []}
 
-    def recorder(name: str) -> benchmark.Evaluate:
+    def recorder(name: str) -> Evaluate:
         def evaluate(x: Array) -> None:
             seen[name].append(float(x[0]))
             busy(6.0)(x)  # longer than a slice: once per round
@@ -50,7 +53,7 @@ def test_every_way_sees_every_candidate_in_every_round() -> None:
         return evaluate
 
     x = np.arange(4.0)[:, None]
-    times = benchmark.interleaved({n: recorder(n) for n in seen}, dict.fromkeys(seen, x), 2)
+    times = interleaved({n: recorder(n) for n in seen}, dict.fromkeys(seen, x), 2)
     for name, values in seen.items():
         # Two evaluations come before the rounds: a first one, and one to choose the repetitions.
         assert values[2:] == [0.0, 1.0, 2.0, 3.0] * 2
@@ -75,12 +78,21 @@ def test_measures_the_rack_and_keeps_its_promises(
 ) -> None:
     monkeypatch.setattr(benchmark, "SAMPLES", (25, 50, 100))
     monkeypatch.setattr(benchmark, "WAYPOINTS", (1, 3))
+    monkeypatch.setattr(benchmark_collisions, "EVALUATIONS", 200)
     arguments = [str(RACK), "--json", "--candidates", "5", "--repeats", "2"]
     assert benchmark.main(arguments) == 0
     result: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert result["plain_over_compiled"] > PROMISED_RATIO
     assert result["interpreted_over_compiled"] > 1.0
     assert result["compiled_ms"] < result["interpreted_ms"] < result["plain_ms"]
+    collisions = result["with_collisions"]
+    for figures in (collisions, collisions["random"]):
+        assert figures["plain_over_compiled"] > PROMISED_RATIO_WITH_COLLISIONS
+        assert result["compiled_ms"] < figures["compiled_ms"] < figures["interpreted_ms"]
+        assert figures["plain_ms"] > result["plain_ms"]
+        assert sum(figures["shares"].values()) == pytest.approx(1.0)
+        assert all(0.0 < share < 1.0 for share in figures["shares"].values())
+    assert collisions["feasible_share"] > collisions["random"]["feasible_share"]
     scaling = result["scaling"]
     assert [entry["samples"] for entry in scaling["samples"]] == [25, 50, 100]
     assert [entry["waypoints"] for entry in scaling["waypoints"]] == [1, 3]

@@ -1,0 +1,131 @@
+"""What a whole candidate costs with collisions, on what a search evaluates and on random ones.
+
+The compiled way is the evaluator that the searches call, with batches of a search's population.
+The plain way is the tests' reference: every pair of every sample goes to FCL.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from codegen.interpreted import InterpretedFunction
+from codegen.source import dense
+from hybrid_opt.algorithms.registry import make
+from hybrid_opt.algorithms.search import search
+from hybrid_opt.algorithms.settings import GeneticSettings
+from hybrid_opt.evaluation import CandidateEvaluator, reached_samples
+from hybrid_opt.problem import CarryProblem
+from studies.benchmark_turns import Evaluate, interleaved, progress, summary
+from symbolic.cell_functions import cell_functions
+from symbolic.workcell import Array, Workcell
+
+EVALUATIONS = 1000
+"""Of the NSGA-II search whose candidates are timed."""
+
+POPULATION = GeneticSettings().population
+"""Candidates per batch."""
+
+SHARED = 5
+"""Most batches on which the shares of the time are measured."""
+
+
+def with_collisions(
+    workcell: Workcell, plain: Evaluate, candidates: int, repeats: int, seed: int
+) -> dict[str, Any]:
+    """Measure the evaluation with collisions; every time is in milliseconds per candidate.
+
+    Figures are means over the rounds, as a search pays the mean and not the median.
+
+    Args:
+        plain: the plain reference with collisions, of one decision vector.
+        candidates: batches of the compiled way, drawn from all candidates; the other ways
+            evaluate one candidate of each batch.
+        repeats: rounds with each of them.
+        seed: of the search and the draws.
+
+    Returns:
+        The figures of the search's candidates and, as 'random', those of uniform candidates.
+    """
+    rng = np.random.default_rng(seed)
+    progress(f"a search of {EVALUATIONS} evaluations, whose candidates are to be timed")
+    evaluator = CandidateEvaluator(workcell)
+    problem = CarryProblem(evaluator)
+    search(problem, make("nsga2"), EVALUATIONS, rng)
+    searched = rng.choice(problem.evaluations.x, (candidates, POPULATION))
+    size = (candidates, POPULATION, evaluator.n_var)
+    uniform = rng.uniform(evaluator.lower, evaluator.upper, size)
+    functions = {
+        name: InterpretedFunction(dense(function))
+        for name, function in cell_functions(workcell).items()
+    }
+    interpreted = CandidateEvaluator(workcell, functions=functions)
+    ways: dict[str, Evaluate] = {
+        "compiled": evaluator.evaluate,
+        "interpreted": interpreted.evaluate,
+        "plain": plain,
+    }
+    figures = []
+    for what, batches in (("the search's", searched), ("random", uniform)):
+        progress(f"{candidates * repeats} rounds on {what} candidates, with collisions")
+        one_each = batches[:, 0]
+        x = {"compiled": batches, "interpreted": one_each, "plain": one_each}
+        times = interleaved(ways, x, repeats)
+        times["compiled"] /= POPULATION
+        verdicts = evaluator.evaluate(np.concatenate(batches))
+        figures.append(
+            {
+                **summary(times, np.mean),
+                "feasible_share": float(verdicts.feasible.mean()),
+                "shares": shares(evaluator, batches[:SHARED], repeats),
+            }
+        )
+    ours, random = figures
+    return {"evaluations": EVALUATIONS, "population": POPULATION, **ours, "random": random}
+
+
+def shares(evaluator: CandidateEvaluator, batches: Array, repeats: int) -> dict[str, float]:
+    """Where the time of the compiled way goes, as shares of the whole.
+
+    candidate: path, arms and forces. bounds: the compiled clearances. judging: FCL on what they
+    leave open, its placements and the order of its work. rest: objectives and bookkeeping.
+
+    Args:
+        batches: (n, size, n_var).
+        repeats: rounds with each batch.
+    """
+    checker = evaluator.checker
+    samples, clearances = [], []
+    for batch in batches:
+        outputs = evaluator.outputs(batch)
+        carries = [_carry(outputs, row) for row in range(len(batch))]
+        samples.append(carries)
+        clearances.append([checker.bounds(*carry[:3]) for carry in carries])
+
+    def bound(k: Array) -> None:
+        for carry in samples[int(k)]:
+            checker.bounds(*carry[:3])
+
+    def judge(k: Array) -> None:
+        for carry, clearance in zip(samples[int(k)], clearances[int(k)], strict=True):
+            checker.check(*carry, clearance)
+
+    ways: dict[str, Evaluate] = {
+        "whole": lambda k: evaluator.evaluate(batches[int(k)]),
+        "candidate": lambda k: evaluator.outputs(batches[int(k)]),
+        "bounds": bound,
+        "judging": judge,
+    }
+    times = interleaved(ways, dict.fromkeys(ways, np.arange(float(len(batches)))), repeats)
+    whole = times.pop("whole")
+    parts = {name: float(np.mean(value / whole)) for name, value in times.items()}
+    return parts | {"rest": 1.0 - sum(parts.values())}
+
+
+def _carry(outputs: Mapping[str, Array], row: int) -> tuple[Array, Array, Array, Array]:
+    """Pose, joints of both arms and time on the samples of a candidate that can collide."""
+    n = reached_samples(outputs, row)
+    pose, q_1, q_2, time = (outputs[name][row, :n] for name in ("pose", "q_1", "q_2", "time"))
+    return pose, q_1, q_2, time
