@@ -11,11 +11,13 @@ REPLICAS = "replicas"
 STAGES = "stages"
 FRONTS = "fronts"
 SELECTED = "selected"
+POLISHED = "polished"
 
 EVALUATIONS = "evaluations.csv.gz"
 FRONT = "front.csv"
 DONE = "replica.json"
 JOURNAL = "journal.bin"
+POLISH = "polish.json"
 
 
 def replica_folder(root: Path, algorithm: str, replica: int) -> Path:
@@ -26,6 +28,16 @@ def replica_folder(root: Path, algorithm: str, replica: int) -> Path:
 def selected_file(root: Path, algorithm: str, replica: int) -> Path:
     """Trajectory file of the solution selected from one replica."""
     return root / SELECTED / algorithm / f"{replica:02d}.json"
+
+
+def polished_folder(root: Path, algorithm: str, replica: int) -> Path:
+    """Folder of what the polish made of one replica's front."""
+    return root / POLISHED / algorithm / f"{replica:02d}"
+
+
+def polished_selected_file(root: Path, algorithm: str, replica: int) -> Path:
+    """Trajectory file of the solution selected from a replica's polished front."""
+    return root / SELECTED / f"{algorithm}-polished" / f"{replica:02d}.json"
 
 
 def reference_front_file(root: Path) -> Path:

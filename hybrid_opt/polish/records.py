@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from symbolic.errors import SettingsError
+from symbolic.errors import ResultsError, SettingsError
 from symbolic.workcell import Array
 
 Method = Literal["pascoletti-serafini", "epsilon"]
@@ -180,6 +181,38 @@ def outcome_to_json(outcome: PolishOutcome) -> dict[str, object]:
         else:
             values[field.name] = _number(value) if isinstance(value, float) else value
     return values
+
+
+def outcome_from_json(values: Mapping[str, Any]) -> PolishOutcome:
+    """The outcome that `outcome_to_json` wrote.
+
+    Raises:
+        ResultsError: the values are not those of an outcome.
+    """
+
+    def numbers(name: str) -> Array:
+        return np.array([np.nan if v is None else v for v in values[name]], dtype=float)
+
+    def number(name: str) -> float:
+        return float("nan") if values[name] is None else float(values[name])
+
+    try:
+        return PolishOutcome(
+            aim=values["aim"],
+            parent=int(values["parent"]),
+            status=values["status"],
+            reason=str(values["reason"]),
+            x=numbers("x"),
+            start=numbers("start"),
+            objectives=numbers("objectives"),
+            residuals=Residuals(*(number(field.name) for field in fields(Residuals))),
+            iterations=int(values["iterations"]),
+            rounds=int(values["rounds"]),
+            rows=int(values["rows"]),
+            seconds=float(values["seconds"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultsError(f"a recorded polish attempt is damaged ({error!r})") from error
 
 
 def _number(value: float) -> float | None:

@@ -1,0 +1,238 @@
+"""The stage of a study that polishes every replica's front, and the files it leaves.
+
+Per replica a folder `polished/ALGORITHM/NN`: `polish.json`, written last, holds the front, every
+attempt and what it took; `journal.bin` holds the attempts of a polish in progress, so that an
+interrupted one repeats none.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.campaign.executor import Job
+from hybrid_opt.campaign.files import read_json, write_json
+from hybrid_opt.campaign.folder import CampaignFolder
+from hybrid_opt.campaign.identity import identity, replica_identity
+from hybrid_opt.campaign.journal import Journal
+from hybrid_opt.campaign.layout import JOURNAL, POLISH, polished_folder
+from hybrid_opt.campaign.progress import Advance, Progress
+from hybrid_opt.campaign.replica import CellEvaluatorSource
+from hybrid_opt.campaign.search_stage import executor_for
+from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.campaign.stages import Stage
+from hybrid_opt.polish.front import FrontPolisher
+from hybrid_opt.polish.records import (
+    PolishedFront,
+    PolishSettings,
+    outcome_from_json,
+    outcome_to_json,
+)
+from hybrid_opt.results import Replica, read_campaign
+from symbolic.errors import ResultsError
+from symbolic.workcell import Array
+
+
+@dataclass(frozen=True)
+class PolisherSource:
+    """Makes a polisher, in any process.
+
+    Attributes:
+        evaluator: makes its evaluator.
+        settings: of the polish.
+    """
+
+    evaluator: CellEvaluatorSource
+    settings: PolishSettings
+
+    def __call__(self) -> FrontPolisher:
+        """Load the compiled functions, or build them where they are missing."""
+        return FrontPolisher(self.evaluator(), self.settings)
+
+
+@dataclass(frozen=True)
+class PolishTask:
+    """A front to polish.
+
+    Attributes:
+        settings: the campaign's, for the seed.
+        algorithm, replica: whose front it is.
+        front_x: (k, n_var) its decision vectors.
+        recorded: the journal's blocks of an earlier, interrupted attempt.
+    """
+
+    settings: CampaignSettings
+    algorithm: str
+    replica: int
+    front_x: Array
+    recorded: tuple[bytes, ...]
+
+
+def polish_stage(settings: PolishSettings) -> Stage:
+    """The stage that polishes the fronts of all replicas."""
+
+    def run(folder: CampaignFolder, progress: Progress) -> None:
+        _Polish(folder, settings).run(progress)
+
+    return Stage("polish", run, asdict(settings))
+
+
+def polish_replica(
+    polisher: FrontPolisher, task: PolishTask, emit: Callable[[bytes], None]
+) -> PolishedFront:
+    """Polish one front; attempts that were recorded are not repeated."""
+    rng = task.settings.replica_rng(f"{task.algorithm}/polish", task.replica)
+    recorded = [outcome_from_json(json.loads(block)) for block in task.recorded]
+    return polisher.polish(
+        task.front_x,
+        rng,
+        recorded=recorded,
+        emit=lambda outcome: emit(json.dumps(outcome_to_json(outcome)).encode()),
+    )
+
+
+@dataclass(frozen=True)
+class PolishedReplica:
+    """What the polish made of one replica's front; arrays are read-only.
+
+    Attributes:
+        x: (k, n_var) non-dominated decision vectors, by increasing first objective.
+        objectives: (k, 2).
+        polished: (k,) whether the polish made the point.
+        figures: attempts by status and reason, success share, seconds, equivalent evaluations,
+            and residuals, as in `polish.json`.
+    """
+
+    x: Array
+    objectives: Array
+    polished: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    figures: dict[str, Any]
+
+
+def read_polished(root: Path, algorithm: str, replica: int) -> PolishedReplica | None:
+    """The polished front of a replica; None where it was not polished.
+
+    Raises:
+        ResultsError: the file is damaged.
+    """
+    path = polished_folder(root, algorithm, replica) / POLISH
+    if not path.exists():
+        return None
+    document = read_json(path)
+    try:
+        front = document["front"]
+        found = PolishedReplica(
+            np.array([point["x"] for point in front], dtype=float),
+            np.array([point["objectives"] for point in front], dtype=float).reshape(-1, 2),
+            np.array([point["polished"] for point in front], dtype=np.bool_),
+            document["figures"],
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultsError(f"{path}: damaged ({error!r}); delete it to polish again") from error
+    for array in (found.x, found.objectives, found.polished):
+        array.setflags(write=False)
+    return found
+
+
+class _Polish:
+    """The fronts that are not polished, and the journals of those that are being worked on."""
+
+    def __init__(self, folder: CampaignFolder, settings: PolishSettings) -> None:
+        self._folder, self._settings = folder, settings
+        source = CellEvaluatorSource.of(folder.archive, folder.settings.objectives)
+        self._job = Job(PolisherSource(source, settings), polish_replica)
+        self._identity = {
+            "campaign": identity(folder.settings, folder.root, folder.workcell),
+            "polish": asdict(settings),
+        }
+        replicas = read_campaign(folder.root).replicas
+        self._all = len(replicas)
+        self._open = [replica for replica in replicas if not self._marker(replica).exists()]
+        self._journals: dict[int, Journal] = {}
+
+    def run(self, progress: Progress) -> None:
+        """Polish all open fronts."""
+        try:
+            if self._open:
+                # Compiles what is missing here, once, instead of in every worker.
+                self._job.make_context()
+            done = self._all - len(self._open)
+            with progress.stage("polish", self._all, "fronts", done) as self._advance:
+                executor = executor_for(self._folder.execution)
+                executor.run(self._job, len(self._open), self._task, self._record, self._finish)
+        finally:
+            for journal in self._journals.values():
+                journal.close()
+
+    _advance: Advance
+
+    def _marker(self, replica: Replica) -> Path:
+        return polished_folder(self._folder.root, replica.algorithm, replica.replica) / POLISH
+
+    def _journal(self, index: int) -> Journal:
+        if index not in self._journals:
+            replica = self._open[index]
+            path = self._marker(replica).with_name(JOURNAL)
+            key = replica_identity(self._identity, replica.algorithm, replica.replica)
+            self._journals[index] = Journal(path, key)
+        return self._journals[index]
+
+    def _task(self, index: int) -> PolishTask:
+        replica = self._open[index]
+        return PolishTask(
+            self._folder.settings,
+            replica.algorithm,
+            replica.replica,
+            np.array(replica.front_x),
+            tuple(self._journal(index).payloads),
+        )
+
+    def _record(self, index: int, payload: bytes) -> None:
+        self._journal(index).append(payload)
+
+    def _finish(self, index: int, front: PolishedFront) -> None:
+        write_json(self._marker(self._open[index]), polish_document(front))
+        self._journals.pop(index).discard()
+        self._advance(1)
+
+
+def polish_document(front: PolishedFront) -> dict[str, Any]:
+    """A polished front as JSON values."""
+    accepted = [outcome for outcome in front.outcomes if outcome.status == "accepted"]
+    return {
+        "front": [
+            {"objectives": values, "x": x, "parent": parent, "polished": polished}
+            for values, x, parent, polished in zip(
+                front.objectives.tolist(),
+                front.x.tolist(),
+                front.parent.tolist(),
+                front.polished.tolist(),
+                strict=True,
+            )
+        ],
+        "figures": {
+            "attempts": len(front.outcomes),
+            "counts": front.counts,
+            "success_share": front.success_share if np.isfinite(front.success_share) else None,
+            "seconds": front.seconds,
+            "median_attempt_seconds": _median([o.seconds for o in front.outcomes]),
+            "equivalent_evaluations": front.equivalent_evaluations,
+            "worst_stationarity": _worst([o.residuals.stationarity for o in accepted]),
+            "worst_feasibility": _worst([o.residuals.feasibility for o in accepted]),
+            "median_stationarity": _median([o.residuals.stationarity for o in accepted]),
+        },
+        "attempts": [outcome_to_json(outcome) for outcome in front.outcomes],
+    }
+
+
+def _median(values: list[float]) -> float | None:
+    return float(np.median(values)) if values else None
+
+
+def _worst(values: list[float]) -> float | None:
+    return max(values) if values else None
