@@ -11,13 +11,14 @@ from typing import NoReturn, get_args
 from hybrid_opt import algorithms
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.settings import ExecutorName, FirstGeneration
-from hybrid_opt.objectives import OBJECTIVES
+from hybrid_opt.objectives import OBJECTIVES, PAPER_OBJECTIVES
+from hybrid_opt.polish.records import PolishSettings
 from hybrid_opt.problem import ConstraintHandling
 from symbolic.errors import SettingsError
 
 _DEFAULT = CampaignSettings()
 
-QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 3
+QUICK_EVALUATIONS, QUICK_REPLICAS, QUICK_POLISH_POINTS = 300, 3, 4
 """Of a small but complete study."""
 
 
@@ -103,6 +104,19 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
     )
     after = parser.add_argument_group("after the search (decides what is made of the results)")
     after.add_argument(
+        "--polish",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="improve every front with IPOPT (default: yes for the paper's two objectives)",
+    )
+    after.add_argument(
+        "--polish-points",
+        type=int,
+        metavar="N",
+        help=f"solves that the polish of one front may take (default: {PolishSettings().points}, "
+        f"with --quick {QUICK_POLISH_POINTS})",
+    )
+    after.add_argument(
         "--force-limit",
         type=_force,
         metavar="N",
@@ -166,6 +180,23 @@ def campaign_settings(options: argparse.Namespace) -> CampaignSettings:
         first_generation=options.first_generation,
         populations=tuple(options.population or ()),
     )
+
+
+def polish_settings(options: argparse.Namespace) -> PolishSettings | None:
+    """How the options want fronts polished, None for not at all.
+
+    Raises:
+        SettingsError: a value is not allowed.
+    """
+    wanted = options.polish
+    if wanted is None:
+        wanted = campaign_settings(options).objectives == PAPER_OBJECTIVES
+    if not wanted:
+        return None
+    points = options.polish_points
+    if points is None:
+        points = QUICK_POLISH_POINTS if options.quick else PolishSettings().points
+    return PolishSettings(points=points)
 
 
 def execution_settings(options: argparse.Namespace, output: Path) -> ExecutionSettings:

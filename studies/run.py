@@ -17,8 +17,15 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
+from hybrid_opt.campaign.polish_stage import polish_stage
+from hybrid_opt.polish.records import PolishSettings
 from hybrid_opt.results import read_summary
-from studies.cli import campaign_parser, campaign_settings, execution_settings
+from studies.cli import (
+    campaign_parser,
+    campaign_settings,
+    execution_settings,
+    polish_settings,
+)
 from studies.report.stage import add_report_options, follow_report_options, report_stage
 from studies.summary import summary_stage
 from studies.terminal_summary import terminal_summary
@@ -38,11 +45,13 @@ class StudySettings:
     """What is made of a search's results.
 
     Attributes:
+        polish: how fronts are polished, None for not at all.
         force_limit: normal force [N] of an additional timing, None for none.
         report: whether figures, tables and the page are written.
         with_paper: whether the figures stand beside those that the paper states.
     """
 
+    polish: PolishSettings | None = None
     force_limit: float | None = None
     report: bool = True
     with_paper: bool = False
@@ -50,8 +59,13 @@ class StudySettings:
 
 def stages(study: StudySettings) -> tuple[Stage, ...]:
     """The stages of a study, in order."""
-    every = (search_stage(), summary_stage(), timing_stage(study.force_limit))
-    return (*every, report_stage(study.with_paper)) if study.report else every
+    every = [search_stage()]
+    if study.polish is not None:
+        every.append(polish_stage(study.polish))
+    every += [summary_stage(), timing_stage(study.force_limit)]
+    if study.report:
+        every.append(report_stage(study.with_paper))
+    return tuple(every)
 
 
 def run_study(
@@ -102,7 +116,9 @@ def main(
         cell: Path = options.workcell if workcell is None else workcell
         settings = campaign_settings(options)
         execution = execution_settings(options, Path("results") / cell.stem)
-        study = StudySettings(options.force_limit, options.report, bool(workcell))
+        study = StudySettings(
+            polish_settings(options), options.force_limit, options.report, bool(workcell)
+        )
         print(run_study(cell, settings, execution, Progress(not options.quiet), study))
         print(f"\nResults: {execution.output}")
         if options.report:

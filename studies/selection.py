@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hybrid_opt.campaign.polish_stage import PolishedReplica
 from hybrid_opt.evaluation import CandidateEvaluator
 from hybrid_opt.metrics import excess_above_static
 from hybrid_opt.results import Replica
@@ -23,7 +24,7 @@ class Selected:
     """A front's balanced solution.
 
     Attributes:
-        row: its row among the replica's evaluations.
+        row: its row among the replica's evaluations, or in the polished front.
         x: (n_var,) decision vector.
         objectives: (n_obj,).
         peak_normal_force, minimum_normal_force: (2,) of each robot along the carry [N].
@@ -51,15 +52,30 @@ def select(evaluator: CandidateEvaluator, replica: Replica, static: StaticHold) 
     """The balanced solution of a replica's front, None where the front is empty."""
     if len(replica.front_rows) == 0:
         return None
-    chosen = balanced(peak_normal_forces(evaluator, replica.front_x))
-    row = int(replica.front_rows[chosen])
-    x = replica.evaluations.x[row]
+    row = int(replica.front_rows[balanced(peak_normal_forces(evaluator, replica.front_x))])
+    found = replica.evaluations
+    return _selected(evaluator, row, found.x[row], found.objectives[row], static)
+
+
+def select_polished(
+    evaluator: CandidateEvaluator, front: PolishedReplica, static: StaticHold
+) -> Selected | None:
+    """The balanced solution of a polished front, by its row in that front."""
+    if len(front.x) == 0:
+        return None
+    row = balanced(peak_normal_forces(evaluator, front.x))
+    return _selected(evaluator, row, front.x[row], front.objectives[row], static)
+
+
+def _selected(
+    evaluator: CandidateEvaluator, row: int, x: Array, objectives: Array, static: StaticHold
+) -> Selected:
     normal = evaluator.outputs(x[None])["normal_force"][0]
     peak = normal.max(axis=0)
     return Selected(
         row,
         x,
-        replica.evaluations.objectives[row],
+        objectives,
         peak,
         normal.min(axis=0),
         excess_above_static(peak, static.normal_force),

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,17 @@ from hybrid_opt.campaign.files import storing, write_atomically, write_json
 from hybrid_opt.campaign.layout import (
     FRONTS,
     SUMMARY,
+    polished_selected_file,
     reference_front_file,
     selected_file,
 )
+from hybrid_opt.campaign.polish_stage import PolishedReplica, read_polished
 from hybrid_opt.evaluation import REASONS, CandidateEvaluator
 from hybrid_opt.results import CampaignResults, Replica, read_campaign
 from hybrid_opt.static_hold import StaticHold, static_hold
 from hybrid_opt.statistics import corrected, rank_test, summarise
 from hybrid_opt.trajectory_file import write_trajectory
-from studies.selection import Selected, select
+from studies.selection import Selected, select, select_polished
 from symbolic.workcell import Array
 
 FIGURES = (
@@ -45,6 +48,19 @@ FIGURES = (
 TESTED = tuple(name for name in FIGURES if name not in ("feasible", "seconds"))
 """Figures that the algorithms are compared by; the count says the same as its share."""
 
+POLISHED_FIGURES = (
+    "non_dominated",
+    "hypervolume",
+    "igd",
+    "igd_plus",
+    "spacing",
+    "seconds",
+    "equivalent_evaluations",
+    "mean_excess_above_static",
+    "payload_limit",
+)
+"""Figures of a polished front that are summarised over the replicas."""
+
 PERCENTILES = (25.0, 50.0, 75.0, 100.0)
 
 
@@ -53,9 +69,33 @@ def summary_stage() -> Stage:
     return Stage("summary", _run)
 
 
-def reference_front(replicas: Sequence[Replica]) -> Array:
-    """(k, n_obj) non-dominated union of all fronts, the campaign's reference for IGD."""
-    return metrics.front_of(np.concatenate([replica.front for replica in replicas]))
+def reference_front(fronts: Sequence[Array]) -> Array:
+    """(k, n_obj) non-dominated union of fronts; of all of a campaign, its reference for IGD."""
+    return metrics.front_of(np.concatenate(fronts))
+
+
+def front_figures(front: Array, reference: Array) -> dict[str, Any]:
+    """Indicators of a front's objectives (k, n_obj)."""
+    return {
+        "non_dominated": len(front),
+        "hypervolume": metrics.hypervolume(front, reference_point(reference.shape[1])),
+        "igd": metrics.igd(front, reference),
+        "igd_plus": metrics.igd_plus(front, reference),
+        "spacing": metrics.spacing(front),
+    }
+
+
+def polished_figures(
+    polished: PolishedReplica, reference: Array, selected: Selected | None, file: str | None
+) -> dict[str, Any]:
+    """What the polish made of a replica: indicators, selected solution, and what it took."""
+    return {
+        **front_figures(polished.objectives, reference),
+        "mean_excess_above_static": selected.mean_excess_above_static if selected else math.nan,
+        "payload_limit": selected.figures["payload_limit"] if selected else math.nan,
+        "selected": _selected_entry(selected, file),
+        **polished.figures,
+    }
 
 
 def replica_figures(
@@ -63,8 +103,7 @@ def replica_figures(
 ) -> dict[str, Any]:
     """One replica's entry in the summary; figures that do not exist are NaN or infinite."""
     found = replica.evaluations
-    front, feasible = replica.front, found.feasible
-    corner = reference_point(found.objectives.shape[1])
+    feasible = found.feasible
     reasons = {
         name: int(np.count_nonzero(found.reason == index)) for index, name in enumerate(REASONS)
     }
@@ -73,11 +112,7 @@ def replica_figures(
         "evaluations": len(found),
         "feasible": metrics.feasible_count(feasible),
         "feasible_share": metrics.feasible_share(feasible),
-        "non_dominated": len(front),
-        "hypervolume": metrics.hypervolume(front, corner),
-        "igd": metrics.igd(front, reference),
-        "igd_plus": metrics.igd_plus(front, reference),
-        "spacing": metrics.spacing(front),
+        **front_figures(replica.front, reference),
         "seconds": replica.seconds,
         "mean_excess_above_static": selected.mean_excess_above_static if selected else math.nan,
         "payload_limit": selected.figures["payload_limit"] if selected else math.nan,
@@ -148,9 +183,8 @@ def campaign_summary(
         "algorithms": {
             name: {
                 "representative": _representative(rows),
-                "statistics": {
-                    figure: asdict(summarise([row[figure] for row in rows])) for figure in FIGURES
-                },
+                "statistics": _statistics(rows, FIGURES),
+                **_polished_statistics(rows),
                 "replicas": list(rows),
             }
             for name, rows in entries.items()
@@ -159,6 +193,29 @@ def campaign_summary(
     }
     cleaned: dict[str, Any] = _without_nan(document)
     return cleaned
+
+
+def _statistics(
+    rows: Sequence[Mapping[str, Any]], names: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    return {name: asdict(summarise([row[name] for row in rows])) for name in names}
+
+
+def _polished_statistics(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Statistics of the polished fronts, and what they gained; nothing without a polish."""
+    if not all("polished" in row for row in rows):
+        return {}
+    polished = [row["polished"] for row in rows]
+    gains = [
+        after["hypervolume"] - row["hypervolume"] for row, after in zip(rows, polished, strict=True)
+    ]
+    return {
+        "polished": {
+            "statistics": _statistics(polished, POLISHED_FIGURES),
+            "hypervolume_gain": asdict(summarise(gains)),
+            "replicas_improved": sum(gain > 0.0 for gain in gains),
+        }
+    }
 
 
 def _representative(rows: Sequence[Mapping[str, Any]]) -> int | None:
@@ -196,32 +253,51 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
     results = read_campaign(folder.root)
     evaluator = CandidateEvaluator(folder.workcell, folder.settings.objectives)
     static = static_hold(folder.workcell)
-    reference = reference_front(results.replicas)
+    polished = {
+        (replica.algorithm, replica.replica): read_polished(
+            results.root, replica.algorithm, replica.replica
+        )
+        for replica in results.replicas
+    }
+    fronts = [replica.front for replica in results.replicas]
+    fronts += [found.objectives for found in polished.values() if found is not None]
+    reference = reference_front(fronts)
     entries: dict[str, list[dict[str, Any]]] = {name: [] for name in results.algorithms}
     with progress.stage("summary", len(results.replicas), "replicas") as advance:
         for replica in results.replicas:
+            key = replica.algorithm, replica.replica
             selected = select(evaluator, replica, static)
-            file = None if selected is None else _store_selected(folder, replica, selected)
+            file = _store_selected(folder, selected_file(folder.root, *key), key, selected)
             entry = replica_figures(replica, reference, selected, file)
+            front = polished[key]
+            if front is not None:
+                chosen = select_polished(evaluator, front, static)
+                path = polished_selected_file(folder.root, *key)
+                file = _store_selected(folder, path, key, chosen)
+                entry["polished"] = polished_figures(front, reference, chosen, file)
             entries[replica.algorithm].append(entry)
             advance(1)
     _write_points(folder, "reference", results.objectives, reference)
     for name in results.algorithms:
-        union = reference_front(results.of(name))
+        union = reference_front([replica.front for replica in results.of(name)])
         _write_points(folder, name, results.objectives, union)
         if len(results.objectives) in (2, 3):
             _write_attainment(folder, name, results)
     write_json(folder.root / SUMMARY, campaign_summary(results, reference, static, entries))
 
 
-def _store_selected(folder: CampaignFolder, replica: Replica, selected: Selected) -> str:
-    path = selected_file(folder.root, replica.algorithm, replica.replica)
+def _store_selected(
+    folder: CampaignFolder, path: Path, replica: tuple[str, int], selected: Selected | None
+) -> str | None:
+    """Write a selected trajectory; returns its path in the folder, None where there is none."""
+    if selected is None:
+        return None
     with storing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     provenance = {
-        "algorithm": replica.algorithm,
-        "replica": replica.replica,
-        "evaluation": selected.row + 1,
+        "algorithm": replica[0],
+        "replica": replica[1],
+        "row": selected.row,
         "settings": folder.settings.effective(),
     }
     write_trajectory(path, folder.workcell, selected.x, selected.figures, provenance)

@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ from hybrid_opt.campaign.replica import CellEvaluatorSource
 from hybrid_opt.campaign.search_stage import executor_for
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Stage
+from hybrid_opt.cell_archive import archive_from_json, unpack_cell
+from hybrid_opt.evaluation import CandidateEvaluator
 from hybrid_opt.polish.front import FrontPolisher
 from hybrid_opt.polish.records import (
     PolishedFront,
@@ -43,16 +46,20 @@ class PolisherSource:
     """Makes a polisher, in any process.
 
     Attributes:
-        evaluator: makes its evaluator.
+        cell: the workcell with its files, as in `CellEvaluatorSource`.
+        objectives: names of the objectives.
         settings: of the polish.
     """
 
-    evaluator: CellEvaluatorSource
+    cell: str
+    objectives: tuple[str, ...]
     settings: PolishSettings
 
     def __call__(self) -> FrontPolisher:
         """Load the compiled functions, or build them where they are missing."""
-        return FrontPolisher(self.evaluator(), self.settings)
+        with TemporaryDirectory() as folder:
+            workcell = unpack_cell(archive_from_json(json.loads(self.cell)), Path(folder))
+            return FrontPolisher(CandidateEvaluator(workcell, self.objectives), self.settings)
 
 
 @dataclass(frozen=True)
@@ -145,7 +152,7 @@ class _Polish:
     def __init__(self, folder: CampaignFolder, settings: PolishSettings) -> None:
         self._folder, self._settings = folder, settings
         source = CellEvaluatorSource.of(folder.archive, folder.settings.objectives)
-        self._job = Job(PolisherSource(source, settings), polish_replica)
+        self._job = Job(PolisherSource(source.cell, source.objectives, settings), polish_replica)
         self._identity = {
             "campaign": identity(folder.settings, folder.root, folder.workcell),
             "polish": asdict(settings),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.evaluation import CandidateEvaluator
 from hybrid_opt.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.results import CampaignResults, Replica, read_campaign, read_summary
@@ -129,12 +130,12 @@ def _algorithm(
     maker: _CarryMaker,
 ) -> AlgorithmRuns:
     runs = tuple(
-        _run(replica, figures)
+        _run(results.root, replica, figures)
         for replica, figures in zip(results.of(name), entry["replicas"], strict=True)
     )
     known = entry["representative"]
     representative = 0 if known is None else int(known)
-    front = runs[representative].front
+    front, hybrid = runs[representative].front, runs[representative].hybrid
     return AlgorithmRuns(
         name=name,
         title=title(name),
@@ -142,13 +143,18 @@ def _algorithm(
         runs=runs,
         representative=representative,
         selected=maker.balanced(front, title(name)) if len(front) else None,
-        hybrid_selected=None,
+        hybrid_selected=None
+        if hybrid is None or not len(hybrid)
+        else maker.balanced(hybrid, f"{title(name)}, polished"),
     )
 
 
-def _run(replica: Replica, figures: Mapping[str, Any]) -> Run:
+def _run(root: Path, replica: Replica, figures: Mapping[str, Any]) -> Run:
     front = Front(replica.front_x, replica.front)
-    return Run(replica.replica, replica.evaluations, front, None, figures, {})
+    polished = read_polished(root, replica.algorithm, replica.replica)
+    hybrid = None if polished is None else Front(polished.x, polished.objectives)
+    after = figures.get("polished", {})
+    return Run(replica.replica, replica.evaluations, front, hybrid, figures, after)
 
 
 def _static(results: CampaignResults, summary: Mapping[str, Any]) -> Array:
