@@ -230,7 +230,12 @@ class _Places:
         for arm in (0, 1):
             reference = ca.reshape(p[start : start + 6 * n_places], 6, n_places)
             start += 6 * n_places
-            self._q.append(solve[arm].map(n_places)(self._pose, reference))
+            needed = sorted({at for kind, at in place_rows if arm in rows.arms(kind)})
+            joints = ca.MX(6, n_places)
+            if needed:
+                inputs = (self._pose[:, needed], reference[:, needed])
+                joints[:, needed] = solve[arm].map(len(needed))(*inputs)
+            self._q.append(ca.densify(joints))
 
     def _call(
         self, make: Callable[[RowKind], ca.Function], weight: ca.MX | None = None

@@ -25,8 +25,8 @@ from symbolic.rotation import rotation_matrix
 from symbolic.scene import Scene
 from symbolic.softness import Softness
 
-SOLVE_STEPS = 7
-"""Newton steps from the reference joints; the last ones square an error below 1e-4."""
+SOLVE_STEPS = 5
+"""Newton steps from the reference joints, which the solver renews in every round."""
 
 WIDTH = float(__import__("os").environ.get("WID", "2e-4"))
 """Width of the smoothed kinks of clearances [m]: sharper kinks cost the solver iterations, and what
@@ -93,6 +93,15 @@ class RowFunctions:
         functions = [make(kind) for kind in kinds for make in makers]
         return {function.name(): function for function in functions}
 
+    def arms(self, kind: RowKind) -> tuple[int, ...]:
+        """The arms whose joints a row depends on."""
+        if kind.kind != "clearance":
+            return (kind.arm,)
+        geometry = self._model.geometry
+        pair = geometry.active[kind.index]
+        frames = [geometry.bodies[body].frame for body in (pair.first, pair.second)]
+        return tuple(sorted({frame.robot for frame in frames if frame.kind == "link"}))
+
     def _value(self, kind: RowKind) -> ca.Function:
         """pose, q_1, q_2 -> value."""
         return self._function("value", kind, lambda: ([], self._expression(kind)))
@@ -108,13 +117,13 @@ class RowFunctions:
     def _pose_gradient(self, kind: RowKind) -> ca.SX:
         row = self._expression(kind)
         gradient = ca.gradient(row, self._pose)
-        for arm in self._arms(row):
+        for arm in self.arms(kind):
             gradient += ca.mtimes(self._follow(arm).T, ca.gradient(row, self._q[arm]))
         return gradient
 
     def _pose_hessian(self, kind: RowKind) -> tuple[list[ca.SX], ca.SX]:
         row, weight = self._expression(kind), ca.SX.sym("weight")
-        arms = self._arms(row)
+        arms = self.arms(kind)
         lagrangian = row
         multipliers, symbols, follow = [], [], [ca.SX.eye(6)]
         for arm in arms:
@@ -154,9 +163,6 @@ class RowFunctions:
             return float(robot.position_upper[kind.index]) - q[kind.index]
         measure = manipulability(self._model.robots[kind.arm].jacobian(q))
         return (measure / robot.min_manipulability) ** 2 - 1.0
-
-    def _arms(self, row: ca.SX) -> list[int]:
-        return [arm for arm in (0, 1) if ca.depends_on(row, self._q[arm])]
 
     def _follow(self, arm: int) -> ca.SX:
         """dq/dpose (6, 6) of an arm."""

@@ -52,9 +52,6 @@ LEAST_GAP = 0.02
 
 NO_SOLUTION = Solution(np.empty(0), "", False, False, UNKNOWN, 0, 0, 0)
 
-BALANCED_ATTEMPTS = 2
-"""Attempts in a row at the balanced middle: it is the solution that gets selected."""
-
 
 @dataclass(frozen=True)
 class _Attempt:
@@ -197,12 +194,12 @@ class _Run:
         self.outcomes: list[PolishOutcome] = []
 
     def all(self, rng: np.random.Generator) -> None:
+        """The front's points first; then ends, middle and gaps in turns, while attempts last."""
         self._do(self._points())
-        self._do(self._ends())
-        for _ in range(BALANCED_ATTEMPTS):
-            self._do([self._middle(rng)])
-        while self._left() > 0 and (gaps := self._gaps()):
-            self._do(gaps)
+        while self._left() > 0:
+            self._do([self._aimed("extreme", objective, rng) for objective in (0, 1)])
+            self._do([self._aimed("balance", None, rng)])
+            self._do(self._gaps()[:1])
 
     def _left(self) -> int:
         return self._settings.points - len(self.outcomes)
@@ -210,7 +207,7 @@ class _Run:
     def _points(self) -> list[_Attempt]:
         """Evenly spread points of the front, the balanced one among them."""
         archive, rows = self._archive, self._archive.rows()
-        count = min(len(rows), (self._settings.points + 1) // 2)
+        count = min(len(rows), (self._settings.points + 2) // 3)
         chosen = {rows[int(k)] for k in np.round(np.linspace(0, len(rows) - 1, count))}
         middle = self._balanced()
         if middle not in chosen and count > 2:
@@ -229,21 +226,21 @@ class _Run:
             attempts.append(_Attempt("point", archive.parent[k], archive.x[k], start, target))
         return attempts
 
-    def _ends(self) -> list[_Attempt]:
-        archive, rows, span = self._archive, self._archive.rows(), self._archive.span()
-        ends = ((0, rows[0]), (1, rows[-1]))
-        return [
-            self._new("extreme", k, extreme(archive.objectives[k], span, objective))
-            for objective, k in ends
-        ]
+    def _aimed(self, aim: Aim, objective: int | None, rng: np.random.Generator) -> _Attempt:
+        """An attempt at an end of the front or at its balanced middle.
 
-    def _middle(self, rng: np.random.Generator) -> _Attempt:
-        archive = self._archive
-        rows = sorted(archive.rows(), key=lambda k: float(np.sum(archive.objectives[k])))
-        tried = any(outcome.aim == "balance" for outcome in self.outcomes)
-        # Later on another start: the middle of another region may lead further down.
-        k = rows[int(rng.integers(min(3, len(rows)))) if tried else 0]
-        return self._new("balance", k, balance(archive.objectives[k], np.full(2, LEAST_SPAN)))
+        It goes on from the best point. Where the last attempt did not get further from there, it
+        starts from any point of the front: another region may lead further down.
+        """
+        archive, rows = self._archive, self._archive.rows()
+        wanted = np.ones(2) if objective is None else np.eye(2)[objective]
+        k = min(rows, key=lambda k: float(wanted @ archive.objectives[k]))
+        last = [o for o in self.outcomes if o.aim == aim][-1 if objective is None else -2 :]
+        if last and last[objective or 0].status != "accepted":
+            k = rows[int(rng.integers(len(rows)))]
+        start, span = archive.objectives[k], np.full(2, LEAST_SPAN)
+        target = balance(start, span) if objective is None else extreme(start, span, objective)
+        return _Attempt(aim, -1, archive.x[k], start, target)
 
     def _balanced(self) -> int:
         return min(self._archive.rows(), key=lambda k: float(np.sum(self._archive.objectives[k])))
@@ -272,9 +269,6 @@ class _Run:
         """Half way between two decision vectors if that is feasible, otherwise the first."""
         half: Array = (self._archive.x[first] + self._archive.x[second]) / 2.0
         return half if self._evaluator.evaluate(half).feasible[0] else self._archive.x[first]
-
-    def _new(self, aim: Aim, k: int, target: Target) -> _Attempt:
-        return _Attempt(aim, -1, self._archive.x[k], self._archive.objectives[k], target)
 
     def _do(self, attempts: list[_Attempt]) -> None:
         """Solve, judge and take in attempts; those on record are not solved again."""

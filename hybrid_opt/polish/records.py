@@ -22,7 +22,7 @@ class PolishSettings:
     """What decides the results of a polish.
 
     Attributes:
-        points: solves that one front may take; the front's own points get at most half of them.
+        points: attempts that one front may take; the front's own points get a third of them.
         method: how a point is improved: along the diagonal (Pascoletti and Serafini 1984), or by
             minimising one objective while the other is held (epsilon constraint).
         max_iterations: of IPOPT in one round.
@@ -35,7 +35,7 @@ class PolishSettings:
         tolerance: improvement of an objective below which a point counts as optimal already.
     """
 
-    points: int = 10
+    points: int = 12
     method: Method = "pascoletti-serafini"
     max_iterations: int = 25
     rounds: int = 6
