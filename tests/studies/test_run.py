@@ -24,7 +24,7 @@ from symbolic.workcell_file import load
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
 
 CELL = str(RACK.with_name("transfer.toml"))
-SMALL = ["--evaluations", "120", "--replicas", "2", "--jobs", "1"]
+SMALL = ["--evaluations", "120", "--replicas", "2", "--jobs", "1", "--no-polish"]
 
 
 @pytest.fixture(scope="module")
