@@ -11,7 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
+from hybrid_opt.collision.judge import FCL_RESOLUTION
+from hybrid_opt.evaluation import (
+    FEASIBLE,
+    REASONS,
+    CandidateEvaluator,
+    Evaluations,
+    reached_samples,
+)
 from symbolic.cell_model import build_cell_model
 from symbolic.evaluator import CONSTRAINTS
 from symbolic.workcell import Array, CollisionSettings, Workcell
@@ -150,3 +157,21 @@ def test_a_warm_start_takes_less_than_a_second() -> None:
     seconds, *modules = run.stdout.split()
     assert float(seconds) < 1.0
     assert not {"scipy", "trimesh", "pymoo", "matplotlib"} & set(modules)
+
+
+def test_screening_changes_no_sample_of_random_candidates() -> None:
+    """Every sample and pair of the carries that a search starts from, against FCL alone."""
+    ours = evaluator(RACK)
+    judge = ours.checker
+    outputs = ours.outputs(candidates(ours.workcell, 230, 64, 1.0))
+    samples = 0
+    for row in range(230):
+        n = reached_samples(outputs, row)
+        pose, q_1, q_2 = (outputs[name][row, :n] for name in ("pose", "q_1", "q_2"))
+        mask = judge.collision_mask(pose, q_1, q_2)
+        bounds = judge.bounds(pose, q_1, q_2)
+        assert not np.any(mask & (bounds > FCL_RESOLUTION))
+        colliding = judge.check(pose, q_1, q_2, outputs["time"][row, :n], bounds).colliding
+        assert colliding.tolist() == mask.any(axis=1).tolist()
+        samples += n
+    assert samples > 20_000
