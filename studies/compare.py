@@ -89,7 +89,7 @@ def compare(first: Path, second: Path) -> Comparison:
     shared = [name for name in runs[0].algorithms if name in runs[1].algorithms]
     if not shared:
         raise ResultsError(f"{first} and {second} have no algorithm in common")
-    reference = reference_front([replica for run in runs for replica in run.replicas])
+    reference = reference_front([replica.front for run in runs for replica in run.replicas])
     figures = [
         figure
         for name in shared

@@ -1,0 +1,211 @@
+"""Hold a polished study against searches alone that may spend as much, or far more.
+
+    python -m studies.control results/rack
+
+The study's own searches are repeated without a polish, with the budget that the most expensive
+polish took (its seconds, as candidate evaluations) added, and with 20,000 evaluations. Each
+replica's hypervolumes are then compared: search, search and polish, longer search.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt import metrics
+from hybrid_opt.campaign import (
+    CampaignSettings,
+    ExecutionSettings,
+    Progress,
+    open_folder,
+    run_stages,
+    search_stage,
+)
+from hybrid_opt.campaign.layout import CONFIGURATION
+from hybrid_opt.results import CampaignResults, read_campaign, read_summary
+from studies.cli import Parser
+from studies.terminal_summary import title
+from symbolic.errors import DualArmError, ResultsError
+
+PROGRAM = "python -m studies.control"
+
+LONG = 20_000
+"""Evaluations of the far longer search."""
+
+
+@dataclass(frozen=True)
+class Control:
+    """One algorithm's replicas beside a longer search of the same algorithm or of another.
+
+    Attributes:
+        algorithm: whose polished fronts are compared.
+        rival: the algorithm that searches longer.
+        evaluations: its budget.
+        polished_wins: replicas in which the polished front has the larger hypervolume.
+        replicas: all of them.
+        search, polished, longer: median hypervolumes.
+    """
+
+    algorithm: str
+    rival: str
+    evaluations: int
+    polished_wins: int
+    replicas: int
+    search: float
+    polished: float
+    longer: float
+
+
+def controls(
+    root: Path, evaluations: Sequence[int], jobs: int, progress: Progress
+) -> list[Control]:
+    """Run the longer searches, in `ROOT/control/EVALUATIONS`, and compare.
+
+    Args:
+        root: results folder of a polished study.
+        evaluations: budgets of the longer searches; empty for that of equal time and `LONG`.
+        jobs: worker processes, 0 for one per core.
+
+    Raises:
+        ResultsError: the study is not complete, or was not polished.
+    """
+    study, summary = read_campaign(root), read_summary(root)
+    settings = _settings(study)
+    budgets = tuple(evaluations) or (settings.evaluations + _polish_cost(root, summary), LONG)
+    found = []
+    for budget in budgets:
+        longer = _search(study, replace(settings, evaluations=budget), root, jobs, progress)
+        for name in study.algorithms:
+            rivals = dict.fromkeys((name, "nsga2" if "nsga2" in study.algorithms else name))
+            found += [_compare(summary, longer, name, rival, budget) for rival in rivals]
+    return found
+
+
+def _settings(study: CampaignResults) -> CampaignSettings:
+    stored: Mapping[str, Any] = study.configuration["settings"]
+    return CampaignSettings(
+        algorithms=study.algorithms,
+        evaluations=int(stored["evaluations"]),
+        replicas=int(stored["replicas"]),
+        seed=int(stored["seed"]),
+        objectives=study.objectives,
+        constraint_handling=stored["constraint_handling"],
+        first_generation=stored["first_generation"],
+        populations=tuple(
+            (name, own.get("population", own.get("swarm")))
+            for name, own in stored["algorithms"].items()
+            if "population" in own or "swarm" in own
+        ),
+    )
+
+
+def _polish_cost(root: Path, summary: Mapping[str, Any]) -> int:
+    """Candidate evaluations that take as long as the most expensive polish of the study."""
+    costs = [
+        row["polished"]["equivalent_evaluations"]
+        for entry in summary["algorithms"].values()
+        for row in entry["replicas"]
+        if "polished" in row
+    ]
+    if not costs:
+        raise ResultsError(f"{root}: its fronts were not polished; run the study with --polish")
+    return int(max(costs))
+
+
+def _search(
+    study: CampaignResults,
+    settings: CampaignSettings,
+    root: Path,
+    jobs: int,
+    progress: Progress,
+) -> CampaignResults:
+    output = root / "control" / str(settings.evaluations)
+    resume = (output / CONFIGURATION).exists()
+    execution = ExecutionSettings(output, jobs=jobs, resume=resume)
+    with open_folder(settings, execution, study.workcell) as folder:
+        run_stages(folder, (search_stage(),), progress)
+    return read_campaign(output)
+
+
+def _compare(
+    summary: Mapping[str, Any], longer: CampaignResults, name: str, rival: str, budget: int
+) -> Control:
+    rows = summary["algorithms"][name]["replicas"]
+    before = [row["hypervolume"] for row in rows]
+    after = [row["polished"]["hypervolume"] for row in rows]
+    alone = [
+        metrics.hypervolume(replica.front, metrics.REFERENCE_POINT) for replica in longer.of(rival)
+    ]
+    return Control(
+        algorithm=name,
+        rival=rival,
+        evaluations=budget,
+        polished_wins=sum(a > b for a, b in zip(after, alone, strict=True)),
+        replicas=len(rows),
+        search=float(np.median(before)),
+        polished=float(np.median(after)),
+        longer=float(np.median(alone)),
+    )
+
+
+def as_text(found: Sequence[Control]) -> str:
+    """The comparison as a table."""
+    lines = [
+        "Median hypervolumes; wins: replicas in which the polished front is ahead",
+        f"{'polished front of':<20}{'search':>9}{'polished':>10}  {'longer search':<30}"
+        f"{'HV':>9}{'wins':>9}",
+    ]
+    for entry in found:
+        rival = f"{title(entry.rival)}, {entry.evaluations} evaluations"
+        lines.append(
+            f"{title(entry.algorithm):<20}{entry.search:9.5f}{entry.polished:10.5f}  {rival:<30}"
+            f"{entry.longer:9.5f}{entry.polished_wins:5d}/{entry.replicas}"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; returns the exit code."""
+    parser = Parser(
+        prog=PROGRAM,
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("results", type=Path, metavar="RESULTS", help="folder of a polished study")
+    parser.add_argument(
+        "--evaluations",
+        nargs="+",
+        type=int,
+        default=[],
+        metavar="N",
+        help=f"budgets of the longer searches (default: that of equal time, and {LONG})",
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=0, metavar="N", help="worker processes, 0 for one per core"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    options = parser.parse_args(arguments)
+    try:
+        found = controls(options.results, options.evaluations, options.jobs, Progress(True))
+    except DualArmError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\ninterrupted, nothing is lost; the same command continues", file=sys.stderr)
+        return 130
+    print(
+        json.dumps([asdict(entry) for entry in found], indent=1) if options.json else as_text(found)
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

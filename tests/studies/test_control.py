@@ -1,0 +1,60 @@
+"""Polished studies beside longer searches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hybrid_opt import metrics
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
+from hybrid_opt.polish.records import PolishSettings
+from hybrid_opt.results import read_campaign, read_summary
+from studies import control
+from studies.run import StudySettings, run_study
+from tests.symbolic.workcell_samples import RACK
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("control") / "results"
+    settings = CampaignSettings(
+        algorithms=("nsga2",), evaluations=120, replicas=2, seed=4, populations=(("nsga2", 20),)
+    )
+    run_study(
+        RACK,
+        settings,
+        ExecutionSettings(root, jobs=1),
+        Progress(shown=False),
+        StudySettings(PolishSettings(points=3), report=False),
+    )
+    return root
+
+
+def test_longer_searches_repeat_the_studys_own_settings(study: Path) -> None:
+    (found,) = control.controls(study, [160], 1, Progress(shown=False))
+    longer = read_campaign(study / "control" / "160")
+    own = read_campaign(study)
+    settings = dict(longer.configuration["settings"]), dict(own.configuration["settings"])
+    assert {key for key in settings[0] if settings[0][key] != settings[1][key]} == {"evaluations"}
+    # The same seed: the longer search begins as the shorter one, up to its cut last generation.
+    first, second = longer.replicas[0].evaluations.x, own.replicas[0].evaluations.x
+    assert (first[:120] == second).all()
+    rows = read_summary(study)["algorithms"]["nsga2"]["replicas"]
+    alone = [metrics.hypervolume(r.front, metrics.REFERENCE_POINT) for r in longer.replicas]
+    wins = sum(row["polished"]["hypervolume"] > a for row, a in zip(rows, alone, strict=True))
+    assert (found.polished_wins, found.replicas, found.evaluations) == (wins, 2, 160)
+    # A second call reads what the first one computed.
+    assert control.controls(study, [160], 1, Progress(shown=False)) == [found]
+    assert "NSGA-II, 160 evaluations" in control.as_text([found])
+
+
+def test_a_study_without_a_polish_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = CampaignSettings(algorithms=("random",), evaluations=60, replicas=1)
+    root = tmp_path / "results"
+    execution = ExecutionSettings(root, jobs=1)
+    run_study(RACK, settings, execution, Progress(shown=False), StudySettings(report=False))
+    assert control.main([str(root)]) == 2
+    assert "not polished; run the study with --polish" in capsys.readouterr().err
