@@ -11,7 +11,7 @@ from symbolic.workcell import Array
 NO_LIMIT = 1e3
 """Offset that leaves an objective free, in units of the range."""
 
-CLOSED_SIDE = 1e-6
+CLOSED_SIDE = 1e-4
 """By this share of the range a side may be exceeded: what the solver rounds off."""
 
 TIE = 1e-4

@@ -1,0 +1,168 @@
+"""Compute the reference front of a workcell: polished from many starts, then filled.
+
+Random feasible candidates, each the start of its own polish, find the regions; the union of what
+they lead to is polished once more as one front. The result is the best front that is known, not a
+proven one. `tests/hybrid_opt/rack_reference_front.csv` was made with
+
+    python -m studies.reference_front studies/workcells/rack.toml --output FILE
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from codegen.function import available_cores
+from hybrid_opt import metrics
+from hybrid_opt.campaign.files import read_bytes, write_atomically
+from hybrid_opt.evaluation import CandidateEvaluator
+from hybrid_opt.polish.front import FrontPolisher
+from hybrid_opt.polish.functions import polish_functions
+from hybrid_opt.polish.records import PolishSettings
+from symbolic.errors import DualArmError, ResultsError, SettingsError
+from symbolic.workcell import Array
+from symbolic.workcell_file import load
+
+CANDIDATES = 4000
+"""Random candidates among which starts are looked for."""
+
+ROUNDS = 14
+"""Rounds of one attempt, more than in a study."""
+
+ATTEMPTS = 5
+"""Attempts from each start: the point itself, both ends, the middle, one gap."""
+
+
+@dataclass(frozen=True)
+class ReferenceFront:
+    """A reference front; arrays are read-only.
+
+    Attributes:
+        digest: of the workcell that it belongs to.
+        objectives: (k, 2) by increasing first objective.
+        x: (k, n_var) decision vectors.
+    """
+
+    digest: str
+    objectives: Array
+    x: Array
+
+
+def compute_reference_front(
+    evaluator: CandidateEvaluator,
+    starts: int,
+    points: int,
+    rng: np.random.Generator,
+    jobs: int = 1,
+    tell: Callable[[str], None] = lambda text: None,
+) -> ReferenceFront:
+    """Polish from many starts, then the union of the results.
+
+    Args:
+        evaluator: with the paper's objectives.
+        starts: random feasible candidates to start from, the hand-made trajectory besides.
+        points: attempts of the final polish of the union.
+        rng: draws the candidates.
+        jobs: child processes; has no influence on the result.
+        tell: takes a line of progress.
+
+    Raises:
+        SettingsError: too few random candidates are feasible.
+    """
+    candidates = rng.uniform(evaluator.lower, evaluator.upper, (CANDIDATES, evaluator.n_var))
+    found = evaluator.evaluate(candidates)
+    feasible = np.flatnonzero(found.feasible)
+    if len(feasible) < starts:
+        raise SettingsError(
+            f"only {len(feasible)} of {CANDIDATES} random candidates are feasible; ask for at "
+            "most as many starts"
+        )
+    begins = [evaluator.workcell.task.initial.reshape(-1), *candidates[feasible[:starts]]]
+    functions = polish_functions(evaluator.workcell)
+    single = FrontPolisher(evaluator, PolishSettings(points=ATTEMPTS, rounds=ROUNDS), functions)
+    x = np.empty((0, evaluator.n_var))
+    for k, start in enumerate(begins, 1):
+        x = np.concatenate([x, single.polish(start[None], rng, jobs).x])
+        tell(f"start {k} of {len(begins)}: {len(x)} points")
+    union = FrontPolisher(evaluator, PolishSettings(points=points, rounds=ROUNDS), functions)
+    front = union.polish(x, rng, jobs)
+    tell(f"reference front: {len(front.x)} points")
+    return ReferenceFront(evaluator.workcell.digest, front.objectives, front.x)
+
+
+def encode(front: ReferenceFront, command: str) -> bytes:
+    """The file: two comment lines, a header, one line per point."""
+    n_var = front.x.shape[1]
+    lines = [
+        f"# made with: {command}",
+        f"# workcell: {front.digest}",
+        ",".join(["peak_force_1", "peak_force_2", *(f"x_{k + 1}" for k in range(n_var))]),
+    ]
+    for objectives, x in zip(front.objectives.tolist(), front.x.tolist(), strict=True):
+        lines.append(",".join(map(repr, [*objectives, *x])))
+    return ("\n".join(lines) + "\n").encode()
+
+
+def read_reference_front(path: Path) -> ReferenceFront:
+    """Read a file of `encode`.
+
+    Raises:
+        ResultsError: it cannot be read or is damaged.
+    """
+    try:
+        lines = read_bytes(path).decode("ascii").splitlines()
+        digest = lines[1].removeprefix("# workcell: ")
+        values = np.array([[float(word) for word in line.split(",")] for line in lines[3:]])
+        objectives, x = values[:, :2].copy(), values[:, 2:].copy()
+    except (ValueError, IndexError) as error:
+        raise ResultsError(f"{path}: no reference front ({error}); make it again") from error
+    for array in (objectives, x):
+        array.setflags(write=False)
+    return ReferenceFront(digest, objectives, x)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.reference_front",
+        description="Compute the reference front of a workcell.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("workcell", type=Path, help="the workcell file")
+    parser.add_argument("--output", type=Path, required=True, help="the CSV file to write")
+    parser.add_argument("--starts", type=int, default=24, help="random starts")
+    parser.add_argument("--points", type=int, default=60, help="attempts of the final polish")
+    parser.add_argument("--seed", type=int, default=1, help="of the random starts")
+    parser.add_argument("--jobs", type=int, default=0, help="processes, 0 for one per core")
+    options = parser.parse_args(arguments)
+    command = (
+        f"python -m studies.reference_front {options.workcell} --output FILE "
+        f"--starts {options.starts} --points {options.points} --seed {options.seed}"
+    )
+    try:
+        front = compute_reference_front(
+            CandidateEvaluator(load(options.workcell)),
+            options.starts,
+            options.points,
+            np.random.default_rng(options.seed),
+            options.jobs or available_cores(),
+            lambda text: print(text, file=sys.stderr, flush=True),
+        )
+        write_atomically(options.output, encode(front, command))
+    except DualArmError as error:
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        return 2
+    print(
+        f"{options.output}: {len(front.x)} points, hypervolume "
+        f"{metrics.hypervolume(front.objectives):.6f}"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

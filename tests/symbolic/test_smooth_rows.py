@@ -1,0 +1,108 @@
+"""Rows at places of the path: values against their definitions, reach through the closure."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from symbolic.arm import flange_target, manipulability, pose_error
+from symbolic.cell_model import CellModel, build_cell_model
+from symbolic.clearance import screening_functions
+from symbolic.rotation import rotation_matrix
+from symbolic.smooth_rows import RowFunctions, RowKind, solve_function
+from symbolic.workcell import Array
+from symbolic.workcell_file import load
+from tests.symbolic.workcell_samples import RACK
+
+
+@cache
+def model() -> CellModel:
+    return build_cell_model(load(RACK))
+
+
+@cache
+def rows() -> RowFunctions:
+    return RowFunctions(model())
+
+
+def pose_near_start(seed: int) -> Array:
+    start = model().workcell.task.waypoints[0].lower
+    away = np.array([-0.15, 0.0, 0.03, 0.0, 0.0, 0.0])
+    spread = np.array([0.1, 0.04, 0.03, 0.1, 0.1, 0.1])
+    return np.asarray(start + away + spread * np.random.default_rng(seed).uniform(-1, 1, 6))
+
+
+def joints_at(pose: Array) -> tuple[Array, Array]:
+    first, second = (
+        np.array(solve_function(model(), arm)(pose, model().start[arm])).ravel() for arm in (0, 1)
+    )
+    return first, second
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20)
+def test_solved_joints_hold_the_box(seed: int) -> None:
+    pose = pose_near_start(seed)
+    for arm, q in enumerate(joints_at(pose)):
+        cell = model().workcell
+        target = flange_target(
+            cell.robots[arm], cell.contacts[arm], pose[:3], rotation_matrix(pose[3:])
+        )
+        residual = pose_error(*target, *model().robots[arm].placement(q))[1]
+        assert float(residual) < 1e-8
+
+
+def test_a_smooth_clearance_never_exceeds_the_sharp_bound() -> None:
+    placements = (model().robots[0].joint_placements, model().robots[1].joint_placements)
+    sharp = screening_functions(model().geometry, placements)["clearance"]
+    for seed in range(3):
+        pose = pose_near_start(seed)
+        q = joints_at(pose)
+        bounds = np.array(sharp(pose, *q)).ravel()
+        for index in range(0, len(bounds), 7):
+            smooth = float(rows().value(RowKind("clearance", index))(pose, *q))
+            assert smooth <= bounds[index] + 1e-12
+            assert smooth >= bounds[index] - 0.1
+
+
+@pytest.mark.parametrize("arm", [0, 1])
+def test_joint_rows_are_their_definitions(arm: int) -> None:
+    pose = pose_near_start(1)
+    q = joints_at(pose)
+    robot = model().workcell.robots[arm]
+    for joint in range(6):
+        lower = float(rows().value(RowKind("lower", joint, arm))(pose, *q))
+        upper = float(rows().value(RowKind("upper", joint, arm))(pose, *q))
+        assert lower == pytest.approx(q[arm][joint] - robot.position_lower[joint])
+        assert upper == pytest.approx(robot.position_upper[joint] - q[arm][joint])
+    jacobian = np.array(model().robots[arm].jacobian(q[arm]))
+    share = abs(np.linalg.det(jacobian)) / robot.min_manipulability
+    value = float(rows().value(RowKind("singularity", -1, arm))(pose, *q))
+    assert value == pytest.approx(share**2 - 1.0, rel=1e-9)
+    assert float(manipulability(jacobian)) == pytest.approx(abs(np.linalg.det(jacobian)))
+
+
+def test_compiled_functions_take_the_place_of_their_names() -> None:
+    frequent = rows().frequent()
+    replaced = RowFunctions(model(), frequent)
+    kind = RowKind("singularity", -1, 0)
+    assert replaced.hessian(kind) is frequent["hessian_singularity_0_1"]
+    assert all(name == function.name() for name, function in frequent.items())
+
+
+def test_rows_know_their_arms() -> None:
+    names = model().geometry.pair_names
+    for index, pair in enumerate(names):
+        expected = tuple(
+            arm
+            for arm, robot in enumerate(model().workcell.robots)
+            if any(
+                name.startswith(f"{robot.name}/") and not name.endswith("base_link")
+                for name in pair
+            )
+        )
+        assert rows().arms(RowKind("clearance", index)) == expected
