@@ -64,7 +64,7 @@ def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
         (np.abs(outputs[f"joint_torque_{i + 1}"]) / robot.torque_max).max(axis=(1, 2))
         for i, robot in enumerate(workcell.robots)
     ]
-    return np.maximum(uses[0], uses[1])
+    return np.asarray(np.maximum(uses[0], uses[1]), dtype=float)
 
 
 def _force_imbalance(outputs: Outputs, workcell: Workcell) -> Array:

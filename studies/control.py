@@ -4,7 +4,8 @@
 
 The study's own searches are repeated without a polish, with the budget that the most expensive
 polish took (its seconds, as candidate evaluations) added, and with 20,000 evaluations. Each
-replica's hypervolumes are then compared: search, search and polish, longer search.
+replica's hypervolumes are then compared: search, search and polish, longer search. With
+`--reference FILE` (from `studies.reference_front`) only the distance to that front is told.
 """
 
 from __future__ import annotations
@@ -29,8 +30,10 @@ from hybrid_opt.campaign import (
     search_stage,
 )
 from hybrid_opt.campaign.layout import CONFIGURATION
+from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.results import CampaignResults, read_campaign, read_summary
 from studies.cli import Parser
+from studies.reference_front import ReferenceFront, read_reference_front
 from studies.terminal_summary import title
 from symbolic.errors import DualArmError, ResultsError
 
@@ -155,6 +158,71 @@ def _compare(
     )
 
 
+@dataclass(frozen=True)
+class Approach:
+    """How near one algorithm's fronts come to a reference front, medians over the replicas.
+
+    Attributes:
+        algorithm: its name.
+        search_gap, polished_gap: the reference's hypervolume less the front's.
+        search_igd, polished_igd: mean distances of the reference's points to the front.
+        closed: share of the gap that the polish closes [%].
+    """
+
+    algorithm: str
+    search_gap: float
+    polished_gap: float
+    search_igd: float
+    polished_igd: float
+    closed: float
+
+
+def approaches(root: Path, reference: ReferenceFront) -> list[Approach]:
+    """The distances of a polished study's fronts to a reference front.
+
+    Raises:
+        ResultsError: the study is not complete, was not polished, or is of another workcell.
+    """
+    study = read_campaign(root)
+    if study.workcell.digest != reference.digest:
+        raise ResultsError(f"{root}: is a study of another workcell than the reference front's")
+    best = metrics.hypervolume(reference.objectives)
+    found = []
+    for name in study.algorithms:
+        searched, polished = [], []
+        for replica in study.of(name):
+            after = read_polished(root, name, replica.replica)
+            if after is None:
+                raise ResultsError(f"{root}: replica {replica.replica} of {name} is not polished")
+            searched.append(replica.front)
+            polished.append(after.objectives)
+        gaps = [
+            float(np.median([best - metrics.hypervolume(front) for front in fronts]))
+            for fronts in (searched, polished)
+        ]
+        igds = [
+            float(np.median([metrics.igd(front, reference.objectives) for front in fronts]))
+            for fronts in (searched, polished)
+        ]
+        closed = 100.0 * (1.0 - gaps[1] / gaps[0])
+        found.append(Approach(name, gaps[0], gaps[1], igds[0], igds[1], closed))
+    return found
+
+
+def approaches_text(found: Sequence[Approach]) -> str:
+    """The distances as a table."""
+    lines = [
+        "Distance to the reference front, medians over the replicas",
+        f"{'':<12}{'HV gap':>12}{'polished':>12}{'closed':>10}{'IGD':>11}{'polished':>11}",
+    ]
+    lines += [
+        f"{title(a.algorithm):<12}{a.search_gap:12.6f}{a.polished_gap:12.6f}{a.closed:8.1f} %"
+        f"{a.search_igd:11.6f}{a.polished_igd:11.6f}"
+        for a in found
+    ]
+    return "\n".join(lines)
+
+
 def as_text(found: Sequence[Control]) -> str:
     """The comparison as a table."""
     lines = [
@@ -191,19 +259,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--jobs", type=int, default=0, metavar="N", help="worker processes, 0 for one per core"
     )
+    parser.add_argument(
+        "--reference",
+        type=Path,
+        metavar="FILE",
+        help="tell the distance to this reference front instead of searching (default: none)",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     options = parser.parse_args(arguments)
+    found: Sequence[Control | Approach]
     try:
-        found = controls(options.results, options.evaluations, options.jobs, Progress(True))
+        if options.reference is not None:
+            found = near = approaches(options.results, read_reference_front(options.reference))
+            text = approaches_text(near)
+        else:
+            progress = Progress(True)
+            found = run = controls(options.results, options.evaluations, options.jobs, progress)
+            text = as_text(run)
     except DualArmError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("\ninterrupted, nothing is lost; the same command continues", file=sys.stderr)
         return 130
-    print(
-        json.dumps([asdict(entry) for entry in found], indent=1) if options.json else as_text(found)
-    )
+    print(json.dumps([asdict(entry) for entry in found], indent=1) if options.json else text)
     return 0
 
 

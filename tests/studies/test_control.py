@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hybrid_opt import metrics
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
+from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.polish.records import PolishSettings
 from hybrid_opt.results import read_campaign, read_summary
 from studies import control
+from studies.reference_front import ReferenceFront
 from studies.run import StudySettings, run_study
+from symbolic.errors import ResultsError
 from tests.symbolic.workcell_samples import RACK
 
 
@@ -47,6 +51,23 @@ def test_longer_searches_repeat_the_studys_own_settings(study: Path) -> None:
     # A second call reads what the first one computed.
     assert control.controls(study, [160], 1, Progress(shown=False)) == [found]
     assert "NSGA-II, 160 evaluations" in control.as_text([found])
+
+
+def test_distance_to_a_reference_front(study: Path) -> None:
+    own = read_campaign(study)
+    union = metrics.front_of(
+        np.concatenate([read_polished(study, "nsga2", k).objectives for k in (0, 1)])  # type: ignore[union-attr]
+    )
+    reference = ReferenceFront(own.workcell.digest, union, np.empty((len(union), 0)))
+    (found,) = control.approaches(study, reference)
+    gaps = [metrics.hypervolume(union) - metrics.hypervolume(r.front) for r in own.replicas]
+    assert found.search_gap == pytest.approx(np.median(gaps))
+    assert 0.0 <= found.polished_gap < found.search_gap
+    assert found.polished_igd < found.search_igd
+    assert found.closed == pytest.approx(100.0 * (1.0 - found.polished_gap / found.search_gap))
+    assert "NSGA-II" in control.approaches_text([found])
+    with pytest.raises(ResultsError, match="another workcell"):
+        control.approaches(study, ReferenceFront("0" * 64, union, np.empty((len(union), 0))))
 
 
 def test_a_study_without_a_polish_is_told(

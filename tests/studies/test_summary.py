@@ -84,7 +84,8 @@ def test_best_steps_begin_with_the_first_feasible_candidate() -> None:
 def test_reference_front_is_the_union() -> None:
     first = replica([[0.2, 0.8], [0.5, 0.5]], ["", ""])
     second = replica([[0.8, 0.2], [0.6, 0.6], [0.1, 0.1]], ["", "", "collision"])
-    assert reference_front([first.front, second.front]).tolist() == [[0.2, 0.8], [0.5, 0.5], [0.8, 0.2]]
+    union = reference_front([first.front, second.front])
+    assert union.tolist() == [[0.2, 0.8], [0.5, 0.5], [0.8, 0.2]]
 
 
 def entry(number: int, **figures: Any) -> dict[str, Any]:

@@ -60,8 +60,8 @@ def test_bounds_never_exceed_the_distance(name: str, folder: Path) -> None:
         distance = np.fmax(true_distances(geometry, *row), 0.0)
         assert np.all(np.fmax(bound[k], 0.0) <= distance + COAL_ACCURACY)
         assert np.all(np.fmax(smooth[k], 0.0) <= distance + COAL_ACCURACY)
-        far += np.count_nonzero(distance > 0.10)
-        near += np.count_nonzero((distance > 0.10) & (bound[k] > 0.0))
+        far += int(np.count_nonzero(distance > 0.10))
+        near += int(np.count_nonzero((distance > 0.10) & (bound[k] > 0.0)))
     # A bound that never clears anything would be safe and useless.
     assert near > 0.9 * far
 

@@ -95,8 +95,8 @@ def test_names_of_bodies(rack: Workcell) -> None:
 
 def test_stretched_length_is_the_sum_of_the_links(rack: Workcell) -> None:
     shoulder, length = stretched_length(rack.robots[0])
-    base = rack.robots[0].T_world_base[:3, 3]
-    np.testing.assert_allclose(shoulder, base + [0.0, 0.0, 0.338], atol=1e-12)
+    above = shoulder - rack.robots[0].T_world_base[:3, 3]
+    np.testing.assert_allclose(above, [0.0, 0.0, 0.338], atol=1e-12)
     assert length == pytest.approx(0.707 + 0.110 + 0.534 + np.hypot(0.101, 0.080))
 
 
