@@ -67,6 +67,7 @@ def terminal_summary(summary: Mapping[str, Any], with_paper: bool) -> str:
         _reasons(summary["algorithms"]),
         _table_2(summary),
         _over_replicas(summary["algorithms"]),
+        _polish(summary["algorithms"]),
         _tests(summary["tests"]),
     ]
     if with_paper:
@@ -142,6 +143,30 @@ def _over_replicas(algorithms: Mapping[str, Any]) -> str:
             cells.append("{} [{}, {}]".format(*values))
         rows.append([title(name), *cells])
     return f"Selected solutions of all replicas, and what a replica took\n{_grid(rows)}"
+
+
+def _polish(algorithms: Mapping[str, Any]) -> str:
+    """What the polish made of the fronts; nothing without one."""
+    polished = {name: entry for name, entry in algorithms.items() if "polished" in entry}
+    if not polished:
+        return ""
+    head = ["median", "HV before", "HV after", "better in", "above static %", "payload kg"]
+    rows = [[*head, "seconds", "= evaluations"]]
+    for name, entry in polished.items():
+        after = entry["polished"]["statistics"]
+        rows.append(
+            [
+                title(name),
+                _number(entry["statistics"]["hypervolume"]["median"], 5),
+                _number(after["hypervolume"]["median"], 5),
+                f"{entry['polished']['replicas_improved']} of {len(entry['replicas'])}",
+                _number(after["mean_excess_above_static"]["median"], 2),
+                _number(after["payload_limit"]["median"], 3),
+                _number(after["seconds"]["median"], 2),
+                _number(after["equivalent_evaluations"]["median"], 0),
+            ]
+        )
+    return f"Fronts after the polish, and what it took\n{_grid(rows)}"
 
 
 def _tests(tests: Sequence[Mapping[str, Any]]) -> str:
