@@ -37,8 +37,8 @@ class PolishSettings:
 
     points: int = 12
     method: Method = "pascoletti-serafini"
-    max_iterations: int = 25
-    rounds: int = 6
+    max_iterations: int = 15
+    rounds: int = 10
     max_seconds: float = 60.0
     margin: float = 1e-6
     clearance: float = 8e-4

@@ -41,7 +41,7 @@ BRANCH_ACTIVITY = 0.02
 SLACK = 1e-3
 """What the epigraph variables start above the peak forces."""
 
-FIRST_RADIUS, LEAST_RADIUS, LARGEST_RADIUS = 0.3, 1e-3, 2.0
+FIRST_RADIUS, LEAST_RADIUS, LARGEST_RADIUS = 0.5, 1e-3, 2.0
 """Half the width of the box of trust, in halves of the decision variables' ranges."""
 
 INSIDE = 0.9
