@@ -18,7 +18,7 @@ from symbolic.errors import SettingsError
 
 _DEFAULT = CampaignSettings()
 
-QUICK_EVALUATIONS, QUICK_REPLICAS, QUICK_POLISH_POINTS = 300, 3, 4
+QUICK_EVALUATIONS, QUICK_REPLICAS, QUICK_POLISH_POINTS = 300, 2, 2
 """Of a small but complete study."""
 
 
