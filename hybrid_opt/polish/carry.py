@@ -30,7 +30,6 @@ class Carry:
         manipulability: (reached, 2) |det J| over its least value, between samples interpolated.
         split: (n, 2) on samples: normal component, tangential magnitude of the required force [N].
         peak: (2,) peak normal forces over their references.
-        pressure: largest shift of a centre of pressure over its patch radius, minus 1.
     """
 
     pose: Array
@@ -41,7 +40,6 @@ class Carry:
     manipulability: Array
     split: Array
     peak: Array
-    pressure: float
 
     @property
     def is_followed(self) -> bool:
@@ -59,7 +57,6 @@ class CarryReader:
     def __init__(self, evaluator: CandidateEvaluator) -> None:
         self._evaluator = evaluator
         task = evaluator.workcell.task
-        self._radii = [contact.patch_radius for contact in evaluator.workcell.contacts]
         self._samples = np.linspace(0.0, 1.0, task.samples)
         self._places = np.linspace(0.0, 1.0, (task.samples - 1) * PER_SAMPLE + 1)
         self.basis = path_basis(len(task.waypoints), self._places).position
@@ -97,7 +94,6 @@ class CarryReader:
                 [force[:, 0] - force[:, 1], found["tangential_force"].sum(axis=1)]
             ),
             peak=force.max(axis=0) / evaluator.workcell.task.reference_force,
-            pressure=float((found["pressure_shift"] / self._radii).max()) - 1.0,
         )
 
     def _between(self, values: Array) -> Array:

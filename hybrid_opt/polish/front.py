@@ -50,9 +50,6 @@ OPTIMAL_STATIONARITY = 1e-3
 LEAST_GAP = 0.02
 """Gaps narrower than this are left, in units of the front's extent."""
 
-TURNS_PER_GAP = 2
-"""Turns at the ends and the middle before one at a gap: they decide hypervolume and payload."""
-
 NO_SOLUTION = Solution(np.empty(0), "", False, False, UNKNOWN, 0, 0, 0)
 
 
@@ -200,9 +197,8 @@ class _Run:
         """The front's points first; then ends, middle and gaps in turns, while attempts last."""
         self._do(self._points())
         while self._left() > 0:
-            for _ in range(TURNS_PER_GAP):
-                self._do([self._aimed("extreme", objective, rng) for objective in (0, 1)])
-                self._do([self._aimed("balance", None, rng)])
+            self._do([self._aimed("extreme", objective, rng) for objective in (0, 1)])
+            self._do([self._aimed("balance", None, rng)])
             self._do(self._gaps()[:1])
 
     def _left(self) -> int:
@@ -211,7 +207,7 @@ class _Run:
     def _points(self) -> list[_Attempt]:
         """Evenly spread points of the front, the balanced one among them."""
         archive, rows = self._archive, self._archive.rows()
-        count = min(len(rows), (self._settings.points + 3) // 4)
+        count = min(len(rows), (self._settings.points + 2) // 3)
         chosen = {rows[int(k)] for k in np.round(np.linspace(0, len(rows) - 1, count))}
         middle = self._balanced()
         if middle not in chosen and count > 2:

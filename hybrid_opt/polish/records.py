@@ -22,7 +22,7 @@ class PolishSettings:
     """What decides the results of a polish.
 
     Attributes:
-        points: attempts that one front may take; the front's own points get a quarter of them.
+        points: attempts that one front may take; the front's own points get a third of them.
         method: how a point is improved: along the diagonal (Pascoletti and Serafini 1984), or by
             minimising one objective while the other is held (epsilon constraint).
         max_iterations: of IPOPT in one round.

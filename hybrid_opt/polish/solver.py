@@ -170,11 +170,6 @@ class PolishSolver:
         if missing or branches or not carry.is_followed:
             self._learn(now, carry, missing, branches, required)
             return "refused"
-        if carry.pressure > -self._settings.margin:
-            # No row says which way: the centre of pressure is far from its limit where forces are
-            # low, and a shorter step nearly always keeps it there.
-            now.went_well, now.radius = False, now.radius / 2.0
-            return "refused"
         step = float(np.max(np.abs(answer.x - now.x) / self._half))
         if level(target, carry.peak) >= level(target, now.carry.peak):
             now.radius = min(now.radius, step) / 4.0
