@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from hybrid_opt.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.results import CampaignResults, Replica, read_campaign, read_summary
 from hybrid_opt.robustness import payload_sensitivity
 from hybrid_opt.timing import TimingModel
+from studies.report.children import in_children
 from studies.report.reach import reach_map
 from studies.report.records import (
     AlgorithmRuns,
@@ -37,8 +39,12 @@ REACH_SEED = 0
 """Of the postures that the reach is drawn from; no result depends on it."""
 
 
-def gather(root: Path) -> ReportData:
+def gather(root: Path, jobs: int = 1) -> ReportData:
     """Read a results folder and evaluate what is drawn in detail.
+
+    Args:
+        root: the results folder.
+        jobs: processes, 0 for one per core.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -51,6 +57,9 @@ def gather(root: Path) -> ReportData:
     geometry = build_geometry(workcell)
     algorithms = _algorithms(results, summary, maker)
     carries = _best(results, algorithms, maker)
+    slow: list[Callable[[], Any]] = [partial(maker.timing, carry) for carry in carries]
+    slow.append(partial(reach_map, geometry, np.random.default_rng(REACH_SEED)))
+    *timings, reach = in_children(slow, jobs)
     return ReportData(
         workcell=workcell,
         geometry=geometry,
@@ -59,8 +68,8 @@ def gather(root: Path) -> ReportData:
         static=_static(results, summary),
         algorithms=algorithms,
         initial=carries[0],
-        timings=tuple(maker.timing(carry) for carry in carries),
-        reach=reach_map(geometry, np.random.default_rng(REACH_SEED)),
+        timings=tuple(timings),
+        reach=reach,
     )
 
 

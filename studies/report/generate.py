@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from hybrid_opt.campaign.files import storing, write_atomically
 from hybrid_opt.timing import TimingModel
-from studies.report.figures import report_figures
+from studies.report.children import in_children
+from studies.report.figures import ReportFigure, report_figures
 from studies.report.page import render_page
 from studies.report.page_data import PageData
 from studies.report.records import ReportData
@@ -20,7 +22,11 @@ TABLES = "tables"
 
 
 def write_report(
-    root: Path, data: ReportData, with_paper: bool, done: Callable[[], None] = lambda: None
+    root: Path,
+    data: ReportData,
+    with_paper: bool,
+    done: Callable[[], None] = lambda: None,
+    jobs: int = 1,
 ) -> Path:
     """Write all files of the report; returns the page.
 
@@ -29,6 +35,7 @@ def write_report(
         data: from `studies.report.data.gather`.
         with_paper: whether figures that the paper states of its rack stand beside ours.
         done: called after every figure and after the page.
+        jobs: processes that draw, 0 for one per core.
 
     Raises:
         ResultsError: the folder cannot be written.
@@ -37,10 +44,9 @@ def write_report(
     folder = root / FIGURES
     with storing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        pictures = []
-        for figure in report_figures(data):
-            pictures.append((save(figure.draw(), folder, figure.name)[0], figure.caption))
-            done()
+        figures = list(report_figures(data))
+        files = in_children([partial(_drawn, figure, folder) for figure in figures], jobs, done)
+    pictures = [(path, figure.caption) for path, figure in zip(files, figures, strict=True)]
     tables = report_tables(data, with_paper)
     for table in tables:
         for suffix, text in (
@@ -54,3 +60,8 @@ def write_report(
     write_atomically(page, render_page(data, document, tables, pictures).encode())
     done()
     return page
+
+
+def _drawn(figure: ReportFigure, folder: Path) -> Path:
+    """Draw a figure into its files; returns the PNG."""
+    return save(figure.draw(), folder, figure.name)[0]

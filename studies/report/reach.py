@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from studies.report.records import ReachMap
-from studies.report.solids import joint_placements
 from symbolic.collision_bodies import ArmGeometry
 from symbolic.collision_pairs import CellGeometry
 from symbolic.workcell import Array
@@ -43,14 +42,33 @@ def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> Arr
     """(POSTURES, 3) pad positions in the world."""
     arm, contact = geometry.arms[i], geometry.workcell.contacts[i]
     pad = (arm.T_joint_box @ contact.T_box_pad)[:3, 3]
-    return np.concatenate([_last_points(arm, pad, rng) for _ in range(POSTURES // _BATCH)])
+    batches = POSTURES // _BATCH
+    return np.concatenate([last_points(arm, pad, rng, _BATCH) for _ in range(batches)])
 
 
-def _last_points(arm: ArmGeometry, point: Array, rng: np.random.Generator) -> Array:
-    """World positions of a point of the last joint's frame in a batch of random postures."""
-    q = rng.uniform(arm.lower, arm.upper, (_BATCH, 6))
-    T = joint_placements(arm, q)[:, 5]
-    return np.asarray(T[:, :3, :3] @ point + T[:, :3, 3])
+def last_points(arm: ArmGeometry, point: Array, rng: np.random.Generator, count: int) -> Array:
+    """(count, 3) world positions of a point (3,) of the last joint's frame in random postures.
+
+    The points go from frame to frame, which takes a fraction of what whole placements take.
+    """
+    q = rng.uniform(arm.lower, arm.upper, (count, 6))
+    points = np.broadcast_to(point, (count, 3))
+    for axis, origin, angle in zip(arm.axes[::-1], arm.origins[::-1], q.T[::-1], strict=True):
+        points = _moved(_turned(points, axis, angle), origin)
+    return _moved(points, arm.T_world_root)
+
+
+def _turned(points: Array, axis: Array, angle: Array) -> Array:
+    """Points (n, 3) turned about a unit axis (3,) by angles (n,) [rad] (Rodrigues' formula)."""
+    along = np.outer(points @ axis, axis)
+    across = points - along
+    sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
+    return np.asarray(along + cosine * across + sine * (across @ np.cross(axis, np.eye(3))))
+
+
+def _moved(points: Array, T: Array) -> Array:
+    """Points (n, 3) in the frame that T (4, 4) leads to."""
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 
 def _common(geometry: CellGeometry, pads: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:

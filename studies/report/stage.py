@@ -18,7 +18,7 @@ def report_stage(with_paper: bool) -> Stage:
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        _write(folder.root, with_paper, progress)
+        _write(folder.root, with_paper, progress, folder.execution.jobs)
 
     return Stage("report", run, {"with_paper": with_paper})
 
@@ -58,19 +58,19 @@ def follow_report_options(root: Path, options: argparse.Namespace) -> None:
         watch(root, options.port)
 
 
-def _write(root: Path, with_paper: bool, progress: Progress) -> None:
+def _write(root: Path, with_paper: bool, progress: Progress, jobs: int) -> None:
     from studies.report.data import gather
     from studies.report.figures import report_figures
     from studies.report.generate import write_report
 
-    data = gather(root)
+    data = gather(root, jobs)
     count = len(list(report_figures(data))) + 1
     with progress.stage("report", count, "pictures") as advance:
-        write_report(root, data, with_paper, lambda: advance(1))
+        write_report(root, data, with_paper, lambda: advance(1), jobs)
 
 
 def rewrite(root: Path, progress: Progress) -> None:
-    """Write the report of a results folder anew, as its study did.
+    """Write the report of a results folder anew, as its study did, with one process per core.
 
     Raises:
         DualArmError: the folder is not complete.
@@ -81,4 +81,4 @@ def rewrite(root: Path, progress: Progress) -> None:
     marker = root / STAGES / "report.json"
     stored = read_json(marker) if marker.exists() else {}
     settings = stored.get("settings", {}) if isinstance(stored, dict) else {}
-    _write(root, bool(settings.get("with_paper")), progress)
+    _write(root, bool(settings.get("with_paper")), progress, jobs=0)

@@ -43,7 +43,10 @@ RC: dict[Any, Any] = {
     "patch.linewidth": 0.6,
     "text.parse_math": False,
     "pdf.fonttype": 42,
-    "figure.dpi": 100.0,
+    # Layout is worked out at the resolution that it is drawn at, and only where it is asked for.
+    "figure.dpi": PNG_DPI,
+    "figure.autolayout": False,
+    "figure.constrained_layout.use": False,
 }
 
 
@@ -100,10 +103,20 @@ def in_style() -> Iterator[None]:
 
 
 def settled(figure: Figure) -> Figure:
-    """The figure with its layout worked out; a first pass still moves tick labels."""
+    """The figure with its layout worked out for good: all files of it show the same."""
     with in_style():
-        figure.draw_without_rendering()
+        engine = figure.get_layout_engine()
+        assert engine is not None
+        # Panels that keep their shape shift in the room of the first pass.
+        for _ in range(2 if any(_keeps_shape(axes) for axes in figure.axes) else 1):
+            engine.execute(figure)
+        # Otherwise every file would be drawn twice, once for the layout alone.
+        figure.set_layout_engine(None)
     return figure
+
+
+def _keeps_shape(axes: Axes) -> bool:
+    return axes.get_aspect() != "auto"
 
 
 def panel_label(axes: Axes, letter: str, text: str) -> None:
@@ -112,10 +125,7 @@ def panel_label(axes: Axes, letter: str, text: str) -> None:
 
 
 def save(figure: Figure, folder: Path, name: str) -> tuple[Path, ...]:
-    """Write a figure as PNG and PDF; returns the files.
-
-    Layout is fixed by the first, so that both show the same.
-    """
+    """Write a settled figure as PNG and PDF; returns the files."""
     paths = []
     with in_style():
         for suffix, metadata in (
@@ -124,6 +134,5 @@ def save(figure: Figure, folder: Path, name: str) -> tuple[Path, ...]:
         ):
             path = folder / f"{name}.{suffix}"
             figure.savefig(path, dpi=PNG_DPI, metadata=metadata)
-            figure.set_layout_engine("none")
             paths.append(path)
     return tuple(paths)
