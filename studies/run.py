@@ -27,7 +27,7 @@ from studies.cli import (
     polish_settings,
 )
 from studies.report.stage import add_report_options, follow_report_options, report_stage
-from studies.summary import summary_stage
+from studies.summary_stage import summary_stage
 from studies.terminal_summary import terminal_summary
 from studies.timing_stage import timing_stage
 from symbolic.errors import DualArmError

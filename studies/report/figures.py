@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from studies.report import figures_carry, figures_cell, figures_search
+from studies.report import figures_carry, figures_cell, figures_fronts, figures_search
 from studies.report.records import Carry, ReportData
 from studies.report.style import in_style, settled
 
@@ -68,7 +68,7 @@ def _search_figures(data: ReportData) -> Iterator[ReportFigure]:
             "fig07_fronts",
             "Feasible candidates and non-dominated ones of each algorithm's run with the largest "
             "hypervolume (paper Figure 7). The star is the level payload at rest.",
-            lambda: figures_search.fronts(data),
+            lambda: figures_fronts.fronts(data),
         )
     yield ReportFigure(
         "fig08_best_so_far",
@@ -81,7 +81,7 @@ def _search_figures(data: ReportData) -> Iterator[ReportFigure]:
             "attainment",
             "Empirical attainment surfaces: what a quarter, half and three quarters of the "
             "replicas reached or bettered.",
-            lambda: figures_search.attainment(data),
+            lambda: figures_fronts.attainment(data),
         )
     yield ReportFigure(
         "indicators",
@@ -92,7 +92,7 @@ def _search_figures(data: ReportData) -> Iterator[ReportFigure]:
         yield ReportFigure(
             "polish",
             "Fronts before and after the polish, and the hypervolume of every replica.",
-            lambda: figures_search.polish(data),
+            lambda: figures_fronts.polish(data),
         )
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import trimesh
 
 from studies.report.records import ReportData
-from studies.report.tables import Table, number
+from studies.report.table_text import Table, number
 from symbolic.errors import ReportError
 
 _OWN_SCRIPTS = ("scene.js", "page.js")

@@ -14,7 +14,7 @@ from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.stages import run_stages
 from hybrid_opt.results import read_campaign
 from studies.compare import compare, main
-from studies.summary import summary_stage
+from studies.summary_stage import summary_stage
 from symbolic.workcell_file import load
 from tests.studies.conftest import TRANSFER
 

@@ -21,16 +21,21 @@ def slowly(value: int) -> tuple[int, int]:
     return value, os.getpid()
 
 
-def refused() -> None:
+def refused() -> int:
     raise ReportError("no room in the figure")
 
 
-def broken() -> None:
+def broken() -> int:
     raise ZeroDivisionError
 
 
-def killed() -> None:
+def killed() -> int:
     os.kill(os.getpid(), signal.SIGKILL)
+    return 0
+
+
+def idle() -> int:
+    return 1
 
 
 def test_results_come_in_order_from_several_processes() -> None:
@@ -49,16 +54,17 @@ def test_one_process_is_this_one(count: int, jobs: int) -> None:
 
 
 def test_calls_need_not_be_picklable() -> None:
-    assert in_children([lambda k=k: k**2 for k in range(4)], JOBS) == [0, 1, 4, 9]
+    texts = ["a", "b", "c"]
+    assert in_children([lambda: "".join(texts), lambda: texts[0]], JOBS) == ["abc", "a"]
 
 
 def test_what_a_call_raises_is_raised() -> None:
     with pytest.raises(DualArmError, match="no room in the figure"):
-        in_children([refused, partial(slowly, 0)], JOBS)
+        in_children([refused, idle], JOBS)
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
-        in_children([broken, partial(slowly, 0)], JOBS)
+        in_children([broken, idle], JOBS)
 
 
 def test_a_death_is_told() -> None:
     with pytest.raises(WorkerError, match="killed"):
-        in_children([killed, partial(slowly, 0)], JOBS)
+        in_children([killed, idle], JOBS)

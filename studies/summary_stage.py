@@ -1,0 +1,109 @@
+"""The stage that turns a finished search into figures, fronts and selected trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hybrid_opt.attainment import attainment_surfaces
+from hybrid_opt.campaign import CampaignFolder, Progress, Stage
+from hybrid_opt.campaign.files import storing, write_atomically, write_json
+from hybrid_opt.campaign.layout import (
+    FRONTS,
+    SUMMARY,
+    polished_selected_file,
+    reference_front_file,
+    selected_file,
+)
+from hybrid_opt.campaign.polish_stage import read_polished
+from hybrid_opt.evaluation import CandidateEvaluator
+from hybrid_opt.results import CampaignResults, read_campaign
+from hybrid_opt.static_hold import static_hold
+from hybrid_opt.trajectory_file import write_trajectory
+from studies.selection import Selected, select, select_polished
+from studies.summary import campaign_summary, polished_figures, reference_front, replica_figures
+from symbolic.workcell import Array
+
+PERCENTILES = (25.0, 50.0, 75.0, 100.0)
+"""Of the attainment surfaces, in percent of the replicas."""
+
+
+def summary_stage() -> Stage:
+    """The stage that computes the figures of a finished search."""
+    return Stage("summary", _run)
+
+
+def _run(folder: CampaignFolder, progress: Progress) -> None:
+    results = read_campaign(folder.root)
+    evaluator = CandidateEvaluator(folder.workcell, folder.settings.objectives)
+    static = static_hold(folder.workcell)
+    polished = {
+        (replica.algorithm, replica.replica): read_polished(
+            results.root, replica.algorithm, replica.replica
+        )
+        for replica in results.replicas
+    }
+    fronts = [replica.front for replica in results.replicas]
+    fronts += [found.objectives for found in polished.values() if found is not None]
+    reference = reference_front(fronts)
+    entries: dict[str, list[dict[str, Any]]] = {name: [] for name in results.algorithms}
+    with progress.stage("summary", len(results.replicas), "replicas") as advance:
+        for replica in results.replicas:
+            key = replica.algorithm, replica.replica
+            selected = select(evaluator, replica, static)
+            file = _store_selected(folder, selected_file(folder.root, *key), key, selected)
+            entry = replica_figures(replica, reference, selected, file)
+            front = polished[key]
+            if front is not None:
+                chosen = select_polished(evaluator, front, static)
+                path = polished_selected_file(folder.root, *key)
+                file = _store_selected(folder, path, key, chosen)
+                entry["polished"] = polished_figures(front, reference, chosen, file)
+            entries[replica.algorithm].append(entry)
+            advance(1)
+    _write_points(folder, "reference", results.objectives, reference)
+    for name in results.algorithms:
+        union = reference_front([replica.front for replica in results.of(name)])
+        _write_points(folder, name, results.objectives, union)
+        if len(results.objectives) in (2, 3):
+            _write_attainment(folder, name, results)
+    write_json(folder.root / SUMMARY, campaign_summary(results, reference, static, entries))
+
+
+def _store_selected(
+    folder: CampaignFolder, path: Path, replica: tuple[str, int], selected: Selected | None
+) -> str | None:
+    """Write a selected trajectory; returns its path in the folder, None where there is none."""
+    if selected is None:
+        return None
+    with storing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    provenance = {
+        "algorithm": replica[0],
+        "replica": replica[1],
+        "row": selected.row,
+        "settings": folder.settings.effective(),
+    }
+    write_trajectory(path, folder.workcell, selected.x, selected.figures, provenance)
+    return path.relative_to(folder.root).as_posix()
+
+
+def _write_points(
+    folder: CampaignFolder, name: str, objectives: Sequence[str], points: Array
+) -> None:
+    lines = [",".join(objectives), *(",".join(map(repr, row)) for row in points.tolist())]
+    path = reference_front_file(folder.root).with_name(f"{name}.csv")
+    write_atomically(path, ("\n".join(lines) + "\n").encode())
+
+
+def _write_attainment(folder: CampaignFolder, name: str, results: CampaignResults) -> None:
+    surfaces = attainment_surfaces([replica.front for replica in results.of(name)], PERCENTILES)
+    lines = [",".join(["percentile", *results.objectives])]
+    lines += [
+        ",".join([f"{surface.percentile:g}", *map(repr, row)])
+        for surface in surfaces
+        for row in surface.points.tolist()
+    ]
+    path = folder.root / FRONTS / f"{name}-attainment.csv"
+    write_atomically(path, ("\n".join(lines) + "\n").encode())
