@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from hybrid_opt.timing import (
     report_timing,
 )
 from hybrid_opt.trajectory_file import read_trajectory
+from studies.children import in_children
 from studies.timing_text import timing_json, timing_text, timings
 from symbolic.workcell import Array, Workcell
 
@@ -105,17 +107,17 @@ def _run(folder: CampaignFolder, progress: Progress, force_limit: float | None) 
     model = TimingModel(folder.workcell)
     selected = folder.root / SELECTED
     files = sorted(path.relative_to(selected) for path in selected.rglob("*.json"))
-    with progress.stage(TIMING, 1 + len(files), "trajectories") as advance:
-        initial = folder.workcell.task.initial.reshape(-1)
-        _store(folder, Path(INITIAL), timed_trajectory(model, initial, force_limit))
-        advance(1)
-        for file in files:
-            x = read_trajectory(selected / file).x
-            _store(folder, file, timed_trajectory(model, x, force_limit))
-            advance(1)
+    found = {Path(INITIAL): folder.workcell.task.initial.reshape(-1)}
+    found |= {file: read_trajectory(selected / file).x for file in files}
+    calls = [partial(_store, folder, file, model, x, force_limit) for file, x in found.items()]
+    with progress.stage(TIMING, len(calls), "trajectories") as advance:
+        in_children(calls, folder.execution.jobs, lambda: advance(1))
 
 
-def _store(folder: CampaignFolder, file: Path, timed: TimedTrajectory) -> None:
+def _store(
+    folder: CampaignFolder, file: Path, model: TimingModel, x: Array, force_limit: float | None
+) -> None:
+    timed = timed_trajectory(model, x, force_limit)
     path = folder.root / TIMING / file
     with storing(path):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from hybrid_opt.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.results import CampaignResults, Replica, read_campaign, read_summary
 from hybrid_opt.robustness import payload_sensitivity
 from hybrid_opt.timing import TimingModel
-from studies.report.children import in_children
+from studies.children import in_children
 from studies.report.reach import reach_map
 from studies.report.records import (
     AlgorithmRuns,

@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 
-from studies.report.children import in_children
+from studies.children import in_children
 from symbolic.errors import DualArmError, ReportError, WorkerError
 
 JOBS = 3

@@ -1,7 +1,7 @@
 """Independent work in forked children, which inherit all that they need and send back results.
 
-Forking suits a report: its data is large, its libraries are loaded, and it lasts for seconds.
-Nothing that a report calls needs a thread that was started before the fork.
+Forking suits what follows a search: data is large, libraries and compiled functions are loaded,
+and it lasts for seconds. Nothing that is called may need a thread that was started before the fork.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def in_children(
             child.end()
     if len(results) < len(calls):
         raise WorkerError(
-            "a process that made the report died (killed from outside, or out of memory?); repeat "
-            "it with `python -m studies.report`"
+            "a worker process died (killed from outside, or out of memory?); what was computed is "
+            "kept: continue with --resume, perhaps with fewer --jobs"
         )
     return [results[index] for index in range(len(calls))]
 
@@ -84,7 +84,7 @@ class _Child:
         fork = multiprocessing.get_context("fork")
         self.connection, theirs = fork.Pipe(duplex=False)
         self._process: ForkProcess = fork.Process(
-            target=_serve, args=(calls, tickets, theirs), name="report", daemon=True
+            target=_serve, args=(calls, tickets, theirs), name="study worker", daemon=True
         )
         # Ctrl-C reaches the whole group, but the parent alone decides what it means. The mask is
         # inherited, so that it holds from the child's first moment.
