@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.robustness import KILOGRAM_FORCE
 from studies.report.records import Carry, ReportData
@@ -74,9 +75,11 @@ def joint_torques(data: ReportData) -> Figure:
     for row, (text, own) in enumerate((("contact wrench alone", False), ("with the arm", True))):
         for i, robot in enumerate(data.workcell.robots):
             axes = panels[row, i]
+            most = np.zeros(6)
             for carry, look in styled(data):
                 torque = carry.timed.torque if own else carry.timed.contact_torque
                 use = torque_use(limit, torque)[6 * i : 6 * i + 6]
+                most = np.maximum(most, use)
                 axes.plot(
                     angles,
                     [*use, use[0]],
@@ -88,13 +91,21 @@ def joint_torques(data: ReportData) -> Figure:
                 )
             axes.set_xticks(angles[:-1], [f"joint {j + 1}" for j in range(6)])
             axes.tick_params(axis="x", pad=4)
-            axes.set_rlabel_position(30.0)
-            axes.yaxis.set_major_formatter(lambda value, _: f"{value:g} %")
+            _label_rings(axes, most)
             letter = "abcd"[2 * row + i]
             axes.set_title(f"({letter}) {shortened(robot.name)!r}: {text} [% of maximum]", pad=12)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
     return figure
+
+
+def _label_rings(axes: Axes, most: Array) -> None:
+    """Round values on the rings, written between the two neighbouring joints that leave most
+    room: most (6,) is the largest use of each [%]."""
+    rings = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(0.0, 1.02 * float(most.max()))
+    axes.set_ylim(0.0, rings[-1])
+    axes.set_yticks(rings[1:-1], [f"{ring:g} %" for ring in rings[1:-1]], va="center", ha="center")
+    axes.set_rlabel_position(30.0 + 60.0 * int(np.argmin(most + np.roll(most, -1))))  # type: ignore[attr-defined]
 
 
 def pressure_shift(data: ReportData) -> Figure:

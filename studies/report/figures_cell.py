@@ -31,29 +31,42 @@ from symbolic.workcell import Array
 _PLAN = View(np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), "y [m]", "x [m]", mirrored=True)
 """From above, the front below."""
 
+HATCHES = ("////", "\\\\\\\\")
+"""Of the regions that the pads reach."""
+
 SHARES = (0.0, 0.33, 0.66, 1.0)
 """Of a carry's duration, as in the paper's Figures 14 and 15."""
 
 
 def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> Figure:
     """Both arms' reach, the common region and the restricted workspace (paper Figure 4)."""
-    figure = new_figure(FULL_WIDTH, 0.52 * FULL_WIDTH)
-    left, right = figure.subplots(1, 2)
+    figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
+    corners = box_corners(*_reach_bounds(reach))
+    left, right = figure.subplots(1, 2, width_ratios=[aspect(v, corners) for v in (FRONT, SIDE)])
     middle = _bounds_of_waypoints(geometry).mean(axis=0)
     for axes, view, across, letter, text in (
-        (left, FRONT, 0, "a", f"front view, slice at x = {middle[0]:.2f} m"),
-        (right, SIDE, 1, "b", f"side view, slice at y = {middle[1]:.2f} m"),
+        (left, FRONT, 0, "a", f"front view, slice at x = {_metres(middle[0])}"),
+        (right, SIDE, 1, "b", f"side view, slice at y = {_metres(middle[1])}"),
     ):
         _draw_reach(axes, reach, view, across, float(middle[across]))
         draw_cell(axes, geometry, _fixed_faces(geometry), view, *_start(carry), hidden=("box",))
         for lower, upper in _free_bounds(geometry):
             draw_box_edges(axes, view, lower, upper, colors="#b00020", linewidths=0.9)
         panel_label(axes, letter, text)
-        frame_axes(axes, view, box_corners(*_reach_bounds(reach)), margin=0.0)
+        frame_axes(axes, view, corners, margin=0.0)
     names = [shortened(robot.name) for robot in geometry.workcell.robots]
     handles = [
-        Patch(facecolor=ARMS[0], alpha=0.35, hatch="////", label=f"pad of {names[0]} reaches"),
-        Patch(facecolor=ARMS[1], alpha=0.35, hatch="\\\\\\\\", label=f"pad of {names[1]} reaches"),
+        *(
+            Patch(
+                facecolor=colour,
+                edgecolor=colour,
+                linewidth=0.0,
+                alpha=0.35,
+                hatch=hatch,
+                label=f"pad of {name} reaches",
+            )
+            for name, colour, hatch in zip(names, ARMS, HATCHES, strict=True)
+        ),
         Patch(facecolor="#2a8f4d", alpha=0.55, label="common region of the box centre"),
         Line2D([], [], color="#b00020", linewidth=0.9, label="bounds of the free waypoints"),
     ]
@@ -63,7 +76,7 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> 
 
 def environment(geometry: CellGeometry, carry: Carry) -> Figure:
     """The cell with the payload at its start: front, side and oblique (paper Figure 5)."""
-    figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
+    figure = new_figure(FULL_WIDTH, 0.34 * FULL_WIDTH)
     solids = cell_solids(geometry)
     faces = cut_faces(solids)
     pose, q = _start(carry)
@@ -91,13 +104,13 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> Figu
     panel_label(left, "a", f"arm {shortened(robot.name)!r} at the start")
     base = robot.T_world_base[:3, 3]
     index = int((base[0] - reach.lower[0]) / reach.step)
-    _fill(right, reach, reach.pads[0][index], (1, 2), FRONT, ARMS[0], "////", 0.35)
+    _fill(right, reach, reach.pads[0][index], (1, 2), FRONT, ARMS[0], HATCHES[0], 0.35)
     draw_cell(right, geometry, cut_faces(arm), FRONT, pose, q)
     bounds = _reach_bounds(reach)
     occupied = np.flatnonzero(reach.pads[0].any(axis=(0, 2)))
     bounds[:, 1] = reach.lower[1] + reach.step * np.array([occupied[0] - 1, occupied[-1] + 2])
     frame_axes(right, FRONT, box_corners(*bounds), margin=0.0)
-    panel_label(right, "b", f"reach of its pad, slice at x = {base[0]:.2f} m")
+    panel_label(right, "b", f"reach of its pad, slice at x = {_metres(base[0])}")
     return figure
 
 
@@ -166,6 +179,10 @@ def sample_at(carry: Carry, shares: Array) -> list[int]:
     return [int(np.argmin(np.abs(carry.timed.time - moment))) for moment in moments]
 
 
+def _metres(value: float) -> str:
+    return f"{value:.2f} m".replace("-", "\N{MINUS SIGN}")
+
+
 def _start(carry: Carry) -> tuple[Array, Array]:
     return carry.timed.pose[0], carry.timed.q[0]
 
@@ -200,11 +217,10 @@ def _draw_reach(axes: Axes, reach: ReachMap, view: View, across: int, at: float)
     kept = tuple(a for a in range(3) if a != across)
     layers = [(reach.common, "#2a8f4d", "", 0.55)]
     if across == 0:
-        hatches = ("////", "\\\\\\\\")
         layers = [
             *(
                 (pads, colour, hatch, 0.35)
-                for pads, colour, hatch in zip(reach.pads, ARMS, hatches, strict=True)
+                for pads, colour, hatch in zip(reach.pads, ARMS, HATCHES, strict=True)
             ),
             *layers,
         ]

@@ -7,12 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.attainment import attainment_surfaces
 from hybrid_opt.metrics import front_of
 from studies.report.records import AlgorithmRuns, ReportData
 from studies.report.style import FULL_WIDTH, new_figure, panel_label, series
 from symbolic.workcell import Array
+
+QUARTILES = (25.0, 75.0)
+"""Attainment surfaces beside the median, in percent of the replicas."""
 
 
 def fronts(data: ReportData) -> Figure:
@@ -81,8 +85,8 @@ def attainment(data: ReportData) -> Figure:
             look = series(k)
             if not found:
                 continue
-            for surface in attainment_surfaces(found, (25.0, 50.0, 75.0)):
-                median = surface.percentile == 50.0
+            for surface in attainment_surfaces(found, (*QUARTILES, 50.0)):
+                median = surface.percentile not in QUARTILES
                 axes.step(
                     surface.points[:, 0],
                     surface.points[:, 1],
@@ -90,8 +94,7 @@ def attainment(data: ReportData) -> Figure:
                     color=look.colour,
                     linestyle=look.line if median else (0, (1, 1)),
                     linewidth=1.6 if median else 0.8,
-                    label=f"{algorithm.title}: "
-                    + ("median" if median else f"{surface.percentile:.0f} % of replicas"),
+                    label=_attained(algorithm.title, surface.percentile),
                 )
         _static_point(axes, data)
         _label_objectives(axes, data)
@@ -100,6 +103,14 @@ def attainment(data: ReportData) -> Figure:
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
     return figure
+
+
+def _attained(title: str, percentile: float) -> str:
+    """Legend of a surface; both quartiles look alike and share one entry."""
+    if percentile not in QUARTILES:
+        return f"{title}: median"
+    shares = " and ".join(f"{share:.0f} %" for share in QUARTILES)
+    return f"{title}: {shares} of the replicas" if percentile == QUARTILES[0] else "_"
 
 
 def polish(data: ReportData) -> Figure:
@@ -160,6 +171,8 @@ def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns], figure: str) -> Non
 def _label_objectives(axes: Axes, data: ReportData) -> None:
     axes.set_xlabel(f"{data.objective_titles[0]} [-]")
     axes.set_ylabel(f"{data.objective_titles[1]} [-]")
+    # Fronts span little, so that labels are long; steps of 2.5 would make them longer.
+    axes.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
 
 
 def _static_point(axes: Axes, data: ReportData) -> None:

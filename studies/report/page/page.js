@@ -72,8 +72,8 @@
       marker: { color: "rgba(0,0,0,0)", size: 18, line: { color: "#b00020", width: 2.5 } } });
     const narrow = $("front-plot").clientWidth < 600;
     const layout = { font: FONT, hovermode: "closest",
-      margin: { l: 70, r: 15, t: 30, b: narrow ? 170 : 100 },
-      xaxis: { title: { text: plain(data.objectiveTitles[0]) + " [-]" }, range: data.ranges[0] },
+      margin: { l: 70, r: 15, t: 30, b: narrow ? 190 : 100 },
+      xaxis: { title: { text: plain(data.objectiveTitles[0]) + " [-]", standoff: 8 }, range: data.ranges[0] },
       yaxis: { title: { text: plain(data.objectiveTitles[1]) + " [-]" }, range: data.ranges[1] },
       legend: { orientation: "h", yref: "container", y: 0.01, yanchor: "bottom",
         font: { size: 11 } } };
@@ -108,6 +108,13 @@
       line: { color: "#b00020", width: 1 } };
   }
 
+  /* The direction [degrees] between the two neighbouring joints that leave most room. */
+  function freeDirection(use) {
+    const most = [0, 1, 2, 3, 4, 5].map((j) => Math.max(use[j], use[j + 6]));
+    const taken = most.map((value, j) => value + most[(j + 1) % 6]);
+    return 30 + 60 * taken.indexOf(Math.min(...taken));
+  }
+
   function drawTorque(carry) {
     const joints = [1, 2, 3, 4, 5, 6, 1].map((j) => "joint " + j);
     const traces = data.robots.map((robot, i) => {
@@ -118,8 +125,8 @@
     });
     const layout = { font: FONT, margin: { l: 50, r: 50, t: 40, b: 30 },
       title: { text: "torque of the contact wrench [% of maximum]", font: { size: 12 } },
-      polar: { radialaxis: { rangemode: "tozero", ticksuffix: " %", angle: 30, nticks: 5,
-        tickfont: { size: 10 } } },
+      polar: { radialaxis: { rangemode: "tozero", ticksuffix: " %", nticks: 5,
+        angle: freeDirection(carry.torqueUse), tickfont: { size: 10 } } },
       legend: { orientation: "h", y: -0.08, font: { size: 10 } } };
     Plotly.react("torque-plot", traces, layout, PLAIN);
   }
