@@ -6,6 +6,7 @@ and it lasts for seconds. Nothing that is called may need a thread that was star
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -103,6 +104,8 @@ class _Child:
 
 def _serve(calls: Sequence[Callable[[], Any]], tickets: int, connection: Connection) -> None:
     """A child's life: ends when no call is left, or nobody listens any more."""
+    # What was inherited stays: looking through it again would take time and copy its memory.
+    gc.freeze()
     while ticket := os.read(tickets, _TICKET):
         index = int.from_bytes(ticket)
         try:

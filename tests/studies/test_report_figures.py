@@ -17,8 +17,9 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from studies.report.figures import ReportFigure, report_figures
-from studies.report.records import ReportData
+from studies.report.records import ReportData, Run
 from studies.report.style import ARMS, INITIAL, SERIES, in_style, save
+from symbolic.workcell import Array
 
 NAMES = (
     "fig04_reachable_regions",
@@ -141,21 +142,54 @@ def test_no_titles_or_labels_overlap(
             assert not box_of(text).overlaps(legend), f"{text.get_text()!r} is under the legend"
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_tick_labels_do_not_overlap(
-    name: str, drawn: dict[str, tuple[ReportFigure, Figure]]
-) -> None:
-    _, figure = drawn[name]
+def overlapping_ticks(figure: Figure) -> list[tuple[str, str]]:
+    """Tick labels of the same axis that cover one another."""
     shown = set(visible_texts(figure))
+    found = []
     for axes in figure.findobj(Axes):
         if axes.name != "rectilinear" or not axes.axison:
             continue
         for labels in (axes.get_xticklabels(), axes.get_yticklabels()):
-            boxes = [box_of(label) for label in labels if label in shown]
             if labels and labels[0].get_rotation():
                 continue
-            for first, second in combinations(boxes, 2):
-                assert not first.overlaps(second)
+            boxes = [(label.get_text(), box_of(label)) for label in labels if label in shown]
+            found += [
+                (first[0], second[0])
+                for first, second in combinations(boxes, 2)
+                if first[1].overlaps(second[1])
+            ]
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_tick_labels_do_not_overlap(
+    name: str, drawn: dict[str, tuple[ReportFigure, Figure]]
+) -> None:
+    assert overlapping_ticks(drawn[name][1]) == []
+
+
+@pytest.mark.parametrize("span", [0.0012, 0.006, 0.0175, 0.03])
+def test_tick_labels_of_narrow_fronts_do_not_overlap(hybrid_data: ReportData, span: float) -> None:
+    def squeezed(points: Array) -> Array:
+        return np.asarray(0.4125 + span * (points - points.min()) / np.ptp(points))
+
+    def moved(run: Run) -> Run:
+        assert run.hybrid is not None
+        front = replace(run.front, objectives=squeezed(run.front.objectives))
+        return replace(
+            run, front=front, hybrid=replace(run.hybrid, objectives=squeezed(run.hybrid.objectives))
+        )
+
+    algorithms = tuple(
+        replace(algorithm, runs=tuple(moved(run) for run in algorithm.runs))
+        for algorithm in hybrid_data.algorithms
+    )
+    shown = replace(hybrid_data, algorithms=algorithms, static=np.full(2, np.nan))
+    for entry in report_figures(shown):
+        if entry.name in ("fig07_fronts", "attainment", "polish"):
+            figure = entry.draw()
+            FigureCanvasAgg(figure).draw()  # type: ignore[no-untyped-call]
+            assert overlapping_ticks(figure) == []
 
 
 @pytest.mark.parametrize("name", NAMES)
