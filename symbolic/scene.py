@@ -85,13 +85,28 @@ class Scene:
             gaps.append(self._gap(self._along(i, j, self._between)[:1]))
         return self.soft.maximum_below(gaps)
 
+    def separable(self, i: int, j: int) -> bool:
+        """Whether bodies i and j (i < j) are the payload and an obstacle of one box."""
+        first, second = self.geometry.bodies[i], self.geometry.bodies[j]
+        return (
+            first.group == "payload"
+            and second.group == "environment"
+            and len(second.pieces) == 1
+            and isinstance(second.pieces[0].shape, Box)
+        )
+
+    def separations(self, i: int, j: int) -> list[ca.SX]:
+        """The gaps between a `separable` pair along single directions; `bound` is the largest."""
+        body, obstacle = self.geometry.bodies[i], self.geometry.bodies[j]
+        (piece,) = obstacle.pieces
+        return _gaps(self._obstacle_intervals(i, body, piece))
+
     def _along(self, i: int, j: int, axes: _Axes) -> list[tuple[Interval, Interval]]:
         return list(zip(self._interval(i, axes), self._interval(j, axes), strict=True))
 
     def _gap(self, pairs: Sequence[tuple[Interval, Interval]]) -> ca.SX:
         """Largest separation over directions, given both bodies' intervals."""
-        gaps = [gap for a, b in pairs for gap in (a[0] - b[1], b[0] - a[1])]
-        return self.soft.maximum_below(gaps)
+        return self.soft.maximum_below(_gaps(pairs))
 
     def _interval(self, index: int, axes: _Axes) -> list[Interval]:
         """Per direction the extent of a body."""
@@ -202,6 +217,15 @@ class Scene:
 
     def _obstacle(self, index: int, body: CollisionBody, piece: Piece) -> ca.SX:
         """A moving body against one fixed piece."""
+        gaps = [self._gap(self._obstacle_intervals(index, body, piece))]
+        if isinstance(piece.shape, Cylinder | Sphere | Capsule):
+            gaps.append(self._round_bound(index, piece))
+        return self.soft.maximum_below(gaps)
+
+    def _obstacle_intervals(
+        self, index: int, body: CollisionBody, piece: Piece
+    ) -> list[tuple[Interval, Interval]]:
+        """Extents of a moving body and of a fixed piece along the directions that matter."""
         axes = self._axes_of(piece)
         fixed = _fixed_intervals(piece, np.array(ca.DM(axes.A)))
         pairs = list(zip(self._interval(index, axes), fixed, strict=True))
@@ -210,10 +234,7 @@ class Scene:
             cover = slab_cover(CollisionBody("", "environment", Frame("world"), (piece,)))[0]
             still = self._piece_interval(own.A, ca.SX.zeros(3), cover)
             pairs += list(zip(self._interval(index, own), still, strict=True))
-        gaps = [self._gap(pairs)]
-        if isinstance(piece.shape, Cylinder | Sphere | Capsule):
-            gaps.append(self._round_bound(index, piece))
-        return self.soft.maximum_below(gaps)
+        return pairs
 
     def _axes_of(self, piece: Piece) -> _Axes:
         """A fixed box's own axes; the world's where they agree or the piece is no box."""
@@ -239,6 +260,11 @@ class Scene:
             axial = self.soft.absolute_below(local[2]) - shape.length / 2.0 - cap
             bounds.append(self.soft.maximum_below([radial, axial]))
         return self.soft.minimum_below(bounds) - radius
+
+
+def _gaps(pairs: Sequence[tuple[Interval, Interval]]) -> list[ca.SX]:
+    """Gaps between two intervals, either one below the other, for all given pairs of them."""
+    return [gap for a, b in pairs for gap in (a[0] - b[1], b[0] - a[1])]
 
 
 def world_placements(

@@ -1,8 +1,9 @@
-"""The payload's part of the smooth problem: forces at every sample with exact derivatives.
+"""The payload's part of the smooth problem: what samples ask, with exact derivatives.
 
 All normal forces are the largest of functions that are linear in the normal component F_n and
 the tangential magnitude F_t of the required force (`contact_forces.normal_force_branches`), so
-that these two, and not the kinked forces, are differentiated.
+that these two, and not the kinked forces, are differentiated. How much of each patch the shift of
+the centre of pressure leaves is differentiated as it is: its kinks are those of the forces.
 
 With the constant-speed law the motion at a sample depends on a window of five neighbouring
 samples alone (two finite differences). One small function serves all inner samples, its window's
@@ -12,6 +13,7 @@ differences, have one function per end. Any other time law is differentiated as 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import casadi as ca
@@ -20,7 +22,7 @@ from numpy.typing import NDArray
 
 from symbolic.contact_forces import split_force
 from symbolic.path import PathBasis, sample_basis, waypoint_matrix
-from symbolic.payload_load import resultant_force
+from symbolic.payload_load import LOAD_OUTPUTS, load_function, resultant_force
 from symbolic.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.time_law import timed_path
 from symbolic.workcell import Array, Task, Workcell
@@ -30,11 +32,11 @@ WINDOW = 5
 
 
 @dataclass(frozen=True)
-class ForceBlock:
+class SampleBlock:
     """Samples that share one function.
 
     Attributes:
-        name: prefix of its functions' names, see `force_functions`.
+        name: part of its functions' names, see `force_functions`.
         samples: (calls, k) the k samples that each call serves.
         basis: (calls, width, n_waypoints) basis rows of each call's window.
     """
@@ -44,42 +46,70 @@ class ForceBlock:
     basis: Array
 
 
-def force_blocks(task: Task) -> tuple[ForceBlock, ...]:
-    """How the task's samples are divided among functions."""
+def sample_blocks(task: Task, wanted: Collection[int] | None = None) -> tuple[SampleBlock, ...]:
+    """How the task's samples are divided among functions.
+
+    Args:
+        wanted: samples without which a call is left out; None for all.
+    """
     n, position = task.samples, sample_basis(task).position
     if task.time_law != "constant":
-        return (ForceBlock("force_path", np.arange(n)[None, :], position[None]),)
-    inner = np.arange(2, n - 2)
-    windows = np.array([position[k - 2 : k + 3] for k in inner])
-    return (
-        ForceBlock("force_inner", inner[:, None], windows),
-        ForceBlock("force_first", np.array([[0, 1]]), position[None, :WINDOW]),
-        ForceBlock("force_last", np.array([[n - 2, n - 1]]), position[None, -WINDOW:]),
+        every = [SampleBlock("path", np.arange(n)[None, :], position[None])]
+    else:
+        inner = np.arange(2, n - 2)
+        windows = np.array([position[k - 2 : k + 3] for k in inner])
+        every = [
+            SampleBlock("inner", inner[:, None], windows),
+            SampleBlock("first", np.array([[0, 1]]), position[None, :WINDOW]),
+            SampleBlock("last", np.array([[n - 2, n - 1]]), position[None, -WINDOW:]),
+        ]
+    if wanted is None:
+        return tuple(every)
+    chosen = [np.isin(block.samples, list(wanted)).any(axis=1) for block in every]
+    return tuple(
+        SampleBlock(block.name, block.samples[calls], block.basis[calls])
+        for block, calls in zip(every, chosen, strict=True)
+        if calls.any()
     )
 
 
 def force_functions(workcell: Workcell) -> dict[str, ca.Function]:
-    """Values and derivatives of F_n and F_t [N] of every block of `force_blocks`, by name.
+    """Values and derivatives of F_n and F_t [N] of every block of `sample_blocks`, by name.
 
     For a block that serves k samples, with x (n_var,) and basis (width, n_waypoints) of the
     window, the last without effect where the block is the whole path:
 
-    NAME_value: x, basis -> split (2 k,) = F_n, F_t of the first sample, of the second, ...
-    NAME_gradient: x, basis -> gradient (n_var, 2 k), one column for each entry of split.
-    NAME_hessian: x, basis, weight (2 k,) -> hessian (n_var, n_var) of weight . split.
+    force_NAME_value: x, basis -> (2 k,) = F_n, F_t of the first sample, of the second, ...
+    force_NAME_gradient: x, basis -> (n_var, 2 k), one column for each entry of the value.
+    force_NAME_hessian: x, basis, weight (2 k,) -> (n_var, n_var) of weight . value.
     """
-    task = workcell.task
-    if task.time_law != "constant":
-        return _whole_path(workcell)
-    columns = {"force_inner": (2,), "force_first": (0, 1), "force_last": (3, 4)}
+    return _sample_functions(workcell, "force", _split_function(workcell))
+
+
+def pressure_functions(workcell: Workcell) -> dict[str, ca.Function]:
+    """Values and derivatives of what the shifts of the centres of pressure leave of the patches.
+
+    As `force_functions`, with names that begin with `pressure` and 1 - (shift / patch radius)^2 of
+    contacts 1 and 2 in place of F_n and F_t.
+    """
+    return _sample_functions(workcell, "pressure", _margin_function(workcell))
+
+
+def _sample_functions(
+    workcell: Workcell, quantity: str, sample: ca.Function
+) -> dict[str, ca.Function]:
+    """The functions of all blocks for a function of pose, rate and second_rate of one sample."""
+    if workcell.task.time_law != "constant":
+        return _whole_path(workcell, quantity, sample)
+    columns = {"inner": (2,), "first": (0, 1), "last": (3, 4)}
     functions: dict[str, ca.Function] = {}
     for name, chosen in columns.items():
-        functions |= _window_functions(workcell, chosen, name)
+        functions |= _window_functions(workcell, sample, chosen, f"{quantity}_{name}")
     return functions
 
 
 def _window_functions(
-    workcell: Workcell, columns: tuple[int, ...], name: str
+    workcell: Workcell, sample: ca.Function, columns: tuple[int, ...], name: str
 ) -> dict[str, ca.Function]:
     task = workcell.task
     n_waypoints = len(task.waypoints)
@@ -88,32 +118,43 @@ def _window_functions(
     identity = np.eye(WINDOW)
     window = ca.mtimes(waypoint_matrix(task, x), basis)
     own = PathBasis(np.linspace(0.0, 1.0, WINDOW), identity, identity, identity)
-    split = _split(workcell, own, window, columns)
-    flat = ca.Function("split", [x, basis], [split]).expand()
+    values = _values(workcell, sample, own, window, columns)
+    flat = ca.Function("values", [x, basis], [values]).expand()
     inputs = [ca.SX.sym("x", task.n_var), ca.SX.sym("basis", n_waypoints, WINDOW)]
     return _derivatives(flat(*inputs), inputs, name)
 
 
-def _whole_path(workcell: Workcell) -> dict[str, ca.Function]:
+def _whole_path(workcell: Workcell, quantity: str, sample: ca.Function) -> dict[str, ca.Function]:
     task = workcell.task
     x, unused = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", len(task.waypoints), task.samples)
-    split = _split(
-        workcell, sample_basis(task), waypoint_matrix(task, x), tuple(range(task.samples))
-    )
-    return _derivatives(split, [x, unused], "force_path")
+    every = tuple(range(task.samples))
+    values = _values(workcell, sample, sample_basis(task), waypoint_matrix(task, x), every)
+    return _derivatives(values, [x, unused], f"{quantity}_path")
 
 
-def _split(
-    workcell: Workcell, basis: PathBasis, waypoints: ca.MX, columns: tuple[int, ...]
+def _values(
+    workcell: Workcell,
+    sample: ca.Function,
+    basis: PathBasis,
+    waypoints: ca.MX,
+    columns: tuple[int, ...],
 ) -> ca.MX:
-    """F_n and F_t (2 k,) at the chosen columns of the timed path."""
+    """A sample's two values (2 k,) at the chosen columns of the timed path."""
     path = timed_path(workcell.task, basis, waypoints)
-    sample = _sample_function(workcell).map(len(columns))
-    chosen = list(columns)
-    return ca.vec(sample(path.pose[:, chosen], path.rate[:, chosen], path.second_rate[:, chosen]))
+    at = list(columns)
+    each = sample.map(len(at))
+    return ca.vec(each(path.pose[:, at], path.rate[:, at], path.second_rate[:, at]))
 
 
-def _sample_function(workcell: Workcell) -> ca.Function:
+def _margin_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,) of a sample to 1 - (shift / patch radius)^2 (2,)."""
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    shift = load_function(workcell)(*motion)[LOAD_OUTPUTS.index("pressure_shift")]
+    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
+    return ca.Function("sample_margin", motion, [1.0 - (shift / radius) ** 2])
+
+
+def _split_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate (6,) of a sample to F_n, F_t (2,)."""
     pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
     rotation = rotation_matrix(pose[3:])
@@ -130,14 +171,14 @@ def _sample_function(workcell: Workcell) -> ca.Function:
 
 
 def _derivatives(
-    split: ca.SX | ca.MX, inputs: list[ca.SX | ca.MX], name: str
+    values: ca.SX | ca.MX, inputs: list[ca.SX | ca.MX], name: str
 ) -> dict[str, ca.Function]:
     x, basis = inputs
-    weight = type(x).sym("weight", split.shape[0])
-    hessian, _ = ca.hessian(ca.dot(weight, split), x)
+    weight = type(x).sym("weight", values.shape[0])
+    hessian, _ = ca.hessian(ca.dot(weight, values), x)
     outputs = {
-        "value": ([x, basis], ["x", "basis"], [split], ["split"]),
-        "gradient": ([x, basis], ["x", "basis"], [ca.jacobian(split, x).T], ["gradient"]),
+        "value": ([x, basis], ["x", "basis"], [values], ["values"]),
+        "gradient": ([x, basis], ["x", "basis"], [ca.jacobian(values, x).T], ["gradient"]),
         "hessian": ([x, basis, weight], ["x", "basis", "weight"], [hessian], ["hessian"]),
     }
     return {

@@ -22,7 +22,7 @@ class Carry:
     """A candidate on m places: the samples, and `PER_SAMPLE` - 1 places between any two.
 
     Attributes:
-        pose: (m, 6) box poses [m, rad].
+        pose, rate: (m, 6) box poses, and their change from place to place [m, rad].
         q: both arms' joint positions, (m, 6) each [rad]; beyond `reached` without meaning.
         reached: places before the first that an arm does not reach.
         stranded: the arms that do not reach all places.
@@ -30,9 +30,11 @@ class Carry:
         manipulability: (reached, 2) |det J| over its least value, between samples interpolated.
         split: (n, 2) on samples: normal component, tangential magnitude of the required force [N].
         peak: (2,) peak normal forces over their references.
+        shift: (n, 2) on samples: shifts of the centres of pressure over their patches' radii.
     """
 
     pose: Array
+    rate: Array
     q: tuple[Array, Array]
     reached: int
     stranded: tuple[int, ...]
@@ -40,6 +42,7 @@ class Carry:
     manipulability: Array
     split: Array
     peak: Array
+    shift: Array
 
     @property
     def is_followed(self) -> bool:
@@ -51,21 +54,25 @@ class CarryReader:
     """Evaluates candidates of one cell on places.
 
     Attributes:
-        basis: (m, n_waypoints) of all places: poses = basis @ waypoints.
+        basis, rate_basis: (m, n_waypoints) of all places: poses = basis @ waypoints, and their
+            change from place to place.
     """
 
     def __init__(self, evaluator: CandidateEvaluator) -> None:
         self._evaluator = evaluator
         task = evaluator.workcell.task
+        self._radii = [contact.patch_radius for contact in evaluator.workcell.contacts]
         self._samples = np.linspace(0.0, 1.0, task.samples)
         self._places = np.linspace(0.0, 1.0, (task.samples - 1) * PER_SAMPLE + 1)
-        self.basis = path_basis(len(task.waypoints), self._places).position
+        along = path_basis(len(task.waypoints), self._places)
+        self.basis, self.rate_basis = along.position, along.first / (len(self._places) - 1)
 
     def read(self, x: Array) -> Carry:
         """Evaluate a decision vector (n_var,)."""
         evaluator = self._evaluator
         found = {name: value[0] for name, value in evaluator.outputs(x[None]).items()}
-        pose = np.ascontiguousarray(self.basis @ waypoints_of(evaluator.workcell.task, x))
+        waypoints = waypoints_of(evaluator.workcell.task, x)
+        pose = np.ascontiguousarray(self.basis @ waypoints)
         guesses = [self._between(found[f"q_{arm}"]) for arm in (1, 2)]
         posture = evaluator.functions["posture"].batch(pose, *guesses)
         followed = np.column_stack(
@@ -85,6 +92,7 @@ class CarryReader:
         force = found["normal_force"]
         return Carry(
             pose=pose,
+            rate=self.rate_basis @ waypoints,
             q=q,
             reached=reached,
             stranded=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
@@ -94,6 +102,7 @@ class CarryReader:
                 [force[:, 0] - force[:, 1], found["tangential_force"].sum(axis=1)]
             ),
             peak=force.max(axis=0) / evaluator.workcell.task.reference_force,
+            shift=found["pressure_shift"] / self._radii,
         )
 
     def _between(self, values: Array) -> Array:

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
-from hybrid_opt import metrics
 from hybrid_opt.evaluation import FEASIBLE, REASONS, CandidateEvaluator
 from hybrid_opt.objectives import PAPER_OBJECTIVES
+from hybrid_opt.polish.archive import Archive
 from hybrid_opt.polish.functions import PolishFunctions, polish_functions
+from hybrid_opt.polish.plan import Attempt, aimed, points, widest_gap
 from hybrid_opt.polish.pool import Lost, SolverPool
 from hybrid_opt.polish.records import (
     UNKNOWN,
@@ -28,18 +29,8 @@ from hybrid_opt.polish.records import (
     Status,
 )
 from hybrid_opt.polish.solver import PolishSolver, Solution, SolveTask
-from hybrid_opt.polish.targets import (
-    Target,
-    balance,
-    epsilon_constraint,
-    extreme,
-    pascoletti_serafini,
-)
 from symbolic.errors import SettingsError
 from symbolic.workcell import Array
-
-LEAST_SPAN = 2e-3
-"""Least scale of an objective: of a front of one point, or one that is nearly flat."""
 
 TIMED_EVALUATIONS = 32
 """Candidates whose evaluation is timed, to express the polish in their unit."""
@@ -47,52 +38,16 @@ TIMED_EVALUATIONS = 32
 OPTIMAL_STATIONARITY = 1e-3
 """Residual below which a point that could not be improved counts as optimal."""
 
-LEAST_GAP = 0.02
-"""Gaps narrower than this are left, in units of the front's extent."""
+TURNS_PER_GAP = 3
+"""Turns at the ends and the middle before one at a gap: they decide hypervolume and payload."""
+
+PROGRESS = 2e-5
+"""Least gain of an attempt, in units of the reference force, that counts as coming further."""
+
+BALANCE_STALLS = 2
+"""Attempts in a row that came no further, after which the balanced middle is left."""
 
 NO_SOLUTION = Solution(np.empty(0), "", False, False, UNKNOWN, 0, 0, 0)
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    aim: Aim
-    parent: int
-    x: Array
-    start: Array
-    target: Target
-
-
-class _Archive:
-    """The points that stand so far: rows of the given front, and new ones."""
-
-    def __init__(self, x: Array, objectives: Array, parent: list[int]) -> None:
-        self.x, self.objectives = list(x), list(objectives)
-        self.parent, self.polished = list(parent), [False] * len(x)
-
-    def replace(self, parent: int, x: Array, objectives: Array) -> None:
-        index = self.parent.index(parent)
-        self.x[index], self.objectives[index], self.polished[index] = x, objectives, True
-
-    def dominates(self, objectives: Array) -> bool:
-        """Whether a point is as good in both objectives."""
-        return bool(np.any(np.all(np.array(self.objectives) <= objectives, axis=1)))
-
-    def add(self, x: Array, objectives: Array) -> None:
-        self.x.append(x)
-        self.objectives.append(objectives)
-        self.parent.append(-1)
-        self.polished.append(True)
-
-    def rows(self) -> list[int]:
-        """Indices of the non-dominated points by increasing first objective."""
-        values = np.array(self.objectives)
-        kept = np.flatnonzero(metrics.non_dominated(values))
-        return [int(k) for k in kept[np.lexsort(values[kept].T[::-1])]]
-
-    def span(self) -> Array:
-        """(2,) the scale of each objective."""
-        values = np.array(self.objectives)[self.rows()]
-        return np.asarray(np.maximum(np.ptp(values, axis=0), LEAST_SPAN))
 
 
 class FrontPolisher:
@@ -142,7 +97,7 @@ class FrontPolisher:
         unit = self._evaluation_seconds(x)
         found = self.evaluator.certified(self.evaluator.evaluate(x))
         feasible = np.flatnonzero(found.feasible)
-        archive = _Archive(x[feasible], found.objectives[feasible], feasible.tolist())
+        archive = Archive(x[feasible], found.objectives[feasible], feasible.tolist())
         run = _Run(self, archive, list(recorded), emit)
         if len(feasible) and self.settings.points:
             with SolverPool(self._solver, jobs, self.settings.max_seconds) as run.pool:
@@ -185,92 +140,50 @@ class _Run:
     def __init__(
         self,
         polisher: FrontPolisher,
-        archive: _Archive,
+        archive: Archive,
         recorded: list[PolishOutcome],
         emit: Callable[[PolishOutcome], None],
     ) -> None:
         self._evaluator, self._settings = polisher.evaluator, polisher.settings
         self._archive, self._recorded, self._emit = archive, recorded, emit
+        self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
         self.outcomes: list[PolishOutcome] = []
 
     def all(self, rng: np.random.Generator) -> None:
         """The front's points first; then ends, middle and gaps in turns, while attempts last."""
-        self._do(self._points())
+        self._do(points(self._archive, self._settings))
         while self._left() > 0:
-            self._do([self._aimed("extreme", objective, rng) for objective in (0, 1)])
-            self._do([self._aimed("balance", None, rng)])
-            self._do(self._gaps()[:1])
+            for _ in range(TURNS_PER_GAP):
+                self._turn("extreme", (0, 1), rng)
+                if self._stalls[None] < BALANCE_STALLS:
+                    self._turn("balance", (None,), rng)
+            self._do(self._gap())
+
+    def _turn(self, aim: Aim, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
+        """An attempt at each of some aims, and whether it came further."""
+        before = [self._archive.best(objective)[1] for objective in objectives]
+        stalls = [self._stalls[objective] for objective in objectives]
+        pairs = zip(objectives, stalls, strict=True)
+        self._do([aimed(self._archive, aim, *pair, rng) for pair in pairs])
+        for objective, value in zip(objectives, before, strict=True):
+            further = self._archive.best(objective)[1] < value - PROGRESS
+            self._stalls[objective] = 0 if further else self._stalls[objective] + 1
+
+    def _gap(self) -> list[Attempt]:
+        """An attempt in the widest gap that was not tried, none where all are narrow."""
+        tried = {outcome.start.tobytes() for outcome in self.outcomes if outcome.aim == "gap"}
+        found = widest_gap(self._archive, tried)
+        if found is None:
+            return []
+        attempt, beyond = found
+        half = (attempt.x + beyond) / 2.0
+        feasible = self._evaluator.evaluate(half).feasible[0]
+        return [replace(attempt, x=half) if feasible else attempt]
 
     def _left(self) -> int:
         return self._settings.points - len(self.outcomes)
 
-    def _points(self) -> list[_Attempt]:
-        """Evenly spread points of the front, the balanced one among them."""
-        archive, rows = self._archive, self._archive.rows()
-        count = min(len(rows), (self._settings.points + 2) // 3)
-        chosen = {rows[int(k)] for k in np.round(np.linspace(0, len(rows) - 1, count))}
-        middle = self._balanced()
-        if middle not in chosen and count > 2:
-            inner = sorted(chosen - {rows[0], rows[-1]}, key=rows.index)
-            chosen.remove(min(inner, key=lambda k: abs(rows.index(k) - rows.index(middle))))
-            chosen.add(middle)
-        span = archive.span()
-        attempts = []
-        for k in sorted(chosen, key=rows.index):
-            start = archive.objectives[k]
-            if self._settings.method == "epsilon":
-                objective = int(rows.index(k) >= len(rows) / 2.0)
-                target = epsilon_constraint(start, span, objective)
-            else:
-                target = pascoletti_serafini(start, span)
-            attempts.append(_Attempt("point", archive.parent[k], archive.x[k], start, target))
-        return attempts
-
-    def _aimed(self, aim: Aim, objective: int | None, rng: np.random.Generator) -> _Attempt:
-        """An attempt at an end of the front or at its balanced middle.
-
-        It goes on from the best point. Where the last attempt did not get further from there, it
-        starts from any point of the front: another region may lead further down.
-        """
-        archive, rows = self._archive, self._archive.rows()
-        wanted = np.ones(2) if objective is None else np.eye(2)[objective]
-        k = min(rows, key=lambda k: float(wanted @ archive.objectives[k]))
-        last = [o for o in self.outcomes if o.aim == aim][-1 if objective is None else -2 :]
-        if last and last[objective or 0].status != "accepted":
-            k = rows[int(rng.integers(len(rows)))]
-        start, span = archive.objectives[k], np.full(2, LEAST_SPAN)
-        target = balance(start, span) if objective is None else extreme(start, span, objective)
-        return _Attempt(aim, -1, archive.x[k], start, target)
-
-    def _balanced(self) -> int:
-        return min(self._archive.rows(), key=lambda k: float(np.sum(self._archive.objectives[k])))
-
-    def _gaps(self) -> list[_Attempt]:
-        """The widest gaps between neighbours, as many as attempts are left, at most all."""
-        archive, rows, span = self._archive, self._archive.rows(), self._archive.span()
-        values = np.array([archive.objectives[k] for k in rows]) / span
-        widths = np.linalg.norm(np.diff(values, axis=0), axis=1)
-        tried = {outcome.start.tobytes() for outcome in self.outcomes if outcome.aim == "gap"}
-        attempts: list[_Attempt] = []
-        for gap in np.argsort(-widths, kind="stable").tolist():
-            first, second = rows[gap], rows[gap + 1]
-            start = (archive.objectives[first] + archive.objectives[second]) / 2.0
-            if start.tobytes() in tried or widths[gap] <= LEAST_GAP:
-                continue
-            chord = np.abs(values[gap + 1] - values[gap])
-            normal = chord[::-1] / np.linalg.norm(chord)
-            target = pascoletti_serafini(start, span, normal)
-            attempts.append(_Attempt("gap", -1, self._between(first, second), start, target))
-            if len(attempts) >= max(1, self._left() // 2):
-                break
-        return attempts
-
-    def _between(self, first: int, second: int) -> Array:
-        """Half way between two decision vectors if that is feasible, otherwise the first."""
-        half: Array = (self._archive.x[first] + self._archive.x[second]) / 2.0
-        return half if self._evaluator.evaluate(half).feasible[0] else self._archive.x[first]
-
-    def _do(self, attempts: list[_Attempt]) -> None:
+    def _do(self, attempts: list[Attempt]) -> None:
         """Solve, judge and take in attempts; those on record are not solved again."""
         attempts = attempts[: max(0, self._left())]
         known = self._recorded[: len(attempts)]
@@ -279,14 +192,14 @@ class _Run:
             self._take(attempt, outcome)
         fresh = attempts[len(known) :]
         begin = time.perf_counter()
-        answers = self.pool.solve([SolveTask(a.x, a.target) for a in fresh])
+        answers = self.pool.solve([SolveTask(a.x, a.target, a.radius) for a in fresh])
         each = (time.perf_counter() - begin) / max(1, len(fresh))
         for attempt, answer in zip(fresh, answers, strict=True):
             outcome = self._judged(attempt, answer, each)
             self._take(attempt, outcome)
             self._emit(outcome)
 
-    def _take(self, attempt: _Attempt, outcome: PolishOutcome) -> None:
+    def _take(self, attempt: Attempt, outcome: PolishOutcome) -> None:
         self.outcomes.append(outcome)
         if outcome.status != "accepted":
             return
@@ -295,7 +208,7 @@ class _Run:
         else:
             self._archive.add(outcome.x, outcome.objectives)
 
-    def _judged(self, attempt: _Attempt, answer: Solution | Lost, solving: float) -> PolishOutcome:
+    def _judged(self, attempt: Attempt, answer: Solution | Lost, solving: float) -> PolishOutcome:
         begin = time.perf_counter()
         status, reason, objectives = self._verdict(attempt, answer)
         told = answer if isinstance(answer, Solution) else NO_SOLUTION
@@ -314,7 +227,7 @@ class _Run:
             seconds=solving + time.perf_counter() - begin,
         )
 
-    def _verdict(self, attempt: _Attempt, answer: Solution | Lost) -> tuple[Status, str, Array]:
+    def _verdict(self, attempt: Attempt, answer: Solution | Lost) -> tuple[Status, str, Array]:
         if isinstance(answer, Lost):
             return "failed", answer.reason, attempt.start
         if not answer.usable:
@@ -336,7 +249,7 @@ class _Run:
             return "rejected", "dominated", attempt.start
         return "accepted", "", objectives
 
-    def _not_improved(self, answer: Solution, attempt: _Attempt) -> tuple[Status, str, Array]:
+    def _not_improved(self, answer: Solution, attempt: Attempt) -> tuple[Status, str, Array]:
         if answer.converged or answer.residuals.stationarity <= OPTIMAL_STATIONARITY:
             return "optimal", "not improved", attempt.start
         return "failed", f"not improved: {answer.message}", attempt.start

@@ -14,12 +14,15 @@ from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from codegen.workcell_functions import workcell_key
 from symbolic.cell_model import build_cell_model
-from symbolic.smooth_forces import force_functions
+from symbolic.smooth_forces import force_functions, pressure_functions
 from symbolic.smooth_rows import RowFunctions, solve_function
 from symbolic.workcell import Workcell
 
 _LEVELS = {
     "force_inner_hessian": 1,
+    "pressure_inner_hessian": 0,
+    "pressure_first_hessian": 0,
+    "pressure_last_hessian": 0,
     "force_first_hessian": 0,
     "force_last_hessian": 0,
     "hessian_singularity_0_1": 0,
@@ -36,13 +39,13 @@ class PolishFunctions:
     """What the smooth problems of a workcell are assembled from.
 
     Attributes:
-        forces: see `symbolic.smooth_forces.force_functions`.
+        samples: see `symbolic.smooth_forces`: of forces and pressure.
         solve: inverse kinematics of both arms, see `symbolic.smooth_rows.solve_function`.
         joints: the same two, for NumPy.
         rows: makes the constraints at places of the path.
     """
 
-    forces: Mapping[str, ca.Function]
+    samples: Mapping[str, ca.Function]
     solve: tuple[ca.Function, ca.Function]
     joints: tuple[NumericFunction, NumericFunction]
     rows: RowFunctions
@@ -60,7 +63,8 @@ def polish_functions(workcell: Workcell) -> PolishFunctions:
 
     def make() -> Mapping[str, ca.Function]:
         solve = {f"solve_{arm + 1}": solve_function(model, arm) for arm in (0, 1)}
-        return {**force_functions(workcell), **solve, **RowFunctions(model).frequent()}
+        samples = {**force_functions(workcell), **pressure_functions(workcell)}
+        return {**samples, **solve, **RowFunctions(model).frequent()}
 
     if workcell.digest:
         key = digest("polish", str(_LEVELS), workcell_key(workcell))
@@ -69,7 +73,7 @@ def polish_functions(workcell: Workcell) -> PolishFunctions:
         compiled = build(make(), levels=_LEVELS).functions
     usable = {name: as_casadi(function) for name, function in compiled.items()}
     return PolishFunctions(
-        forces={name: f for name, f in usable.items() if name.startswith("force")},
+        samples={name: f for name, f in usable.items() if name.startswith(("force", "pressure"))},
         solve=(usable["solve_1"], usable["solve_2"]),
         joints=(compiled["solve_1"], compiled["solve_2"]),
         rows=RowFunctions(model, usable),

@@ -35,6 +35,54 @@ IPOPT: dict[str, Any] = {
 }
 
 
+FEASIBLE = 1e-3
+"""Violation, in the program's scaled constraints, at which an iterate counts as feasible."""
+
+PATIENCE = 3
+"""Times the wanted number of iterations that IPOPT may take to become feasible."""
+
+
+class _Stop(ca.Callback):  # type: ignore[misc]  # CasADi has no types
+    """Ends a solve after the wanted number of iterations, as soon as an iterate is feasible.
+
+    A solve that is cut off wherever it stands ends in an obstacle more often than not.
+    """
+
+    def __init__(self, problem: SmoothProblem, iterations: int) -> None:
+        ca.Callback.__init__(self)
+        self._problem, self._iterations, self._count = problem, iterations, 0
+        self._below = self._above = np.empty(0)
+        self.construct("stop", {})
+
+    def begin(self, below: Array, above: Array) -> None:
+        """Before every solve: bounds of the constraints."""
+        self._below, self._above, self._count = below, above, 0
+
+    def get_n_in(self) -> int:
+        """CasADi's question."""
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        """CasADi's question."""
+        return 1
+
+    def get_sparsity_in(self, index: int) -> ca.Sparsity:
+        """CasADi's question."""
+        name, nlp = ca.nlpsol_out(index), self._problem.nlp
+        shapes = {"f": (1, 1), "x": nlp.size_in(0), "lam_x": nlp.size_in(0)}
+        shapes |= {"g": nlp.size_out(1), "lam_g": nlp.size_out(1), "lam_p": (0, 0)}
+        return ca.Sparsity.dense(*shapes[name])
+
+    def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
+        """1 to stop, 0 to go on."""
+        self._count += 1
+        if self._count <= self._iterations:
+            return [ca.DM(0)]
+        g = arguments[2].full().ravel()
+        violation = max(np.max(self._below - g), np.max(g - self._above))
+        return [ca.DM(float(violation <= FEASIBLE))]
+
+
 @dataclass(frozen=True)
 class Program:
     """The numbers of a program: start z, parameters p, bounds of z and of the constraints."""
@@ -68,23 +116,34 @@ class Answer:
     iterations: int
 
 
-def ipopt(problem: SmoothProblem, settings: PolishSettings) -> ca.Function:
+@dataclass(frozen=True)
+class Ipopt:
+    """IPOPT for one program, and what ends it."""
+
+    solver: ca.Function
+    stop: _Stop
+
+
+def ipopt(problem: SmoothProblem, settings: PolishSettings) -> Ipopt:
     """IPOPT for a program."""
+    stop = _Stop(problem, settings.max_iterations)
     options = IPOPT | {
         "grad_f": problem.grad_f,
         "jac_g": problem.jac_g,
         "hess_lag": problem.hess_lag,
-        "ipopt.max_iter": settings.max_iterations,
+        "ipopt.max_iter": PATIENCE * settings.max_iterations,
+        "iteration_callback": stop,
         "ipopt.max_wall_time": settings.max_seconds,
     }
-    return ca.nlpsol("polish", "ipopt", problem.nlp, options)
+    return Ipopt(ca.nlpsol("polish", "ipopt", problem.nlp, options), stop)
 
 
-def run(problem: SmoothProblem, solver: ca.Function, program: Program) -> Answer:
+def run(problem: SmoothProblem, solver: Ipopt, program: Program) -> Answer:
     """Solve a program."""
     n = len(problem.scale)
+    solver.stop.begin(program.below, program.above)
     try:
-        found = solver(
+        found = solver.solver(
             x0=program.start,
             p=program.parameters,
             lbx=program.low,
@@ -96,7 +155,7 @@ def run(problem: SmoothProblem, solver: ca.Function, program: Program) -> Answer
         # CasADi's way to report that a function failed outright.
         message = str(error).strip().splitlines()[-1]
         return Answer(np.full(n, np.nan), message, False, False, UNKNOWN, 0)
-    statistics = solver.stats()
+    statistics = solver.solver.stats()
     z = np.asarray(found["x"].full()).ravel()
     usable = bool(np.isfinite(z).all())
     x = problem.centre + problem.scale * np.clip(z[:n], program.low[:n], program.high[:n])
@@ -104,7 +163,7 @@ def run(problem: SmoothProblem, solver: ca.Function, program: Program) -> Answer
     return Answer(
         x=x,
         message=str(statistics["return_status"]),
-        converged=bool(statistics["success"]),
+        converged=statistics["return_status"] == "Solve_Succeeded",
         usable=usable,
         residuals=residuals(problem, program, z, *multipliers) if usable else UNKNOWN,
         iterations=int(statistics["iter_count"]),

@@ -22,7 +22,7 @@ class PolishSettings:
     """What decides the results of a polish.
 
     Attributes:
-        points: attempts that one front may take; the front's own points get a third of them.
+        points: attempts that one front may take; the front's own points get a sixth of them.
         method: how a point is improved: along the diagonal (Pascoletti and Serafini 1984), or by
             minimising one objective while the other is held (epsilon constraint).
         max_iterations: of IPOPT in one round.
@@ -35,10 +35,10 @@ class PolishSettings:
         tolerance: improvement of an objective below which a point counts as optimal already.
     """
 
-    points: int = 12
+    points: int = 22
     method: Method = "pascoletti-serafini"
     max_iterations: int = 15
-    rounds: int = 10
+    rounds: int = 7
     max_seconds: float = 60.0
     margin: float = 1e-6
     clearance: float = 8e-4

@@ -17,15 +17,17 @@ import casadi as ca
 import numpy as np
 
 from hybrid_opt.evaluation import CandidateEvaluator
-from hybrid_opt.polish.active import ActiveSet, Row
+from hybrid_opt.polish.active import ActiveSet
 from hybrid_opt.polish.carry import Carry, CarryReader
 from hybrid_opt.polish.functions import PolishFunctions
+from hybrid_opt.polish.passages import Row
 from hybrid_opt.polish.program import Answer, Program, ipopt, run
 from hybrid_opt.polish.records import UNKNOWN, PolishSettings, Residuals
 from hybrid_opt.polish.targets import Target, level, needed_level
+from symbolic.smooth_blocks import PlaceRow
 from symbolic.smooth_problem import (
     ForceRow,
-    PlaceRow,
+    PressureRow,
     SmoothProblem,
     branch_coefficients,
     smooth_problem,
@@ -38,10 +40,20 @@ CONE_TIGHT = 0
 BRANCH_ACTIVITY = 0.02
 """Branches within this share of the ruling one are constraints, too."""
 
-SLACK = 1e-3
-"""What the epigraph variables start above the peak forces."""
+STRIDE = 2
+"""Of the samples every so many get force rows: forces are smooth along the path. So do those beside
+the highest, where the sample decides."""
 
-FIRST_RADIUS, LEAST_RADIUS, LARGEST_RADIUS = 0.5, 1e-3, 2.0
+FREE_STRIDE = 6
+"""The same for a robot whose force only breaks ties."""
+
+NEAR_PEAK = 0.98
+"""Local maxima of the force above this share of the highest get rows."""
+
+SLACK = 0.1
+"""What the epigraph variables start above the peak forces, in units of the range."""
+
+FIRST_RADIUS, LEAST_RADIUS, LARGEST_RADIUS = 1.0, 1e-3, 2.0
 """Half the width of the box of trust, in halves of the decision variables' ranges."""
 
 INSIDE = 0.9
@@ -50,8 +62,11 @@ INSIDE = 0.9
 STRICTER = 1e-4
 """Least rise of a required value that counts as a new demand [m, rad, 1]."""
 
+LASTING = ("clearance", "lower", "upper")
+"""Kinds of rows that are kept when the solve moves on to another candidate."""
+
 LEVEL_BOUND = 2e3
-"""Bound of |a|; beyond anything the targets ask for."""
+"""Bound of |phi| and |a|; beyond anything the targets ask for."""
 
 KEPT_PROBLEMS = 32
 """Assembled problems kept for reuse."""
@@ -64,10 +79,12 @@ class SolveTask:
     Attributes:
         x: (n_var,) feasible decision vector to start from.
         target: what to aim at.
+        radius: of the first box of trust, in halves of the decision variables' ranges.
     """
 
     x: Array
     target: Target
+    radius: float = FIRST_RADIUS
 
 
 @dataclass(frozen=True)
@@ -100,11 +117,13 @@ class _Progress:
 
     x: Array
     carry: Carry
-    radius: float = FIRST_RADIUS
+    radius: float
     went_well: bool = False
     rows: set[Row] = field(default_factory=set)
     demanded: dict[Row, float] = field(default_factory=dict)
     forces: set[ForceRow] = field(default_factory=set)
+    samples: set[int] = field(default_factory=set)
+    pressed: set[PressureRow] = field(default_factory=set)
 
 
 class PolishSolver:
@@ -120,13 +139,15 @@ class PolishSolver:
         self._coefficients = branch_coefficients(self._workcell)
         half = (self._task.upper - self._task.lower) / 2.0
         self._half = np.where(half > 0.0, half, 1.0)
-        self._cones = {(i, CONE_TIGHT, k) for k in range(self._task.samples) for i in (0, 1)}
+        last = self._task.samples - 1
+        # One-sided differences make the forces of the first and last samples no smooth function.
+        self._every = {*range(0, last, STRIDE), 1, last - 1, last}
         self._kept: OrderedDict[Any, tuple[SmoothProblem, ca.Function]] = OrderedDict()
 
     def solve(self, task: SolveTask) -> Solution:
         """Improve towards the task's target."""
         x = np.clip(task.x, self._task.lower, self._task.upper)
-        now = _Progress(x, self._reader.read(x))
+        now = _Progress(x, self._reader.read(x), task.radius)
         best = Solution(x, "", False, False, UNKNOWN, 0, 0, 0)
         while (
             best.rounds < self._settings.rounds
@@ -165,18 +186,24 @@ class PolishSolver:
             now.radius /= 4.0
             return "refused"
         carry = self._reader.read(answer.x)
-        missing = set(self._active.violated(carry))
+        missing = set(self._active.violated(carry, now.carry))
         branches = self._other_branches(carry) - now.forces
-        if missing or branches or not carry.is_followed:
+        pressed = self._active.pressed(carry, share=1.0 - self._settings.margin)
+        if missing or branches or pressed or not carry.is_followed:
+            now.pressed |= pressed
             self._learn(now, carry, missing, branches, required)
             return "refused"
         step = float(np.max(np.abs(answer.x - now.x) / self._half))
         if level(target, carry.peak) >= level(target, now.carry.peak):
-            now.radius = min(now.radius, step) / 4.0
+            peaks = self._peaks(carry) - now.samples - self._peaks(now.carry) - self._every
+            now.samples |= peaks
+            if not peaks:
+                now.radius = min(now.radius, step) / 4.0
             return "refused"
         now.x, now.carry = answer.x, carry
-        # What the reach demanded was relative to the candidate that is left behind.
-        now.demanded = {r: v for r, v in now.demanded.items() if r[0].kind != "singularity"}
+        # What was demanded of other rows was relative to the candidate that is left behind.
+        now.rows = {row for row in now.rows if row[0].kind in LASTING}
+        now.demanded = {row: v for row, v in now.demanded.items() if row[0].kind in LASTING}
         held = step >= INSIDE * now.radius
         if now.went_well and held:
             now.radius = min(2.0 * now.radius, LARGEST_RADIUS)
@@ -209,45 +236,62 @@ class PolishSolver:
     def _round(self, now: _Progress, target: Target, required: dict[Row, float]) -> Answer:
         """Solve the smooth problem in the box of trust."""
         rows, carry = sorted(required), now.carry
-        forces = sorted(self._cones | now.forces | self._other_branches(carry))
+        samples = self._every | now.samples | self._peaks(carry)
+        cones = {
+            (robot, CONE_TIGHT, k)
+            for robot in (0, 1)
+            for k in samples
+            if target.limits[robot] or k % FREE_STRIDE == 0
+        }
+        forces = sorted(cones | now.forces | self._other_branches(carry))
+        pressed = sorted(now.pressed | self._active.pressed(carry))
         places = sorted({place for _, place in rows})
         index = {place: k for k, place in enumerate(places)}
         placed = tuple((kind, index[place]) for kind, place in rows)
-        problem, solver = self._problem(tuple(forces), placed, len(places))
+        problem, solver = self._problem(tuple(forces), tuple(pressed), placed, len(places))
         xi, low, high = (
             (x - problem.centre) / problem.scale
             for x in (now.x, self._task.lower, self._task.upper)
         )
-        f = carry.peak + SLACK
+        phi = (carry.peak - target.anchor) / target.span + SLACK
         free = len(forces) + 2
         return run(
             problem,
             solver,
             Program(
-                start=np.concatenate([xi, f, [needed_level(target, f) + SLACK]]),
+                start=np.concatenate([xi, phi, [needed_level(target, phi) + SLACK]]),
                 parameters=problem.parameters(
                     target.vector(),
                     self._reader.basis[places],
+                    self._reader.rate_basis[places],
                     carry.q[0][places],
                     carry.q[1][places],
                 ),
-                low=np.concatenate([np.maximum(low, xi - now.radius), [0.0, 0.0, -LEVEL_BOUND]]),
-                high=np.concatenate(
-                    [np.minimum(high, xi + now.radius), [np.inf, np.inf, LEVEL_BOUND]]
+                low=np.concatenate([np.maximum(low, xi - now.radius), np.full(3, -LEVEL_BOUND)]),
+                high=np.concatenate([np.minimum(high, xi + now.radius), np.full(3, LEVEL_BOUND)]),
+                below=np.concatenate(
+                    [
+                        np.full(free, -np.inf),
+                        np.full(len(pressed), self._settings.margin),
+                        np.array([required[row] for row in rows]) / problem.row_scale,
+                    ]
                 ),
-                below=np.concatenate([np.full(free, -np.inf), [required[row] for row in rows]]),
-                above=np.concatenate([np.zeros(free), np.full(len(rows), np.inf)]),
+                above=np.concatenate([np.zeros(free), np.full(len(pressed) + len(rows), np.inf)]),
             ),
         )
 
     def _problem(
-        self, forces: tuple[ForceRow, ...], rows: tuple[PlaceRow, ...], places: int
+        self,
+        forces: tuple[ForceRow, ...],
+        pressed: tuple[PressureRow, ...],
+        rows: tuple[PlaceRow, ...],
+        places: int,
     ) -> tuple[SmoothProblem, ca.Function]:
-        key = (forces, rows, places)
+        key = (forces, pressed, rows, places)
         if key not in self._kept:
             problem = smooth_problem(
                 self._workcell,
-                self._functions.forces,
+                self._functions.samples,
                 self._functions.solve,
                 self._functions.rows,
                 *key,
@@ -257,6 +301,16 @@ class PolishSolver:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
+
+    def _peaks(self, carry: Carry) -> set[int]:
+        """Samples at and beside local maxima of either robot's normal force."""
+        force = np.einsum("rbk,nk->nrb", self._coefficients, carry.split).max(axis=2)
+        inner = force[1:-1]
+        high = (
+            (inner >= force[:-2]) & (inner >= force[2:]) & (inner >= NEAR_PEAK * inner.max(axis=0))
+        )
+        tops = np.flatnonzero(high.any(axis=1)) + 1
+        return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
 
     def _other_branches(self, carry: Carry) -> set[ForceRow]:
         """Force rows of other branches than the tight cones' that rule, or nearly do."""

@@ -14,6 +14,9 @@ NO_LIMIT = 1e3
 CLOSED_SIDE = 1e-4
 """By this share of the range a side may be exceeded: what the solver rounds off."""
 
+LARGER = 0.5
+"""Weight of the larger objective beside the sum of both in the balanced middle."""
+
 TIE = 1e-4
 """Weight of the sum of both objectives beside the level: excludes weakly efficient points."""
 
@@ -27,6 +30,12 @@ class Target:
     direction: Array
     offset: Array
     cost: Array
+
+    @property
+    def limits(self) -> tuple[bool, bool]:
+        """Per robot whether its force matters for more than ties."""
+        first, second = (self.offset < NO_LIMIT).tolist()
+        return first, second
 
     def vector(self) -> Array:
         """In the order of the problem's parameters."""
@@ -60,13 +69,14 @@ def extreme(anchor: Array, span: Array, objective: int) -> Target:
 
 
 def balance(anchor: Array, span: Array) -> Target:
-    """Minimise the sum of both objectives in units of the span."""
-    return Target(anchor, span, np.ones(2), np.full(2, NO_LIMIT), np.array([TIE, 1.0, 1.0]))
+    """Minimise the sum of both objectives and half of the larger one: where one robot can relieve
+    the other at little cost, both carry alike, which leaves most room for payload."""
+    middle = np.full(2, anchor.mean())
+    return Target(middle, span, np.ones(2), np.zeros(2), np.array([LARGER, 1.0, 1.0]))
 
 
-def needed_level(target: Target, peak: Array) -> float:
-    """The least level a that peak forces (2,) over their references allow."""
-    phi = (peak - target.anchor) / target.span
+def needed_level(target: Target, phi: Array) -> float:
+    """The least level a that scaled peak forces (2,) allow."""
     ahead = target.direction > 0.0
     return float(np.max((phi - target.offset)[ahead] / target.direction[ahead]))
 
@@ -79,4 +89,4 @@ def level(target: Target, peak: Array) -> float:
     phi = (peak - target.anchor) / target.span
     if np.any((phi > target.offset + CLOSED_SIDE) & (target.direction <= 0.0)):
         return float("inf")
-    return float(target.cost @ np.concatenate([[needed_level(target, peak)], phi]))
+    return float(target.cost @ np.concatenate([[needed_level(target, phi)], phi]))

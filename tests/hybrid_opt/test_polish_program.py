@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from hybrid_opt.polish.program import Program, ipopt, residuals, run
+from hybrid_opt.polish.program import FEASIBLE, PATIENCE, Program, ipopt, residuals, run
 from hybrid_opt.polish.records import PolishSettings
 from symbolic.smooth_problem import SmoothProblem
 
@@ -36,7 +36,9 @@ def problem_of(objective: ca.SX, g: ca.SX, z: ca.SX, p: ca.SX) -> SmoothProblem:
             ["triu_hess_gamma_x_x"],
         ),
         force_rows=(),
+        pressure_rows=(),
         place_rows=(),
+        row_scale=np.ones(0),
         n_places=0,
         scale=np.ones(2),
         centre=np.zeros(2),
@@ -128,3 +130,28 @@ def test_an_infeasible_program_says_so() -> None:
     answer = run(problem, ipopt(problem, PolishSettings(max_iterations=200)), impossible)
     assert not answer.converged
     assert answer.residuals.feasibility > 0.5
+
+
+def curved() -> tuple[SmoothProblem, Program]:
+    """From outside onto a thin ring, which steps along its tangent violate again and again."""
+    z, p = ca.SX.sym("z", 2), ca.SX.sym("p")
+    problem = problem_of(-z[0] - z[1] ** 3, 100.0 * (ca.sumsqr(z) - 1.0), z, p)
+    return problem, Program(
+        start=np.array([0.1, 2.0]),
+        parameters=np.array([0.0]),
+        low=np.full(2, -5.0),
+        high=np.full(2, 5.0),
+        below=np.array([-1e-3]),
+        above=np.array([1e-3]),
+    )
+
+
+def test_a_solve_is_not_cut_off_where_it_violates_something() -> None:
+    problem, program = curved()
+    cut = run(problem, ipopt(problem, PolishSettings(max_iterations=1)), program)
+    assert cut.residuals.feasibility > FEASIBLE
+    assert cut.iterations == PATIENCE
+    patient = run(problem, ipopt(problem, PolishSettings(max_iterations=2)), program)
+    assert patient.message == "User_Requested_Stop"
+    assert 2 < patient.iterations < PATIENCE * 2
+    assert patient.residuals.feasibility <= FEASIBLE

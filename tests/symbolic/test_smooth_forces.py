@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from symbolic.evaluator import candidate_function
-from symbolic.smooth_forces import force_blocks, force_functions
+from symbolic.smooth_forces import force_functions, pressure_functions, sample_blocks
 from symbolic.smooth_problem import branch_coefficients
 from symbolic.workcell import Array, TimeLaw, Workcell
 from tests.symbolic.cells import hand_cell, hand_model
@@ -28,8 +28,8 @@ def random_x(cell: Workcell, seed: int) -> Array:
 def split_of(cell: Workcell, functions: Mapping[str, ca.Function], x: Array) -> Array:
     """(samples, 2) from the blocks, put in the samples' order."""
     split = np.full((cell.task.samples, 2), np.nan)
-    for block in force_blocks(cell.task):
-        value = functions[f"{block.name}_value"]
+    for block in sample_blocks(cell.task):
+        value = functions[f"force_{block.name}_value"]
         for samples, basis in zip(block.samples, block.basis, strict=True):
             split[samples] = np.array(value(x, basis.T)).reshape(-1, 2)
     return split
@@ -49,15 +49,17 @@ def test_the_largest_branch_is_the_evaluators_normal_force(time_law: TimeLaw, sa
         np.testing.assert_allclose(forces, expected, rtol=1e-10, atol=1e-9)
 
 
+@pytest.mark.parametrize("quantity", ["force", "pressure"])
 @pytest.mark.parametrize("time_law", ["constant", "ramped"])
-def test_derivatives_are_those_of_the_values(time_law: TimeLaw) -> None:
+def test_derivatives_are_those_of_the_values(time_law: TimeLaw, quantity: str) -> None:
     cell = cell_with(time_law)
-    functions = force_functions(cell)
+    functions = {**force_functions(cell), **pressure_functions(cell)}
     rng = np.random.default_rng(3)
     step = 1e-6
-    for block in force_blocks(cell.task):
+    for block in sample_blocks(cell.task):
         value, gradient, hessian = (
-            functions[f"{block.name}_{kind}"] for kind in ("value", "gradient", "hessian")
+            functions[f"{quantity}_{block.name}_{kind}"]
+            for kind in ("value", "gradient", "hessian")
         )
         x, basis = random_x(cell, 1), block.basis[len(block.basis) // 2].T
         weight = rng.normal(size=value.size1_out(0))
@@ -80,6 +82,6 @@ def test_derivatives_are_those_of_the_values(time_law: TimeLaw) -> None:
 
 def test_every_sample_is_served_once() -> None:
     for samples in (5, 6, 7, 100):
-        blocks = force_blocks(cell_with("constant", samples).task)
+        blocks = sample_blocks(cell_with("constant", samples).task)
         served = np.concatenate([block.samples.ravel() for block in blocks])
         assert sorted(served.tolist()) == list(range(samples))

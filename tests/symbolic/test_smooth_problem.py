@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from symbolic.cell_model import build_cell_model
+from symbolic.evaluator import candidate_function
 from symbolic.path import path_basis
-from symbolic.smooth_forces import force_functions
+from symbolic.smooth_forces import force_functions, pressure_functions
 from symbolic.smooth_problem import SmoothProblem, smooth_problem
 from symbolic.smooth_rows import RowFunctions, RowKind, solve_function
 from symbolic.workcell import Array
@@ -18,6 +19,8 @@ from symbolic.workcell_file import load
 from tests.symbolic.workcell_samples import RACK
 
 PLACES = np.array([0.11, 0.3, 0.56])
+
+TARGET = np.array([0.42, 0.43, 0.01, 0.02, 1.0, 0.7, 0.0, 0.1, 1.0, 1e-4, 2e-4])
 
 
 @cache
@@ -35,6 +38,8 @@ def parts() -> tuple[SmoothProblem, Array, Array]:
     )
     kinds = [
         RowKind("clearance", payload),
+        RowKind("separation", payload, direction=3),
+        RowKind("passing", payload, direction=5, after=0),
         RowKind("clearance", both),
         RowKind("clearance", own),
         RowKind("lower", 2, 0),
@@ -44,14 +49,16 @@ def parts() -> tuple[SmoothProblem, Array, Array]:
     solve = (solve_function(model, 0), solve_function(model, 1))
     problem = smooth_problem(
         cell,
-        force_functions(cell),
+        {**force_functions(cell), **pressure_functions(cell)},
         solve,
         RowFunctions(model),
         tuple((robot, branch, 3 * k) for k in range(30) for robot in (0, 1) for branch in (0, 3)),
+        ((1, 0), (0, 40), (1, 40), (0, 99)),
         tuple((kind, place) for place in range(3) for kind in kinds),
         len(PLACES),
     )
-    basis = path_basis(len(cell.task.waypoints), PLACES).position
+    along_path = path_basis(len(cell.task.waypoints), PLACES)
+    bases = (along_path.position, along_path.first / 100.0)
     waypoints = np.array([waypoint.lower for waypoint in cell.task.waypoints])
     waypoints[list(cell.task.free_indices)] = cell.task.initial
     joints = []
@@ -62,11 +69,10 @@ def parts() -> tuple[SmoothProblem, Array, Array]:
             q = np.array(solve[arm](pose, q)).ravel()
             along.append(q)
         joints.append(np.array(along)[np.round(100 * PLACES).astype(int)])
-    target = np.array([0.42, 0.43, 0.01, 0.02, 1.0, 0.7, 0.0, 0.1, 1.0, 1e-4, 2e-4])
     z = np.concatenate(
         [np.random.default_rng(0).uniform(-0.2, 0.2, cell.task.n_var), [0.43] * 2, [0.1]]
     )
-    return problem, problem.parameters(target, basis, *joints), z
+    return problem, problem.parameters(TARGET, *bases, *joints), z
 
 
 def constraints(z: Array) -> Array:
@@ -118,11 +124,27 @@ def test_rows_are_in_the_order_they_were_asked_for(kind: str) -> None:
     n = len(problem.force_rows)
     if kind == "force":
         # N_1 and N_2 of one sample and branch differ by the same F_n in every branch.
-        forces = (found[:n] + z[-3]).reshape(-1, 2, 2)
+        scaled = found[:n].reshape(-1, 2, 2) + z[-3:-1, None]
+        forces = scaled * TARGET[2:4, None] + TARGET[:2, None]
         np.testing.assert_allclose(
             forces[:, 0, 0] - forces[:, 1, 0], forces[:, 0, 1] - forces[:, 1, 1], atol=1e-12
         )
     else:
-        rows = found[n + 2 :].reshape(len(PLACES), -1)
-        assert np.all(rows[:, 3:5] > 0.0)
+        rows = found[n + 6 :].reshape(len(PLACES), -1)
+        assert np.all(rows[:, 5:7] > 0.0)
         assert len({tuple(row) for row in rows.tolist()}) == len(PLACES)
+
+
+def test_pressure_rows_are_what_the_evaluators_shifts_leave_of_the_patches() -> None:
+    problem, _, z = parts()
+    cell = load(RACK)
+    evaluate = candidate_function(build_cell_model(cell))
+    x = problem.centre + problem.scale * z[: cell.task.n_var]
+    shift = np.array(evaluate(x)[evaluate.name_out().index("pressure_shift")])
+    n = len(problem.force_rows) + 2
+    found = constraints(z)[n : n + len(problem.pressure_rows)]
+    expected = [
+        1.0 - (shift[robot, sample] / cell.contacts[robot].patch_radius) ** 2
+        for robot, sample in problem.pressure_rows
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
