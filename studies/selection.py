@@ -1,4 +1,9 @@
-"""The balanced solution of a front: the least mean of both robots' peak normal forces."""
+"""The balanced solution of a front: the least mean of both robots' peak normal forces.
+
+Where one robot can relieve the other at no cost, a polished front is flat: many points have the
+same mean to five digits. Of such points the most even one is selected, which leaves most room for
+payload.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +19,9 @@ from hybrid_opt.results import Replica
 from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.trajectory_figures import trajectory_figures
 from symbolic.workcell import Array
+
+TIE = 3e-4
+"""Relative difference below which two mean forces are equal to any robot: 15 mN on the rack."""
 
 _CHUNK = 256
 """Candidates evaluated at once; every sample of each is held in memory."""
@@ -44,8 +52,11 @@ class Selected:
 
 
 def balanced(peak_normal_force: Array) -> int:
-    """Index of the least mean of both robots' peak forces (k, 2), the first of equals."""
-    return int(np.argmin(peak_normal_force.mean(axis=1)))
+    """Index of the least mean of both robots' peak forces (k, 2); of equals, whose means differ by
+    less than `TIE`, that of the least larger force."""
+    mean = peak_normal_force.mean(axis=1)
+    equal = mean <= mean.min() * (1.0 + TIE)
+    return int(np.argmin(np.where(equal, peak_normal_force.max(axis=1), np.inf)))
 
 
 def select(evaluator: CandidateEvaluator, replica: Replica, static: StaticHold) -> Selected | None:
