@@ -34,8 +34,8 @@ CANDIDATES = 4000
 ROUNDS = 14
 """Rounds of one attempt, more than in a study."""
 
-ATTEMPTS = 5
-"""Attempts from each start: the point itself, both ends, the middle, one gap."""
+ATTEMPTS = 7
+"""Attempts from each start: the point itself, then both ends and the middle, twice."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ def replica_of(evaluator: CandidateEvaluator, count: int) -> Replica:
 
 
 def test_balanced_is_the_least_mean() -> None:
-    assert balanced(np.array([[50.0, 70.0], [59.0, 60.0], [80.0, 30.0], [55.0, 55.0]])) == 2
+    assert balanced(np.array([[50.0, 70.0], [59.0, 60.0], [80.0, 30.0], [55.0, 55.0]])) == 3
     assert balanced(np.array([[50.0, 60.0], [55.0, 55.0]])) == 1
     assert balanced(np.array([[50.0, 60.0], [55.02, 55.02]])) == 0
     assert balanced(np.array([[50.0, 60.0], [55.01, 55.01]])) == 1
