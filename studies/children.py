@@ -9,7 +9,6 @@ from __future__ import annotations
 import gc
 import multiprocessing
 import os
-import signal
 import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
@@ -17,6 +16,7 @@ from multiprocessing.context import ForkProcess
 from typing import Any, TypeVar
 
 from codegen.function import available_cores
+from hybrid_opt.campaign.executor import start_shielded
 from symbolic.errors import DualArmError, WorkerError
 
 Result = TypeVar("Result")
@@ -87,13 +87,7 @@ class _Child:
         self._process: ForkProcess = fork.Process(
             target=_serve, args=(calls, tickets, theirs), name="study worker", daemon=True
         )
-        # Ctrl-C reaches the whole group, but the parent alone decides what it means. The mask is
-        # inherited, so that it holds from the child's first moment.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        start_shielded(self._process)
         theirs.close()
 
     def end(self) -> None:

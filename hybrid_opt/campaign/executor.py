@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
+from multiprocessing.process import BaseProcess
 from typing import Any, Generic, Protocol, TypeVar
 
 from codegen.function import available_cores
@@ -149,6 +150,19 @@ def local_executor(jobs: int) -> Executor:
     return SerialExecutor() if jobs == 1 else ProcessExecutor(jobs)
 
 
+def start_shielded(process: BaseProcess) -> None:
+    """Start a process that Ctrl-C does not reach.
+
+    It is sent to the whole group, but the parent alone decides what it means. The mask is
+    inherited, so that it holds from the process's first moment.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class _Worker:
     """A process and this side of its pipe; index: the task it has, None without one."""
 
@@ -159,13 +173,7 @@ class _Worker:
         self._process: SpawnProcess = spawn.Process(
             target=_serve, args=(theirs, job), name="campaign worker", daemon=True
         )
-        # Ctrl-C reaches the whole group, but the parent alone decides what it means. The mask is
-        # inherited, so that it holds from the worker's first moment.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        start_shielded(self._process)
         theirs.close()
 
     def give(self, index: int, task: object) -> None:

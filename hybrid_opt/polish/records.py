@@ -25,7 +25,8 @@ class PolishSettings:
         points: attempts that one front may take; the front's own points get a sixth of them.
         method: how a point is improved: along the diagonal (Pascoletti and Serafini 1984), or by
             minimising one objective while the other is held (epsilon constraint).
-        max_iterations: of IPOPT in one round.
+        max_iterations: of IPOPT in one round; to become feasible it may take more, see
+            `hybrid_opt.polish.program.PATIENCE`.
         rounds: of one point at most; see `hybrid_opt.polish.solver`.
         max_seconds: wall time after which a solve is given up. Generous, because a result that
             depends on it cannot be repeated.

@@ -13,7 +13,6 @@ from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-import casadi as ca
 import numpy as np
 
 from hybrid_opt.evaluation import CandidateEvaluator
@@ -21,7 +20,7 @@ from hybrid_opt.polish.active import ActiveSet
 from hybrid_opt.polish.carry import Carry, CarryReader
 from hybrid_opt.polish.functions import PolishFunctions
 from hybrid_opt.polish.passages import Row
-from hybrid_opt.polish.program import Answer, Program, ipopt, run
+from hybrid_opt.polish.program import Answer, Ipopt, Program, ipopt, run
 from hybrid_opt.polish.records import UNKNOWN, PolishSettings, Residuals
 from hybrid_opt.polish.targets import Target, level, needed_level
 from symbolic.smooth_blocks import PlaceRow
@@ -142,7 +141,7 @@ class PolishSolver:
         last = self._task.samples - 1
         # One-sided differences make the forces of the first and last samples no smooth function.
         self._every = {*range(0, last, STRIDE), 1, last - 1, last}
-        self._kept: OrderedDict[Any, tuple[SmoothProblem, ca.Function]] = OrderedDict()
+        self._kept: OrderedDict[Any, tuple[SmoothProblem, Ipopt]] = OrderedDict()
 
     def solve(self, task: SolveTask) -> Solution:
         """Improve towards the task's target."""
@@ -286,7 +285,7 @@ class PolishSolver:
         pressed: tuple[PressureRow, ...],
         rows: tuple[PlaceRow, ...],
         places: int,
-    ) -> tuple[SmoothProblem, ca.Function]:
+    ) -> tuple[SmoothProblem, Ipopt]:
         key = (forces, pressed, rows, places)
         if key not in self._kept:
             problem = smooth_problem(
