@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from codegen.cache import FORMAT, Cache, Entry, digest, source_digest
 from codegen.compiled import CompiledFunction
 from codegen.compiler import FLAGS, Compiler, default_level, find_compiler
+from codegen.errors import CodegenError
 from codegen.function import NumericFunction, available_cores
 from codegen.interpreted import InterpretedFunction, warn_interpreted
 from codegen.signature import Signature
-from symbolic.errors import CodegenError
 
 if TYPE_CHECKING:
     import casadi as ca

@@ -27,7 +27,7 @@ from typing import Any
 
 import platformdirs
 
-from symbolic.errors import CodegenError
+from codegen.errors import CodegenError
 
 FORMAT = 1
 """Part of every key; rises when what is stored changes its meaning."""

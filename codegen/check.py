@@ -10,9 +10,10 @@ import numpy as np
 
 from codegen.build import compile_function
 from codegen.cache import Cache
-from codegen.function import Array, NumericFunction
+from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
+from symbolic.array import Array
 
 TOLERANCE = 1e-10
 """Largest relative difference allowed between compiled and interpreted."""

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.function import Array, NumericFunction, available_cores
+from codegen.errors import CodegenError
+from codegen.function import NumericFunction, available_cores
 from codegen.signature import Signature
-from symbolic.errors import CodegenError
+from symbolic.array import Array
 
 _CHUNKS_PER_THREAD = 4
 """Pieces of a batch per thread: small enough to even out threads that are held up."""

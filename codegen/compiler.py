@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from symbolic.errors import CodegenError
+from codegen.errors import CodegenError
 
 FLAGS = (
     "-std=gnu11",

@@ -13,10 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from codegen.errors import CodegenError
 from codegen.signature import Shape, Signature
-from symbolic.errors import CodegenError
-
-Array = NDArray[np.float64]
+from symbolic.array import Array
 
 _FLOAT = np.dtype(np.float64)
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.function import Array, NumericFunction
+from codegen.errors import CodegenError
+from codegen.function import NumericFunction
 from codegen.signature import Signature
-from symbolic.errors import CodegenError
+from symbolic.array import Array
 
 if TYPE_CHECKING:
     import casadi as ca

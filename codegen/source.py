@@ -6,7 +6,7 @@ from itertools import accumulate
 
 import casadi as ca
 
-from symbolic.errors import CodegenError
+from codegen.errors import CodegenError
 
 _DRIVER = """
 #if defined(__GNUC__)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from hybrid_opt.statistics import Summary
+from hybrid_opt.indicators.statistics import Summary
 
 Verdict = Literal["inside", "better", "worse"]
 

@@ -15,10 +15,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from hybrid_opt import algorithms, analytic_problems, metrics
-from hybrid_opt.algorithms import Evaluated
-from hybrid_opt.analytic_problems import AnalyticProblem
-from hybrid_opt.statistics import RankTest, Summary, corrected, rank_test, summarise
+from hybrid_opt import metaheuristics
+from hybrid_opt.indicators import metrics
+from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
+from hybrid_opt.metaheuristics import Evaluated, analytic_problems
+from hybrid_opt.metaheuristics.analytic_problems import AnalyticProblem
 from studies.algorithm_bands import BAND_POPULATION, BAND_SOURCE, BANDS, Band, Verdict, judge
 from symbolic.errors import DualArmError, SettingsError
 
@@ -69,14 +70,14 @@ def _indicators(target: AnalyticProblem, points: Evaluated) -> tuple[float, floa
 
 
 def _settings(name: str, population: int) -> dict[str, object]:
-    known = algorithms.settings_of(name)
+    known = metaheuristics.settings_of(name)
     size = next(key for key in ("swarm", "population", "batch") if hasattr(known, key))
     return {size: population}
 
 
 def _run(target: AnalyticProblem, name: str, evaluations: int, population: int, seed: int) -> _Run:
-    algorithm = algorithms.make(name, _settings(name, population))
-    result = algorithms.search(target.problem, algorithm, evaluations, seed)
+    algorithm = metaheuristics.make(name, _settings(name, population))
+    result = metaheuristics.search(target.problem, algorithm, evaluations, seed)
     # Judged anew from the decisions: an algorithm's word for feasibility is not enough.
     constraints = target.problem.evaluate(result.front.decisions, return_values_of=["G"])
     return _Run(
@@ -146,7 +147,7 @@ def compare(
         SettingsError: unknown names, no seeds, or a budget below the population.
     """
     for name in names:
-        algorithms.settings_of(name)
+        metaheuristics.settings_of(name)
     targets = [analytic_problems.make(problem) for problem in problems]
     if seeds < 1 or min(budgets) < population:
         raise SettingsError(

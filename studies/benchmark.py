@@ -27,15 +27,17 @@ import numpy as np
 
 from codegen.build import compile_function
 from codegen.compiled import CompiledFunction
+from codegen.errors import CodegenError
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from studies.benchmark_collisions import with_collisions
 from studies.benchmark_turns import Evaluate, interleaved, progress, summary
+from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
-from symbolic.errors import CodegenError, DualArmError, SettingsError
-from symbolic.evaluator import candidate_function
-from symbolic.workcell import Array, Task, Waypoint, Workcell
-from symbolic.workcell_file import load
+from symbolic.errors import DualArmError, SettingsError
+from symbolic.functions.candidate import candidate_function
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Task, Waypoint, Workcell
 
 SAMPLES = (25, 50, 100, 200, 400)
 WAYPOINTS = (1, 2, 3, 4, 5, 6, 7, 8)

@@ -13,14 +13,15 @@ import numpy as np
 
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
-from hybrid_opt.algorithms.registry import make
-from hybrid_opt.algorithms.search import search
-from hybrid_opt.algorithms.settings import GeneticSettings
-from hybrid_opt.evaluation import CandidateEvaluator, reached_samples
-from hybrid_opt.problem import CarryProblem
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, reached_samples
+from hybrid_opt.metaheuristics.problem import CarryProblem
+from hybrid_opt.metaheuristics.registry import make
+from hybrid_opt.metaheuristics.run import search
+from hybrid_opt.metaheuristics.settings import GeneticSettings
 from studies.benchmark_turns import Evaluate, interleaved, progress, summary
-from symbolic.cell_functions import cell_functions
-from symbolic.workcell import Array, Workcell
+from symbolic.array import Array
+from symbolic.functions.cell import cell_functions
+from symbolic.workcell.records import Workcell
 
 EVALUATIONS = 1000
 """Of the NSGA-II search whose candidates are timed."""

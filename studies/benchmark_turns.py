@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from symbolic.workcell import Array
+from symbolic.array import Array
 
 Evaluate = Callable[[Array], object]
 

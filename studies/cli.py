@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn, get_args
 
-from hybrid_opt import algorithms
+from hybrid_opt import metaheuristics
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.settings import ExecutorName, FirstGeneration
-from hybrid_opt.objectives import OBJECTIVES, PAPER_OBJECTIVES
-from hybrid_opt.polish.records import PolishSettings
-from hybrid_opt.problem import ConstraintHandling
+from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
+from hybrid_opt.metaheuristics.problem import ConstraintHandling
+from hybrid_opt.polishing.records import PolishSettings
 from symbolic.errors import SettingsError
 
 _DEFAULT = CampaignSettings()
@@ -63,7 +63,8 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"which of {', '.join(algorithms.names())} (default: {' '.join(_DEFAULT.algorithms)})",
+        help=f"which of {', '.join(metaheuristics.names())} "
+        f"(default: {' '.join(_DEFAULT.algorithms)})",
     )
     search.add_argument(
         "--population",
@@ -226,9 +227,9 @@ def _population(text: str) -> tuple[str, int]:
     name, separator, size = text.partition("=")
     if not separator or not size.isdecimal():
         raise argparse.ArgumentTypeError(f"found {text!r}; allowed is NAME=N, as nsga2=40")
-    if name not in algorithms.names():
+    if name not in metaheuristics.names():
         raise SettingsError(
-            f"unknown algorithm '{name}'; known are {', '.join(algorithms.names())}"
+            f"unknown algorithm '{name}'; known are {', '.join(metaheuristics.names())}"
         )
     return name, int(size)
 

@@ -17,13 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt import metrics
-from hybrid_opt.results import CampaignResults, Replica, read_campaign, read_summary
-from hybrid_opt.statistics import RankTest, Summary, corrected, rank_test, summarise
+from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.indicators import metrics
+from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
 from studies.summary import reference_front, reference_point
 from studies.terminal_summary import title
-from symbolic.errors import DualArmError, ResultsError
-from symbolic.workcell import Array
+from symbolic.array import Array
+from symbolic.errors import DualArmError
 
 PROGRAM = "python -m studies.compare"
 

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt import metrics
 from hybrid_opt.campaign import (
     CampaignSettings,
     ExecutionSettings,
@@ -31,11 +30,13 @@ from hybrid_opt.campaign import (
 )
 from hybrid_opt.campaign.layout import CONFIGURATION
 from hybrid_opt.campaign.polish_stage import read_polished
-from hybrid_opt.results import CampaignResults, read_campaign, read_summary
+from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_summary
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.indicators import metrics
 from studies.cli import Parser
 from studies.reference_front import ReferenceFront, read_reference_front
 from studies.terminal_summary import title
-from symbolic.errors import DualArmError, ResultsError
+from symbolic.errors import DualArmError
 
 PROGRAM = "python -m studies.control"
 

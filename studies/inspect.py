@@ -17,7 +17,7 @@ from pathlib import Path
 
 from studies.inspection import Branch, Inspection, Judged, inspect
 from symbolic.errors import DualArmError, SettingsError
-from symbolic.workcell_file import load
+from symbolic.workcell.file import load
 
 PROGRAM = "python -m studies.inspect"
 

@@ -8,17 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
-from hybrid_opt.static_hold import static_hold
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
+from hybrid_opt.evaluate.static_hold import static_hold
 from hybrid_opt.timing import TimingModel
 from studies.report.data import carry_of
 from studies.report.figures_cell import environment, reachable_regions
 from studies.report.reach import reach_map
 from studies.report.style import in_style, save, settled
-from symbolic.branches import StartBranch
+from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.errors import SettingsError
-from symbolic.workcell import Array, Workcell
+from symbolic.robot.branches import StartBranch
+from symbolic.workcell.records import Workcell
 
 _CHUNK = 500
 
@@ -43,7 +44,8 @@ class Judged:
 @dataclass(frozen=True)
 class Branch:
     """A posture of one arm at the start and the least margins of the hand-made trajectory from
-    there; see `symbolic.branches.StartBranch`. clearance_mm is None where nothing can collide."""
+    there; see `symbolic.robot.branches.StartBranch`. clearance_mm is None where nothing can
+    collide."""
 
     joints_deg: tuple[float, ...]
     kept_samples: int

@@ -2,7 +2,7 @@
 
 Random feasible candidates, each the start of its own polish, find the regions; the union of what
 they lead to is polished once more as one front. The result is the best front that is known, not a
-proven one. `tests/hybrid_opt/rack_reference_front.csv` was made with
+proven one. `tests/hybrid_opt/polishing/rack_reference_front.csv` was made with
 
     python -m studies.reference_front studies/workcells/rack.toml --output FILE
 """
@@ -18,15 +18,16 @@ from pathlib import Path
 import numpy as np
 
 from codegen.function import available_cores
-from hybrid_opt import metrics
-from hybrid_opt.campaign.files import read_bytes, write_atomically
-from hybrid_opt.evaluation import CandidateEvaluator
-from hybrid_opt.polish.front import FrontPolisher
-from hybrid_opt.polish.functions import polish_functions
-from hybrid_opt.polish.records import PolishSettings
-from symbolic.errors import DualArmError, ResultsError, SettingsError
-from symbolic.workcell import Array
-from symbolic.workcell_file import load
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.indicators import metrics
+from hybrid_opt.polishing.front import FrontPolisher
+from hybrid_opt.polishing.functions import polish_functions
+from hybrid_opt.polishing.records import PolishSettings
+from hybrid_opt.store.files import read_bytes, write_atomically
+from symbolic.array import Array
+from symbolic.errors import DualArmError, SettingsError
+from symbolic.workcell.file import load
 
 CANDIDATES = 4000
 """Random candidates among which starts are looked for."""

@@ -10,10 +10,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from hybrid_opt.export import FORMATS, export_trajectory, sample_trajectory
-from hybrid_opt.replay import Replay, replay
+from hybrid_opt.store.export import FORMATS, export_trajectory, sample_trajectory
+from hybrid_opt.store.replay import Replay, replay
+from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing import TimingModel
-from hybrid_opt.trajectory_file import StoredTrajectory, read_trajectory
 from studies.timing_stage import timed_trajectory
 from studies.timing_text import timings
 from symbolic.errors import DualArmError, SettingsError

@@ -18,8 +18,8 @@ from hybrid_opt.campaign import (
     search_stage,
 )
 from hybrid_opt.campaign.polish_stage import polish_stage
-from hybrid_opt.polish.records import PolishSettings
-from hybrid_opt.results import read_summary
+from hybrid_opt.campaign.results import read_summary
+from hybrid_opt.polishing.records import PolishSettings
 from studies.cli import (
     campaign_parser,
     campaign_settings,
@@ -31,7 +31,7 @@ from studies.summary_stage import summary_stage
 from studies.terminal_summary import terminal_summary
 from studies.timing_stage import timing_stage
 from symbolic.errors import DualArmError
-from symbolic.workcell_file import load
+from symbolic.workcell.file import load
 
 PAGE = "report.html"
 """The report in a results folder."""

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt import metrics
 from hybrid_opt.campaign.layout import reference_front_file
 from hybrid_opt.campaign.polish_stage import PolishedReplica
-from hybrid_opt.evaluation import REASONS
-from hybrid_opt.results import CampaignResults, Replica
-from hybrid_opt.static_hold import StaticHold
-from hybrid_opt.statistics import corrected, rank_test, summarise
-from studies.selection import Selected
-from symbolic.workcell import Array
+from hybrid_opt.campaign.results import CampaignResults, Replica
+from hybrid_opt.evaluate.evaluation import REASONS
+from hybrid_opt.evaluate.static_hold import StaticHold
+from hybrid_opt.indicators import metrics
+from hybrid_opt.indicators.selection import Selected
+from hybrid_opt.indicators.statistics import corrected, rank_test, summarise
+from symbolic.array import Array
 
 FIGURES = (
     "feasible",

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hybrid_opt.attainment import attainment_surfaces
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage
-from hybrid_opt.campaign.files import storing, write_atomically, write_json
 from hybrid_opt.campaign.layout import (
     FRONTS,
     SUMMARY,
@@ -17,13 +15,15 @@ from hybrid_opt.campaign.layout import (
     selected_file,
 )
 from hybrid_opt.campaign.polish_stage import read_polished
-from hybrid_opt.evaluation import CandidateEvaluator
-from hybrid_opt.results import CampaignResults, read_campaign
-from hybrid_opt.static_hold import static_hold
-from hybrid_opt.trajectory_file import write_trajectory
-from studies.selection import Selected, select, select_polished
+from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.static_hold import static_hold
+from hybrid_opt.indicators.attainment import attainment_surfaces
+from hybrid_opt.indicators.selection import Selected, select, select_polished
+from hybrid_opt.store.files import storing, write_atomically, write_json
+from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.summary import campaign_summary, polished_figures, reference_front, replica_figures
-from symbolic.workcell import Array
+from symbolic.array import Array
 
 PERCENTILES = (25.0, 50.0, 75.0, 100.0)
 """Of the attainment surfaces, in percent of the replicas."""

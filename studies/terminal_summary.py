@@ -56,7 +56,7 @@ def terminal_summary(summary: Mapping[str, Any], with_paper: bool) -> str:
     """The figures of a summary.json as text.
 
     Args:
-        summary: as from `hybrid_opt.results.read_summary`.
+        summary: as from `hybrid_opt.campaign.results.read_summary`.
         with_paper: whether to print what the paper states, which is of its rack cell.
     """
     settings = summary["settings"]

@@ -8,14 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage
-from hybrid_opt.campaign.files import storing, write_json
 from hybrid_opt.campaign.layout import SELECTED
-from hybrid_opt.robustness import (
-    Margin,
-    PayloadSensitivity,
-    payload_sensitivity,
-    robustness_margins,
-)
+from hybrid_opt.store.files import storing, write_json
+from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import (
     ForceCurve,
     TimingModel,
@@ -23,10 +18,16 @@ from hybrid_opt.timing import (
     duration_against_force_limit,
     report_timing,
 )
-from hybrid_opt.trajectory_file import read_trajectory
-from studies.children import in_children
+from hybrid_opt.timing.robustness import (
+    Margin,
+    PayloadSensitivity,
+    payload_sensitivity,
+    robustness_margins,
+)
+from hybrid_opt.work.children import in_children
 from studies.timing_text import timing_json, timing_text, timings
-from symbolic.workcell import Array, Workcell
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
 
 TIMING = "timing"
 """Folder of the timings in a results folder, laid out as that of the selected trajectories."""

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.robustness import KILOGRAM_FORCE, Margin, PayloadSensitivity
 from hybrid_opt.timing import ForceCurve, Timing, TimingReport
+from hybrid_opt.timing.robustness import KILOGRAM_FORCE, Margin, PayloadSensitivity
 from hybrid_opt.timing.use import joint_use
-from symbolic.workcell import Workcell
+from symbolic.workcell.records import Workcell
 
 
 def timings(report: TimingReport) -> dict[str, Timing]:

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from symbolic.branches import StartBranch, start_branches
-from symbolic.clearance import screening_functions
-from symbolic.collision_pairs import CellGeometry, build_geometry
+from symbolic.array import Array
 from symbolic.errors import WorkcellError
-from symbolic.robot_model import RobotModel, build_robot_model
-from symbolic.workcell import Array, Workcell
+from symbolic.geometry.clearance import screening_functions
+from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.robot.branches import StartBranch, start_branches
+from symbolic.robot.model import RobotModel, build_robot_model
+from symbolic.workcell.records import Workcell
 
 
 @dataclass(frozen=True)

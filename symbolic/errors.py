@@ -1,4 +1,7 @@
-"""The project's error hierarchy: every error a user can cause has one root."""
+"""The root of all errors that a user can cause, and those of describing a cell.
+
+Each package above has an `errors` module with those that it alone raises.
+"""
 
 
 class DualArmError(Exception):
@@ -28,10 +31,6 @@ class BridgeError(DualArmError):
     """The compiled Pinocchio-CasADi bridge is missing or was built for other versions."""
 
 
-class CodegenError(DualArmError):
-    """C code could not be generated, compiled, cached or loaded."""
-
-
 class CollisionModelError(DualArmError):
     """A collision shape is empty, degenerate or otherwise unusable."""
 
@@ -40,13 +39,5 @@ class SettingsError(DualArmError):
     """An option or setting is unknown or outside its allowed range."""
 
 
-class ResultsError(DualArmError):
-    """Stored results are missing, damaged, or belong to another configuration."""
-
-
-class WorkerError(DualArmError):
-    """Processes or machines that work for this one were lost or do not fit."""
-
-
-class ReportError(DualArmError):
-    """A report, picture or animation cannot be made."""
+class BundleError(DualArmError):
+    """A workcell's files cannot be collected into one value, or unpacked from it."""

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from symbolic.workcell import Array, Robot
+from symbolic.array import Array
+from symbolic.workcell.records import Robot
 
 GOFA_URDF = Path(__file__).parent.parent / "studies" / "robots" / "gofa12.urdf"
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.evaluation import FEASIBLE, REASONS, Evaluations
-from symbolic.errors import ResultsError
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
 
 _LEVEL = 4
 _FIXED = ("evaluation", "generation", "feasible", "reason", "position")

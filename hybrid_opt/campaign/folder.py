@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from hybrid_opt.campaign.files import locked, read_json, storing, sync_folder, write_json
 from hybrid_opt.campaign.identity import identity, require_equal
 from hybrid_opt.campaign.layout import CONFIGURATION, WORKCELL
 from hybrid_opt.campaign.settings import CampaignSettings, ExecutionSettings
-from hybrid_opt.cell_archive import CellArchive, archive_cell, unpack_cell
-from symbolic.errors import ResultsError
-from symbolic.workcell import Workcell
-from symbolic.workcell_file import load
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.store.files import locked, read_json, storing, sync_folder, write_json
+from symbolic.workcell.archive import CellArchive, archive_cell, unpack_cell
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from typing import Any
 
 from codegen.cache import source_digest
 from hybrid_opt.campaign.settings import CampaignSettings
-from symbolic.errors import ResultsError
-from symbolic.workcell import Workcell
+from hybrid_opt.errors import ResultsError
+from symbolic.workcell.records import Workcell
 
 FORMAT = "dual-arm-carry campaign"
 VERSION = 1

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.campaign.files import read_bytes, storing
-from hybrid_opt.evaluation import REASONS, Evaluations
-from symbolic.errors import ResultsError
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.evaluation import REASONS, Evaluations
+from hybrid_opt.store.files import read_bytes, storing
 
 _MAGIC = b"DACARRY1"
 _FRAME = struct.Struct("<II")

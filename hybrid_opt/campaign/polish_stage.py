@@ -16,29 +16,29 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.campaign.executor import Job
-from hybrid_opt.campaign.files import read_json, write_json
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.identity import identity, replica_identity
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.layout import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.progress import Advance, Progress
 from hybrid_opt.campaign.replica import CellEvaluatorSource
+from hybrid_opt.campaign.results import Replica, read_campaign
 from hybrid_opt.campaign.search_stage import executor_for
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Stage
-from hybrid_opt.cell_archive import archive_from_json, unpack_cell
-from hybrid_opt.evaluation import CandidateEvaluator
-from hybrid_opt.polish.front import FrontPolisher
-from hybrid_opt.polish.records import (
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.polishing.front import FrontPolisher
+from hybrid_opt.polishing.records import (
     PolishedFront,
     PolishSettings,
     outcome_from_json,
     outcome_to_json,
 )
-from hybrid_opt.results import Replica, read_campaign
-from symbolic.errors import ResultsError
-from symbolic.workcell import Array
+from hybrid_opt.store.files import read_json, write_json
+from hybrid_opt.work.executor import Job
+from symbolic.array import Array
+from symbolic.workcell.archive import archive_from_json, unpack_cell
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,16 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hybrid_opt import algorithms
+from hybrid_opt import metaheuristics
 from hybrid_opt.campaign.evaluations_file import EvaluationTable, encode, encode_front
 from hybrid_opt.campaign.journal import decode_generation, encode_generation
 from hybrid_opt.campaign.settings import CampaignSettings
-from hybrid_opt.cell_archive import CellArchive, archive_from_json, archive_to_json, unpack_cell
-from hybrid_opt.evaluation import CandidateEvaluator, Evaluations
-from hybrid_opt.metrics import non_dominated
-from hybrid_opt.problem import CarryProblem, Evaluator, disarmed
-from symbolic.errors import ResultsError
-from symbolic.workcell import Array
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
+from hybrid_opt.indicators.metrics import non_dominated
+from hybrid_opt.metaheuristics.problem import CarryProblem, Evaluator, disarmed
+from symbolic.array import Array
+from symbolic.workcell.archive import CellArchive, archive_from_json, archive_to_json, unpack_cell
 
 EvaluatorSource = Callable[[], Evaluator]
 """Makes the evaluator, in any process; can be pickled and hashed."""
@@ -31,7 +31,7 @@ class CellEvaluatorSource:
     """Makes a workcell's evaluator from nothing but this value.
 
     Attributes:
-        cell: the workcell with its files, JSON of `hybrid_opt.cell_archive.archive_to_json`.
+        cell: the workcell with its files, JSON of `symbolic.workcell.archive.archive_to_json`.
         objectives: names of the objectives.
     """
 
@@ -106,9 +106,9 @@ def run_replica(
     recording = _Recording(evaluator, task, emit)
     problem = CarryProblem(recording, settings.constraint_handling)
     start = task.initial[None] if settings.starts_from_initial(task.algorithm) else None
-    algorithm = algorithms.make(task.algorithm, settings.overrides(task.algorithm), start)
+    algorithm = metaheuristics.make(task.algorithm, settings.overrides(task.algorithm), start)
     rng = settings.replica_rng(task.algorithm, task.replica)
-    algorithms.search(problem, algorithm, settings.evaluations, rng)
+    metaheuristics.search(problem, algorithm, settings.evaluations, rng)
     generation = np.repeat(
         np.arange(1, len(problem.batches) + 1), [len(batch) for batch in problem.batches]
     )

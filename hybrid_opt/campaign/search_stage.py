@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from hybrid_opt.campaign.dask_executor import DaskExecutor
-from hybrid_opt.campaign.executor import Executor, Job, local_executor
-from hybrid_opt.campaign.files import read_json, sha256, write_atomically, write_json
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.identity import environment, identity, replica_identity
 from hybrid_opt.campaign.journal import Journal, candidates_in
@@ -19,6 +16,9 @@ from hybrid_opt.campaign.replica import (
 )
 from hybrid_opt.campaign.settings import ExecutionSettings
 from hybrid_opt.campaign.stages import Stage
+from hybrid_opt.store.files import read_json, sha256, write_atomically, write_json
+from hybrid_opt.work.dask_executor import DaskExecutor
+from hybrid_opt.work.executor import Executor, Job, local_executor
 
 
 def search_stage(source: EvaluatorSource | None = None) -> Stage:

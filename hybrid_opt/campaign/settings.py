@@ -9,9 +9,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from hybrid_opt import algorithms
-from hybrid_opt.objectives import PAPER_OBJECTIVES, select_objectives
-from hybrid_opt.problem import ConstraintHandling
+from hybrid_opt import metaheuristics
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, select_objectives
+from hybrid_opt.metaheuristics.problem import ConstraintHandling
 from symbolic.errors import SettingsError
 
 FirstGeneration = Literal["initial", "random"]
@@ -28,11 +28,11 @@ class CampaignSettings:
     """What decides a campaign's results, besides the workcell.
 
     Attributes:
-        algorithms: names known to `hybrid_opt.algorithms`, each once.
+        algorithms: names known to `hybrid_opt.metaheuristics`, each once.
         evaluations: budget of every replica.
         replicas: independent runs per algorithm.
         seed: the campaign's seed; every replica derives its own from it.
-        objectives: names known to `hybrid_opt.objectives`, each once.
+        objectives: names known to `hybrid_opt.evaluate.objectives`, each once.
         constraint_handling: 'penalty' (the paper's) or 'constraints'.
         first_generation: what the searches start from; uniform random search is always all random.
         populations: (algorithm, candidates per generation) where not the algorithm's default.
@@ -77,14 +77,14 @@ class CampaignSettings:
                 f"({', '.join(self.algorithms)}) at most once"
             )
         for name in self.algorithms:
-            algorithms.settings_of(name, self.overrides(name))
+            metaheuristics.settings_of(name, self.overrides(name))
 
     def overrides(self, algorithm: str) -> dict[str, object]:
         """The settings of an algorithm that differ from its defaults."""
         size = dict(self.populations).get(algorithm)
         if size is None:
             return {}
-        known = {field.name for field in fields(algorithms.settings_of(algorithm))}
+        known = {field.name for field in fields(metaheuristics.settings_of(algorithm))}
         return {key: size for key in _SIZE_KEYS if key in known}
 
     def starts_from_initial(self, algorithm: str) -> bool:
@@ -96,7 +96,7 @@ class CampaignSettings:
         values = asdict(self)
         del values["populations"]
         values["algorithms"] = {
-            name: asdict(algorithms.settings_of(name, self.overrides(name)))
+            name: asdict(metaheuristics.settings_of(name, self.overrides(name)))
             for name in self.algorithms
         }
         values["objectives"] = list(self.objectives)

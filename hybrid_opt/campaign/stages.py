@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hybrid_opt.campaign.files import read_json, write_json
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.layout import STAGES
 from hybrid_opt.campaign.progress import Progress
-from symbolic.errors import ResultsError
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.store.files import read_json, write_json
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ import numpy as np
 from hybrid_opt.collision.between import PROOF_DEPTH, MotionVerdict, check_between
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.collision.verdict import Contact
+from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell import Array
 
 Configuration = Callable[[Array], tuple[Array, Array, Array]]
 """From path parameters (n,) to box poses (n, 6) and joint positions q_1, q_2 (n, 6)."""

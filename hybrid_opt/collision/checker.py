@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from codegen.function import NumericFunction
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
 from hybrid_opt.collision.verdict import Contact, Verdict, sample_durations
-from symbolic.collision_bodies import PAYLOAD
-from symbolic.collision_pairs import CellGeometry
-from symbolic.workcell import Array
+from symbolic.array import Array
+from symbolic.geometry.bodies import PAYLOAD
+from symbolic.geometry.pairs import CellGeometry
 
 RESTING_TOLERANCE = 1e-3
 """How deep the payload may sink into a body that it is allowed to rest on [m]."""
@@ -26,7 +26,8 @@ RESTING_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Motion:
-    """Chord and bend (n, n_pairs) [m] of every pair between configurations: `symbolic.motion`."""
+    """Chord and bend (n, n_pairs) [m] of every pair between configurations, see
+    `symbolic.geometry.motion_bounds`."""
 
     chord: Array
     bend: Array
@@ -51,7 +52,7 @@ class CollisionChecker:
 
         Args:
             functions: 'clearance', 'piece_poses' and 'motion' of
-                `symbolic.clearance.screening_functions`, compiled or interpreted.
+                `symbolic.geometry.clearance.screening_functions`, compiled or interpreted.
         """
         self.geometry = geometry
         self.resting_tolerance = resting_tolerance

@@ -9,10 +9,11 @@ from __future__ import annotations
 import fcl
 import numpy as np
 
-from symbolic.collision_bodies import BOX, PAYLOAD, CollisionBody
-from symbolic.collision_pairs import CellGeometry
-from symbolic.geometry import SMALLEST_SIZE, Capsule, ConvexShape, Hull, Piece, reach
-from symbolic.workcell import Array, Box, Cylinder, Sphere
+from symbolic.array import Array
+from symbolic.geometry.bodies import BOX, PAYLOAD, CollisionBody
+from symbolic.geometry.pairs import CellGeometry
+from symbolic.geometry.pieces import SMALLEST_SIZE, Capsule, ConvexShape, Hull, Piece, reach
+from symbolic.workcell.records import Box, Cylinder, Sphere
 
 FCL_RESOLUTION = 1e-5
 """What FCL resolves [m]: intersections and, downwards, distances; ten times its tolerance."""

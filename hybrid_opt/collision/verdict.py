@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from symbolic.workcell import Array
+from symbolic.array import Array
 
 
 @dataclass(frozen=True)

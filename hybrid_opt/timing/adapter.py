@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from symbolic.workcell import Array
+from symbolic.array import Array
 
 SPEED_CEILING = 1e4
 """Largest squared path speed that toppra's solver admits, in its scaled path coordinate."""

@@ -12,8 +12,8 @@ from hybrid_opt.timing.point_limits import duration_at_speed_limits
 from hybrid_opt.timing.records import Place, TimedCarry, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, joint_use, limit_use, worst
+from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell import Array
 
 NEAREST_FORCE = 1.001
 """Least force limit of the curve, over the force at rest: below, the motion has to creep."""

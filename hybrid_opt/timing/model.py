@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from codegen.build import build, compile_function, load_or_build
 from codegen.cache import Cache, digest
 from codegen.function import NumericFunction
-from codegen.workcell_functions import workcell_functions, workcell_key
+from hybrid_opt.evaluate.functions import workcell_functions, workcell_key
 from hybrid_opt.timing.records import TimedCarry
+from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
-from symbolic.evaluator import candidate_function
-from symbolic.timing_functions import timing_functions
-from symbolic.urdf_model import arm_model
-from symbolic.workcell import Array, Robot, Workcell
+from symbolic.functions.candidate import candidate_function
+from symbolic.functions.timing import timing_functions
+from symbolic.robot.urdf import arm_model
+from symbolic.workcell.records import Robot, Workcell
 
 STAGES = 200
 """Pieces of constant path acceleration."""
@@ -33,7 +34,7 @@ REFINEMENT = 10
 class PathMotion:
     """Geometry of a carry at samples of the path parameter; arms side by side (12 joints).
 
-    `symbolic.path_motion` describes the quantities.
+    `symbolic.physics.path_motion` describes the quantities.
     """
 
     parameter: Array
@@ -138,7 +139,7 @@ class TimingModel:
         return PathMotion(parameter=np.linspace(0.0, 1.0, n), **values)
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
-        """`symbolic.payload_load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
+        """`symbolic.physics.payload_load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
         return self._functions["load"].batch(pose, rate, second_rate)
 
     def uncertain_load(
@@ -245,7 +246,7 @@ def contact_torque(wrench_torque: Array, load: Mapping[str, Array]) -> Array:
 
     Args:
         wrench_torque: (n, 2, 6, 6) from wrenches to torques.
-        load: outputs of `symbolic.payload_load`.
+        load: outputs of `symbolic.physics.payload_load`.
     """
     wrench = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
     torque: Array = np.einsum("nijk,nik->nij", wrench_torque, wrench)

@@ -9,7 +9,7 @@ from hybrid_opt.timing import rows as rows_of
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel, contact_torque
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.rows import STAGE_POINTS, PointRows
-from symbolic.workcell import Array
+from symbolic.array import Array
 
 POINT_TOLERANCE = 1e-3
 """Largest excess at the points where limits are imposed, as a share of the limit."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell import Array, Workcell
+from symbolic.workcell.records import Workcell
 
 
 class TimingStatus(StrEnum):

@@ -15,8 +15,9 @@ import numpy as np
 from hybrid_opt.timing.adapter import SPEED_CEILING, StageRows
 from hybrid_opt.timing.model import PathMotion
 from hybrid_opt.timing.records import TimingLimits
-from symbolic.contact_forces import GRAVITY, normal_force_branches
-from symbolic.workcell import Array, Workcell
+from symbolic.array import Array
+from symbolic.physics.contact_forces import GRAVITY, normal_force_branches
+from symbolic.workcell.records import Workcell
 
 STAGE_POINTS = (0.0, 1.0)
 """Places within a stage at which limits are imposed, as a share of its length."""

@@ -22,7 +22,7 @@ from hybrid_opt.timing.point_limits import POINT_TOLERANCE, PointLimits
 from hybrid_opt.timing.records import Place, TimedCarry, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.rows import STAGE_POINTS, PointRows
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_ratios, limit_use, worst
-from symbolic.workcell import Array
+from symbolic.array import Array
 
 MAX_ITERATIONS = 25
 SETTLED = 2e-4

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hybrid_opt.timing.records import Excess, Place, TimedCarry, TimingLimits
-from symbolic.workcell import Array, Workcell
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
 
 JOINT_CONSTRAINTS = ("joint velocity", "joint acceleration", "joint torque")
 CONTACT_CONSTRAINTS = ("normal force", "friction", "pressure shift")

@@ -12,14 +12,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
+from studies.errors import ReportError
 from studies.report.drawing import ISOMETRIC, cut_faces, draw_cell, draw_path, frame_axes
 from studies.report.figures_cell import motion_points
 from studies.report.records import Carry
 from studies.report.solids import cell_solids
 from studies.report.style import in_style
-from symbolic.collision_pairs import CellGeometry
-from symbolic.errors import ReportError
-from symbolic.workcell import Array
+from symbolic.array import Array
+from symbolic.geometry.pairs import CellGeometry
 
 FRAMES_PER_SECOND = 15
 SIZE = (6.4, 4.0)

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.campaign.polish_stage import read_polished
-from hybrid_opt.evaluation import CandidateEvaluator
-from hybrid_opt.objectives import OBJECTIVES, PAPER_OBJECTIVES
-from hybrid_opt.results import CampaignResults, Replica, read_campaign, read_summary
-from hybrid_opt.robustness import payload_sensitivity
+from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
+from hybrid_opt.indicators.selection import balanced, peak_normal_forces
 from hybrid_opt.timing import TimingModel
-from studies.children import in_children
+from hybrid_opt.timing.robustness import payload_sensitivity
+from hybrid_opt.work.children import in_children
 from studies.report.reach import reach_map
 from studies.report.records import (
     AlgorithmRuns,
@@ -25,11 +26,10 @@ from studies.report.records import (
     Run,
     TimedSelection,
 )
-from studies.selection import balanced, peak_normal_forces
 from studies.terminal_summary import title
 from studies.timing_stage import timed_trajectory
-from symbolic.collision_pairs import CellGeometry, build_geometry
-from symbolic.workcell import Array
+from symbolic.array import Array
+from symbolic.geometry.pairs import CellGeometry, build_geometry
 
 INITIAL_LABEL = "hand-made"
 CURVE_POINTS = 12

@@ -14,9 +14,9 @@ from matplotlib.colors import to_rgb
 
 from studies.report.solids import Solid, frame_placements
 from studies.report.style import ARMS, GROUND, OBSTACLE, PAYLOAD
-from symbolic.collision_bodies import Frame
-from symbolic.collision_pairs import CellGeometry
-from symbolic.workcell import Array
+from symbolic.array import Array
+from symbolic.geometry.bodies import Frame
+from symbolic.geometry.pairs import CellGeometry
 
 MAX_EDGE = 0.12
 """Faces are cut to this size, so that sorting them by their middle is right [m]."""

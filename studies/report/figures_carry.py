@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from hybrid_opt.robustness import KILOGRAM_FORCE
+from hybrid_opt.timing.robustness import KILOGRAM_FORCE
 from studies.report.records import Carry, ReportData
 from studies.report.style import (
     FULL_WIDTH,
@@ -20,7 +20,7 @@ from studies.report.style import (
     series,
     shortened,
 )
-from symbolic.workcell import Array
+from symbolic.array import Array
 
 STATIC_COLOUR = "#b00020"
 

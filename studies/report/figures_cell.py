@@ -25,8 +25,8 @@ from studies.report.drawing import (
 from studies.report.records import Carry, ReachMap
 from studies.report.solids import cell_solids, extent_points
 from studies.report.style import ARMS, FULL_WIDTH, new_figure, panel_label, shortened
-from symbolic.collision_pairs import CellGeometry
-from symbolic.workcell import Array
+from symbolic.array import Array
+from symbolic.geometry.pairs import CellGeometry
 
 _PLAN = View(np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), "y [m]", "x [m]", mirrored=True)
 """From above, the front below."""

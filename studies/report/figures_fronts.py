@@ -9,11 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from hybrid_opt.attainment import attainment_surfaces
-from hybrid_opt.metrics import front_of
+from hybrid_opt.indicators.attainment import attainment_surfaces
+from hybrid_opt.indicators.metrics import front_of
 from studies.report.records import AlgorithmRuns, ReportData
 from studies.report.style import FULL_WIDTH, new_figure, panel_label, series
-from symbolic.workcell import Array
+from symbolic.array import Array
 
 QUARTILES = (25.0, 75.0)
 """Attainment surfaces beside the median, in percent of the replicas."""

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from hybrid_opt.campaign.files import storing, write_atomically
+from hybrid_opt.store.files import storing, write_atomically
 from hybrid_opt.timing import TimingModel
-from studies.children import in_children
+from hybrid_opt.work.children import in_children
 from studies.report.figures import ReportFigure, report_figures
 from studies.report.page import render_page
 from studies.report.page_data import PageData

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from studies.errors import ReportError
 from studies.report.records import Carry
 from studies.report.solids import Solid, cell_solids, frame_placements
-from symbolic.collision_bodies import Frame
-from symbolic.collision_pairs import CellGeometry
-from symbolic.errors import ReportError
-from symbolic.workcell import Array
+from symbolic.array import Array
+from symbolic.geometry.bodies import Frame
+from symbolic.geometry.pairs import CellGeometry
 
 if TYPE_CHECKING:
     import viser

@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from hybrid_opt.results import read_summary
+from hybrid_opt.campaign.results import read_summary
+from studies.errors import ReportError
 from studies.report.animation import write_animation
 from studies.report.data import gather_carries
 from studies.report.generate import TABLES
 from studies.report.live import LiveView
-from symbolic.errors import ReportError
 
 BEGIN = "<!-- measured: begin -->"
 END = "<!-- measured: end -->"

@@ -18,9 +18,9 @@ from typing import Any
 
 import trimesh
 
+from studies.errors import ReportError
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
-from symbolic.errors import ReportError
 
 _OWN_SCRIPTS = ("scene.js", "page.js")
 

@@ -13,8 +13,8 @@ from studies.report.figures_cell import motion_points
 from studies.report.records import AlgorithmRuns, Carry, Front, ReportData
 from studies.report.solids import Solid, cell_solids
 from studies.report.style import series
-from symbolic.collision_pairs import CellGeometry
-from symbolic.workcell import Array
+from symbolic.array import Array
+from symbolic.geometry.pairs import CellGeometry
 
 MAX_SAMPLES = 60
 """Samples of a trajectory on the page; its force peaks are kept besides."""

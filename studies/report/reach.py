@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from studies.report.records import ReachMap
-from symbolic.collision_bodies import ArmGeometry
-from symbolic.collision_pairs import CellGeometry
-from symbolic.workcell import Array
+from symbolic.array import Array
+from symbolic.geometry.bodies import ArmGeometry
+from symbolic.geometry.pairs import CellGeometry
 
 STEP = 0.05
 """Edge of the cubes [m]: what a drawing of two metres shows."""

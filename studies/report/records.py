@@ -8,11 +8,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from hybrid_opt.evaluation import Evaluations
-from hybrid_opt.robustness import Margin, PayloadSensitivity
+from hybrid_opt.evaluate.evaluation import Evaluations
 from hybrid_opt.timing import ForceCurve, TimedCarry, TimingReport
-from symbolic.collision_pairs import CellGeometry
-from symbolic.workcell import Array, Workcell
+from hybrid_opt.timing.robustness import Margin, PayloadSensitivity
+from symbolic.array import Array
+from symbolic.geometry.pairs import CellGeometry
+from symbolic.workcell.records import Workcell
 
 
 @dataclass(frozen=True)

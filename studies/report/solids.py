@@ -10,10 +10,11 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from symbolic.collision_bodies import ArmGeometry, Frame
-from symbolic.collision_pairs import CellGeometry
-from symbolic.geometry import Capsule, Hull, Piece
-from symbolic.workcell import Array, Box, Cylinder, Sphere
+from symbolic.array import Array
+from symbolic.geometry.bodies import ArmGeometry, Frame
+from symbolic.geometry.pairs import CellGeometry
+from symbolic.geometry.pieces import Capsule, Hull, Piece
+from symbolic.workcell.records import Box, Cylinder, Sphere
 
 SECTIONS = 24
 """Facets around a cylinder."""
@@ -96,7 +97,7 @@ def joint_placements(arm: ArmGeometry, q: Array) -> Array:
 def box_placements(pose: Array) -> Array:
     """(n, 4, 4) of the box in the world from poses (n, 6) [m, rad]."""
     T = np.zeros((len(pose), 4, 4))
-    # Rz(yaw) Ry(pitch) Rx(roll), as `symbolic.rotation` has it.
+    # Rz(yaw) Ry(pitch) Rx(roll), as `symbolic.physics.rotation` has it.
     T[:, :3, :3] = Rotation.from_euler("xyz", pose[:, 3:]).as_matrix()
     T[:, :3, 3] = pose[:, :3]
     T[:, 3, 3] = 1.0

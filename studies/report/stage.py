@@ -75,8 +75,8 @@ def rewrite(root: Path, progress: Progress) -> None:
     Raises:
         DualArmError: the folder is not complete.
     """
-    from hybrid_opt.campaign.files import read_json
     from hybrid_opt.campaign.layout import STAGES
+    from hybrid_opt.store.files import read_json
 
     marker = root / STAGES / "report.json"
     stored = read_json(marker) if marker.exists() else {}

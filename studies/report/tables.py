@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.statistics import summarise
+from hybrid_opt.indicators.statistics import summarise
 from studies.report.records import AlgorithmRuns, Carry, ReportData
 from studies.report.table_text import NOTHING, Table, number
 from studies.terminal_summary import PAPER

@@ -18,8 +18,8 @@ from codegen.build import build, build_set, compile_function, load_or_build
 from codegen.cache import Cache
 from codegen.compiled import CompiledFunction
 from codegen.compiler import LARGE_SOURCE, SMALL_SOURCE, default_level, find_compiler
+from codegen.errors import CodegenError
 from codegen.source import operations
-from symbolic.errors import CodegenError
 
 SET = """
 import casadi as ca

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from codegen.cache import Cache, default_folder, digest, source_digest
-from symbolic.errors import CodegenError
+from codegen.errors import CodegenError
 
 KEY = digest("test")
 
@@ -164,7 +164,7 @@ def test_full_disk_is_one_message(tmp_path: Path) -> None:
 import resource, sys
 from pathlib import Path
 from codegen.cache import Cache
-from symbolic.errors import CodegenError
+from codegen.errors import CodegenError
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 def make(path):
     path.write_bytes(b"x" * 100_000)

@@ -14,18 +14,17 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from codegen.build import compile_function
 from codegen.cache import Cache
 from codegen.check import directional_derivative, relative_difference
 from codegen.compiled import CompiledFunction
+from codegen.errors import CodegenError
 from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
-from symbolic.errors import CodegenError
+from symbolic.array import Array
 
-Array = NDArray[np.float64]
 Make = Callable[[ca.Function], NumericFunction]
 
 BINARY = [

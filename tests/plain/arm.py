@@ -6,8 +6,9 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from symbolic.arm import MAX_JOINT_STEP, NEWTON_STEPS, REACH_TOLERANCE
-from symbolic.workcell import Array, Contact, Robot
+from symbolic.array import Array
+from symbolic.robot.arm import MAX_JOINT_STEP, NEWTON_STEPS, REACH_TOLERANCE
+from symbolic.workcell.records import Contact, Robot
 from tests.plain.motion import rotation
 
 
@@ -72,7 +73,7 @@ class PlainArm:
         return float(np.hypot(distance, 2.0 * np.sin(angle / 2.0)))
 
     def follow(self, start: Array, poses: Array, wrenches: Array) -> dict[str, Array]:
-        """Every output of `symbolic.arm.TRACK_OUTPUTS` along the samples.
+        """Every output of `symbolic.robot.arm.TRACK_OUTPUTS` along the samples.
 
         Args:
             start: (6,) joints at the first pose [rad].

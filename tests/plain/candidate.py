@@ -1,4 +1,4 @@
-"""A whole candidate written plainly: the oracle of `symbolic.evaluator.candidate_function`.
+"""A whole candidate written plainly: the oracle of `symbolic.functions.candidate`.
 
 Numeric Pinocchio, NumPy and SciPy in Python loops; only tolerances are shared with the symbolic
 model. It iterates exactly as the symbolic model does, so both may be compared to rounding.
@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from symbolic.arm import REACH_TOLERANCE
-from symbolic.evaluator import CONSTRAINTS, FRICTION_TOLERANCE
-from symbolic.workcell import Array, Workcell
+from symbolic.array import Array
+from symbolic.functions.candidate import CONSTRAINTS, FRICTION_TOLERANCE
+from symbolic.robot.arm import REACH_TOLERANCE
+from symbolic.workcell.records import Workcell
 from tests.plain.arm import PlainArm
 from tests.plain.load import sample_load
 from tests.plain.motion import timed_motion

@@ -1,6 +1,6 @@
 """Collisions written plainly: every pair of every sample goes to FCL, nothing is screened.
 
-Which pairs can meet at all is a fact of the cell (`symbolic.collision_pairs`), and so are the
+Which pairs can meet at all is a fact of the cell (`symbolic.geometry.pairs`), and so are the
 convex pieces of a mesh. Shapes and placements are Pinocchio's own reading of the URDF.
 """
 
@@ -15,9 +15,10 @@ import numpy as np
 import pinocchio as pin
 
 from hybrid_opt.collision.checker import RESTING_TOLERANCE
-from symbolic.collision_pairs import build_geometry
-from symbolic.meshes import convex_pieces
-from symbolic.workcell import Array, Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
+from symbolic.array import Array
+from symbolic.geometry.meshes import convex_pieces
+from symbolic.geometry.pairs import build_geometry
+from symbolic.workcell.records import Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
 from tests.plain.motion import rotation
 
 PAYLOAD = "payload"

@@ -6,14 +6,15 @@ from itertools import combinations
 
 import numpy as np
 
-from symbolic.workcell import Array, Workcell
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
 from tests.plain.motion import angular_rates, rotation
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 def sample_load(workcell: Workcell, pose: Array, rate: Array, second: Array) -> dict[str, Array]:
-    """Every load quantity of one sample, named as in `symbolic.payload_load.LOAD_OUTPUTS`."""
+    """Every load quantity of one sample, named as in `LOAD_OUTPUTS`."""
     payload, contacts = workcell.payload, workcell.contacts
     R = rotation(pose[3:])
     omega, alpha = angular_rates(pose[3:], rate[3:], second[3:])

@@ -10,8 +10,9 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from symbolic.time_law import STEP_TIME_FLOOR
-from symbolic.workcell import Array, Task
+from symbolic.array import Array
+from symbolic.physics.time_law import STEP_TIME_FLOOR
+from symbolic.workcell.records import Task
 
 
 def waypoints(task: Task, x: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The full verdict on a candidate, written plainly: the oracle of `hybrid_opt.evaluation`."""
+"""The full verdict on a candidate, written plainly: the oracle of `hybrid_opt.evaluate`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from symbolic.evaluator import CONSTRAINTS
-from symbolic.workcell import Array, Workcell
+from symbolic.array import Array
+from symbolic.functions.candidate import CONSTRAINTS
+from symbolic.workcell.records import Workcell
 from tests.plain.candidate import PlainCandidate, PlainEvaluator
 from tests.plain.collisions import PlainCollisionChecker, PlainCollisions
 

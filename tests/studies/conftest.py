@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
-from hybrid_opt.metrics import hypervolume, non_dominated
+from hybrid_opt.indicators.metrics import hypervolume, non_dominated
 from studies.report.data import gather
 from studies.report.records import Front, ReportData
 from studies.run import StudySettings, run_study

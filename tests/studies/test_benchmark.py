@@ -12,8 +12,8 @@ import pytest
 
 from studies import benchmark, benchmark_collisions
 from studies.benchmark_turns import Evaluate, interleaved, summary
+from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell import Array
 from tests.symbolic.cells import RACK, hand_cell
 
 PROMISED_RATIO = 200.0

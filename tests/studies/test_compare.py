@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt import metrics
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress, open_folder
+from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.stages import run_stages
-from hybrid_opt.results import read_campaign
+from hybrid_opt.indicators import metrics
 from studies.compare import compare, main
 from studies.summary_stage import summary_stage
-from symbolic.workcell_file import load
+from symbolic.workcell.file import load
 from tests.studies.conftest import TRANSFER
 
 

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt import metrics
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
 from hybrid_opt.campaign.polish_stage import read_polished
-from hybrid_opt.polish.records import PolishSettings
-from hybrid_opt.results import read_campaign, read_summary
+from hybrid_opt.campaign.results import read_campaign, read_summary
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.indicators import metrics
+from hybrid_opt.polishing.records import PolishSettings
 from studies import control
 from studies.reference_front import ReferenceFront
 from studies.run import StudySettings, run_study
-from symbolic.errors import ResultsError
-from tests.symbolic.workcell_samples import RACK
+from tests.symbolic.workcell.samples import RACK
 
 
 @pytest.fixture(scope="module")

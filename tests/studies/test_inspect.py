@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hybrid_opt.evaluation import REASONS, CandidateEvaluator
+from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
 from studies.inspect import main
 from studies.inspection import Inspection, inspect, straight_line
-from symbolic.workcell import Workcell
-from symbolic.workcell_file import load
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
 from tests.studies.conftest import TRANSFER
 from tests.symbolic.cells import RACK
 

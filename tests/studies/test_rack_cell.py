@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid_opt.evaluation import REASONS, CandidateEvaluator
-from symbolic.workcell_file import load
-from tests.symbolic.workcell_samples import RACK
+from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
+from symbolic.workcell.file import load
+from tests.symbolic.workcell.samples import RACK
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,9 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from hybrid_opt.evaluation import CandidateEvaluator
-from hybrid_opt.trajectory_figures import trajectory_figures
-from hybrid_opt.trajectory_file import write_trajectory
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.store.trajectory_figures import trajectory_figures
+from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.replay import main
 from tests.symbolic.cells import rack_cell
 

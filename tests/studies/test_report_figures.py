@@ -19,7 +19,7 @@ from PIL import Image
 from studies.report.figures import ReportFigure, report_figures
 from studies.report.records import ReportData, Run
 from studies.report.style import ARMS, INITIAL, SERIES, in_style, save
-from symbolic.workcell import Array
+from symbolic.array import Array
 
 NAMES = (
     "fig04_reachable_regions",

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
+from studies.errors import ReportError
 from studies.report.__main__ import main
 from studies.report.animation import FRAMES_PER_SECOND, frames, write_animation
 from studies.report.live import LiveView
 from studies.report.records import Carry, ReportData
-from symbolic.errors import ReportError
 
 
 @pytest.fixture(scope="module")

@@ -17,11 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.timing import TimingModel
+from studies.errors import ReportError
 from studies.report import page
 from studies.report.generate import write_report
 from studies.report.page_data import PageData
 from studies.report.records import ReportData
-from symbolic.errors import ReportError
 
 HOSTILE = "</title></script><script>window.broken = 1</script><img src=x onerror=alert(1)>\"'&"
 SHORT = '<b>&"</script>'

@@ -17,11 +17,11 @@ from studies.report.solids import (
     frame_placements,
     joint_placements,
 )
-from symbolic.collision_bodies import Frame
-from symbolic.collision_pairs import CellGeometry, build_geometry
-from symbolic.urdf_model import arm_model
-from symbolic.workcell import Box
-from symbolic.workcell_file import load
+from symbolic.geometry.bodies import Frame
+from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.robot.urdf import arm_model
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Box
 from tests.studies.conftest import TRANSFER
 
 ANGLES = st.floats(-3.0, 3.0)

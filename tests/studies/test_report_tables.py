@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from studies.errors import ReportError
 from studies.report.look import BEGIN, END, insert_tables
 from studies.report.records import ReportData
 from studies.report.table_text import NOTHING, Table
 from studies.report.tables import report_tables
-from symbolic.errors import ReportError
 
 TEXTS = st.text(st.characters(blacklist_categories=("Cs", "Cc")), min_size=1, max_size=20)
 

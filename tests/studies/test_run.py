@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt import metrics
-from hybrid_opt.results import read_campaign, read_summary
-from hybrid_opt.trajectory_file import read_trajectory
+from hybrid_opt.campaign.results import read_campaign, read_summary
+from hybrid_opt.indicators import metrics
+from hybrid_opt.store.trajectory_file import read_trajectory
 from studies import rack, run
 from studies.cli import campaign_parser, campaign_settings
-from symbolic.workcell_file import load
+from symbolic.workcell.file import load
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
 
 CELL = str(RACK.with_name("transfer.toml"))

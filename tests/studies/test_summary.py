@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign.replica import front_rows
-from hybrid_opt.evaluation import FEASIBLE, REASONS, Evaluations
-from hybrid_opt.results import CampaignResults, Replica
-from hybrid_opt.static_hold import StaticHold
-from hybrid_opt.statistics import rank_test
+from hybrid_opt.campaign.results import CampaignResults, Replica
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.evaluate.static_hold import StaticHold
+from hybrid_opt.indicators.statistics import rank_test
 from studies.summary import (
     FIGURES,
     TESTED,
@@ -23,7 +23,7 @@ from studies.summary import (
     replica_figures,
 )
 from studies.terminal_summary import PAPER, terminal_summary
-from symbolic.workcell_file import load
+from symbolic.workcell.file import load
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, RACK
 
 NAN = math.nan

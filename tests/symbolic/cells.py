@@ -15,13 +15,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from symbolic.array import Array
 from symbolic.cell_model import CellModel
-from symbolic.collision_pairs import build_geometry
-from symbolic.evaluator import candidate_function
-from symbolic.pose import pose_matrix
-from symbolic.robot_model import RobotModel, build_robot_model
-from symbolic.workcell import Array, Contact, Payload, Robot, Task, Waypoint, Workcell
-from symbolic.workcell_file import load
+from symbolic.functions.candidate import candidate_function
+from symbolic.geometry.pairs import build_geometry
+from symbolic.physics.pose import pose_matrix
+from symbolic.robot.model import RobotModel, build_robot_model
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Contact, Payload, Robot, Task, Waypoint, Workcell
 from tests.plain.arm import PlainArm
 
 ROOT = Path(__file__).resolve().parents[2]

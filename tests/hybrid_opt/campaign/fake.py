@@ -21,10 +21,10 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
-from hybrid_opt.evaluation import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
+from symbolic.array import Array
 from symbolic.errors import DualArmError
-from symbolic.workcell import Array
-from symbolic.workcell_file import load
+from symbolic.workcell.file import load
 
 ROOT = Path(__file__).parents[3]
 RACK = ROOT / "studies/workcells/rack.toml"

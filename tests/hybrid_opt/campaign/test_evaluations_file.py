@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode, encode, encode_front
-from hybrid_opt.evaluation import REASONS, Evaluations
-from symbolic.errors import ResultsError
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.evaluation import REASONS, Evaluations
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
 
 PATH = Path("evaluations.csv.gz")

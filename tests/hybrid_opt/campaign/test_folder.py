@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, open_folder
-from symbolic.errors import ResultsError
-from symbolic.workcell_file import load
+from hybrid_opt.errors import ResultsError
+from symbolic.workcell.file import load
 from tests.hybrid_opt.campaign.fake import RACK, run_search
 
 SETTINGS = CampaignSettings(evaluations=200, replicas=2)

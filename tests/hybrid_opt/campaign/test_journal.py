@@ -17,8 +17,8 @@ from hybrid_opt.campaign.journal import (
     decode_generation,
     encode_generation,
 )
-from hybrid_opt.evaluation import Evaluations
-from symbolic.errors import ResultsError
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.evaluation import Evaluations
 from tests.hybrid_opt.campaign.fake import verdicts
 
 IDENTITY = bytes(range(32))

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt import metrics
 from hybrid_opt.campaign import (
     CampaignSettings,
     ExecutionSettings,
@@ -21,12 +20,13 @@ from hybrid_opt.campaign import (
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.layout import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.polish_stage import polish_stage, read_polished
-from hybrid_opt.evaluation import CandidateEvaluator
-from hybrid_opt.polish.records import PolishSettings, outcome_from_json, outcome_to_json
-from hybrid_opt.results import read_campaign
-from symbolic.errors import ResultsError
-from symbolic.workcell_file import load
-from tests.symbolic.workcell_samples import RACK
+from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.indicators import metrics
+from hybrid_opt.polishing.records import PolishSettings, outcome_from_json, outcome_to_json
+from symbolic.workcell.file import load
+from tests.symbolic.workcell.samples import RACK
 
 SETTINGS = CampaignSettings(algorithms=("nsga2",), evaluations=200, replicas=1, seed=5)
 POLISHED = PolishSettings(points=4)

@@ -18,9 +18,10 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress, open_folder
-from hybrid_opt.results import read_campaign
-from symbolic.errors import DualArmError, ResultsError, WorkerError
-from symbolic.workcell_file import load
+from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.errors import ResultsError, WorkerError
+from symbolic.errors import DualArmError
+from symbolic.workcell.file import load
 from tests.hybrid_opt.campaign.fake import (
     RACK,
     ROOT,

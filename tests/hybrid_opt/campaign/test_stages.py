@@ -17,8 +17,8 @@ from hybrid_opt.campaign import (
     open_folder,
     run_stages,
 )
-from symbolic.errors import ResultsError
-from symbolic.workcell_file import load
+from hybrid_opt.errors import ResultsError
+from symbolic.workcell.file import load
 from tests.hybrid_opt.campaign.fake import RACK
 
 

@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 
 from hybrid_opt.timing import TimingModel
-from symbolic.workcell import Array, Workcell
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
 from tests.symbolic.cells import hand_cell, hand_model
 
 STAGES = 200

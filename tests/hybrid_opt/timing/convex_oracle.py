@@ -16,7 +16,7 @@ from scipy import sparse
 
 from hybrid_opt.timing import TimingLimits, TimingModel
 from hybrid_opt.timing.model import REFINEMENT, PathMotion
-from symbolic.workcell import Array
+from symbolic.array import Array
 
 Terms = dict[int, float]
 

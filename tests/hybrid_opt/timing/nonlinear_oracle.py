@@ -12,8 +12,8 @@ import numpy as np
 from hybrid_opt.timing import TimingLimits, TimingModel
 from hybrid_opt.timing.model import REFINEMENT
 from hybrid_opt.timing.rows import squared_speed_limit
-from symbolic.payload_load import LOAD_OUTPUTS, load_function
-from symbolic.workcell import Array
+from symbolic.array import Array
+from symbolic.physics.payload_load import LOAD_OUTPUTS, load_function
 
 
 def shortest_duration(model: TimingModel, x: Array, start: Array) -> float:

@@ -22,8 +22,8 @@ from hybrid_opt.timing import (
     time_path,
 )
 from hybrid_opt.timing.use import limit_ratios
+from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell import Array
 from tests.hybrid_opt.timing.cells import (
     hand_timing,
     initial,

@@ -1,0 +1,11 @@
+"""What can go wrong with results and with those who compute them."""
+
+from symbolic.errors import DualArmError
+
+
+class ResultsError(DualArmError):
+    """Stored results are missing, damaged, or belong to another configuration."""
+
+
+class WorkerError(DualArmError):
+    """Processes or machines that work for this one were lost or do not fit."""

@@ -1,0 +1,1 @@
+"""What a candidate is worth: compiled model, verdict, objectives, certification, static hold."""

@@ -1,0 +1,258 @@
+"""Evaluation of candidates: compiled physics, collision verdict, objectives, feasibility.
+
+This is what every search calls. A candidate is a decision vector; it is judged on the task's
+samples. Infeasible candidates get the paper's penalty (Eq. 60), extended to every constraint:
+all objectives take the value 1 + (time in violation, summed over the constraints) / duration.
+The same evaluation also returns each constraint's violation for constraint domination.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.function import NumericFunction
+from hybrid_opt.collision.certify import Certificate
+from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.collision.verdict import Verdict
+from hybrid_opt.evaluate.certification import (
+    LostPathError,
+    SampledPath,
+    certificate,
+    waypoints_of,
+)
+from hybrid_opt.evaluate.functions import workcell_functions
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, select_objectives
+from hybrid_opt.indicators.metrics import non_dominated
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.functions.candidate import CONSTRAINTS
+from symbolic.geometry.pairs import build_geometry
+from symbolic.workcell.records import Workcell
+
+COLLISION = "collision"
+BETWEEN_SAMPLES = "between_samples"
+NOT_FINITE = "not_finite"
+REASONS = (*CONSTRAINTS, COLLISION, BETWEEN_SAMPLES, NOT_FINITE)
+"""What can make a candidate infeasible; `Evaluations.reason` indexes it.
+
+between_samples: not proven free of collisions between the samples; only fronts are certified.
+not_finite: an objective is NaN or infinite (a solver or model failure, never a front member).
+"""
+
+FEASIBLE = -1
+"""`Evaluations.reason` of a feasible candidate."""
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """Verdicts on n candidates; every array has a leading axis over them.
+
+    Attributes:
+        x: (n, n_var) decision vectors.
+        objectives: (n, m) values without penalty; only meaningful where feasible.
+        penalised: (n, m) objectives with the paper's penalty, always finite; what a search sees.
+        feasible: (n,).
+        reason: (n,) index into `REASONS` of the constraint violated first along the path, or
+            `FEASIBLE`.
+        position: (n,) path parameter in [0, 1] of the first violation; NaN where feasible.
+        violation: (n, len(REASONS)) violation of each constraint, 0 where satisfied; the unit
+            is the constraint's (`symbolic.functions.candidate.CONSTRAINTS`), time share for
+            collision, 1 for those that follow it.
+        violation_time: (n, len(REASONS)) time in violation over the duration.
+    """
+
+    x: Array
+    objectives: Array
+    penalised: Array
+    feasible: NDArray[np.bool_]
+    reason: NDArray[np.int8]
+    position: Array
+    violation: Array
+    violation_time: Array
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Evaluations:
+        return Evaluations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+
+class CandidateEvaluator:
+    """Evaluates candidates of one workcell with a fixed selection of objectives.
+
+    Attributes:
+        workcell: the cell.
+        objective_names: the selected objectives.
+        functions: the cell's compiled functions by name.
+        checker: FCL's verdict on samples.
+        n_var, lower, upper: size and bounds of the decision vector.
+        count: candidates evaluated so far.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        objectives: tuple[str, ...] = PAPER_OBJECTIVES,
+        threads: int = 1,
+        functions: Mapping[str, NumericFunction] | None = None,
+    ) -> None:
+        """Load or build the compiled functions.
+
+        Args:
+            functions: those of `symbolic.functions.cell`, if not to be loaded or built here.
+
+        Raises:
+            SettingsError: an objective is unknown.
+            DualArmError: the model cannot be built (see `symbolic.cell_model`, `codegen`).
+        """
+        self.workcell = workcell
+        self.objective_names = objectives
+        self._objectives = select_objectives(objectives)
+        self._threads = threads
+        self.functions = workcell_functions(workcell) if functions is None else functions
+        self._candidate = self.functions["candidate"]
+        self.checker = CollisionChecker(build_geometry(workcell), self.functions)
+        self.n_var = workcell.task.n_var
+        self.lower = workcell.task.lower
+        self.upper = workcell.task.upper
+        self.count = 0
+
+    def outputs(self, x: Array) -> dict[str, Array]:
+        """Every per-sample output for decision vectors (n, n_var), see
+        `symbolic.functions.candidate`."""
+        return self._candidate.batch(self._checked(x), threads=self._threads)
+
+    def evaluate(self, x: Array) -> Evaluations:
+        """Verdicts on decision vectors (n, n_var).
+
+        Raises:
+            SettingsError: x has the wrong shape.
+        """
+        x = self._checked(x)
+        outputs = self.outputs(x)
+        self.count += len(x)
+        return self._judge(x, outputs)
+
+    def certificate(self, x: Array) -> Certificate:
+        """The continuous verdict on one decision vector (n_var,).
+
+        Raises:
+            LostPathError: an arm loses the path, on its samples or between them.
+        """
+        outputs = self.outputs(x)
+        if outputs["lost_1"].any() or outputs["lost_2"].any():
+            raise LostPathError("an arm loses the path; no more can be said of its collisions")
+        waypoints = waypoints_of(self.workcell.task, self._checked(x)[0])
+        path = SampledPath(waypoints, outputs["q_1"][0], outputs["q_2"][0])
+        return certificate(self.checker, self.functions["posture"], path)
+
+    def certified(self, evaluations: Evaluations) -> Evaluations:
+        """The evaluations with their feasible front proven free between the samples.
+
+        Members of the front that are not proven free become infeasible for the reason
+        `between_samples`; what only they dominated is certified in turn, until the front stands.
+        """
+        feasible, reason = evaluations.feasible.copy(), evaluations.reason.copy()
+        position, violation = evaluations.position.copy(), evaluations.violation.copy()
+        proven = np.zeros(len(evaluations), dtype=bool)
+        while True:
+            front = non_dominated(evaluations.objectives, feasible)
+            unproven = np.flatnonzero(front & ~proven)
+            if len(unproven) == 0:
+                break
+            for row in unproven.tolist():
+                failure = self._failure_between_samples(evaluations.x[row])
+                proven[row] = failure is None
+                if failure is not None:
+                    feasible[row], position[row] = False, failure
+                    reason[row] = REASONS.index(BETWEEN_SAMPLES)
+                    violation[row, reason[row]] = 1.0
+        return replace(
+            evaluations,
+            feasible=feasible,
+            reason=reason,
+            position=position,
+            violation=violation,
+        )
+
+    def _failure_between_samples(self, x: Array) -> float | None:
+        """Path parameter where a carry is not proven free, None where it is throughout."""
+        try:
+            verdict = self.certificate(x)
+        except LostPathError:
+            return 0.0
+        return None if verdict.is_free else verdict.at_parameter
+
+    def _checked(self, x: Array) -> Array:
+        x = np.ascontiguousarray(np.atleast_2d(x), dtype=float)
+        if x.ndim != 2 or x.shape[1] != self.n_var:
+            raise SettingsError(
+                f"decision vectors have shape {x.shape}; this cell needs (n, {self.n_var})"
+            )
+        return x
+
+    def _judge(self, x: Array, outputs: dict[str, Array]) -> Evaluations:
+        n = len(x)
+        values = np.column_stack(
+            [objective.evaluate(outputs, self.workcell) for objective in self._objectives]
+        )
+        n_constraints = len(CONSTRAINTS)
+        violation = np.zeros((n, len(REASONS)))
+        violation_time = np.zeros((n, len(REASONS)))
+        violation[:, :n_constraints] = outputs["violation"]
+        violation_time[:, :n_constraints] = outputs["violation_time"]
+        judged = np.column_stack([values, violation])
+        broken = np.asarray(~np.isfinite(judged).all(axis=1), dtype=np.bool_)
+        violation[broken] = 0.0
+        violation_time[broken] = 0.0
+        violation[broken, REASONS.index(NOT_FINITE)] = 1.0
+        violation_time[broken, REASONS.index(NOT_FINITE)] = 1.0
+
+        reason = np.full(n, FEASIBLE, dtype=np.int8)
+        position = np.full(n, np.nan)
+        for row in range(n):
+            if broken[row]:
+                reason[row], position[row] = REASONS.index(NOT_FINITE), 0.0
+                continue
+            verdict = self._collisions(outputs, row)
+            share = verdict.collision_time / float(outputs["time"][row, -1])
+            violation[row, n_constraints] = violation_time[row, n_constraints] = share
+            if share > 0.0 or violation[row].any():
+                reason[row], position[row] = _first_violation(outputs["constraint"][row], verdict)
+        feasible = reason == FEASIBLE
+        penalty = 1.0 + violation_time.sum(axis=1)
+        penalised = np.where(feasible[:, None], values, penalty[:, None])
+        return Evaluations(
+            x, values, penalised, feasible, reason, position, violation, violation_time
+        )
+
+    def _collisions(self, outputs: dict[str, Array], row: int) -> Verdict:
+        """The collision verdict on the samples that both arms reach."""
+        reached = reached_samples(outputs, row)
+        return self.checker.check(
+            outputs["pose"][row, :reached],
+            outputs["q_1"][row, :reached],
+            outputs["q_2"][row, :reached],
+            outputs["time"][row, :reached],
+        )
+
+
+def reached_samples(outputs: Mapping[str, Array], row: int) -> int:
+    """Number of samples of a candidate before an arm loses the path: those that can collide."""
+    lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
+    return int(np.argmax(lost)) if lost.any() else len(lost)
+
+
+def _first_violation(constraint: Array, verdict: Verdict) -> tuple[int, float]:
+    """Reason and path parameter of the first violated sample; constraint (samples, k)."""
+    last = len(constraint) - 1
+    violated = constraint > 0.0
+    samples = np.flatnonzero(violated.any(axis=1))
+    contact = verdict.first_contact
+    if contact is not None and (len(samples) == 0 or contact.sample < samples[0]):
+        return REASONS.index(COLLISION), contact.sample / last
+    return int(np.argmax(violated[samples[0]])), float(samples[0]) / last

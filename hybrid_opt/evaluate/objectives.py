@@ -1,0 +1,138 @@
+"""The objectives a search may minimise, each a pure function of the evaluator's outputs.
+
+The paper's two are the peak normal forces of both robots (Eq. 60). All are dimensionless and
+scaled so that values of interest lie below one, which keeps the paper's penalty (values above
+one for every infeasible candidate) meaningful for any selection of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.workcell.records import Workcell
+
+Outputs = Mapping[str, Array]
+"""Batch outputs of the candidate function, each with a leading axis over candidates."""
+
+
+@dataclass(frozen=True)
+class Objective:
+    """One objective to be minimised.
+
+    Attributes:
+        name: its name on the command line and in results.
+        title: what it is, for axes and tables.
+        evaluate: from the batch outputs (n candidates) and the workcell to (n,) values.
+    """
+
+    name: str
+    title: str
+    evaluate: Callable[[Outputs, Workcell], Array]
+
+
+PAPER_OBJECTIVES = ("peak_force_1", "peak_force_2")
+"""The paper's pair: peak normal force of each robot."""
+
+
+def _peak_force(robot: int) -> Callable[[Outputs, Workcell], Array]:
+    def evaluate(outputs: Outputs, workcell: Workcell) -> Array:
+        peak: Array = outputs["normal_force"][:, :, robot].max(axis=1)
+        return peak / float(workcell.task.reference_force[robot])
+
+    return evaluate
+
+
+def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
+    """Time average of both normal forces over the mean reference force."""
+    both = outputs["normal_force"].mean(axis=2)
+    return _time_average(both, outputs["time"]) / float(workcell.task.reference_force.mean())
+
+
+def _duration(outputs: Outputs, workcell: Workcell) -> Array:
+    """Duration over twice the time that the initial trajectory's polygon takes."""
+    duration = outputs["time"][:, -1] / (2.0 * _polygon_time(workcell))
+    return np.asarray(duration, dtype=float)
+
+
+def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
+    """Largest joint torque from the contact wrench over that joint's maximum."""
+    uses = [
+        (np.abs(outputs[f"joint_torque_{i + 1}"]) / robot.torque_max).max(axis=(1, 2))
+        for i, robot in enumerate(workcell.robots)
+    ]
+    return np.asarray(np.maximum(uses[0], uses[1]), dtype=float)
+
+
+def _force_imbalance(outputs: Outputs, workcell: Workcell) -> Array:
+    """Largest difference of the two normal forces over the mean reference force."""
+    forces = outputs["normal_force"]
+    difference: Array = np.abs(forces[:, :, 0] - forces[:, :, 1]).max(axis=1)
+    return difference / float(workcell.task.reference_force.mean())
+
+
+def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
+    """Least friction margin, as the share of friction used at the reference squeeze.
+
+    With the least normal forces the cones are tight by construction, so the margin is taken at
+    the reference forces: both pads squeeze as hard as they may, the needed coefficient is
+    F_t / (N_1 + N_2) with N_1 - N_2 = F_n, and its share of the smaller coefficient is returned.
+    """
+    force = outputs["normal_force"]
+    difference = np.abs(force[:, :, 0] - force[:, :, 1])
+    squeeze = 2.0 * float(workcell.task.reference_force.min()) - difference
+    needed = outputs["tangential_force"].sum(axis=2) / np.maximum(squeeze, 1e-9)
+    use: Array = needed.max(axis=1)
+    return use / min(contact.friction for contact in workcell.contacts)
+
+
+def _time_average(values: Array, time: Array) -> Array:
+    """Trapezoidal average over time; values and time (n, samples)."""
+    integral = np.trapezoid(values, time, axis=1)
+    return np.asarray(integral / (time[:, -1] - time[:, 0]), dtype=float)
+
+
+def _polygon_time(workcell: Workcell) -> float:
+    """Time [s] along the hand-made trajectory's straight pieces at the reference speeds."""
+    task = workcell.task
+    points = np.array([waypoint.lower for waypoint in task.waypoints])
+    points[list(task.free_indices)] = task.initial
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps[:, :3], axis=1) / task.reference_speed
+    turns = np.linalg.norm(steps[:, 3:], axis=1) / task.reference_angular_speed
+    return float(np.maximum(lengths, turns).sum())
+
+
+OBJECTIVES: dict[str, Objective] = {
+    objective.name: objective
+    for objective in (
+        Objective("peak_force_1", "peak normal force of robot 1 / reference", _peak_force(0)),
+        Objective("peak_force_2", "peak normal force of robot 2 / reference", _peak_force(1)),
+        Objective("mean_force", "mean normal force / reference", _mean_force),
+        Objective("duration", "duration / twice the initial polygon's time", _duration),
+        Objective("peak_torque_use", "peak joint torque / maximum", _peak_torque_use),
+        Objective("force_imbalance", "peak |N1 - N2| / reference", _force_imbalance),
+        Objective("friction_use", "peak friction use at the reference squeeze", _friction_use),
+    )
+}
+"""All objectives by name."""
+
+
+def select_objectives(names: tuple[str, ...]) -> tuple[Objective, ...]:
+    """The named objectives in order.
+
+    Raises:
+        SettingsError: a name is unknown or given twice, or none is given.
+    """
+    unknown = [name for name in names if name not in OBJECTIVES]
+    if unknown:
+        raise SettingsError(
+            f"unknown objective {', '.join(unknown)}; known are {', '.join(OBJECTIVES)}"
+        )
+    if not names or len(set(names)) != len(names):
+        raise SettingsError(f"objectives {names}: name at least one, each once")
+    return tuple(OBJECTIVES[name] for name in names)

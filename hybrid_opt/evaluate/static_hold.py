@@ -1,0 +1,51 @@
+"""The forces of holding the payload still, which no carry can stay far below."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.physics.payload_load import load_function
+from symbolic.workcell.records import Workcell
+
+
+@dataclass(frozen=True)
+class StaticHold:
+    """A level box at rest.
+
+    Attributes:
+        normal_force: (2,) normal force of each robot [N].
+        contact_force: (2,) magnitude of each robot's whole force [N].
+        payload_limit: payload at which a robot's whole force reaches its reference force [kg].
+    """
+
+    normal_force: Array
+    contact_force: Array
+    payload_limit: float
+
+
+def static_hold(workcell: Workcell) -> StaticHold:
+    """Forces of the payload held level and still.
+
+    With equal friction coefficients mu the normal forces are m g / (2 mu) each, and the whole
+    forces (m g / 2) sqrt(1 + 1 / mu^2).
+    """
+    function = load_function(workcell)
+    outputs = function(pose=np.zeros(6), rate=np.zeros(6), second_rate=np.zeros(6))
+    normal = np.array(outputs["normal_force"], dtype=float).reshape(2)
+    whole = np.linalg.norm(np.array(outputs["contact_force"], dtype=float).reshape(2, 3), axis=1)
+    return StaticHold(normal, whole, payload_limit(workcell, whole))
+
+
+def payload_limit(workcell: Workcell, contact_force: Array) -> float:
+    """Payload [kg] at which a robot's whole force reaches its reference force.
+
+    Forces along an unchanged motion are proportional to the mass (paper Figure 12).
+
+    Args:
+        workcell: the cell.
+        contact_force: (2,) peak magnitudes with the workcell's own mass [N].
+    """
+    return float(workcell.payload.mass * (workcell.task.reference_force / contact_force).min())

@@ -1,0 +1,1 @@
+"""Figures of fronts: indicators, statistics, attainment surfaces, selection."""

@@ -1,0 +1,174 @@
+"""Indicators of fronts and of all the points that a search evaluated.
+
+All objectives are minimised. A front is an (n, n_obj) array of objectives. Hypervolume, IGD and
+spacing compare objectives of different units, so normalise first, and with the same bounds for
+everything that is compared.
+"""
+
+from __future__ import annotations
+
+import moocore
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from symbolic.array import Array
+
+Mask = NDArray[np.bool_]
+
+REFERENCE_POINT = (1.1, 1.1)
+"""Of the hypervolume, in normalised objectives (the paper's)."""
+
+
+def normalise(objectives: ArrayLike, ideal: ArrayLike, nadir: ArrayLike) -> Array:
+    """Map `ideal` to 0 and `nadir` to 1 in each objective, without clipping.
+
+    Args:
+        objectives: (n, n_obj).
+        ideal, nadir: (n_obj,).
+
+    Raises:
+        ValueError: nadir does not exceed ideal in every objective.
+    """
+    low, high = np.asarray(ideal, dtype=np.float64), np.asarray(nadir, dtype=np.float64)
+    if not (high > low).all():
+        raise ValueError(f"nadir {high} must exceed ideal {low} in every objective")
+    return np.asarray((np.asarray(objectives, dtype=np.float64) - low) / (high - low))
+
+
+def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Mask:
+    """(n,) mask of the feasible points that no feasible point dominates.
+
+    Of equal points the first is kept. A point with a NaN or infinite objective is never in.
+
+    Args:
+        objectives: (n, n_obj).
+        feasible: (n,) bool, None for all.
+    """
+    values = np.asarray(objectives, dtype=np.float64)
+    candidates = np.isfinite(values).all(axis=1)
+    if feasible is not None:
+        candidates &= np.asarray(feasible, dtype=bool)
+    mask = np.zeros(len(values), dtype=bool)
+    index = np.flatnonzero(candidates)
+    if len(index) > 0:
+        mask[index[moocore.is_nondominated(values[index])]] = True
+    return mask
+
+
+def front_of(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Array:
+    """(k, n_obj) the non-dominated feasible objectives, by increasing first objective."""
+    values = np.asarray(objectives, dtype=np.float64)
+    front = values[non_dominated(values, feasible)]
+    return np.asarray(front[np.lexsort(front.T[::-1])])
+
+
+def hypervolume(front: ArrayLike, reference: ArrayLike = REFERENCE_POINT) -> float:
+    """Volume that a front dominates up to the reference point; 0 for an empty front.
+
+    Source: Zitzler and Thiele 1999; computed by moocore (Fonseca et al. 2006).
+    """
+    points = np.asarray(front, dtype=np.float64)
+    if len(points) == 0:
+        return 0.0
+    return float(moocore.hypervolume(points, ref=np.asarray(reference, dtype=np.float64)))
+
+
+def igd(front: ArrayLike, reference_front: ArrayLike) -> float:
+    """Inverted generational distance: mean Euclidean distance from each reference point to the
+    nearest point of the front; infinite for an empty front.
+
+    Source: Coello Coello and Reyes Sierra 2004, with the mean of distances (not the root of
+    their squared sum).
+    """
+    if len(np.asarray(front)) == 0:
+        return float("inf")
+    return float(
+        moocore.igd(
+            np.asarray(front, dtype=np.float64), ref=np.asarray(reference_front, dtype=np.float64)
+        )
+    )
+
+
+def igd_plus(front: ArrayLike, reference_front: ArrayLike) -> float:
+    """IGD with only the components in which the front is worse than the reference; weakly
+    Pareto compliant; infinite for an empty front.
+
+    Source: Ishibuchi, Masuda, Tanigaki and Nojima 2015.
+    """
+    if len(np.asarray(front)) == 0:
+        return float("inf")
+    return float(
+        moocore.igd_plus(
+            np.asarray(front, dtype=np.float64), ref=np.asarray(reference_front, dtype=np.float64)
+        )
+    )
+
+
+def spacing(front: ArrayLike) -> float:
+    """Sample standard deviation (divisor n - 1) of each point's L1 distance to its nearest
+    neighbour; 0 is even.
+
+    NaN for fewer than three points: one has no neighbour, and two are always evenly spaced.
+    Says nothing about convergence or extent, so never use it alone.
+    Source: Schott 1995.
+    """
+    # Not imported at the top: SciPy takes long to start, and evaluations alone do not need it.
+    from scipy.spatial import cKDTree
+
+    points = np.asarray(front, dtype=np.float64)
+    if len(points) < 3:
+        return float("nan")
+    distances = cKDTree(points).query(points, k=2, p=1)[0][:, 1]
+    return float(np.std(distances, ddof=1))
+
+
+def feasible_count(feasible: ArrayLike) -> int:
+    """Number of feasible points."""
+    return int(np.count_nonzero(np.asarray(feasible, dtype=bool)))
+
+
+def feasible_share(feasible: ArrayLike) -> float:
+    """Feasible points as a fraction of all, in [0, 1]; NaN without points."""
+    mask = np.asarray(feasible, dtype=bool)
+    return feasible_count(mask) / len(mask) if len(mask) > 0 else float("nan")
+
+
+def best_so_far(objectives: ArrayLike, feasible: ArrayLike) -> Array:
+    """(n, n_obj) least feasible value of each objective up to each evaluation.
+
+    NaN before the first feasible point. The objectives' minima may belong to different points.
+    """
+    values = np.asarray(objectives, dtype=np.float64)
+    usable = np.asarray(feasible, dtype=bool) & np.isfinite(values).all(axis=1)
+    history = np.minimum.accumulate(np.where(usable[:, None], values, np.inf), axis=0)
+    return np.asarray(np.where(np.isinf(history), np.nan, history))
+
+
+def hypervolume_history(
+    objectives: ArrayLike, feasible: ArrayLike, reference: ArrayLike = REFERENCE_POINT
+) -> Array:
+    """(n,) hypervolume of the feasible points up to each evaluation."""
+    values = np.asarray(objectives, dtype=np.float64)
+    corner = np.asarray(reference, dtype=np.float64)
+    usable = np.asarray(feasible, dtype=bool) & np.isfinite(values).all(axis=1)
+    history = np.zeros(len(values))
+    front = np.empty((0, values.shape[1]))
+    current = 0.0
+    for index, point in enumerate(values):
+        counts = usable[index] and (point < corner).all()
+        if counts and not (front <= point).all(axis=1).any():
+            front = np.vstack([front[~(point <= front).all(axis=1)], point])
+            current = hypervolume(front, corner)
+        history[index] = current
+    return history
+
+
+def excess_above_static(objectives: ArrayLike, static: ArrayLike) -> Array:
+    """How far peak forces lie above the force of holding the payload still, in percent.
+
+    Args:
+        objectives: (..., n_obj) normalised peak normal forces.
+        static: (n_obj,) or scalar, the same figures at rest, positive.
+    """
+    ratio = np.asarray(objectives, dtype=np.float64) / np.asarray(static, dtype=np.float64)
+    return np.asarray(100.0 * (ratio - 1.0))

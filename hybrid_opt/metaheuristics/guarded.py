@@ -1,0 +1,140 @@
+"""What every algorithm here promises beyond pymoo: an exact budget and finite fronts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import moocore
+import numpy as np
+from pymoo.core.algorithm import Algorithm
+from pymoo.core.mating import Mating
+from pymoo.core.population import Population
+from pymoo.core.problem import Problem
+from pymoo.operators.sampling.rnd import FloatRandomSampling
+from pymoo.termination.max_eval import MaximumFunctionCallTermination
+
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+
+WORST_OBJECTIVE = 1e30
+"""Stands in for an objective that is not finite: every real point dominates it, and unlike
+infinity it leaves differences and normalisations finite."""
+
+
+def violation_of(objectives: Array, constraints: Array) -> Array:
+    """Total constraint violation of evaluated points.
+
+    Args:
+        objectives: (n, n_obj).
+        constraints: (n, n_con), satisfied where <= 0; n_con may be 0.
+
+    Returns:
+        (n,), the sum of positive constraint values: 0 is feasible; infinite where an
+        objective or a constraint is not a finite number below `WORST_OBJECTIVE`.
+    """
+    total = np.maximum(constraints, 0.0).sum(axis=1)
+    sound = (np.abs(objectives) < WORST_OBJECTIVE).all(axis=1) & np.isfinite(constraints).all(
+        axis=1
+    )
+    return np.where(sound, total, np.inf)
+
+
+def feasible_front(points: Population) -> Population:
+    """The feasible, mutually non-dominated members of evaluated points, each value once."""
+    if len(points) == 0:
+        return points
+    feasible = points[points.get("CV")[:, 0] == 0.0]
+    if len(feasible) == 0:
+        return Population.empty()
+    return feasible[moocore.is_nondominated(feasible.get("F"))]
+
+
+class Guarded(Algorithm):  # type: ignore[misc]
+    """Mixin, to stand before a pymoo algorithm among the bases.
+
+    - The last generation is cut so that exactly the evaluations of an `n_eval` termination
+      are spent, whatever the population size.
+    - A point with a NaN or infinite objective or constraint is infeasible, without limit,
+      also on a problem without constraints; it loses every comparison and enters no front.
+    """
+
+    def _setup(self, problem: Problem, **kwargs: Any) -> None:
+        if problem.n_eq_constr > 0:
+            raise SettingsError(
+                f"the problem has {problem.n_eq_constr} equality constraints; "
+                "state them as inequalities with a tolerance"
+            )
+        super()._setup(problem, **kwargs)
+
+    @property
+    def budget(self) -> int | None:
+        """Evaluations that the termination allows in total, None without such a limit."""
+        if isinstance(self.termination, MaximumFunctionCallTermination):
+            return int(self.termination.n_max_evals)
+        return None
+
+    def infill(self) -> Population:
+        """The next candidates, never more than the budget has left."""
+        candidates = super().infill()
+        if self.budget is None:
+            return candidates
+        return candidates[: max(self.budget - self.evaluator.n_eval, 0)]
+
+    def advance(self, infills: Population | None = None, **kwargs: Any) -> Any:
+        """Take evaluated candidates; those without finite values are disarmed first."""
+        if infills is not None and len(infills) > 0:
+            objectives, constraints = infills.get("F", "G")
+            violation = violation_of(objectives, constraints)
+            for index in np.flatnonzero(np.isinf(violation)):
+                infills[index].F = np.full_like(objectives[index], WORST_OBJECTIVE)
+                infills[index].G = np.full_like(constraints[index], WORST_OBJECTIVE)
+            # Not `infills.set`, which first lets pymoo compute the value in Python.
+            for individual, total in zip(infills, violation[:, None], strict=True):
+                individual.CV = total
+        return super().advance(infills=infills, **kwargs)
+
+    def _set_optimum(self) -> None:
+        self.opt = feasible_front(self.pop)
+
+
+class WarmSampling(FloatRandomSampling):  # type: ignore[misc]
+    """Uniform samples within the bounds, the first of them replaced by given points."""
+
+    def __init__(self, initial: Array | None = None) -> None:
+        super().__init__()
+        self.initial = initial
+
+    def _do(
+        self, problem: Problem, n_samples: int, *args: Any, random_state: Any = None, **kwargs: Any
+    ) -> Array:
+        samples: Array = super()._do(problem, n_samples, random_state=random_state)
+        if self.initial is None:
+            return samples
+        initial = np.atleast_2d(np.asarray(self.initial, dtype=np.float64))
+        if initial.shape[1] != problem.n_var or len(initial) > n_samples:
+            raise SettingsError(
+                f"initial points have shape {initial.shape}; allowed are at most {n_samples} "
+                f"(the population) of {problem.n_var} values"
+            )
+        # Written so that a NaN coordinate is refused too.
+        if not ((initial >= problem.xl) & (initial <= problem.xu)).all():
+            raise SettingsError("an initial point lies outside the bounds; move it inside")
+        samples[: len(initial)] = initial
+        return samples
+
+
+class FillingMating(Mating):  # type: ignore[misc]
+    """Mating that always delivers: what unique offspring cannot fill, uniform samples do.
+
+    pymoo stops a run early when crossover and mutation yield duplicates only, as happens in a
+    collapsed population; the budget would then not be spent.
+    """
+
+    def do(self, problem: Problem, pop: Population, n_offsprings: int, **kwargs: Any) -> Population:
+        """Return exactly `n_offsprings` offspring of `pop`."""
+        offspring = super().do(problem, pop, n_offsprings, **kwargs)
+        missing = n_offsprings - len(offspring)
+        if missing > 0:
+            fresh = FloatRandomSampling()(problem, missing, random_state=kwargs["random_state"])
+            offspring = Population.merge(offspring, fresh)
+        return offspring

@@ -1,0 +1,116 @@
+"""What the polish of a front attempts next: a point of it, an end, the middle, or a gap."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybrid_opt.polishing.archive import LEAST_SPAN, Archive
+from hybrid_opt.polishing.records import Aim, PolishSettings
+from hybrid_opt.polishing.solver import FIRST_RADIUS
+from hybrid_opt.polishing.targets import (
+    Target,
+    balance,
+    epsilon_constraint,
+    extreme,
+    pascoletti_serafini,
+)
+from symbolic.array import Array
+
+LEAST_GAP = 0.02
+"""Gaps narrower than this are left, in units of the front's extent."""
+
+SMALL_RADIUS = 0.1
+"""First box of trust of an attempt that goes on where the last one came no further."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One attempt.
+
+    Attributes:
+        aim, parent, start: as in `hybrid_opt.polishing.records.PolishOutcome`.
+        x: (n_var,) decision vector to start from.
+        target, radius: see `hybrid_opt.polishing.solver.SolveTask`.
+    """
+
+    aim: Aim
+    parent: int
+    x: Array
+    start: Array
+    target: Target
+    radius: float = FIRST_RADIUS
+
+
+def points(archive: Archive, settings: PolishSettings) -> list[Attempt]:
+    """Evenly spread points of the front, the balanced one among them."""
+    rows = archive.rows()
+    count = min(len(rows), (settings.points + 5) // 6)
+    chosen = {rows[int(k)] for k in np.round(np.linspace(0, len(rows) - 1, count))}
+    middle, _ = archive.best(None)
+    if middle not in chosen and count > 2:
+        inner = sorted(chosen - {rows[0], rows[-1]}, key=rows.index)
+        chosen.remove(min(inner, key=lambda k: abs(rows.index(k) - rows.index(middle))))
+        chosen.add(middle)
+    span = archive.span()
+    attempts = []
+    for k in sorted(chosen, key=rows.index):
+        start = archive.objectives[k]
+        if settings.method == "epsilon":
+            objective = int(rows.index(k) >= len(rows) / 2.0)
+            target = epsilon_constraint(start, span, objective)
+        else:
+            target = pascoletti_serafini(start, span)
+        attempts.append(Attempt("point", archive.parent[k], archive.x[k], start, target))
+    return attempts
+
+
+def aimed(
+    archive: Archive, aim: Aim, objective: int | None, stalls: int, rng: np.random.Generator
+) -> Attempt:
+    """An attempt at an end of the front or at its balanced middle.
+
+    It goes on from the best point. Where the last attempt did not get further from there, it
+    takes smaller steps; where that does not help either, it starts from any point of the front:
+    another region may lead further down.
+
+    Args:
+        objective: whose end; None for the middle.
+        stalls: attempts in a row that came no further.
+    """
+    k, radius = archive.best(objective)[0], FIRST_RADIUS
+    if stalls % 2 == 1:
+        radius = SMALL_RADIUS
+    elif stalls:
+        rows = archive.rows()
+        k = rows[int(rng.integers(len(rows)))]
+    start, span = archive.objectives[k], np.full(2, LEAST_SPAN)
+    target = balance(start, span) if objective is None else extreme(start, span, objective)
+    return Attempt(aim, -1, archive.x[k], start, target, radius)
+
+
+def widest_gap(archive: Archive, tried: Collection[bytes]) -> tuple[Attempt, Array] | None:
+    """An attempt in the widest gap between neighbours, along the normal of their chord.
+
+    Args:
+        tried: starts of earlier attempts, as bytes.
+
+    Returns:
+        The attempt, from the first neighbour, and the second one's decision vector; None where
+        no gap is left.
+    """
+    rows, span = archive.rows(), archive.span()
+    values = np.array([archive.objectives[k] for k in rows]) / span
+    widths = np.linalg.norm(np.diff(values, axis=0), axis=1)
+    for gap in np.argsort(-widths, kind="stable").tolist():
+        first, second = rows[gap], rows[gap + 1]
+        start = (archive.objectives[first] + archive.objectives[second]) / 2.0
+        if start.tobytes() in tried or widths[gap] <= LEAST_GAP:
+            continue
+        chord = np.abs(values[gap + 1] - values[gap])
+        normal = chord[::-1] / np.linalg.norm(chord)
+        target = pascoletti_serafini(start, span, normal)
+        return Attempt("gap", -1, archive.x[first], start, target), archive.x[second]
+    return None

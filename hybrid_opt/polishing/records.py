@@ -1,0 +1,221 @@
+"""Settings of the polish and what it reports."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from hybrid_opt.errors import ResultsError
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+
+Method = Literal["pascoletti-serafini", "epsilon"]
+Aim = Literal["point", "extreme", "balance", "gap"]
+Status = Literal["accepted", "optimal", "rejected", "failed"]
+
+
+@dataclass(frozen=True)
+class PolishSettings:
+    """What decides the results of a polish.
+
+    Attributes:
+        points: attempts that one front may take; the front's own points get a sixth of them.
+        method: how a point is improved: along the diagonal (Pascoletti and Serafini 1984), or by
+            minimising one objective while the other is held (epsilon constraint).
+        max_iterations: of IPOPT in one round; to become feasible it may take more, see
+            `hybrid_opt.polishing.program.PATIENCE`.
+        rounds: of one point at most; see `hybrid_opt.polishing.solver`.
+        max_seconds: wall time after which a solve is given up. Generous, because a result that
+            depends on it cannot be repeated.
+        margin: kept from every constraint but clearances, in the constraint's own scale.
+        clearance: distance kept from obstacles [m]; lets the motion between samples be certified.
+        activity: obstacles nearer than this to the start get constraints at once [m].
+        tolerance: improvement of an objective below which a point counts as optimal already.
+    """
+
+    points: int = 22
+    method: Method = "pascoletti-serafini"
+    max_iterations: int = 15
+    rounds: int = 7
+    max_seconds: float = 60.0
+    margin: float = 1e-6
+    clearance: float = 8e-4
+    activity: float = 0.03
+    tolerance: float = 1e-6
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            SettingsError: with the value, and what is allowed.
+        """
+        if self.method not in get_args(Method):
+            raise SettingsError(
+                f"polish method {self.method!r}; known are {', '.join(get_args(Method))}"
+            )
+        for name, least in (("points", 0), ("max_iterations", 1), ("rounds", 1)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise SettingsError(
+                    f"polish {name} is {value!r}; allowed are whole numbers from {least}"
+                )
+        for name in ("max_seconds", "margin", "clearance", "activity", "tolerance"):
+            if not getattr(self, name) > 0.0:
+                raise SettingsError(f"polish {name} is {getattr(self, name)!r}; it must exceed 0")
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """How well a solution satisfies the optimality conditions of the smooth problem.
+
+    Recomputed here from the functions of the problem and the multipliers that the solver returned.
+
+    Attributes:
+        stationarity: largest entry of the Lagrangian's gradient (scaled variables).
+        feasibility: largest violation of a constraint or bound of the smooth problem.
+        complementarity: largest product of a multiplier and its constraint's slack.
+    """
+
+    stationarity: float
+    feasibility: float
+    complementarity: float
+
+
+UNKNOWN = Residuals(np.nan, np.nan, np.nan)
+"""Of a solve that returned nothing."""
+
+
+@dataclass(frozen=True)
+class PolishOutcome:
+    """What became of one attempt.
+
+    Attributes:
+        aim: 'point' improves a point of the given front; 'extreme', 'balance' and 'gap' look for
+            new ones.
+        parent: row of the given front that is to be replaced, -1 for a new point.
+        status: accepted; optimal (not improved by more than the tolerance: the original stays);
+            rejected by the re-evaluation; failed in the solver.
+        reason: why it was not accepted, empty if it was.
+        x: (n_var,) the new decision vector if accepted, otherwise the one started from.
+        start, objectives: (2,) before and after; equal where nothing was accepted.
+        residuals: of the solver's last answer, whatever became of it.
+        iterations: of IPOPT, over all rounds.
+        rounds: solves, one more for every time that constraints were added.
+        rows: constraints at places of the path in the last round.
+        seconds: spent on this attempt, re-evaluation and certification included.
+    """
+
+    aim: Aim
+    parent: int
+    status: Status
+    reason: str
+    x: Array
+    start: Array
+    objectives: Array
+    residuals: Residuals
+    iterations: int
+    rounds: int
+    rows: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class PolishedFront:
+    """A front after the polish; arrays are read-only.
+
+    Attributes:
+        x: (k, n_var) non-dominated decision vectors, by increasing first objective.
+        objectives: (k, 2) as the full evaluator gives them.
+        parent: (k,) row of the given front that the point replaced or still is, -1 for a new one.
+        polished: (k,) whether the polish made the point.
+        outcomes: every attempt, in order.
+        seconds: spent in total.
+        evaluation_seconds: measured for one candidate evaluation, the unit of the search.
+    """
+
+    x: Array
+    objectives: Array
+    parent: np.ndarray[tuple[int], np.dtype[np.int64]]
+    polished: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    outcomes: tuple[PolishOutcome, ...]
+    seconds: float
+    evaluation_seconds: float
+
+    def __post_init__(self) -> None:
+        """Make the arrays read-only."""
+        for name in ("x", "objectives", "parent", "polished"):
+            getattr(self, name).setflags(write=False)
+
+    @property
+    def equivalent_evaluations(self) -> int:
+        """Candidate evaluations that take as long as the polish did."""
+        return int(np.ceil(self.seconds / self.evaluation_seconds))
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Attempts by status, and those not accepted also by 'status: reason'."""
+        listed = Counter[str](outcome.status for outcome in self.outcomes)
+        listed.update(f"{o.status}: {o.reason}" for o in self.outcomes if o.reason)
+        return dict(listed)
+
+    @property
+    def success_share(self) -> float:
+        """Share of the attempted points of the given front that were accepted or optimal; NaN
+        where none was attempted."""
+        own = [o.status for o in self.outcomes if o.aim == "point"]
+        good = sum(status in ("accepted", "optimal") for status in own)
+        return good / len(own) if own else float("nan")
+
+
+def outcome_to_json(outcome: PolishOutcome) -> dict[str, object]:
+    """An outcome as JSON values; NaN becomes null."""
+    values: dict[str, object] = {}
+    for field in fields(outcome):
+        value = getattr(outcome, field.name)
+        if isinstance(value, np.ndarray):
+            values[field.name] = [_number(float(v)) for v in value]
+        elif isinstance(value, Residuals):
+            values |= {f.name: _number(getattr(value, f.name)) for f in fields(value)}
+        else:
+            values[field.name] = _number(value) if isinstance(value, float) else value
+    return values
+
+
+def outcome_from_json(values: Mapping[str, Any]) -> PolishOutcome:
+    """The outcome that `outcome_to_json` wrote.
+
+    Raises:
+        ResultsError: the values are not those of an outcome.
+    """
+
+    def numbers(name: str) -> Array:
+        return np.array([np.nan if v is None else v for v in values[name]], dtype=float)
+
+    def number(name: str) -> float:
+        return float("nan") if values[name] is None else float(values[name])
+
+    try:
+        return PolishOutcome(
+            aim=values["aim"],
+            parent=int(values["parent"]),
+            status=values["status"],
+            reason=str(values["reason"]),
+            x=numbers("x"),
+            start=numbers("start"),
+            objectives=numbers("objectives"),
+            residuals=Residuals(*(number(field.name) for field in fields(Residuals))),
+            iterations=int(values["iterations"]),
+            rounds=int(values["rounds"]),
+            rows=int(values["rows"]),
+            seconds=float(values["seconds"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultsError(f"a recorded polish attempt is damaged ({error!r})") from error
+
+
+def _number(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,1 @@
+"""Files: trajectories, exports, atomic writes."""

@@ -1,0 +1,78 @@
+"""Two synchronised RAPID tasks (ABB MultiMove) that drive a trajectory. docs/export.md has limits.
+
+Syntax after ABB's technical reference manual for RAPID instructions (MoveAbsJ, SyncMoveOn,
+SyncMoveOff) and the MultiMove application manual: every move between SyncMoveOn and SyncMoveOff
+carries an ID, the same in both tasks, ascending.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybrid_opt.store.export.samples import SampledTrajectory
+from symbolic.errors import SettingsError
+
+TASKS = ("T_ROB1", "T_ROB2")
+MAX_MOVES = 2000
+"""A module beyond this many moves is refused: controllers load them slowly or not at all."""
+
+LEAST_MOVE_TIME = 0.02
+"""Shortest time of one move [s]: below it a controller cannot plan ahead."""
+
+APPROACH_SPEED = "v50"
+ZONE = "z1"
+_LINE_LENGTH = 60
+
+
+def rapid_modules(trajectory: SampledTrajectory) -> tuple[str, str]:
+    """The modules of both tasks.
+
+    Raises:
+        SettingsError: the time step is too short or the trajectory too long for RAPID.
+    """
+    moves = len(trajectory.time) - 1
+    step = float(trajectory.time[1])
+    if step < LEAST_MOVE_TIME or moves > MAX_MOVES:
+        raise SettingsError(
+            f"{moves} moves of {step:g} s are too many or too short for RAPID; choose a time "
+            f"step of at least {LEAST_MOVE_TIME:g} s that gives at most {MAX_MOVES} moves"
+        )
+    return _module(trajectory, 0), _module(trajectory, 1)
+
+
+def _module(trajectory: SampledTrajectory, arm: int) -> str:
+    degrees = np.rad2deg(trajectory.position[:, arm])
+    lines = [
+        f"MODULE Carry{arm + 1}",
+        f"  ! {_comment(trajectory.name)}",
+        f"  ! Robot {_comment(trajectory.robots[arm])} in task {TASKS[arm]}",
+        f"  ! {len(trajectory.time)} positions, {float(trajectory.time[-1]):.3f} s",
+        f'  PERS tasks carryTasks{{2}} := [["{TASKS[0]}"],["{TASKS[1]}"]];',
+        "  VAR syncident carryStart;",
+        "  VAR syncident carryEnd;",
+        "",
+        "  PROC Carry()",
+        f"    MoveAbsJ {_target(degrees[0])} \\NoEOffs, {APPROACH_SPEED}, fine, tool0;",
+        "    SyncMoveOn carryStart, carryTasks;",
+    ]
+    for k in range(1, len(degrees)):
+        time = float(trajectory.time[k] - trajectory.time[k - 1])
+        zone = ZONE if k < len(degrees) - 1 else "fine"
+        lines.append(
+            f"    MoveAbsJ {_target(degrees[k])} \\ID:={10 * k} \\NoEOffs, "
+            f"v1000 \\T:={time:.6f}, {zone}, tool0;"
+        )
+    lines += ["    SyncMoveOff carryEnd;", "  ENDPROC", "ENDMODULE", ""]
+    # RAPID files have Windows line ends.
+    return "\r\n".join(lines)
+
+
+def _target(degrees: np.ndarray) -> str:
+    """A jointtarget without external axes."""
+    robot = ",".join(f"{value:.6f}" for value in degrees)
+    return f"[[{robot}],[9E9,9E9,9E9,9E9,9E9,9E9]]"
+
+
+def _comment(text: str) -> str:
+    """Text that cannot end or leave a RAPID comment line."""
+    return "".join(c if " " <= c <= "~" else "?" for c in text)[:_LINE_LENGTH]

@@ -1,0 +1,125 @@
+"""Writing files so that an interruption at any moment leaves the old content or the new one."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hybrid_opt.errors import ResultsError
+
+LOCK = ".lock"
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+@contextmanager
+def storing(path: Path) -> Iterator[None]:
+    """Turn a failure to store `path` into one clear message."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise ResultsError(
+                f"{path}: no space left to write ({error.strerror}); everything stored before is "
+                "kept: make room and continue with --resume"
+            ) from error
+        raise ResultsError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file in one step, durably; its folder is made if it is missing.
+
+    Raises:
+        ResultsError: it cannot be written.
+    """
+    draft = path.with_name(f".{path.name}.draft")
+    with storing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with draft.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(draft, path)
+        except OSError:
+            draft.unlink(missing_ok=True)
+            raise
+        sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a folder's entries durable."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Store JSON values, see `write_atomically`; NaN and infinities are refused."""
+    text = json.dumps(document, indent=1, allow_nan=False)
+    write_atomically(path, (text + "\n").encode())
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON values.
+
+    Raises:
+        ResultsError: the file cannot be read or is not JSON.
+    """
+    try:
+        return json.loads(read_bytes(path))
+    except (ValueError, RecursionError) as error:
+        raise ResultsError(f"{path}: damaged, not JSON ({error})") from error
+
+
+def read_bytes(path: Path) -> bytes:
+    """A file's content.
+
+    Raises:
+        ResultsError: it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def sha256(content: bytes) -> str:
+    """SHA-256 as hexadecimal text."""
+    return hashlib.sha256(content).hexdigest()
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold a results folder for this process alone; the lock goes with the process.
+
+    Raises:
+        ResultsError: another process holds it, or the folder cannot be written.
+    """
+    path = folder / LOCK
+    with storing(path):
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            holder = os.read(handle, 32).decode(errors="replace").strip() or "unknown"
+            raise ResultsError(
+                f"{folder}: in use by another process (id {holder}); wait for it, or choose "
+                "another --output"
+            ) from error
+        with storing(path):
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
+        yield
+    finally:
+        os.close(handle)

@@ -1,0 +1,76 @@
+"""Re-evaluation of a stored trajectory from its file alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
+from hybrid_opt.store.trajectory_figures import same_figure, trajectory_figures
+from hybrid_opt.store.trajectory_file import StoredTrajectory
+from symbolic.workcell.records import Workcell
+
+START_TOLERANCE = 1e-6
+"""Largest difference of the start postures [rad]."""
+
+
+@dataclass(frozen=True)
+class FigureComparison:
+    """A stored figure beside the recomputed one, which is None where nothing computes it."""
+
+    name: str
+    stored: float
+    recomputed: float | None
+
+    @property
+    def same(self) -> bool:
+        """Whether both agree to the tolerances of a re-evaluation."""
+        return self.recomputed is not None and same_figure(self.stored, self.recomputed)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A re-evaluated trajectory.
+
+    Attributes:
+        workcell: as unpacked from the file.
+        figures: every stored figure, compared.
+        start_difference: largest difference of the start postures [rad].
+    """
+
+    workcell: Workcell
+    figures: tuple[FigureComparison, ...]
+    start_difference: float
+
+    @property
+    def reproduced(self) -> bool:
+        """Whether every stored figure and the start postures came out again."""
+        return self.start_difference <= START_TOLERANCE and all(
+            figure.same for figure in self.figures
+        )
+
+
+def replay(stored: StoredTrajectory, folder: Path) -> Replay:
+    """Unpack a stored trajectory's workcell into a folder and evaluate the trajectory again.
+
+    Raises:
+        DualArmError: the stored workcell is not valid, or its model cannot be built.
+    """
+    workcell = stored.unpack(folder)
+    named = [name.removeprefix("objective_") for name in stored.figures]
+    objectives = tuple(name for name in named if name in OBJECTIVES)
+    evaluator = CandidateEvaluator(workcell, objectives or PAPER_OBJECTIVES)
+    recomputed = trajectory_figures(evaluator, stored.x)
+    outputs = evaluator.outputs(stored.x[None])
+    start = np.array([outputs[f"q_{arm}"][0, 0] for arm in (1, 2)])
+    return Replay(
+        workcell,
+        tuple(
+            FigureComparison(name, value, recomputed.get(name))
+            for name, value in stored.figures.items()
+        ),
+        float(np.abs(start - stored.start).max()),
+    )

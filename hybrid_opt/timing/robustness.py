@@ -1,0 +1,214 @@
+"""How much a carry could bear: heavier payloads, less friction, wrong centres of mass.
+
+All functions are pure and judge a `TimedCarry`, so under the search's timing as under a real one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from hybrid_opt.timing.model import TimingModel, contact_torque
+from hybrid_opt.timing.records import TimedCarry
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
+
+KILOGRAM_FORCE = 9.80665
+"""[N] per kgf."""
+
+SCAN_STEPS = 16
+"""Steps of the scan that brackets where a carry fails."""
+
+BISECTIONS = 20
+LEAST_FRICTION_SHARE = 0.02
+"""The scan of friction ends at this share of the nominal coefficient."""
+
+
+@dataclass(frozen=True)
+class PayloadSensitivity:
+    """Forces against payload mass (paper Figure 12); they grow in proportion to it.
+
+    Attributes:
+        mass: the workcell's payload [kg].
+        resultant: (2,) largest |f_i| of each robot at that mass [N].
+        normal: (2,) largest normal force of each robot at that mass [N].
+        mass_by_resultant: (2,) payload at which each robot's |f_i| reaches its reference force
+            [kg]; the paper's reading.
+        mass_by_normal: (2,) payload at which each robot's normal force reaches it [kg].
+        static_mass: payload at which the resultant of a robot reaches its reference force in a
+            level box at rest [kg].
+    """
+
+    mass: float
+    resultant: Array
+    normal: Array
+    mass_by_resultant: Array
+    mass_by_normal: Array
+    static_mass: float
+
+    @property
+    def payload_limit(self) -> float:
+        """Payload at which the first robot reaches its reference force with |f_i| [kg]."""
+        return float(self.mass_by_resultant.min())
+
+    def force_at(self, masses: Array) -> Array:
+        """(n, 2) largest |f_i| [N] at payload masses (n,) [kg]."""
+        forces: Array = np.asarray(masses)[:, None] / self.mass * self.resultant
+        return forces
+
+
+@dataclass(frozen=True)
+class Margin:
+    """How wrong one assumption may be before the carry fails.
+
+    Attributes:
+        quantity: what is wrong.
+        unit: of the values, '' for a pure number.
+        nominal: what the workcell assumes.
+        limit: the last value at which the carry holds, found to a 1e-7 of the scanned range.
+        fails: what fails beyond it, '' where nothing does within the scanned range.
+    """
+
+    quantity: str
+    unit: str
+    nominal: float
+    limit: float
+    fails: str
+
+
+def payload_sensitivity(model: TimingModel, carry: TimedCarry) -> PayloadSensitivity:
+    """Forces against payload mass for an unchanged timing."""
+    workcell = model.workcell
+    mass, reference = workcell.payload.mass, workcell.task.reference_force
+    resultant = np.linalg.norm(carry.contact_force, axis=2).max(axis=0)
+    normal = carry.normal_force.max(axis=0)
+    return PayloadSensitivity(
+        mass,
+        resultant,
+        normal,
+        mass * reference / resultant,
+        mass * reference / normal,
+        static_payload_limit(model),
+    )
+
+
+def static_payload_limit(model: TimingModel) -> float:
+    """Payload [kg] whose level hold at rest brings a robot's |f_i| to its reference force.
+
+    With equal friction coefficients mu it is 2 f / (g sqrt(1 + 1 / mu^2)).
+    """
+    still = np.zeros((1, 6))
+    force = model.load(still, still, still)["contact_force"].reshape(2, 3)
+    share = np.linalg.norm(force, axis=1) / model.workcell.payload.mass
+    return float((model.workcell.task.reference_force / share).min())
+
+
+def robustness_margins(model: TimingModel, carry: TimedCarry) -> tuple[Margin, ...]:
+    """How far friction, centre of mass and patch size may be off before the carry fails.
+
+    The forces are allocated anew for the changed values (the robots squeeze as hard as it takes);
+    the carry fails when a normal force exceeds its reference force, a centre of pressure leaves
+    its patch, or a joint torque exceeds its maximum. Motion and timing stay as they are.
+    """
+    judge = _Judge(model, carry)
+    names = [robot.name for robot in model.workcell.robots]
+    margins = [
+        _friction_margin(judge, "friction of both contacts", np.array([1.0, 1.0])),
+        _friction_margin(judge, f"friction of {names[0]}", np.array([1.0, 0.0])),
+        _friction_margin(judge, f"friction of {names[1]}", np.array([0.0, 1.0])),
+    ]
+    margins += [_centre_margin(judge, axis, sign) for axis in range(3) for sign in (1.0, -1.0)]
+    return (*margins, *_patch_margins(carry, model.workcell))
+
+
+class _Judge:
+    """Re-evaluates one carry with other friction coefficients and centres of mass.
+
+    Attributes:
+        workcell: the cell.
+        friction: (2,) nominal coefficients.
+        centre: (3,) nominal centre of mass [m].
+    """
+
+    def __init__(self, model: TimingModel, carry: TimedCarry) -> None:
+        self.workcell = model.workcell
+        self.friction = np.array([contact.friction for contact in model.workcell.contacts])
+        self.centre = np.array(model.workcell.payload.centre_of_mass)
+        self._model = model
+        self._carry = carry
+        self._wrench_torque = model.wrench_torque(carry.q, carry.pose)
+        self._torque_max = np.concatenate([robot.torque_max for robot in model.workcell.robots])
+        self._radius = np.array([contact.patch_radius for contact in model.workcell.contacts])
+
+    def failure(self, friction: Array, centre: Array) -> str:
+        """What is exceeded most, or '' where everything holds."""
+        load = self._model.uncertain_load(self._carry, friction, centre)
+        torque = contact_torque(self._wrench_torque, load) + self._carry.own_torque
+        reference = self.workcell.task.reference_force
+        use = {
+            "normal force": float((load["normal_force"] / reference).max()),
+            "pressure shift": float((load["pressure_shift"] / self._radius).max()),
+            "joint torque": float((np.abs(torque) / self._torque_max).max()),
+        }
+        name = max(use, key=lambda key: use[key])
+        return "" if use[name] <= 1.0 else name
+
+
+def _friction_margin(judge: _Judge, name: str, which: Array) -> Margin:
+    """Margin of the coefficients marked by `which` (2,), lowered by the same share."""
+    nominal = float(judge.friction[which > 0.0].min())
+    lost, fails = _last_holding(
+        lambda lost: judge.failure(judge.friction * (1.0 - lost * which), judge.centre),
+        1.0 - LEAST_FRICTION_SHARE,
+    )
+    return Margin(name, "", nominal, nominal * (1.0 - lost), fails)
+
+
+def _centre_margin(judge: _Judge, axis: int, sign: float) -> Margin:
+    """Margin of the centre of mass along one box axis, up to the box's faces."""
+    nominal, direction = float(judge.centre[axis]), sign * np.eye(3)[axis]
+    room = float(judge.workcell.payload.size[axis]) / 2.0 - sign * nominal
+    offset, fails = _last_holding(
+        lambda offset: judge.failure(judge.friction, judge.centre + offset * direction), room
+    )
+    name = f"centre of mass towards {'+' if sign > 0.0 else '-'}{'xyz'[axis]}"
+    return Margin(name, "m", nominal, nominal + sign * offset, fails)
+
+
+def _patch_margins(carry: TimedCarry, workcell: Workcell) -> list[Margin]:
+    """The least patch radius is the largest pressure shift, because no force depends on it."""
+    return [
+        Margin(
+            f"patch radius of {robot.name}",
+            "m",
+            contact.patch_radius,
+            float(shift),
+            "pressure shift",
+        )
+        for robot, contact, shift in zip(
+            workcell.robots, workcell.contacts, carry.pressure_shift.max(axis=0), strict=True
+        )
+    ]
+
+
+def _last_holding(failure: Callable[[float], str], end: float) -> tuple[float, str]:
+    """Largest change in [0, end] up to which nothing fails, and what fails beyond it.
+
+    A scan brackets the first failure, so that a carry that fails and recovers is not misjudged.
+    """
+    fails = failure(0.0)
+    if fails:
+        return 0.0, fails
+    for low, high in pairwise(np.linspace(0.0, end, SCAN_STEPS + 1).tolist()):
+        fails = failure(high)
+        if not fails:
+            continue
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2.0
+            reason = failure(middle)
+            low, high, fails = (low, middle, reason) if reason else (middle, high, fails)
+        return low, fails
+    return end, ""

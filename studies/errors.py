@@ -1,0 +1,7 @@
+"""What can go wrong with reports."""
+
+from symbolic.errors import DualArmError
+
+
+class ReportError(DualArmError):
+    """A report, picture or animation cannot be made."""

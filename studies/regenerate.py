@@ -1,0 +1,166 @@
+"""Generate and compile the functions of a workcell: `python -m studies.regenerate WORKCELL`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from codegen.build import Build, FunctionReport, build_set
+from codegen.cache import Cache
+from codegen.check import Comparison, compare
+from symbolic.errors import DualArmError
+
+PROGRAM = "python -m studies.regenerate"
+
+DISAGREES = 1
+BAD_INPUT = 2
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit code: 0, 1 where `--check` fails, 2 on bad input."""
+    options = _parser().parse_args(arguments)
+    try:
+        return _run(options)
+    except DualArmError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return BAD_INPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Generate the functions of a workcell as C, compile them and keep them in the "
+        "cache (DUAL_ARM_CACHE, by default in the user's cache folder).",
+    )
+    parser.add_argument("workcell", nargs="?", type=Path, help="workcell file (TOML)")
+    parser.add_argument(
+        "--clean", action="store_true", help="empty the cache first; alone, only that"
+    )
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="compile anew and compare with the interpreted functions on random inputs, outputs "
+        "and first derivatives; exit code 1 where they differ",
+    )
+    parser.add_argument(
+        "--samples", type=int, default=20, help="random inputs per function (default: 20)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the random inputs (default: 0)")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    if options.workcell is None and not options.clean:
+        _parser().error("name a workcell file, or --clean")
+    if options.samples < 1:
+        _parser().error(f"--samples is {options.samples}; give 1 or more")
+    if options.seed < 0:
+        _parser().error(f"--seed is {options.seed}; give 0 or more")
+    cache = Cache()
+    removed = cache.clean() if options.clean else None
+    built: Build | None = None
+    comparisons: list[Comparison] = []
+    if options.workcell is not None:
+        from hybrid_opt.evaluate.functions import workcell_key
+        from symbolic.functions.cell import cell_functions
+        from symbolic.workcell.file import load
+
+        workcell = load(options.workcell)
+        made = cell_functions(workcell)
+        built = build_set(workcell_key(workcell), made, cache, rebuild=options.check)
+        if options.check:
+            bounds = {"x": (workcell.task.lower, workcell.task.upper)}
+            rng = np.random.default_rng(options.seed)
+            comparisons = [
+                compare(
+                    name,
+                    function,
+                    built.functions[name],
+                    bounds,
+                    rng,
+                    samples=options.samples,
+                    cache=cache,
+                )
+                for name, function in made.items()
+            ]
+    if options.json:
+        _print_json(cache, removed, built, comparisons)
+    else:
+        _print_tables(cache, removed, built, comparisons)
+    return 0 if all(comparison.agrees for comparison in comparisons) else DISAGREES
+
+
+def _print_json(
+    cache: Cache, removed: int | None, built: Build | None, comparisons: Sequence[Comparison]
+) -> None:
+    result: dict[str, object] = {"cache": str(cache.folder)}
+    if removed is not None:
+        result["removed"] = removed
+    if built is not None:
+        result["functions"] = [asdict(report) for report in built.reports]
+    if comparisons:
+        result["check"] = [
+            asdict(comparison) | {"agrees": comparison.agrees} for comparison in comparisons
+        ]
+    print(json.dumps(result, indent=2))
+
+
+def _print_tables(
+    cache: Cache, removed: int | None, built: Build | None, comparisons: Sequence[Comparison]
+) -> None:
+    if removed is not None:
+        print(f"{removed} libraries removed from {cache.folder}")
+    if built is not None:
+        print(_table(_HEADINGS, [_row(report) for report in built.reports]))
+    if comparisons:
+        print()
+        rows = [
+            (
+                c.name,
+                str(c.samples),
+                f"{c.outputs:.1e}",
+                f"{c.derivatives:.1e}",
+                "yes" if c.agrees else f"NO: {c.worst_output}",
+            )
+            for c in comparisons
+        ]
+        print(_table(("function", "inputs", "outputs", "derivatives", "agrees"), rows))
+
+
+_HEADINGS = ("function", "operations", "C size", "compile time", "from cache")
+
+
+def _row(report: FunctionReport) -> tuple[str, ...]:
+    if not report.compiled:
+        return (report.name, f"{report.operations:,}", "-", "interpreted", "-")
+    return (
+        report.name,
+        f"{report.operations:,}",
+        f"{report.c_bytes / 1000.0:,.1f} kB",
+        f"{report.compile_seconds:.2f} s (-O{report.level})",
+        "yes" if report.from_cache else "no",
+    )
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Text columns: the first to the left, the others to the right."""
+    widths = [max(len(row[k]) for row in [headings, *rows]) for k in range(len(headings))]
+    lines = [
+        "  ".join(
+            cell.ljust(width) if k == 0 else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in [headings, *rows]
+    ]
+    return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The functions that are compiled, by who needs them: candidate, cell, timing."""

@@ -1,0 +1,142 @@
+"""The whole candidate as one CasADi function: from the decision vector to every sample.
+
+Composes path, time law, payload load and both arms. The outputs hold one sample per column, so
+that NumPy sees (n_samples, dim).
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from symbolic.cell_model import CellModel
+from symbolic.physics.contact_forces import GRAVITY
+from symbolic.physics.path import sample_basis, waypoint_matrix
+from symbolic.physics.payload_load import LOAD_OUTPUTS, load_function
+from symbolic.physics.time_law import timed_path
+from symbolic.robot.arm import REACH_TOLERANCE, TRACK_OUTPUTS, follow_function
+from symbolic.workcell.records import Workcell
+
+CONSTRAINTS = (
+    "reach_1",
+    "reach_2",
+    "joint_limits_1",
+    "joint_limits_2",
+    "singularity_1",
+    "singularity_2",
+    "friction",
+    "pressure_1",
+    "pressure_2",
+)
+"""Columns of the `constraint` output, each at most 0 where a sample satisfies it.
+
+reach: pose residual over its tolerance [m, rad], or 1 once the arm lost the path.
+joint_limits: excess over the nearest limit [rad]. singularity: 1 - |det J| over its least value.
+friction: excess of the tangential over the limiting force, over the payload's weight.
+pressure: shift of the centre of pressure over the patch radius, minus 1.
+Limits and singularity of a lost arm are unknown and count as satisfied; its loss does not.
+"""
+
+FRICTION_TOLERANCE = 1e-9
+"""Rounding allowed in a tight friction cone, as a share of the payload's weight."""
+
+
+def candidate_function(model: CellModel) -> ca.Function:
+    """Evaluator of one candidate: x (n_var,) to every per-sample quantity.
+
+    Outputs (NumPy shapes, n samples): time (n,) [s]; pose (n, 6), rate, second_rate (n, 6) with
+    respect to time; those of `LOAD_OUTPUTS` without the wrenches; per robot i = 1, 2 those of
+    `TRACK_OUTPUTS` as q_i (n, 6) and so on; constraint (n, 9), see `CONSTRAINTS`; violation
+    (9,): largest positive value of each constraint over the samples; violation_time (9,): time
+    for which each is violated, over the duration.
+    """
+    workcell = model.workcell
+    n = workcell.task.samples
+    x = ca.MX.sym("x", workcell.task.n_var)
+    path = timed_path(workcell.task, sample_basis(workcell.task), waypoint_matrix(workcell.task, x))
+    load = dict(
+        zip(
+            LOAD_OUTPUTS,
+            load_function(workcell).map(n)(path.pose, path.rate, path.second_rate),
+            strict=True,
+        )
+    )
+    outputs: dict[str, ca.MX] = {
+        "time": path.time,
+        "pose": path.pose,
+        "rate": path.rate,
+        "second_rate": path.second_rate,
+        **{name: load[name] for name in LOAD_OUTPUTS if not name.startswith("wrench")},
+    }
+    for i in (0, 1):
+        tracked = _track(model, i, path.pose, load[f"wrench_{i + 1}"])
+        outputs |= {f"{name}_{i + 1}": tracked[name] for name in TRACK_OUTPUTS}
+    constraint = _constraint_function(workcell).map(n)(
+        *[outputs[name] for name in _CONSTRAINT_INPUTS]
+    )
+    violated = ca.fmax(constraint, 0.0)
+    outputs["constraint"] = constraint
+    outputs["violation"] = _row_max(violated)
+    outputs["violation_time"] = ca.mtimes(violated > 0.0, _time_share(path.time).T)
+    return ca.Function(
+        "candidate", [x], list(outputs.values()), ["x"], list(outputs), {"cse": True}
+    )
+
+
+def _track(model: CellModel, i: int, pose: ca.MX, wrench: ca.MX) -> dict[str, ca.MX]:
+    robot, contact = model.workcell.robots[i], model.workcell.contacts[i]
+    n = model.workcell.task.samples
+    follow = follow_function(robot, model.robots[i], contact, n, f"arm_{i + 1}")
+    results = follow(ca.DM(model.start[i]), pose, wrench)
+    return dict(zip(TRACK_OUTPUTS, results, strict=True))
+
+
+_CONSTRAINT_INPUTS = (
+    "ik_residual_1",
+    "ik_residual_2",
+    "lost_1",
+    "lost_2",
+    "limit_margin_1",
+    "limit_margin_2",
+    "manipulability_1",
+    "manipulability_2",
+    "normal_force",
+    "tangential_force",
+    "pressure_shift",
+)
+
+
+def _constraint_function(workcell: Workcell) -> ca.Function:
+    """Constraint values (9,) of one sample from the named outputs."""
+    sizes = {"normal_force": 2, "tangential_force": 2, "pressure_shift": 2}
+    inputs = {name: ca.SX.sym(name, sizes.get(name, 1)) for name in _CONSTRAINT_INPUTS}
+    weight = -workcell.payload.mass * GRAVITY[2]
+    values: dict[str, ca.SX] = {}
+    cones = []
+    for i in (0, 1):
+        robot, contact, arm = workcell.robots[i], workcell.contacts[i], i + 1
+        lost = inputs[f"lost_{arm}"]
+        off_path = ca.fmax(inputs[f"ik_residual_{arm}"] - REACH_TOLERANCE, lost)
+        values[f"reach_{arm}"] = ca.if_else(lost > 0.5, off_path, -REACH_TOLERANCE)
+        values[f"joint_limits_{arm}"] = ca.if_else(lost > 0.5, 0.0, -inputs[f"limit_margin_{arm}"])
+        values[f"singularity_{arm}"] = ca.if_else(
+            lost > 0.5, 0.0, 1.0 - inputs[f"manipulability_{arm}"] / robot.min_manipulability
+        )
+        values[f"pressure_{arm}"] = inputs["pressure_shift"][i] / contact.patch_radius - 1.0
+        limit = contact.friction * inputs["normal_force"][i]
+        cones.append((inputs["tangential_force"][i] - limit) / weight - FRICTION_TOLERANCE)
+    values["friction"] = ca.fmax(cones[0], cones[1])
+    return ca.Function(
+        "constraints",
+        list(inputs.values()),
+        [ca.vertcat(*[values[name] for name in CONSTRAINTS])],
+    )
+
+
+def _row_max(matrix: ca.MX) -> ca.MX:
+    return ca.vertcat(*[ca.mmax(matrix[i, :]) for i in range(matrix.shape[0])])
+
+
+def _time_share(time: ca.MX) -> ca.MX:
+    """Share (1, n) of the duration that each sample stands for: half of both neighbouring steps."""
+    steps = time[:, 1:] - time[:, :-1]
+    return (ca.horzcat(0.0, steps) + ca.horzcat(steps, 0.0)) / (2.0 * time[-1])

@@ -1,0 +1,31 @@
+"""All CasADi functions of a workcell that are worth compiling."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from symbolic.cell_model import build_cell_model
+from symbolic.functions.candidate import candidate_function
+from symbolic.geometry.clearance import screening_functions
+from symbolic.robot.arm import posture_function
+from symbolic.workcell.records import Workcell
+
+
+def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
+    """The functions by name.
+
+    candidate: the evaluator of a whole candidate (`symbolic.functions.candidate`).
+    posture: both arms at one box pose (`symbolic.robot.arm.posture_function`).
+    clearance, piece_poses, motion: collision bounds, placements and bounds of the motion
+    (`symbolic.geometry.clearance.screening_functions`).
+
+    Raises:
+        DualArmError: the cell's model cannot be built.
+    """
+    model = build_cell_model(workcell)
+    placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
+    return {
+        "candidate": candidate_function(model),
+        "posture": posture_function(model.workcell.robots, model.robots, model.workcell.contacts),
+        **screening_functions(model.geometry, placements),
+    }

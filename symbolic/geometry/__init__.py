@@ -1,0 +1,1 @@
+"""Collision shapes: pieces, bodies, pairs, clearance bounds, bounds of the motion between."""

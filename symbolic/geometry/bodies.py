@@ -1,0 +1,223 @@
+"""The collision bodies of a workcell: links, tools, payload and environment as convex pieces."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+
+from symbolic.array import Array
+from symbolic.errors import CollisionModelError
+from symbolic.geometry.pieces import Capsule, Piece, check_piece
+from symbolic.robot.urdf import arm_model, resolve_mesh
+from symbolic.workcell.records import Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
+
+Group = Literal["robot 1", "robot 2", "payload", "environment"]
+PAYLOAD = "payload"
+"""Name of the payload's body."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a body is fixed to.
+
+    Attributes:
+        kind: 'world', 'box', or 'link', behind a joint of a robot.
+        robot, joint: 0-based indices of a link's robot and joint, otherwise -1.
+    """
+
+    kind: Literal["world", "link", "box"]
+    robot: int = -1
+    joint: int = -1
+
+
+WORLD = Frame("world")
+BOX = Frame("box")
+
+
+@dataclass(frozen=True)
+class CollisionBody:
+    """A named rigid body.
+
+    Attributes:
+        name: environment bodies keep theirs; links and tools are 'robot/link'.
+        group: which of the four parties of the cell it belongs to.
+        frame: what it is fixed to.
+        pieces: its convex pieces, in that frame.
+        is_tool: whether it is part of a robot's tool.
+    """
+
+    name: str
+    group: Group
+    frame: Frame
+    pieces: tuple[Piece, ...]
+    is_tool: bool = False
+
+
+@dataclass(frozen=True)
+class ArmGeometry:
+    """The constant geometry of an arm's joints.
+
+    Attributes:
+        T_world_root: (4, 4) of the URDF's root.
+        origins: (6, 4, 4), each joint's frame in the one before it (the first: in the root),
+            at joint position zero.
+        axes: (6, 3) unit axis of each joint in its own frame.
+        T_joint_box: (4, 4), the carried box in the last joint's frame.
+        lower, upper: (6,) joint limits [rad].
+    """
+
+    T_world_root: Array
+    origins: Array
+    axes: Array
+    T_joint_box: Array
+    lower: Array
+    upper: Array
+
+
+def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
+    """All bodies: robot 1, robot 2, payload, environment, each in the order of its file.
+
+    Raises:
+        CollisionModelError: a shape or mesh is unusable, or two bodies share a name.
+    """
+    bodies = [body for i in (0, 1) for body in _robot_bodies(workcell.robots[i], i)]
+    payload = Piece(Box(np.asarray(workcell.payload.size)), np.eye(4))
+    bodies.append(CollisionBody(PAYLOAD, "payload", BOX, (payload,)))
+    for obstacle in workcell.environment:
+        owner = f"environment body {obstacle.name!r}"
+        pieces = shape_pieces(obstacle.shape, obstacle.pose, owner)
+        bodies.append(CollisionBody(obstacle.name, "environment", WORLD, pieces))
+    for body in bodies:
+        for piece in body.pieces:
+            check_piece(piece, f"collision body {body.name!r}")
+    names = [body.name for body in bodies]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise CollisionModelError(f"collision bodies share the name(s) {repeated}; rename them")
+    return tuple(bodies)
+
+
+def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
+    """The joints of robot i as numbers."""
+    robot, contact = workcell.robots[i], workcell.contacts[i]
+    model = arm_model(robot)
+    data = model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model), np.zeros(model.nv))
+    joints = range(1, model.njoints)
+    flange = model.frames[model.getFrameId(robot.flange)]
+    T_flange_box = robot.T_flange_pad @ np.linalg.inv(contact.T_box_pad)
+    return ArmGeometry(
+        T_world_root=robot.T_world_base,
+        origins=np.array([model.jointPlacements[j].homogeneous for j in joints]),
+        axes=np.array([np.asarray(data.joints[j].S).ravel()[3:] for j in joints]),
+        T_joint_box=flange.placement.homogeneous @ T_flange_box,
+        lower=robot.position_lower,
+        upper=robot.position_upper,
+    )
+
+
+def shape_pieces(shape: Shape | Capsule, pose: Array, owner: str) -> tuple[Piece, ...]:
+    """The convex pieces of a shape at a pose (4, 4)."""
+    if not isinstance(shape, Mesh):
+        return (Piece(shape, pose),)
+    # Not imported at the top: trimesh takes long to start, and most cells have no meshes.
+    from symbolic.geometry.meshes import convex_pieces
+
+    try:
+        return tuple(Piece(hull, pose) for hull in convex_pieces(shape.path, shape.scale))
+    except CollisionModelError as error:
+        raise CollisionModelError(f"{owner}: {error}") from error
+
+
+def _robot_bodies(robot: Robot, i: int) -> list[CollisionBody]:
+    group: Group = "robot 1" if i == 0 else "robot 2"
+    model = arm_model(robot)
+    bodies = []
+    for link, pieces in _link_pieces(robot).items():
+        if pieces:
+            frame, T = _attachment(model, link, robot, i)
+            moved = tuple(piece.moved(T) for piece in pieces)
+            bodies.append(CollisionBody(f"{robot.name}/{link}", group, frame, moved))
+    frame, T = _attachment(model, robot.flange, robot, i)
+    for tool in robot.tool:
+        owner = f"tool {tool.name!r} of robot {robot.name!r}"
+        pieces = tuple(piece.moved(T) for piece in shape_pieces(tool.shape, tool.pose, owner))
+        bodies.append(CollisionBody(f"{robot.name}/{tool.name}", group, frame, pieces, True))
+    return bodies
+
+
+def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Frame, Array]:
+    """The frame that a link is fixed to and the link's pose in it."""
+    frame = model.frames[model.getFrameId(link)]
+    placement: Array = frame.placement.homogeneous
+    if frame.parentJoint == 0:
+        return WORLD, robot.T_world_base @ placement
+    return Frame("link", i, frame.parentJoint - 1), placement
+
+
+def _link_pieces(robot: Robot) -> dict[str, tuple[Piece, ...]]:
+    """The collision pieces of every link of a URDF, in the link's frame."""
+    root = ElementTree.parse(robot.urdf).getroot()
+    links = {}
+    for link in root.iter("link"):
+        name = str(link.get("name"))
+        owner = f"link {name!r} of {robot.urdf.name}"
+        pieces: list[Piece] = []
+        for collision in link.findall("collision"):
+            origin = collision.find("origin")
+            pose = np.eye(4)
+            if origin is not None:
+                pose[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), 3, owner)
+                pose[:3, :3] = pin.rpy.rpyToMatrix(_numbers(origin.get("rpy", "0 0 0"), 3, owner))
+            shape = _urdf_shape(collision.find("geometry"), robot, owner)
+            pieces += shape_pieces(shape, pose, owner)
+        links[name] = tuple(pieces)
+    return links
+
+
+def _urdf_shape(geometry: ElementTree.Element | None, robot: Robot, owner: str) -> Shape | Capsule:
+    element = next(iter(geometry), None) if geometry is not None else None
+    if element is None:
+        raise CollisionModelError(f"{owner}: a collision shape without geometry; add or remove it")
+    match element.tag:
+        case "box":
+            return Box(_numbers(element.get("size", ""), 3, owner))
+        case "sphere":
+            return Sphere(_number(element, "radius", owner))
+        case "cylinder":
+            return Cylinder(_number(element, "radius", owner), _number(element, "length", owner))
+        case "capsule":
+            return Capsule(_number(element, "radius", owner), _number(element, "length", owner))
+        case "mesh":
+            address = element.get("filename", "")
+            path = resolve_mesh(address, robot.urdf, robot.package_dirs)
+            if path is None:
+                looked = ", ".join(map(str, robot.package_dirs)) or "none given"
+                raise CollisionModelError(
+                    f"{owner}: mesh {address!r} not found; package folders looked in: {looked}"
+                )
+            return Mesh(Path(path), _numbers(element.get("scale", "1 1 1"), 3, owner))
+        case tag:
+            raise CollisionModelError(
+                f"{owner}: collision geometry {tag!r} is unknown; use box, cylinder, sphere, "
+                "capsule or mesh"
+            )
+
+
+def _number(element: ElementTree.Element, key: str, owner: str) -> float:
+    return float(_numbers(element.get(key, ""), 1, owner)[0])
+
+
+def _numbers(text: str, count: int, owner: str) -> Array:
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count:
+        raise CollisionModelError(f"{owner}: found {text!r} where {count} number(s) belong")
+    return values

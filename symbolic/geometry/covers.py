@@ -1,0 +1,170 @@
+"""Few simple shapes that contain a body: what the compiled screening computes with.
+
+Two covers per body: `slab_cover`, boxes, cylinders, spheres and capsules with exact support
+functions, and `chain_cover`, chains of equal spheres. Both are proven to contain the body by
+exact functions of `symbolic.geometry.pieces`.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations, product
+
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.errors import CollisionModelError
+from symbolic.geometry.bodies import CollisionBody
+from symbolic.geometry.pairs import CellGeometry, relative_placement
+from symbolic.geometry.pieces import (
+    Hull,
+    Piece,
+    SphereChain,
+    bounding_box,
+    contains,
+    sphere_chain,
+    support,
+)
+from symbolic.workcell.records import Box
+
+MERGE_SLACK = 0.004
+"""Pieces are merged into one box that stands out from their hull by at most this [m]."""
+
+SLENDERNESS = 1.3
+"""Length of a chain's slabs over the body's width: fewer, larger spheres for larger values."""
+
+
+POSTURES = 200
+"""Random postures in which chains of spheres are tried."""
+
+OFTEN = 0.5
+"""Share of those postures from which on a pair gets the finer bound."""
+
+
+def _directions() -> Array:
+    grid = np.array([u for u in product((-2, -1, 0, 1, 2), repeat=3) if any(u)], dtype=float)
+    return np.asarray(grid / np.linalg.norm(grid, axis=1, keepdims=True))
+
+
+_DIRECTIONS = _directions()
+
+
+def slab_cover(body: CollisionBody) -> tuple[Piece, ...]:
+    """Boxes, cylinders, spheres and capsules that contain the body.
+
+    Simple shapes stand for themselves; a hull gets its smallest box among a few orientations.
+    Pieces inside another are dropped, and pieces that fill a common box nearly are merged.
+    """
+    cover = [_simple(piece) for piece in body.pieces]
+    cover = _outermost(cover)
+    while (merged := _merge_once(cover)) is not None:
+        cover = _outermost(merged)
+    for piece in body.pieces:
+        if not _covered(piece, cover):
+            raise CollisionModelError(f"the cover of {body.name!r} does not contain it")
+    return tuple(cover)
+
+
+def chain_cover(body: CollisionBody) -> SphereChain:
+    """A chain of equal spheres that contains the body, along its longest principal side."""
+    return min(
+        (sphere_chain(body.pieces, axes, SLENDERNESS) for axes in _orientations(body.pieces)),
+        key=lambda chain: chain.radius,
+    )
+
+
+def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
+    """Pairs within an arm whose chains of spheres cannot be told apart in many postures."""
+    rng = np.random.default_rng(0)
+    chains = [chain_cover(body) for body in geometry.bodies]
+    postures = [rng.uniform(arm.lower, arm.upper, (POSTURES, 6)) for arm in geometry.arms]
+    found = []
+    for pair in geometry.active:
+        a, b = geometry.bodies[pair.first], geometry.bodies[pair.second]
+        if a.group != b.group:
+            continue
+        robot = b.frame.robot
+        near = 0
+        for q in postures[robot]:
+            T = relative_placement(geometry.arms[robot], a.frame.joint, b.frame.joint, q)
+            moved = chains[pair.second].centres @ T[:3, :3].T + T[:3, 3]
+            gaps = np.linalg.norm(chains[pair.first].centres[:, None] - moved, axis=2)
+            touching = gaps.min() <= chains[pair.first].radius + chains[pair.second].radius
+            if touching and a.frame.kind == "world":
+                moved_pieces = tuple(piece.moved(T) for piece in b.pieces)
+                touching = not _apart(a.pieces, moved_pieces)
+            near += bool(touching)
+        if near > OFTEN * POSTURES:
+            found.append((pair.first, pair.second))
+    return frozenset(found)
+
+
+def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...]) -> bool:
+    """Whether two sets of pieces are separated along a coordinate axis."""
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    high = np.max([support(piece, axes) for piece in first], axis=0)
+    low = -np.max([support(piece, -axes) for piece in second], axis=0)
+    return bool(np.any(low > high))
+
+
+def _covered(piece: Piece, cover: list[Piece]) -> bool:
+    """A piece is its own cover, or lies in one box of the cover (exact)."""
+    return any(
+        other is piece or (isinstance(other.shape, Box) and contains(other, piece))
+        for other in cover
+    )
+
+
+def _simple(piece: Piece) -> Piece:
+    if not isinstance(piece.shape, Hull):
+        return piece
+    boxes = [bounding_box((piece,), axes) for axes in _orientations((piece,))]
+    return min(boxes, key=_volume)
+
+
+def _volume(box: Piece) -> float:
+    assert isinstance(box.shape, Box)
+    return float(np.prod(box.shape.size))
+
+
+def _orientations(pieces: tuple[Piece, ...]) -> list[Array]:
+    """The body's axes, each piece's axes, and the principal axes of hull vertices."""
+    found = [np.eye(3)]
+    for piece in pieces:
+        found.append(piece.rotation)
+        if isinstance(piece.shape, Hull):
+            points = piece.shape.vertices @ piece.rotation.T
+            _, vectors = np.linalg.eigh(np.cov(points.T))
+            if np.linalg.det(vectors) < 0.0:
+                vectors[:, 0] *= -1.0
+            found.append(vectors)
+    unique: list[Array] = []
+    for axes in found:
+        if not any(np.allclose(np.abs(axes.T @ other).max(axis=0), 1.0) for other in unique):
+            unique.append(axes)
+    return unique
+
+
+def _outermost(cover: list[Piece]) -> list[Piece]:
+    kept: list[Piece] = []
+    ordered = sorted(cover, key=lambda piece: -float(support(piece, _DIRECTIONS).mean()))
+    for piece in ordered:
+        if not _covered(piece, kept):
+            kept.append(piece)
+    return kept
+
+
+def _merge_once(cover: list[Piece]) -> list[Piece] | None:
+    """Merge the pair whose common box stands out least, if that is within the slack."""
+    best: tuple[float, int, int, Piece] | None = None
+    for i, j in combinations(range(len(cover)), 2):
+        pair = (cover[i], cover[j])
+        hull = np.maximum(support(pair[0], _DIRECTIONS), support(pair[1], _DIRECTIONS))
+        for axes in _orientations(pair):
+            box = bounding_box(pair, axes)
+            excess = float(np.max(support(box, _DIRECTIONS) - hull))
+            if excess <= MERGE_SLACK and (best is None or excess < best[0]):
+                best = (excess, i, j, box)
+    if best is None:
+        return None
+    _, i, j, box = best
+    return [piece for k, piece in enumerate(cover) if k not in (i, j)] + [box]

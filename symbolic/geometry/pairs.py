@@ -1,0 +1,284 @@
+"""Which pairs of bodies are checked for collision, and why the others are not.
+
+A pair is left out only for a reason that holds for every candidate: the bodies never move
+against each other, they are neighbours in an arm and overlap by construction, the user says so,
+they touch in every sampled posture, or a bound of their motion proves that they never meet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import pinocchio as pin
+
+from symbolic.array import Array
+from symbolic.errors import CollisionModelError
+from symbolic.geometry.bodies import (
+    ArmGeometry,
+    CollisionBody,
+    Frame,
+    arm_geometry,
+    collision_bodies,
+)
+from symbolic.geometry.coal_shapes import coal_distance
+from symbolic.geometry.pieces import (
+    Piece,
+    ball,
+    farthest_from_axis,
+    farthest_from_point,
+    swept_cylinder,
+)
+from symbolic.workcell.records import IgnoredPair, Workcell
+
+POSTURES = 300
+"""Random postures in which a pair has to touch to count as always touching."""
+
+
+@dataclass(frozen=True)
+class ActivePair:
+    """Two bodies, as indices into the cell's bodies, that have to be kept apart."""
+
+    first: int
+    second: int
+
+
+@dataclass(frozen=True)
+class ExcludedPair:
+    """Two bodies that are not checked, and why."""
+
+    first: int
+    second: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class CellGeometry:
+    """Everything that collision checking knows of a workcell.
+
+    Attributes:
+        workcell: the description.
+        bodies: all collision bodies.
+        arms: the joints of both arms as numbers.
+        active: pairs to be checked; the order of every clearance vector.
+        excluded: all other pairs, with the reason.
+    """
+
+    workcell: Workcell
+    bodies: tuple[CollisionBody, ...]
+    arms: tuple[ArmGeometry, ArmGeometry]
+    active: tuple[ActivePair, ...]
+    excluded: tuple[ExcludedPair, ...]
+
+    @property
+    def pair_names(self) -> tuple[tuple[str, str], ...]:
+        """Names of the two bodies of every active pair, in order."""
+        return tuple((self.bodies[p.first].name, self.bodies[p.second].name) for p in self.active)
+
+    def index(self, name: str) -> int:
+        """Index of a body.
+
+        Raises:
+            CollisionModelError: there is no such body.
+        """
+        names = [body.name for body in self.bodies]
+        if name not in names:
+            raise CollisionModelError(f"no collision body {name!r}; there are {', '.join(names)}")
+        return names.index(name)
+
+
+def build_geometry(workcell: Workcell) -> CellGeometry:
+    """Read all shapes of a workcell and sort its pairs.
+
+    Raises:
+        CollisionModelError: a shape is unusable, or an ignored pair names no body.
+    """
+    bodies = collision_bodies(workcell)
+    arms = (arm_geometry(workcell, 0), arm_geometry(workcell, 1))
+    ignored = _ignored(workcell.collision.ignored, bodies)
+    active, excluded = [], []
+    always = _AlwaysTouching(bodies, arms)
+    for i, j in combinations(range(len(bodies)), 2):
+        a, b = bodies[i], bodies[j]
+        reason = (
+            ignored.get(frozenset((a.name, b.name)), "")
+            or _rigid(a, b, arms)
+            or _neighbours(a, b, bodies)
+            or _out_of_reach(a, b, arms, workcell.collision.tolerance)
+            or _never_meet(a, b, arms, workcell.collision.tolerance)
+            or always.reason(a, b)
+        )
+        if reason:
+            excluded.append(ExcludedPair(i, j, reason))
+        else:
+            active.append(ActivePair(i, j))
+    return CellGeometry(workcell, bodies, arms, tuple(active), tuple(excluded))
+
+
+def _ignored(
+    pairs: tuple[IgnoredPair, ...], bodies: tuple[CollisionBody, ...]
+) -> dict[frozenset[str], str]:
+    names = {body.name for body in bodies}
+    for pair in pairs:
+        for name in (pair.first, pair.second):
+            if name not in names:
+                raise CollisionModelError(
+                    f"collision.ignored names {name!r}; the bodies are {', '.join(sorted(names))}"
+                )
+    return {frozenset((p.first, p.second)): f"ignored in the file: {p.reason}" for p in pairs}
+
+
+def _anchor(
+    body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int
+) -> CollisionBody:
+    """The body with a carried box seen as part of a robot's last link."""
+    if body.frame.kind != "box":
+        return body
+    pieces = tuple(piece.moved(arms[robot].T_joint_box) for piece in body.pieces)
+    return CollisionBody(body.name, body.group, Frame("link", robot, 5), pieces)
+
+
+def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:
+    """The pair does not move against each other: fixed, or held by the exact grasp."""
+    for robot in (0, 1):
+        left, right = _anchor(a, arms, robot), _anchor(b, arms, robot)
+        if left.frame == right.frame:
+            gap = coal_distance(left.pieces, right.pieces)
+            state = f"gap {1e3 * gap:.1f} mm" if gap > 0.0 else "touching"
+            where = {
+                "world": "both stand still",
+                "link": "they move as one body" if a.frame == b.frame else "held by the grasp",
+                "box": "they move as one body",
+            }[left.frame.kind]
+            return f"{where}: {state}, always"
+    return ""
+
+
+def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody, ...]) -> str:
+    """Links of one arm with no shape on the joints between them."""
+    if a.group != b.group or a.group == "environment" or a.is_tool or b.is_tool:
+        return ""
+    low, high = sorted((a.frame.joint, b.frame.joint))
+    between = [x for x in bodies if x.group == a.group and low < x.frame.joint < high]
+    return "neighbours in the arm, they overlap at their joint" if not between else ""
+
+
+def _out_of_reach(
+    a: CollisionBody,
+    b: CollisionBody,
+    arms: tuple[ArmGeometry, ArmGeometry],
+    tolerance: float,
+) -> str:
+    """A bound of the motion of one about the other keeps them apart."""
+    margin = tolerance + 1e-3
+    if {a.frame.robot, b.frame.robot} == {0, 1}:
+        zones = [_zone(body, arms[body.frame.robot], -1) for body in (a, b)]
+        gap = coal_distance((zones[0],), (zones[1],))
+        return f"out of reach: their zones stay {1e3 * gap:.0f} mm apart" if gap > margin else ""
+    for robot in (0, 1):
+        left, right = _anchor(a, arms, robot), _anchor(b, arms, robot)
+        low, high = sorted((left, right), key=lambda body: body.frame.joint)
+        if high.frame.robot != robot or low.frame.robot not in (robot, -1):
+            continue
+        gap = coal_distance((_zone(high, arms[robot], low.frame.joint),), low.pieces)
+        if gap > margin:
+            return f"out of reach: the zone of {high.name} stays {1e3 * gap:.0f} mm away"
+    return ""
+
+
+def _never_meet(
+    a: CollisionBody,
+    b: CollisionBody,
+    arms: tuple[ArmGeometry, ArmGeometry],
+    tolerance: float,
+) -> str:
+    """Bodies two joints apart that no position of the two joints brings together.
+
+    The farther body is replaced by its swept cylinder about the second joint's axis; the first
+    joint's range is cut into intervals, each cleared by the distance at its middle, which is
+    more than the body can move within half the interval.
+    """
+    for robot, arm in enumerate(arms):
+        left, right = _anchor(a, arms, robot), _anchor(b, arms, robot)
+        low, high = sorted((left, right), key=lambda body: body.frame.joint)
+        own_base = low.frame.robot == robot or low.group == f"robot {robot + 1}"
+        if high.frame.robot != robot or not own_base or high.frame.joint - low.frame.joint != 2:
+            continue
+        first = low.frame.joint + 1
+        swept = _zone(high, arm, first)
+        reach = farthest_from_axis(swept, np.zeros(3), arm.axes[first])
+        turn = min(float(arm.upper[first] - arm.lower[first]), 2.0 * np.pi)
+        ranges = [(float(arm.lower[first]), float(arm.lower[first]) + turn)]
+        least = np.inf
+        while ranges:
+            start, end = ranges.pop()
+            q = np.zeros(6)
+            q[first] = (start + end) / 2.0
+            T = relative_placement(arm, low.frame.joint, first, q)
+            gap = coal_distance((swept.moved(T),), low.pieces)
+            if gap <= tolerance + 1e-3:
+                return ""
+            kept = gap - reach * (end - start) / 2.0
+            if kept > tolerance:
+                least = min(least, kept)
+            else:
+                ranges += [(start, q[first]), (q[first], end)]
+        return f"never meet: at least {1e3 * least:.1f} mm apart at all positions of both joints"
+    return ""
+
+
+def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
+    """What a body behind joint `body.frame.joint` can reach, seen from joint `below` (-1: world).
+
+    One joint between them: the swept cylinder about its axis. More: the ball about the first
+    joint's origin whose radius is the stretched chain.
+    """
+    first = below + 1
+    T = arm.T_world_root @ arm.origins[0] if first == 0 else arm.origins[first]
+    if body.frame.joint == first:
+        return swept_cylinder(body.pieces, np.zeros(3), arm.axes[first]).moved(T)
+    return ball(T[:3, 3], chain_radius(body, arm, first))
+
+
+def chain_radius(body: CollisionBody, arm: ArmGeometry, first: int) -> float:
+    """Distance from the origin of joint `first` that no point of a body behind it exceeds [m]."""
+    offsets = np.linalg.norm(arm.origins[first + 1 : body.frame.joint + 1, :3, 3], axis=1)
+    own = max(farthest_from_point(piece, np.zeros(3)) for piece in body.pieces)
+    return float(offsets.sum()) + own
+
+
+class _AlwaysTouching:
+    """Pairs within an arm (the box it holds included) that touch in every sampled posture."""
+
+    def __init__(
+        self, bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]
+    ) -> None:
+        self.arms = arms
+        rng = np.random.default_rng(0)
+        self.postures = [rng.uniform(arm.lower, arm.upper, (POSTURES, 6)) for arm in arms]
+
+    def reason(self, a: CollisionBody, b: CollisionBody) -> str:
+        for robot in (0, 1):
+            left, right = _anchor(a, self.arms, robot), _anchor(b, self.arms, robot)
+            group = f"robot {robot + 1}"
+            if group not in (a.group, b.group) or {a.group, b.group} - {group, "payload"}:
+                continue
+            low, high = sorted((left, right), key=lambda body: body.frame.joint)
+            for q in self.postures[robot]:
+                T = relative_placement(self.arms[robot], low.frame.joint, high.frame.joint, q)
+                if coal_distance(tuple(p.moved(T) for p in high.pieces), low.pieces) > 0.0:
+                    break
+            else:
+                return f"touch in all of {POSTURES} random postures"
+        return ""
+
+
+def relative_placement(arm: ArmGeometry, below: int, joint: int, q: Array) -> Array:
+    """(4, 4) of a joint's frame in the frame of an earlier joint (-1: world) at q (6,) [rad]."""
+    T: Array = arm.T_world_root if below < 0 else np.eye(4)
+    for k in range(below + 1, joint + 1):
+        turn = np.eye(4)
+        turn[:3, :3] = pin.exp3(arm.axes[k] * q[k])
+        T = T @ arm.origins[k] @ turn
+    return T

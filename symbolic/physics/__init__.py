@@ -1,0 +1,1 @@
+"""Motion and forces of the payload: path, time laws, rotation, contact forces, pressure, loads."""

@@ -1,0 +1,103 @@
+"""The box path: a natural quintic spline through waypoints, linear in the waypoints.
+
+Paper Eqs. 13-20. The paper leaves the joining of the segments open; here the spline is C4 at
+the inner waypoints with third and fourth derivatives zero at both ends (the natural quintic
+spline, the curve of least integrated squared jerk through the waypoints). Knots are uniform in
+the path parameter u in [0, 1].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.workcell.records import Task
+
+
+@dataclass(frozen=True)
+class PathBasis:
+    """Constant matrices that turn waypoints into samples: poses = position @ waypoints.
+
+    Attributes:
+        parameter: (n,) path parameter u of every sample.
+        position: (n, n_waypoints), value of the spline.
+        first, second: (n, n_waypoints), its first and second derivative with respect to u.
+    """
+
+    parameter: Array
+    position: Array
+    first: Array
+    second: Array
+
+
+def path_basis(n_waypoints: int, parameter: Array) -> PathBasis:
+    """Basis matrices of the natural quintic spline at the given parameters.
+
+    Args:
+        n_waypoints: number of waypoints, at least 2; two make a straight line.
+        parameter: (n,) values of u in [0, 1].
+    """
+    identity = np.eye(n_waypoints)
+    if n_waypoints == 2:
+        # Two points do not determine a natural quintic spline: the straight line has least jerk.
+        position = np.column_stack([1.0 - parameter, parameter])
+        slope = np.tile([-1.0, 1.0], (len(parameter), 1))
+        return _read_only(parameter, position, slope, np.zeros_like(slope))
+    # Not imported at the top: SciPy takes long to start, and compiled functions need no basis.
+    from scipy.interpolate import make_interp_spline
+
+    knots = np.linspace(0.0, 1.0, n_waypoints)
+    natural = [(3, np.zeros(n_waypoints)), (4, np.zeros(n_waypoints))]
+    spline = make_interp_spline(knots, identity, k=5, bc_type=(natural, natural))
+    return _read_only(
+        parameter,
+        spline(parameter),
+        spline.derivative(1)(parameter),
+        spline.derivative(2)(parameter),
+    )
+
+
+def sample_basis(task: Task) -> PathBasis:
+    """Basis at the task's samples, uniform in u."""
+    return path_basis(len(task.waypoints), np.linspace(0.0, 1.0, task.samples))
+
+
+def waypoint_matrix(task: Task, x: ca.MX | ca.SX) -> ca.MX | ca.SX:
+    """All waypoints (6, n_waypoints) from the decision vector (paper Eq. 17), angles unwrapped.
+
+    Args:
+        x: (n_var,) free waypoints in path order, each x, y, z, roll, pitch, yaw.
+    """
+    columns = []
+    taken = 0
+    for waypoint in task.waypoints:
+        if waypoint.is_fixed:
+            columns.append(type(x)(ca.DM(waypoint.lower)))
+        else:
+            columns.append(x[6 * taken : 6 * taken + 6])
+            taken += 1
+    for previous, current in zip(range(len(columns)), range(1, len(columns)), strict=False):
+        columns[current] = ca.vertcat(
+            columns[current][:3], _unwrap(columns[previous][3:], columns[current][3:])
+        )
+    return ca.horzcat(*columns)
+
+
+def _unwrap(reference: ca.MX | ca.SX, angles: ca.MX | ca.SX) -> ca.MX | ca.SX:
+    """Angles moved by full turns to lie within half a turn of the reference.
+
+    Half a turn in either direction stays as it is written (NumPy's `unwrap`).
+    """
+    difference = angles - reference
+    turns = ca.sign(difference) * ca.ceil(ca.fabs(difference) / (2.0 * np.pi) - 0.5)
+    return angles - 2.0 * np.pi * turns
+
+
+def _read_only(parameter: Array, position: Array, first: Array, second: Array) -> PathBasis:
+    arrays = [np.ascontiguousarray(a, dtype=float) for a in (parameter, position, first, second)]
+    for array in arrays:
+        array.setflags(write=False)
+    return PathBasis(*arrays)

@@ -1,0 +1,208 @@
+"""Every inverse-kinematics branch of an arm at a pose, and the ranking of start branches.
+
+A six-joint arm reaches a pose in up to sixteen ways. No closed form covers every arm (the GoFa's
+wrist is offset), so Newton's method is run from a low-discrepancy set of starts over the whole
+joint range, all at once, and the distinct solutions are collected; each one's residual is checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.physics.path import sample_basis, waypoint_matrix
+from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.physics.time_law import timed_path
+from symbolic.robot.arm import TRACK_OUTPUTS, box_flange, follow_function
+from symbolic.robot.model import RobotModel
+from symbolic.workcell.records import Contact, Robot, Workcell
+
+N_STARTS = 1024
+"""Starts of the search; a power of two keeps the Sobol points balanced."""
+
+MAX_ITERATIONS = 80
+SOLUTION_TOLERANCE = 1e-10
+"""Largest pose residual of a solution [m, rad]."""
+
+SAME_BRANCH = 1e-4
+"""Solutions closer than this in every joint are one [rad]."""
+
+STEP_LIMIT = 0.4
+"""Largest change of a joint in one step of the search [rad]."""
+
+ROBUST_CLEARANCE = 0.02
+"""Clearance above which more of it does not make a branch better [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class StartBranch:
+    """One way for one arm to hold the box at the start, and how the carry goes from there.
+
+    Attributes:
+        q: (6,) joint positions at the first waypoint [rad].
+        kept: samples of the hand-made trajectory that are reached, within limits and away from
+            singularities, counted until the first that is not.
+        clearance: least clearance bound of this arm along that trajectory [m]; infinite where
+            no bound is given.
+        limit_margin: least distance to a joint limit along it [rad].
+        manipulability: least |det J| along it [m^3].
+        path: (n, 6), the joint path along it [rad].
+    """
+
+    q: Array
+    kept: int
+    clearance: float
+    limit_margin: float
+    manipulability: float
+    path: Array
+
+    @property
+    def rank(self) -> tuple[float, ...]:
+        """Sort key, smaller is better: samples kept, then clearance, then margins.
+
+        Clearance beyond `ROBUST_CLEARANCE` counts no more. The last key is the distance to the
+        nearest limit in radians times the manipulability: both have to be large.
+        """
+        robust = min(self.clearance, ROBUST_CLEARANCE)
+        return (-float(self.kept), -round(robust, 4), -self.limit_margin * self.manipulability)
+
+
+def inverse_kinematics(
+    robot: Robot, model: RobotModel, T_root_flange: Array, n_starts: int = N_STARTS
+) -> Array:
+    """All joint positions found for a flange pose, full turns of a joint counted once.
+
+    Args:
+        T_root_flange: (4, 4) wanted flange placement in the robot's root frame.
+        n_starts: number of starts of the search, a power of two.
+
+    Returns:
+        (m, 6) [rad], sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`
+        and each joint on the turn that is nearest the middle of its range; postures with a joint
+        that no turn brings within its limits are left out.
+    """
+    # Not imported at the top: it takes long to start, and a model from the cache needs no search.
+    from scipy.stats import qmc
+
+    centre = (robot.position_lower + robot.position_upper) / 2.0
+    half = np.minimum((robot.position_upper - robot.position_lower) / 2.0, np.pi)
+    q = centre + (2.0 * qmc.Sobol(6, scramble=False).random(n_starts) - 1.0) * half
+    solved = [np.empty((0, 6))]
+    for _ in range(MAX_ITERATIONS):
+        error, jacobian, residual = _batch_error(model, q, T_root_flange)
+        arrived = residual < SOLUTION_TOLERANCE
+        solved.append(q[arrived])
+        q, error, jacobian, residual = (
+            values[~arrived] for values in (q, error, jacobian, residual)
+        )
+        if len(q) == 0:
+            break
+        # Slight damping keeps singular postures finite and vanishes near a solution.
+        damping = (1e-3 * np.minimum(residual, 1.0) ** 2 + 1e-14)[:, None, None] * np.eye(6)
+        normal = np.einsum("nki,nkj->nij", jacobian, jacobian) + damping
+        step = np.linalg.solve(normal, np.einsum("nki,nk->ni", jacobian, error)[..., None])[..., 0]
+        largest = np.maximum(np.abs(step).max(axis=1, keepdims=True), STEP_LIMIT)
+        q = q + step * (STEP_LIMIT / largest)
+    distinct = _distinct(np.concatenate(solved))
+    central = distinct + _central_turns(robot, distinct, distinct)
+    within = (central >= robot.position_lower) & (central <= robot.position_upper)
+    possible = central[within.all(axis=1)]
+    return possible[np.lexsort(np.round(possible, 6).T[::-1])]
+
+
+def _batch_error(model: RobotModel, q: Array, target: Array) -> tuple[Array, Array, Array]:
+    """Newton's right-hand side (n, 6), Jacobian (n, 6, 6) and pose residual (n,)."""
+    n = len(q)
+    R, p = model.placement.map(n)(q.T)
+    jacobian = np.array(model.jacobian.map(n)(q.T)).reshape(6, n, 6).transpose(1, 0, 2)
+    rotation = np.array(R).reshape(3, n, 3).transpose(1, 0, 2)
+    dR = np.einsum("ij,nkj->nik", target[:3, :3], rotation)
+    axis = np.stack(
+        [dR[:, 2, 1] - dR[:, 1, 2], dR[:, 0, 2] - dR[:, 2, 0], dR[:, 1, 0] - dR[:, 0, 1]], axis=1
+    )
+    dp = target[:3, 3] - np.array(p).T
+    turn_squared = np.sum((target[:3, :3] - rotation) ** 2, axis=(1, 2)) / 2.0
+    residual = np.sqrt(np.sum(dp**2, axis=1) + turn_squared)
+    return np.concatenate([dp, axis / 2.0], axis=1), jacobian, residual
+
+
+def _distinct(q: Array) -> Array:
+    """Rows that differ from all earlier ones by more than rounding, full turns apart ignored."""
+    kept: list[Array] = []
+    for row in q:
+        turns = [np.abs(np.remainder(row - other + np.pi, 2 * np.pi) - np.pi) for other in kept]
+        if not any(np.all(turn < SAME_BRANCH) for turn in turns):
+            kept.append(row)
+    return np.array(kept).reshape(-1, 6)
+
+
+def _central_turns(robot: Robot, least: Array, greatest: Array) -> Array:
+    """Full turns [rad] that move a joint range nearest to the middle of the joint's limits."""
+    middle = (robot.position_lower + robot.position_upper) / 2.0
+    turns = np.round((middle - (least + greatest) / 2.0) / (2.0 * np.pi))
+    return np.asarray(2.0 * np.pi * turns, dtype=np.float64)
+
+
+def start_branches(
+    workcell: Workcell,
+    arm: int,
+    model: RobotModel,
+    clearance: Callable[[Array, Array], float] | None = None,
+) -> tuple[StartBranch, ...]:
+    """All branches of one arm at the first waypoint, best first (see `StartBranch.rank`).
+
+    Each branch is followed along the hand-made initial trajectory; a joint that may turn more
+    than once starts on the turn that keeps it farthest from its limits there.
+
+    Args:
+        arm: 0 or 1.
+        clearance: from box poses (n, 6) and joint positions (n, 6) to the arm's least clearance
+            bound [m].
+    """
+    robot, contact = workcell.robots[arm], workcell.contacts[arm]
+    poses = initial_poses(workcell)
+    target = start_flange(workcell, robot, contact)
+    follow = follow_function(robot, model, contact, len(poses), f"follow_{arm + 1}")
+    branches = []
+    for q in inverse_kinematics(robot, model, target):
+        tracked = follow(q, poses.T, np.zeros((6, len(poses))))
+        result = {name: np.array(value) for name, value in zip(TRACK_OUTPUTS, tracked, strict=True)}
+        tracked_path = result["q"].T
+        turns = _central_turns(robot, tracked_path.min(axis=0), tracked_path.max(axis=0))
+        path = np.ascontiguousarray(tracked_path + turns)
+        to_limits = np.minimum(path - robot.position_lower, robot.position_upper - path)
+        margin, measure = to_limits.min(axis=1), result["manipulability"][0]
+        good = (result["lost"][0] == 0.0) & (margin >= 0.0) & (measure >= robot.min_manipulability)
+        kept = int(np.argmin(good)) if not good.all() else len(poses)
+        span = slice(0, max(kept, 1))
+        branches.append(
+            StartBranch(
+                q=q + turns,
+                kept=kept,
+                clearance=clearance(poses[span], path[span]) if clearance else float("inf"),
+                limit_margin=float(margin[span].min()),
+                manipulability=float(measure[span].min()),
+                path=path,
+            )
+        )
+    return tuple(sorted(branches, key=lambda branch: branch.rank))
+
+
+def start_flange(workcell: Workcell, robot: Robot, contact: Contact) -> Array:
+    """T_root_flange (4, 4) of an arm that holds the box at the first waypoint."""
+    start = workcell.task.waypoints[0].lower
+    T_world_box = pose_matrix(start[:3], start[3:])
+    return inverse(robot.T_world_base) @ T_world_box @ box_flange(robot, contact)
+
+
+def initial_poses(workcell: Workcell) -> Array:
+    """Sampled box poses (n, 6) of the hand-made initial trajectory."""
+    task = workcell.task
+    x = ca.MX.sym("x", task.n_var)
+    path = timed_path(task, sample_basis(task), waypoint_matrix(task, x))
+    poses = ca.Function("poses", [x], [path.pose])
+    return np.array(poses(task.initial.reshape(-1))).T

@@ -1,0 +1,164 @@
+"""A robot's URDF as a serial arm of six revolute joints, and the files the URDF names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pinocchio as pin
+
+from symbolic.errors import RobotModelError
+from symbolic.workcell.reader import suggestion
+from symbolic.workcell.records import Robot
+
+N_JOINTS = 6
+
+
+@dataclass(frozen=True)
+class UrdfContent:
+    """What a URDF says about shapes.
+
+    Attributes:
+        collision_links: links that have a collision shape.
+        collision_meshes, visual_meshes: mesh addresses as written.
+    """
+
+    collision_links: tuple[str, ...]
+    collision_meshes: tuple[str, ...]
+    visual_meshes: tuple[str, ...]
+
+
+def reduced_model(urdf: Path, locked_joints: Iterable[tuple[str, float]] = ()) -> pin.Model:
+    """The Pinocchio model of a URDF with some joints held.
+
+    Args:
+        urdf: the model file.
+        locked_joints: names of single-axis joints and their positions [rad or m].
+
+    Raises:
+        RobotModelError: the file cannot be read as a URDF, or a locked joint does not exist.
+    """
+    try:
+        model = pin.buildModelFromUrdf(str(urdf))
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise RobotModelError(f"Pinocchio cannot read {urdf.name}: {_first_line(error)}") from error
+    configuration = pin.neutral(model)
+    locked = []
+    for name, position in locked_joints:
+        if name not in list(model.names)[1:]:
+            candidates = list(model.names)[1:]
+            raise RobotModelError(
+                f"no moving joint {name!r} in {urdf.name}"
+                f"{suggestion(name, candidates) or f'; it has {_listed(candidates)}'}"
+            )
+        joint = model.getJointId(name)
+        if model.joints[joint].nq != 1:
+            raise RobotModelError(
+                f"joint {name!r} of {urdf.name} is continuous or has several axes; only revolute "
+                "and prismatic joints can be locked"
+            )
+        configuration[model.joints[joint].idx_q] = position
+        locked.append(joint)
+    return pin.buildReducedModel(model, locked, configuration) if locked else model
+
+
+def arm_model(robot: Robot) -> pin.Model:
+    """The model of a robot of a workcell, its locked joints held.
+
+    Raises:
+        RobotModelError: it is not a serial arm of six revolute joints with that flange.
+    """
+    model = reduced_model(robot.urdf, robot.locked_joints)
+    for problem in (structure_problem(model), flange_problem(model, robot.flange)):
+        if problem:
+            raise RobotModelError(f"robot {robot.name!r}: {problem}")
+    return model
+
+
+def structure_problem(model: pin.Model) -> str:
+    """Why a model is no serial arm of six revolute joints, or an empty string."""
+    names = list(model.names)[1:]
+    if model.njoints - 1 != N_JOINTS:
+        return (
+            f"found {len(names)} joints that are not locked ({_listed(names)}); allowed are "
+            f"{N_JOINTS}, name others under locked_joints"
+        )
+    for joint, name in enumerate(names, start=1):
+        kind = str(model.joints[joint].shortname())
+        if not kind.startswith("JointModelR") or model.joints[joint].nq != 1:
+            return (
+                f"joint {name!r} is of kind {kind.removeprefix('JointModel')}; allowed are "
+                "revolute joints with limits"
+            )
+        if model.parents[joint] != joint - 1:
+            return (
+                f"joint {name!r} does not follow the joint before it; allowed is one serial chain"
+            )
+    return ""
+
+
+def flange_problem(model: pin.Model, flange: str) -> str:
+    """Why a frame cannot carry the tool, or an empty string."""
+    bodies = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+    last = [frame.name for frame in model.frames if _carried_by_last(model, frame)]
+    if flange not in bodies:
+        hint = suggestion(flange, last)
+        return f"found {flange!r}, no link of the URDF; allowed are {_listed(last)}{hint}"
+    if flange not in last:
+        return f"found {flange!r}, which the last joint does not move; allowed are {_listed(last)}"
+    return ""
+
+
+def read_urdf_content(urdf: Path) -> UrdfContent:
+    """The links with collision shapes and the mesh files that a URDF names.
+
+    Raises:
+        RobotModelError: the file is not XML.
+    """
+    try:
+        root = ElementTree.parse(urdf).getroot()
+    except (ElementTree.ParseError, OSError, ValueError) as error:
+        raise RobotModelError(f"{urdf.name} is not readable XML: {_first_line(error)}") from error
+    return UrdfContent(
+        collision_links=tuple(
+            str(link.get("name"))
+            for link in root.iter("link")
+            if link.find("collision") is not None
+        ),
+        collision_meshes=_meshes(root, "collision"),
+        visual_meshes=_meshes(root, "visual"),
+    )
+
+
+def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
+    """The file behind a mesh address of a URDF, or None where there is none.
+
+    `package://NAME/REST` is looked up as NAME/REST in each package folder; `file://` addresses
+    are absolute; anything else is relative to the URDF's folder.
+    """
+    if address.startswith("package://"):
+        rest = address.removeprefix("package://")
+        candidates = [folder / rest for folder in package_dirs]
+    else:
+        candidates = [urdf.parent / address.removeprefix("file://")]
+    return next((candidate.resolve() for candidate in candidates if candidate.is_file()), None)
+
+
+def _meshes(root: ElementTree.Element, kind: str) -> tuple[str, ...]:
+    found = (mesh.get("filename", "") for mesh in root.findall(f"link/{kind}/geometry/mesh"))
+    return tuple(dict.fromkeys(found))
+
+
+def _carried_by_last(model: pin.Model, frame: pin.Frame) -> bool:
+    return bool(frame.type == pin.FrameType.BODY and frame.parentJoint == model.njoints - 1)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or ["no reason given"])[0]
+
+
+def _listed(names: Sequence[str], most: int = 20) -> str:
+    text = ", ".join(repr(name) for name in names[:most]) or "none"
+    return f"{text} and {len(names) - most} more" if len(names) > most else text

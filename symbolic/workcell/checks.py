@@ -1,0 +1,187 @@
+"""Checks across the sections of a workcell: names, references, reach, consistency.
+
+Each function records what it finds in `problems` and looks only at parts that are themselves
+in order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.errors import RobotModelError
+from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.robot.urdf import arm_model, read_urdf_content
+from symbolic.workcell.reader import Problems, suggestion
+from symbolic.workcell.records import Robot, Workcell
+
+PAYLOAD_BODY = "payload"
+REACH_SLACK = 1e-6  # [m], rounding of a flange exactly at full stretch
+
+
+def body_names(workcell: Workcell) -> dict[str, tuple[str, ...]]:
+    """The names by which collision pairs are addressed, per owner.
+
+    The payload is `payload`, an environment body has its own name, a link or tool body of a
+    robot is `ROBOT/NAME`. The keys are `payload`, `environment` and the robots' names.
+    """
+    names = {
+        PAYLOAD_BODY: (PAYLOAD_BODY,),
+        "environment": tuple(body.name for body in workcell.environment),
+    }
+    for robot in workcell.robots:
+        links = read_urdf_content(robot.urdf).collision_links
+        tools = tuple(body.name for body in robot.tool)
+        names[robot.name] = tuple(f"{robot.name}/{name}" for name in (*links, *tools))
+    return names
+
+
+def check_names(workcell: Workcell, problems: Problems) -> None:
+    """Names are unique where they are used to address something."""
+    robots = [(f"robots[{i}].name", robot.name) for i, robot in enumerate(workcell.robots)]
+    bodies = [(f"environment[{i}].name", b.name) for i, b in enumerate(workcell.environment)]
+    _check_unique([("'payload' (reserved)", PAYLOAD_BODY), *robots, *bodies], problems)
+    for index, robot in enumerate(workcell.robots):
+        path = f"robots[{index}]"
+        links: list[tuple[str, str]] = []
+        if problems.clean(f"{path}.urdf"):
+            content = read_urdf_content(robot.urdf)
+            links = [(f"a link of {robot.urdf.name}", link) for link in content.collision_links]
+        tools = [(f"{path}.tool[{i}].name", body.name) for i, body in enumerate(robot.tool)]
+        _check_unique([*links, *tools], problems)
+    for index, body in enumerate(workcell.environment):
+        if "/" in body.name:
+            problems.add(
+                f"environment[{index}].name",
+                f"found {body.name!r}; allowed is a name without '/', which marks a robot's bodies",
+            )
+
+
+def _check_unique(entries: list[tuple[str, str]], problems: Problems) -> None:
+    first: dict[str, str] = {}
+    for path, name in entries:
+        if name and name in first:
+            problems.add(path, f"found {name!r} again; it is already {first[name]}")
+        first.setdefault(name, path)
+
+
+def check_contacts(workcell: Workcell, problems: Problems) -> None:
+    """The two contacts squeeze the box: they lie on opposite faces."""
+    if not problems.clean("contacts", "payload.size"):
+        return
+    first, second = (contact.T_box_pad[:3, 2] for contact in workcell.contacts)
+    if not np.allclose(first, -second, atol=1e-9):
+        problems.add(
+            "contacts[1].xyz",
+            f"lies on the {_face_name(second)} face, contacts[0] on the {_face_name(first)} face; "
+            "allowed are opposite faces, the force model holds for opposite normals only",
+        )
+
+
+def _face_name(inward_normal: Array) -> str:
+    axis = int(np.argmax(np.abs(inward_normal)))
+    return f"{'-' if inward_normal[axis] > 0 else '+'}{'xyz'[axis]}"
+
+
+def check_references(workcell: Workcell, problems: Problems) -> None:
+    """Names in allowed contacts and ignored pairs exist."""
+    if not problems.clean("environment"):
+        return
+    environment = [body.name for body in workcell.environment]
+    for index, contact in enumerate(workcell.task.allowed_contacts):
+        path = f"task.allowed_contacts[{index}].body"
+        if problems.clean(path) and contact.body not in environment:
+            hint = suggestion(contact.body, environment) or f"; they are {', '.join(environment)}"
+            problems.add(path, f"found {contact.body!r}; allowed is an environment body{hint}")
+    parts = ("name", "urdf", "tool")
+    if not problems.clean(*(f"robots[{index}].{part}" for index in (0, 1) for part in parts)):
+        return
+    known = [name for group in body_names(workcell).values() for name in group]
+    for index, pair in enumerate(workcell.collision.ignored):
+        for side, name in (("first", pair.first), ("second", pair.second)):
+            path = f"collision.ignored[{index}].{side}"
+            if problems.clean(path) and name not in known:
+                hint = suggestion(name, known) or f"; they are {', '.join(known)}"
+                problems.add(path, f"found {name!r}; allowed is a body of the cell{hint}")
+
+
+def check_speeds(workcell: Workcell, problems: Problems) -> None:
+    """The reference speeds are within the payload's own limits."""
+    task, payload = workcell.task, workcell.payload
+    for key, value, limit_key, limit in (
+        ("reference_speed", task.reference_speed, "velocity_max", payload.velocity_max),
+        (
+            "reference_angular_speed",
+            task.reference_angular_speed,
+            "angular_velocity_max",
+            payload.angular_velocity_max,
+        ),
+    ):
+        if problems.clean(f"task.{key}", f"payload.{limit_key}") and value > limit:
+            problems.add(
+                f"task.{key}",
+                f"found {value:g}; allowed is at most payload.{limit_key} = {limit:g}",
+            )
+
+
+def check_reach(workcell: Workcell, problems: Problems) -> None:
+    """No fixed pose asks for more than the stretched length of an arm.
+
+    This is necessary, not sufficient: it costs no inverse kinematics.
+    """
+    poses = [(path, pose) for path, pose in _fixed_poses(workcell) if problems.clean(path)]
+    parts = ("urdf", "locked_joints", "flange", "base", "pad")
+    for index, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
+        needed = [f"robots[{index}].{part}" for part in parts]
+        if not problems.clean("payload.size", f"contacts[{index}]", *needed):
+            continue
+        shoulder, length = stretched_length(robot)
+        T_box_flange = contact.T_box_pad @ inverse(robot.T_flange_pad)
+        for path, pose in poses:
+            flange = (pose_matrix(pose[:3], pose[3:]) @ T_box_flange)[:3, 3]
+            distance = float(np.linalg.norm(flange - shoulder))
+            if distance > length + REACH_SLACK:
+                where = ", ".join(f"{entry:.3f}" for entry in flange)
+                box = ", ".join(f"{entry:g}" for entry in pose[:3])
+                problems.add(
+                    path,
+                    f"the box at ({box}) m is out of reach: the flange of robot {robot.name!r} "
+                    f"has to stand at ({where}) m, {distance:.3f} m from its first joint; allowed "
+                    f"is {length:.3f} m, its links stretched out (look at robots[{index}].base, "
+                    f"robots[{index}].pad and contacts[{index}] as well)",
+                )
+
+
+def stretched_length(robot: Robot) -> tuple[Array, float]:
+    """Where the first joint stands (3,) [m] in the world, and an upper bound of the reach [m].
+
+    The bound is the sum of the distances between successive joints and the flange.
+
+    Raises:
+        RobotModelError: the robot's model is not a serial arm of six revolute joints.
+    """
+    model = arm_model(robot)
+    shoulder = robot.T_world_base @ np.append(model.jointPlacements[1].translation, 1.0)
+    flange = model.frames[model.getFrameId(robot.flange)].placement.translation
+    offsets = [model.jointPlacements[joint].translation for joint in range(2, model.njoints)]
+    return shoulder[:3], float(sum(np.linalg.norm(offset) for offset in [*offsets, flange]))
+
+
+def _fixed_poses(workcell: Workcell) -> Iterator[tuple[str, Array]]:
+    waypoints = workcell.task.waypoints
+    yield "task.start", waypoints[0].lower
+    for waypoint in waypoints[1:-1]:
+        if waypoint.is_fixed:
+            yield "task.waypoints", waypoint.lower
+    yield "task.goal", waypoints[-1].lower
+
+
+def check_all(workcell: Workcell, problems: Problems) -> None:
+    """Every check across sections that needs no inverse kinematics."""
+    for check in (check_names, check_contacts, check_references, check_speeds, check_reach):
+        try:
+            check(workcell, problems)
+        except RobotModelError as error:  # pragma: no cover - the robots section reports it first
+            problems.add("robots", str(error))

@@ -1,0 +1,50 @@
+"""The believable range of every quantity in a workcell file.
+
+The ranges are wide for cells of industrial arms and narrow enough that a value in another unit
+(mm, degrees, g, kgf, mm/s) falls outside and is told so. docs/workcell.md lists them.
+"""
+
+from __future__ import annotations
+
+import math
+
+from symbolic.workcell.reader import Quantity
+
+STANDARD_GRAVITY = 9.80665  # [m/s^2], turns kgf into N
+
+_MILLIMETRES = (("mm", 1e-3),)
+_DEGREES = (("deg", math.pi / 180),)
+_DEGREES_PER_SECOND = (("deg/s", math.pi / 180),)
+_MILLIMETRES_PER_SECOND = (("mm/s", 1e-3),)
+_TURN = 2 * math.pi + 1e-9
+
+POSITION = Quantity("m", -10.0, 10.0, mistaken=_MILLIMETRES)
+ANGLE = Quantity("rad", -_TURN, _TURN, mistaken=_DEGREES)
+POSE = (POSITION,) * 3 + (ANGLE,) * 3
+
+SHAPE_SIZE = Quantity("m", 0.0, 10.0, low_open=True, mistaken=_MILLIMETRES)
+SCALE = Quantity("", 0.0, 1000.0, low_open=True)
+
+PAYLOAD_SIZE = Quantity("m", 0.0, 5.0, low_open=True, mistaken=_MILLIMETRES)
+MASS = Quantity("kg", 0.0, 500.0, low_open=True, mistaken=(("g", 1e-3),))
+INERTIA = Quantity("kg m^2", -1000.0, 1000.0)
+SPEED = Quantity("m/s", 0.0, 10.0, low_open=True, mistaken=_MILLIMETRES_PER_SECOND)
+ACCELERATION = Quantity("m/s^2", 0.0, 100.0, low_open=True, mistaken=(("mm/s^2", 1e-3),))
+ANGULAR_SPEED = Quantity("rad/s", 0.0, 20.0, low_open=True, mistaken=_DEGREES_PER_SECOND)
+ANGULAR_ACCELERATION = Quantity(
+    "rad/s^2", 0.0, 200.0, low_open=True, mistaken=(("deg/s^2", math.pi / 180),)
+)
+
+FRICTION = Quantity("", 0.0, 5.0, low_open=True, mistaken=(("%", 1e-2),))
+PATCH_RADIUS = Quantity("m", 0.0, 0.5, low_open=True, mistaken=_MILLIMETRES)
+
+JOINT_POSITION = Quantity("rad", -4 * math.pi, 4 * math.pi, mistaken=_DEGREES)
+LOCKED_POSITION = Quantity("rad or m", -4 * math.pi, 4 * math.pi)
+TORQUE = Quantity("N m", 0.0, 1e5, low_open=True)
+MANIPULABILITY = Quantity("m^3", 0.0, 10.0, low_open=True)
+
+# Below 20 N a value is kgf by all likelihood: it would be a hold of less than 2 kg per robot.
+FORCE = Quantity("N", 20.0, 1e5, mistaken=(("kgf", STANDARD_GRAVITY),))
+DURATION = Quantity("s", 0.0, 60.0, low_open=True, mistaken=(("ms", 1e-3),))
+DEPARTURE = Quantity("m", 0.0, 1.0, low_open=True, mistaken=_MILLIMETRES)
+TOLERANCE = Quantity("m", 0.0, 0.1, mistaken=_MILLIMETRES)

@@ -1,0 +1,275 @@
+"""The description of a dual-arm cell as frozen, validated records.
+
+Units are SI throughout: m, rad, kg, s, N, N m. A transform `T_a_b` is a (4, 4) homogeneous
+matrix that maps coordinates of frame b into frame a, so that `T_a_c = T_a_b @ T_b_c`.
+
+Frames: `world` (z up), one `base` per robot, its `flange`, its `pad` (origin at the centre of
+the contact patch, z along the contact normal, pointing from the robot into the box) and the
+`box` (origin at the geometric centre of the payload, axes along its edges).
+
+Arrays are read-only. The records hold no behaviour that depends on a solver or on a file
+format; `symbolic.workcell.file` reads them from TOML.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from symbolic.array import Array
+
+TimeLaw = Literal["constant", "ramped"]
+
+
+@dataclass(frozen=True)
+class Box:
+    """A cuboid centred at its frame. size: (3,) full edge lengths [m]."""
+
+    size: Array
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A cylinder centred at its frame, axis along z. radius, length [m]."""
+
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere centred at its frame. radius [m]."""
+
+    radius: float
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh file (anything trimesh reads). scale: (3,) factor per axis."""
+
+    path: Path
+    scale: Array
+
+
+Shape = Box | Cylinder | Sphere | Mesh
+
+
+@dataclass(frozen=True)
+class Body:
+    """A named collision shape.
+
+    Attributes:
+        name: unique within its owner.
+        shape: its geometry.
+        pose: (4, 4), the shape's frame in its parent frame (world for the environment,
+            flange for a tool).
+    """
+
+    name: str
+    shape: Shape
+    pose: Array
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One arm: its model file, where it stands, what it carries and what it may do.
+
+    Attributes:
+        name: unique in the workcell.
+        urdf: the model file.
+        package_dirs: folders that `package://` addresses of the URDF are looked up in.
+        flange: name of the URDF frame that the tool is mounted on.
+        locked_joints: joints of the URDF held at a fixed position [rad or m].
+        T_world_base: (4, 4), the URDF's root in the world.
+        T_flange_pad: (4, 4), the pad frame on the flange.
+        tool: collision bodies of the tool, in the flange frame.
+        position_lower, position_upper: (6,) joint limits [rad].
+        velocity_max: (6,) [rad/s].
+        acceleration_max: (6,) [rad/s^2].
+        torque_max: (6,) [N m].
+        min_manipulability: least allowed |det J| of the flange-pad Jacobian [m^3].
+    """
+
+    name: str
+    urdf: Path
+    package_dirs: tuple[Path, ...]
+    flange: str
+    locked_joints: tuple[tuple[str, float], ...]
+    T_world_base: Array
+    T_flange_pad: Array
+    tool: tuple[Body, ...]
+    position_lower: Array
+    position_upper: Array
+    velocity_max: Array
+    acceleration_max: Array
+    torque_max: Array
+    min_manipulability: float
+
+
+@dataclass(frozen=True)
+class Payload:
+    """The carried box.
+
+    Attributes:
+        size: (3,) edge lengths along the box axes [m].
+        mass: [kg].
+        centre_of_mass: (3,) in the box frame [m].
+        inertia: (3, 3) about the centre of mass, box axes [kg m^2].
+        velocity_max, acceleration_max: limits of the box's translation [m/s, m/s^2].
+        angular_velocity_max, angular_acceleration_max: of its rotation [rad/s, rad/s^2].
+    """
+
+    size: Array
+    mass: float
+    centre_of_mass: Array
+    inertia: Array
+    velocity_max: float
+    acceleration_max: float
+    angular_velocity_max: float
+    angular_acceleration_max: float
+
+
+@dataclass(frozen=True)
+class Contact:
+    """The frictional contact between one robot's pad and the box.
+
+    Attributes:
+        T_box_pad: (4, 4), the pad frame in the box frame; its origin lies on a face of the
+            box and its z axis is the inward normal of that face.
+        friction: Coulomb coefficient.
+        patch_radius: radius of the contact patch [m].
+    """
+
+    T_box_pad: Array
+    friction: float
+    patch_radius: float
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """A pose of the box path: fixed where lower equals upper, otherwise free within them.
+
+    Attributes:
+        lower, upper: (6,) x, y, z [m], roll, pitch, yaw [rad].
+    """
+
+    lower: Array
+    upper: Array
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether the task fixes this pose."""
+        return bool(np.all(self.lower == self.upper))
+
+
+@dataclass(frozen=True)
+class AllowedContact:
+    """The payload may touch a named environment body near the fixed poses.
+
+    Attributes:
+        body: name of the environment body.
+        departure: the contact is allowed while the box centre is within this distance of a
+            fixed waypoint at which the payload touches (or is within tolerance of) the body [m].
+    """
+
+    body: str
+    departure: float
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be carried where, and how a candidate is sampled and judged.
+
+    Attributes:
+        waypoints: the ordered poses of the path; the first and last are fixed.
+        samples: number of samples along the path, ends included.
+        time_law: 'constant' (the paper's) or 'ramped' (from rest to rest).
+        reference_speed: [m/s], speed of the box centre (cruise speed of 'ramped').
+        reference_angular_speed: [rad/s], for steps that mostly rotate.
+        ramp_time: [s], duration of each ramp of 'ramped'.
+        reference_force: (2,) [N], normalises each robot's normal force.
+        initial: (n_free, 6), the hand-made trajectory's free waypoints.
+        allowed_contacts: contacts that are no collisions, see AllowedContact.
+    """
+
+    waypoints: tuple[Waypoint, ...]
+    samples: int
+    time_law: TimeLaw
+    reference_speed: float
+    reference_angular_speed: float
+    ramp_time: float
+    reference_force: Array
+    initial: Array
+    allowed_contacts: tuple[AllowedContact, ...]
+
+    @property
+    def free_indices(self) -> tuple[int, ...]:
+        """Positions of the free waypoints in `waypoints`."""
+        return tuple(i for i, w in enumerate(self.waypoints) if not w.is_fixed)
+
+    @property
+    def n_var(self) -> int:
+        """Number of decision variables, six per free waypoint (paper Eq. 14)."""
+        return 6 * len(self.free_indices)
+
+    @property
+    def lower(self) -> Array:
+        """(n_var,) lower bounds of the decision vector."""
+        return np.concatenate([self.waypoints[i].lower for i in self.free_indices])
+
+    @property
+    def upper(self) -> Array:
+        """(n_var,) upper bounds of the decision vector."""
+        return np.concatenate([self.waypoints[i].upper for i in self.free_indices])
+
+
+@dataclass(frozen=True)
+class IgnoredPair:
+    """A pair of bodies that collision checking leaves out, with the user's reason."""
+
+    first: str
+    second: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class CollisionSettings:
+    """How collisions are judged.
+
+    Attributes:
+        tolerance: bodies closer than this count as colliding [m].
+        ignored: pairs left out by the user.
+    """
+
+    tolerance: float = 0.0
+    ignored: tuple[IgnoredPair, ...] = ()
+
+
+@dataclass(frozen=True)
+class Workcell:
+    """A dual-arm cell and its task.
+
+    Attributes:
+        name: title for reports.
+        robots: the two arms; robot i holds contact i.
+        payload, contacts, task, environment, collision: see their records.
+        start_branch: (2,) per robot the index of the start branch among the ranked branches,
+            or -1 for the stated criterion's choice.
+        source: the file it came from.
+        digest: SHA-256 over the file and every file it names (URDF, meshes); identifies the
+            cell in caches and results.
+    """
+
+    name: str
+    robots: tuple[Robot, Robot]
+    payload: Payload
+    contacts: tuple[Contact, Contact]
+    task: Task
+    environment: tuple[Body, ...]
+    collision: CollisionSettings = field(default_factory=CollisionSettings)
+    start_branch: tuple[int, int] = (-1, -1)
+    source: Path = Path()
+    digest: str = ""

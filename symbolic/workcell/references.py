@@ -1,0 +1,154 @@
+"""Finding every file that a workcell file names, and a layout in which its references hold."""
+
+from __future__ import annotations
+
+import posixpath
+import tomllib
+from collections.abc import Iterator, Mapping
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from symbolic.errors import BundleError, RobotModelError
+from symbolic.robot.urdf import read_urdf_content, resolve_mesh
+from symbolic.workcell.records import Workcell
+
+
+class CellCollector:
+    """Gathers a workcell's files and gives each a place relative to the workcell file."""
+
+    def __init__(self, source: Path) -> None:
+        self._source = source
+        self._text = source.read_bytes().decode("utf-8")
+        self._files: dict[str, bytes] = {}
+        self._folders: list[str] = []
+        self._moved = 0
+        self._places: dict[str, str] = {}
+
+    def collect(self, workcell: Workcell) -> None:
+        """Add every file that the workcell names."""
+        data = parse_toml(self._text.encode("utf-8"))
+        for robot, entry in zip(workcell.robots, data["robots"], strict=True):
+            urdf = self._place(str(entry["urdf"]))
+            folders = [self._place(str(folder)) for folder in entry.get("package_dirs", [])]
+            self._folders.extend(folders)
+            self._files[urdf] = self._with_meshes(
+                robot.urdf, urdf, list(zip(robot.package_dirs, folders, strict=True))
+            )
+        for reference, package_dirs in references(data):
+            if package_dirs is None:
+                content = (self._source.parent / reference).read_bytes()
+                self._files[self._place(reference)] = content
+
+    def layout(self) -> tuple[str, dict[str, bytes], tuple[str, ...]]:
+        """Everything collected, moved so that no path leads upwards.
+
+        Returns:
+            The path of the workcell file, the content of every file by path, and the package
+            folders.
+        """
+        names = [name.split("/") for name in (*self._files, *self._folders)]
+        depth = max((parts.count("..") for parts in names), default=0)
+        taken = {part for parts in names for part in parts}
+        level = next(name for name in (f"cell{k or ''}" for k in count()) if name not in taken)
+        base = "/".join([level] * depth)
+        workcell = joined(base, "workcell.toml" if depth else f"{level}.toml")
+        files = {joined(base, name): content for name, content in self._files.items()}
+        files[workcell] = self._text.encode("utf-8")
+        folders = dict.fromkeys(joined(base, name) for name in self._folders)
+        return workcell, files, tuple(folders)
+
+    def _place(self, reference: str) -> str:
+        """The place of a reference of the workcell file, relative to that file."""
+        if not posixpath.isabs(reference):
+            return posixpath.normpath(reference)
+        if reference in self._places:  # both robots may name one file
+            return self._places[reference]
+        moved = self._places[reference] = self._new_place(reference)
+        self._text = _replaced(self._text, reference, moved, self._source.name)
+        return moved
+
+    def _new_place(self, reference: str) -> str:
+        self._moved += 1
+        return f"embedded/{self._moved}/{posixpath.basename(reference) or 'folder'}"
+
+    def _with_meshes(self, path: Path, place: str, packages: list[tuple[Path, str]]) -> bytes:
+        """Add the meshes of a URDF; its content with absolute addresses replaced."""
+        content = path.read_bytes()
+        try:
+            named = read_urdf_content(path)
+        except RobotModelError as error:
+            raise BundleError(str(error)) from error
+        for address in dict.fromkeys((*named.collision_meshes, *named.visual_meshes)):
+            if address.startswith("package://"):
+                for folder, folder_place in packages:
+                    mesh = resolve_mesh(address, path, (folder,))
+                    if mesh is not None:
+                        rest = address.removeprefix("package://")
+                        self._files[joined(folder_place, rest)] = mesh.read_bytes()
+                        break
+                continue
+            mesh = resolve_mesh(address, path, ())
+            target = address.removeprefix("file://")
+            if mesh is None:
+                continue
+            if posixpath.isabs(target):
+                moved = self._new_place(target)
+                base = posixpath.dirname(place) or "."
+                relative = posixpath.relpath(moved, base)
+                content = _replaced(content.decode("utf-8"), address, relative, path.name).encode(
+                    "utf-8"
+                )
+                self._files[moved] = mesh.read_bytes()
+            else:
+                self._files[joined(posixpath.dirname(place), target)] = mesh.read_bytes()
+        return content
+
+
+def _replaced(text: str, reference: str, moved: str, file: str) -> str:
+    """Text with every quoted occurrence of a reference replaced."""
+    for quote in ('"', "'"):
+        if f"{quote}{reference}{quote}" in text:
+            return text.replace(f"{quote}{reference}{quote}", f"{quote}{moved}{quote}")
+    raise BundleError(
+        f"{file} names {reference!r} by an absolute path in an unusual spelling; write it "
+        "relative to the file so that the trajectory can be stored with it"
+    )
+
+
+def joined(base: str, reference: str) -> str:
+    """A reference seen from the folder that `base` is relative to, `..` resolved."""
+    return posixpath.normpath(posixpath.join(base, reference))
+
+
+def parse_toml(content: bytes) -> dict[str, Any]:
+    """The tables of a workcell file.
+
+    Raises:
+        BundleError: it is not TOML.
+    """
+    try:
+        return tomllib.loads(content.decode("utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise BundleError(f"the stored workcell is not valid TOML: {error}") from error
+
+
+def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]]:
+    """Files named by a workcell: the reference and, for a URDF, its package folders.
+
+    Raises:
+        BundleError: a key is missing or has another type.
+    """
+    try:
+        for robot in data.get("robots", []):
+            yield str(robot["urdf"]), [str(entry) for entry in robot.get("package_dirs", [])]
+            yield from _meshes(robot.get("tool", []))
+        yield from _meshes(data.get("environment", []))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise BundleError(f"the stored workcell lacks or misuses the key {error}") from error
+
+
+def _meshes(bodies: Any) -> Iterator[tuple[str, None]]:
+    for body in bodies:
+        if body.get("kind") == "mesh":
+            yield str(body["path"]), None

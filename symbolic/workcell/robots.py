@@ -1,0 +1,181 @@
+"""The robots section of a workcell file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from symbolic.array import Array
+from symbolic.errors import RobotModelError
+from symbolic.robot.urdf import (
+    N_JOINTS,
+    UrdfContent,
+    flange_problem,
+    read_urdf_content,
+    reduced_model,
+    resolve_mesh,
+    structure_problem,
+)
+from symbolic.workcell import quantities as quantity
+from symbolic.workcell.reader import Quantity, Table, read_only, shown
+from symbolic.workcell.records import Robot
+from symbolic.workcell.sections import read_body, read_file, read_pose
+
+# Joint accelerations are rarely published; this is slow for an arm of this class.
+DEFAULT_ACCELERATION = 5.0  # [rad/s^2]
+DEFAULT_MIN_MANIPULABILITY = 0.005  # [m^3], exceeded by 9 of 10 random poses of a 1.3 m arm
+MAX_START_BRANCH = 1000
+
+_ONES = read_only(np.ones(N_JOINTS))
+
+
+def read_robot(table: Table, folder: Path) -> tuple[Robot, int]:
+    """One arm and the index of its start branch (-1: the criterion's choice)."""
+    problems = table.problems
+    name = table.text("name")
+    if "/" in name:
+        problems.add(table.at("name"), f"found {name!r}; allowed is a name without '/'")
+    urdf = read_file(table, "urdf", folder)
+    package_dirs = _read_folders(table, folder)
+    locked = _read_locked(table)
+    flange = table.text("flange")
+    model = _read_model(table, urdf, locked, flange)
+    _check_meshes(table, urdf, package_dirs)
+    limits = _read_limits(table, model)
+    robot = Robot(
+        name=name,
+        urdf=urdf,
+        package_dirs=package_dirs,
+        flange=flange,
+        locked_joints=locked,
+        T_world_base=read_pose(table, "base"),
+        T_flange_pad=read_pose(table, "pad"),
+        tool=tuple(read_body(entry, folder) for entry in table.tables("tool")),
+        position_lower=limits["position_lower"],
+        position_upper=limits["position_upper"],
+        velocity_max=limits["velocity_max"],
+        acceleration_max=limits["acceleration_max"],
+        torque_max=limits["torque_max"],
+        min_manipulability=table.number(
+            "min_manipulability", quantity.MANIPULABILITY, DEFAULT_MIN_MANIPULABILITY
+        ),
+    )
+    branch = table.integer("start_branch", -1, MAX_START_BRANCH, -1)
+    table.close()
+    return robot, branch
+
+
+def _read_folders(table: Table, folder: Path) -> tuple[Path, ...]:
+    value = table.raw("package_dirs", [])
+    path = table.at("package_dirs")
+    if not isinstance(value, list):
+        table.problems.add(path, f"found {shown(value)}; allowed is an array of folders")
+        return ()
+    folders = []
+    for index, entry in enumerate(value):
+        if not isinstance(entry, str) or "\0" in entry or not (folder / entry).is_dir():
+            table.problems.add(
+                f"{path}[{index}]",
+                f"found {shown(entry)}; allowed is a folder, its path relative to the workcell "
+                "file",
+            )
+            continue
+        folders.append((folder / entry).resolve())
+    return tuple(folders)
+
+
+def _read_locked(table: Table) -> tuple[tuple[str, float], ...]:
+    inner = table.table("locked_joints", {})
+    return tuple((name, inner.number(name, quantity.LOCKED_POSITION)) for name in inner)
+
+
+def _read_model(
+    table: Table, urdf: Path, locked: tuple[tuple[str, float], ...], flange: str
+) -> pin.Model | None:
+    """The arm's model, or recorded problems and None."""
+    problems = table.problems
+    if not problems.clean(table.at("urdf"), table.at("locked_joints")):
+        return None
+    try:
+        read_urdf_content(urdf)  # tells bad XML better than Pinocchio does
+        reduced_model(urdf)
+    except RobotModelError as error:
+        problems.add(table.at("urdf"), str(error))
+        return None
+    try:
+        model = reduced_model(urdf, locked)
+    except RobotModelError as error:
+        problems.add(table.at("locked_joints"), str(error))
+        return None
+    problem = structure_problem(model)
+    if problem:
+        problems.add(table.at("urdf"), problem)
+        return None
+    if problems.clean(table.at("flange")):
+        problem = flange_problem(model, flange)
+        if problem:
+            problems.add(table.at("flange"), problem)
+    return model
+
+
+def _check_meshes(table: Table, urdf: Path, package_dirs: tuple[Path, ...]) -> None:
+    if not table.problems.clean(table.at("urdf"), table.at("package_dirs")):
+        return
+    content: UrdfContent = read_urdf_content(urdf)
+    for address in content.collision_meshes:
+        if resolve_mesh(address, urdf, package_dirs) is None:
+            table.problems.add(
+                table.at("urdf"),
+                f"the collision mesh {shown(address)} that it names does not exist; package:// "
+                "addresses are looked up in the folders of package_dirs, others beside the URDF",
+            )
+
+
+def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array]:
+    """The limits, from the file or else from the URDF; (6,) each."""
+    from_urdf: dict[str, Array | None] = {
+        "position_lower": None if model is None else model.lowerPositionLimit,
+        "position_upper": None if model is None else model.upperPositionLimit,
+        "velocity_max": None if model is None else model.velocityLimit,
+        "torque_max": None if model is None else model.effortLimit,
+        "acceleration_max": np.full(N_JOINTS, DEFAULT_ACCELERATION),
+    }
+    allowed = {
+        "position_lower": quantity.JOINT_POSITION,
+        "position_upper": quantity.JOINT_POSITION,
+        "velocity_max": quantity.ANGULAR_SPEED,
+        "torque_max": quantity.TORQUE,
+        "acceleration_max": quantity.ANGULAR_ACCELERATION,
+    }
+    limits = {key: _limit(table, key, allowed[key], from_urdf[key]) for key in allowed}
+    problems = table.problems
+    if model is not None and problems.clean(table.at("position_lower"), table.at("position_upper")):
+        for joint in range(N_JOINTS):
+            low, high = limits["position_lower"][joint], limits["position_upper"][joint]
+            if low >= high:
+                problems.add(
+                    f"{table.at('position_lower')}[{joint}]",
+                    f"found {low:g} rad for joint {model.names[joint + 1]!r}, not below its upper "
+                    f"limit {high:g} rad; allowed is lower < upper",
+                )
+    return limits
+
+
+def _limit(table: Table, key: str, allowed: Quantity, urdf_value: Array | None) -> Array:
+    if key in table:
+        # One number for all joints is right for a bound on magnitude, not for a range's end.
+        return table.vector(key, (allowed,) * N_JOINTS, scalar_fills=not key.startswith("position"))
+    table.raw(key, None)
+    if urdf_value is None:
+        return _ONES
+    for joint, value in enumerate(urdf_value):
+        if not allowed.contains(float(value)):
+            table.problems.add(
+                table.at(key),
+                f"the URDF gives {value:g} for joint {joint + 1}; allowed is {allowed.allowed()}"
+                f"{allowed.suspicion(float(value))}; correct the URDF or give {key} here",
+            )
+            return _ONES
+    return read_only(urdf_value)

@@ -1,0 +1,127 @@
+"""The task section of a workcell file."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.workcell import quantities as quantity
+from symbolic.workcell.reader import Table, checked_vector, read_only, shown
+from symbolic.workcell.records import AllowedContact, Task, TimeLaw, Waypoint
+
+MIN_SAMPLES = 5
+MAX_SAMPLES = 10_000
+MAX_WAYPOINTS = 100
+COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
+TIME_LAWS = ("constant", "ramped")
+
+
+def read_task(table: Table) -> Task:
+    """What is to be carried where, and how a candidate is sampled and judged."""
+    problems = table.problems
+    start = _fixed(table, "start")
+    between = [waypoint for entry in table.tables("waypoints") for waypoint in _waypoints(entry)]
+    goal = _fixed(table, "goal")
+    waypoints = (start, *between, goal)
+    if problems.clean(table.at("waypoints")):
+        if all(waypoint.is_fixed for waypoint in waypoints):
+            problems.add(
+                table.at("waypoints"), "no waypoint is free; allowed is at least one free waypoint"
+            )
+        if len(waypoints) > MAX_WAYPOINTS:
+            problems.add(
+                table.at("waypoints"),
+                f"found {len(waypoints)} poses with start and goal; allowed are {MAX_WAYPOINTS}",
+            )
+    task = Task(
+        waypoints=waypoints,
+        samples=table.integer("samples", MIN_SAMPLES, MAX_SAMPLES, 100),
+        time_law=cast("TimeLaw", table.choice("time_law", TIME_LAWS, "constant")),
+        reference_speed=table.number("reference_speed", quantity.SPEED),
+        reference_angular_speed=table.number(
+            "reference_angular_speed", quantity.ANGULAR_SPEED, 0.5
+        ),
+        ramp_time=table.number("ramp_time", quantity.DURATION, 0.5),
+        reference_force=table.vector("reference_force", (quantity.FORCE,) * 2, scalar_fills=True),
+        initial=_read_initial(table, [w for w in waypoints if not w.is_fixed]),
+        allowed_contacts=tuple(_allowed_contact(e) for e in table.tables("allowed_contacts")),
+    )
+    table.close()
+    return task
+
+
+def _fixed(table: Table, key: str) -> Waypoint:
+    pose = table.vector(key, quantity.POSE)
+    return Waypoint(pose, pose)
+
+
+def _waypoints(table: Table) -> list[Waypoint]:
+    """One fixed waypoint, or `count` free ones that share their bounds."""
+    problems = table.problems
+    if "fixed" in table:
+        pose = table.vector("fixed", quantity.POSE)
+        for key in ("lower", "upper", "count"):
+            if key in table:
+                table.raw(key)
+                problems.add(table.at(key), "found beside 'fixed'; allowed is one or the other")
+        table.close()
+        return [Waypoint(pose, pose)]
+    lower = table.vector("lower", quantity.POSE)
+    upper = table.vector("upper", quantity.POSE)
+    count = table.integer("count", 1, MAX_WAYPOINTS, 1)
+    table.raw("fixed", ())
+    table.close()
+    if problems.clean(table.path):
+        for component, low, high in zip(COMPONENTS, lower, upper, strict=True):
+            if low > high:
+                index = COMPONENTS.index(component)
+                problems.add(
+                    f"{table.at('lower')}[{index}]",
+                    f"found {low:g} for {component}, above its upper bound {high:g}; allowed is "
+                    "lower <= upper",
+                )
+        if np.array_equal(lower, upper):
+            problems.add(
+                table.path, "lower equals upper everywhere; a fixed pose is written fixed = [...]"
+            )
+    return [Waypoint(lower, upper)] * count
+
+
+def _read_initial(table: Table, free: list[Waypoint]) -> Array:
+    """The hand-made free waypoints (n_free, 6); the centres of the bounds by default."""
+    value = table.raw("initial", None)
+    path, problems = table.at("initial"), table.problems
+    if value is None:
+        return read_only(np.reshape([(w.lower + w.upper) / 2 for w in free], (-1, 6)))
+    if not isinstance(value, list):
+        problems.add(path, f"found {shown(value)}; allowed is an array of rows of 6 numbers")
+        return read_only(np.zeros((len(free), 6)))
+    rows = [
+        checked_vector(row, quantity.POSE, f"{path}[{index}]", problems)
+        for index, row in enumerate(value)
+    ]
+    if not problems.clean(table.at("waypoints")):
+        return read_only(np.reshape(rows, (-1, 6)))
+    if len(rows) != len(free):
+        problems.add(
+            path, f"found {len(rows)} rows; allowed is one per free waypoint, {len(free)} here"
+        )
+    for row, (values, waypoint) in enumerate(zip(rows, free, strict=False)):
+        if not problems.clean(f"{path}[{row}]"):
+            continue
+        outside = np.flatnonzero((values < waypoint.lower) | (values > waypoint.upper))
+        for column in outside:
+            problems.add(
+                f"{path}[{row}][{column}]",
+                f"found {values[column]:g} for {COMPONENTS[column]}, outside its bounds; allowed "
+                f"is {waypoint.lower[column]:g} to {waypoint.upper[column]:g}",
+            )
+    return read_only(np.reshape(rows, (-1, 6)))
+
+
+def _allowed_contact(table: Table) -> AllowedContact:
+    contact = AllowedContact(table.text("body"), table.number("departure", quantity.DEPARTURE))
+    table.close()
+    return contact

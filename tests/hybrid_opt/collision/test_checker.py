@@ -1,0 +1,296 @@
+"""The verdict: screened against unscreened FCL, FCL against Coal, tolerance, resting, contacts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import coal
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from codegen.interpreted import InterpretedFunction
+from codegen.source import dense
+from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
+from hybrid_opt.collision.verdict import sample_durations
+from symbolic.geometry.coal_shapes import coal_distance, coal_geometry
+from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.geometry.pieces import Piece
+from symbolic.workcell.records import AllowedContact, CollisionSettings, Workcell
+from tests.symbolic.geometry.collision_cells import (
+    Configurations,
+    functions_of,
+    geometry_of,
+    placed_pieces,
+    rack,
+    random_configurations,
+    true_distances,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+
+RESOLUTION = 1e-5
+"""FCL's and Coal's solvers agree within this [m]."""
+
+STILL = np.zeros((1, 6))
+
+
+def checker_of(geometry: CellGeometry) -> CollisionChecker:
+    functions = functions_of(geometry)
+    return CollisionChecker(
+        geometry, {name: InterpretedFunction(dense(f)) for name, f in functions.items()}
+    )
+
+
+@cache
+def checker(name: str, folder: Path = Path()) -> CollisionChecker:
+    return checker_of(geometry_of(name, folder))
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.getbasetemp() / "checker"
+
+
+def coal_mask(geometry: CellGeometry, at: Configurations) -> NDArray[np.bool_]:
+    """(n, n_pairs) Coal's collisions, with bodies placed by numeric Pinocchio."""
+    request, result = coal.CollisionRequest(), coal.CollisionResult()
+    mask = np.zeros((len(at[0]), len(geometry.active)), dtype=bool)
+    for k, row in enumerate(zip(*at, strict=True)):
+        shapes = [[coal_geometry(p) for p in body] for body in placed_pieces(geometry, *row)]
+        for i, pair in enumerate(geometry.active):
+            for a, T_a in shapes[pair.first]:
+                for b, T_b in shapes[pair.second]:
+                    result.clear()
+                    mask[k, i] = mask[k, i] or coal.collide(a, T_a, b, T_b, request, result) > 0
+    return mask
+
+
+def assert_agree(name: str, folder: Path, n: int, seed: int) -> None:
+    """FCL and Coal differ on no pair, but where the bodies are within their resolution."""
+    geometry = geometry_of(name, folder)
+    at = random_configurations(geometry, n, np.random.default_rng(seed))
+    ours, theirs = checker(name, folder).collision_mask(*at), coal_mask(geometry, at)
+    assert ours.any()
+    assert not ours.all()
+    for k, i in np.argwhere(ours != theirs):
+        pieces = placed_pieces(geometry, *(array[k] for array in at))
+        pair = geometry.active[i]
+        gap = coal_distance(pieces[pair.first], pieces[pair.second])
+        assert abs(gap) < RESOLUTION, (geometry.pair_names[i], gap)
+
+
+@pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
+def test_fcl_agrees_with_coal(name: str, folder: Path) -> None:
+    assert_agree(name, folder, 250, 31)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
+def test_fcl_agrees_with_coal_on_ten_thousand_configurations(name: str, folder: Path) -> None:
+    assert_agree(name, folder, 10_000, 32)
+
+
+def assert_screening_changes_nothing(name: str, folder: Path, n: int, seed: int) -> None:
+    """Every sample's verdict and every cleared pair, against FCL on all pairs."""
+    judge = checker(name, folder)
+    at = random_configurations(judge.geometry, n, np.random.default_rng(seed))
+    bounds, mask = judge.bounds(*at), judge.collision_mask(*at)
+    assert not np.any(mask & (bounds > RESOLUTION))
+    time = np.arange(float(n))
+    screened = judge.check(*at, time, bounds)
+    plain = judge.check(*at, time, bounds, screened=False)
+    assert screened.colliding.tolist() == plain.colliding.tolist() == mask.any(axis=1).tolist()
+    assert screened.first_contact == plain.first_contact
+    assert screened.collision_time == plain.collision_time
+    assert screened.fcl_calls < 0.2 * plain.fcl_calls
+    contact = screened.first_contact
+    assert contact is not None
+    names = judge.geometry.pair_names
+    hit = [names[i] for i in np.flatnonzero(mask[contact.sample])]
+    assert contact.sample == np.flatnonzero(mask.any(axis=1))[0]
+    assert (contact.first, contact.second) in hit
+    assert contact.time == time[contact.sample]
+
+
+@pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
+def test_screening_changes_nothing(name: str, folder: Path) -> None:
+    assert_screening_changes_nothing(name, folder, 1500, 33)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
+def test_screening_changes_nothing_in_twenty_thousand_samples(name: str, folder: Path) -> None:
+    assert_screening_changes_nothing(name, folder, 20_000, 37)
+
+
+@pytest.mark.parametrize("name", ["obstacles", "ur10"])
+def test_measured_distances_are_those_of_coal(name: str, folder: Path) -> None:
+    judge = checker(name, folder)
+    at = random_configurations(judge.geometry, 60, np.random.default_rng(34))
+    apart = ~judge.collision_mask(*at)
+    measured = np.full(apart.shape, -1.0)
+    assert judge.measure(*at, measured, apart).max() == -1
+    expected = np.array([true_distances(judge.geometry, *row) for row in zip(*at, strict=True)])
+    error = (measured - expected)[apart]
+    # Never above the distance, and almost always close to it.
+    assert error.max() <= 1e-6
+    assert np.quantile(error, 0.02) >= -1e-3
+    assert np.all(measured[~apart] == -1.0)
+
+
+def test_measuring_stops_at_a_collision() -> None:
+    judge = checker("rack")
+    at = random_configurations(judge.geometry, 30, np.random.default_rng(36))
+    mask = judge.collision_mask(*at)
+    hits = judge.measure(*at, judge.bounds(*at), np.ones(mask.shape, dtype=bool))
+    assert (hits >= 0).tolist() == mask.any(axis=1).tolist()
+    assert all(mask[k, hit] for k, hit in enumerate(hits) if hit >= 0)
+
+
+def test_the_least_distance_is_found_past_the_bounds() -> None:
+    judge = checker("rack")
+    at = random_configurations(judge.geometry, 200, np.random.default_rng(35))
+    free = ~judge.check(*at, np.arange(200.0)).colliding
+    apart = (at[0][free], at[1][free], at[2][free])
+    assert len(apart[0])
+    distance, where = judge.min_distance(*apart)
+    expected = np.array([true_distances(judge.geometry, *row) for row in zip(*apart, strict=True)])
+    assert distance == pytest.approx(expected.min(), abs=RESOLUTION)
+    assert where is not None
+    k, i = np.unravel_index(np.argmin(expected), expected.shape)
+    assert (where.first, where.second) == judge.geometry.pair_names[i]
+    assert where.sample == k
+    assert judge.check(*apart, np.arange(float(len(apart[0])))).min_clearance <= distance
+
+
+def above_board(gaps: list[float]) -> Configurations:
+    """The box level above the middle board, both arms stretched upwards."""
+    n = len(gaps)
+    pose = np.zeros((n, 6))
+    pose[:, 2] = 0.725 + np.array(gaps)
+    return pose, np.zeros((n, 6)), np.zeros((n, 6))
+
+
+def only_payload(cell: Workcell) -> CellGeometry:
+    """The cell's geometry with the payload against the middle board alone."""
+    geometry = build_geometry(cell)
+    k = geometry.pair_names.index(("payload", "middle board"))
+    return replace(geometry, active=(geometry.active[k],))
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.003])
+def test_the_tolerance_is_decided_alike_with_and_without_screening(tolerance: float) -> None:
+    """Gaps a hair below, at and above the tolerance: one judge, so one answer."""
+    cell = replace(rack(), collision=CollisionSettings(tolerance=tolerance))
+    judge = checker_of(only_payload(cell))
+    offsets = [s * d for d in (1e-3, 2e-5, 1e-5, 1e-6, 1e-8, 0.0) for s in (-1.0, 1.0)]
+    at = above_board([tolerance + offset for offset in offsets])
+    time = np.arange(float(len(offsets)))
+    screened = judge.check(*at, time).colliding
+    assert screened.tolist() == judge.check(*at, time, screened=False).colliding.tolist()
+    for offset, hit in zip(offsets, screened, strict=True):
+        if abs(offset) > RESOLUTION:
+            assert hit == (offset < 0.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-2e-5, 2e-5), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-3.0, 3.0))
+def test_touching_is_decided_alike_at_any_tilt(
+    gap: float, roll: float, pitch: float, yaw: float
+) -> None:
+    judge = checker("rack")
+    pose = np.array([[0.0, 0.0, 0.9, roll, pitch, yaw]])
+    corner = judge.bounds(pose, STILL, STILL)
+    k = judge.geometry.pair_names.index(("payload", "middle board"))
+    pose[0, 2] -= corner[0, k] - gap
+    at = (pose, STILL, STILL)
+    assert judge.check(*at, np.zeros(1)).colliding[0] == judge.collision_mask(*at).any()
+
+
+def resting_cell(departure: float) -> Workcell:
+    """The box starts on the middle board, and may touch it near there."""
+    cell = rack()
+    start = np.array([0.0, 0.0, 0.725, 0.0, 0.0, 0.0])
+    waypoints = (
+        replace(cell.task.waypoints[0], lower=start, upper=start),
+        *cell.task.waypoints[1:],
+    )
+    allowed = (AllowedContact("middle board", departure),)
+    return replace(cell, task=replace(cell.task, waypoints=waypoints, allowed_contacts=allowed))
+
+
+def test_a_resting_box_is_no_collision_but_a_sunken_one_is() -> None:
+    judge = checker_of(only_payload(resting_cell(0.03)))
+    depth = RESTING_TOLERANCE
+    gaps = [0.0, -0.5 * depth, -depth + 1e-5, -depth - 1e-5, -0.01, 0.01, 0.04]
+    at = above_board(gaps)
+    verdict = judge.check(*at, np.arange(float(len(gaps))))
+    assert verdict.colliding.tolist() == [False, False, False, True, True, False, False]
+    unscreened = judge.check(*at, np.arange(float(len(gaps))), screened=False)
+    assert unscreened.colliding.tolist() == verdict.colliding.tolist()
+
+
+def test_away_from_the_resting_place_touching_is_a_collision() -> None:
+    judge = checker_of(only_payload(resting_cell(0.03)))
+    pose, q_1, q_2 = above_board([-0.0005, -0.0005, -0.0005])
+    pose[:, 0] = [0.0, 0.029, 0.031]
+    assert judge.check(pose, q_1, q_2, np.arange(3.0)).colliding.tolist() == [False, False, True]
+
+
+def test_a_body_not_touched_at_a_fixed_pose_gets_no_allowance() -> None:
+    cell = rack()
+    allowed = (AllowedContact("middle board", 0.5),)
+    cell = replace(cell, task=replace(cell.task, allowed_contacts=allowed))
+    judge = checker_of(only_payload(cell))
+    assert judge.check(*above_board([-0.0005]), np.zeros(1)).colliding.all()
+
+
+def test_collision_time_is_what_the_colliding_samples_stand_for() -> None:
+    judge = checker_of(only_payload(rack()))
+    time = np.array([0.0, 1.0, 1.5, 3.5, 4.0])
+    verdict = judge.check(*above_board([-0.1, 0.1, -0.1, -0.1, 0.1]), time)
+    assert verdict.colliding.tolist() == [True, False, True, True, False]
+    assert verdict.collision_time == pytest.approx(0.5 + 1.25 + 1.25)
+    assert sample_durations(time).sum() == pytest.approx(4.0)
+    assert verdict.first_contact is not None
+    assert (verdict.first_contact.sample, verdict.first_contact.time) == (0, 0.0)
+    assert (verdict.first_contact.first, verdict.first_contact.second) == (
+        "payload",
+        "middle board",
+    )
+    assert not verdict.is_free
+    assert verdict.min_clearance == pytest.approx(-0.1)
+
+
+def test_no_samples_are_free_of_collisions() -> None:
+    """An arm that loses the path at once leaves nothing to check."""
+    verdict = checker("rack").check(*above_board([]), np.zeros(0))
+    assert verdict.is_free
+    assert (verdict.collision_time, verdict.fcl_calls) == (0.0, 0)
+    assert verdict.min_clearance == np.inf
+
+
+def test_unknown_bounds_go_to_fcl() -> None:
+    judge = checker_of(only_payload(rack()))
+    unknown = np.full((1, 1), np.nan)
+    assert judge.check(*above_board([-0.1]), np.zeros(1), unknown).colliding.all()
+
+
+def test_hulls_and_their_pieces_reach_fcl_unchanged() -> None:
+    """Every UR10 mesh piece: FCL and Coal measure the same distance from a far point's ball."""
+    import fcl
+
+    from hybrid_opt.collision.judge import fcl_object
+    from symbolic.geometry.pieces import ball
+
+    probe = ball(np.array([0.7, -0.6, 0.9]), 0.05)
+    for body in geometry_of("ur10").bodies[:8]:
+        for piece in body.pieces:
+            ours = fcl.distance(fcl_object(piece), fcl_object(probe))
+            assert isinstance(piece, Piece)
+            assert ours == pytest.approx(coal_distance((piece,), (probe,)), abs=1e-5)

@@ -1,0 +1,93 @@
+"""Carries between their samples, and fronts that are proven free there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from hybrid_opt import metaheuristics
+from hybrid_opt.evaluate.certification import (
+    LostPathError,
+    SampledPath,
+    configurations,
+    waypoints_of,
+)
+from hybrid_opt.evaluate.evaluation import BETWEEN_SAMPLES, REASONS, CandidateEvaluator
+from hybrid_opt.indicators.metrics import non_dominated
+from hybrid_opt.metaheuristics.problem import CarryProblem
+from symbolic.array import Array
+from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.robot.arm import box_flange
+from symbolic.robot.model import build_robot_model
+from symbolic.workcell.file import load
+from tests.symbolic.workcell.samples import RACK
+
+
+@pytest.fixture(scope="module")
+def evaluator() -> CandidateEvaluator:
+    return CandidateEvaluator(load(RACK))
+
+
+def sampled(evaluator: CandidateEvaluator, x: Array) -> SampledPath:
+    outputs = evaluator.outputs(x)
+    return SampledPath(
+        waypoints_of(evaluator.workcell.task, x), outputs["q_1"][0], outputs["q_2"][0]
+    )
+
+
+def test_places_between_samples_close_both_arms(evaluator: CandidateEvaluator) -> None:
+    workcell = evaluator.workcell
+    path = sampled(evaluator, workcell.task.initial.reshape(-1))
+    u = np.random.default_rng(1).uniform(0.0, 1.0, 30)
+    poses, *joints = configurations(path, evaluator.functions["posture"], u)
+    for robot, contact, q in zip(workcell.robots, workcell.contacts, joints, strict=True):
+        model = build_robot_model(robot)
+        data = model.model.createData()
+        for pose, posture in zip(poses, q, strict=True):
+            pin.framesForwardKinematics(model.model, data, posture)
+            reached = data.oMf[model.flange_id].homogeneous
+            wanted = inverse(robot.T_world_base) @ pose_matrix(pose[:3], pose[3:])
+            np.testing.assert_allclose(reached, wanted @ box_flange(robot, contact), atol=2e-6)
+
+
+def test_samples_are_places_on_the_path(evaluator: CandidateEvaluator) -> None:
+    task = evaluator.workcell.task
+    x = task.initial.reshape(-1)
+    path = sampled(evaluator, x)
+    samples = np.linspace(0.0, 1.0, task.samples)
+    poses, q_1, q_2 = configurations(path, evaluator.functions["posture"], samples)
+    np.testing.assert_allclose(poses, evaluator.outputs(x)["pose"][0], atol=1e-12)
+    np.testing.assert_allclose(q_1, path.q_1, atol=1e-5)
+    np.testing.assert_allclose(q_2, path.q_2, atol=1e-5)
+
+
+def test_a_path_that_an_arm_cannot_follow_is_told(evaluator: CandidateEvaluator) -> None:
+    path = sampled(evaluator, evaluator.workcell.task.initial.reshape(-1))
+    away = path.waypoints.copy()
+    away[2, 2] += 3.0
+    broken = SampledPath(away, path.q_1, path.q_2)
+    with pytest.raises(LostPathError, match="between its samples, at u"):
+        configurations(broken, evaluator.functions["posture"], np.array([0.1, 0.5]))
+
+
+def test_the_initial_trajectory_is_proven_free(evaluator: CandidateEvaluator) -> None:
+    verdict = evaluator.certificate(evaluator.workcell.task.initial.reshape(-1))
+    assert verdict.is_free
+    assert verdict.points > evaluator.workcell.task.samples
+
+
+def test_every_member_of_a_certified_front_is_proven_free(evaluator: CandidateEvaluator) -> None:
+    problem = CarryProblem(evaluator, "penalty")
+    metaheuristics.search(problem, metaheuristics.make("nsga2"), 600, np.random.default_rng(1))
+    before = problem.evaluations
+    after = evaluator.certified(before)
+    front = np.flatnonzero(non_dominated(after.objectives, after.feasible))
+    assert all(evaluator.certificate(x).is_free for x in after.x[front])
+
+    rejected = np.flatnonzero(after.reason == REASONS.index(BETWEEN_SAMPLES))
+    np.testing.assert_array_equal(np.flatnonzero(before.feasible & ~after.feasible), rejected)
+    assert not any(evaluator.certificate(x).is_free for x in after.x[rejected])
+    # What the search saw stays; a second pass changes nothing.
+    np.testing.assert_array_equal(after.penalised, before.penalised)
+    np.testing.assert_array_equal(evaluator.certified(after).feasible, after.feasible)

@@ -1,0 +1,156 @@
+"""Indicators against hand-computed cases and their laws."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hybrid_opt.indicators import metrics
+from symbolic.array import Array
+
+points = st.integers(1, 12).flatmap(
+    lambda n: arrays(np.float64, (n, 2), elements=st.floats(0.0, 1.25, width=32))
+)
+modest = settings(max_examples=80, deadline=None)
+
+
+def dominates(a: Array, b: Array) -> bool:
+    return bool((a <= b).all() and (a < b).any())
+
+
+def test_hypervolume_by_hand() -> None:
+    # Two rectangles: 0.9 x 0.3 below (0.2, 0.8) and 0.5 x 0.6 more down to (0.6, 0.2).
+    assert metrics.hypervolume([[0.2, 0.8], [0.6, 0.2]]) == pytest.approx(0.27 + 0.30)
+    assert metrics.hypervolume([[0.0, 0.0]]) == pytest.approx(1.21)
+    assert metrics.hypervolume([[1.1, 0.0], [2.0, -5.0]]) == 0.0
+    assert metrics.hypervolume(np.empty((0, 2))) == 0.0
+    assert metrics.hypervolume([[1.0, 2.0, 3.0]], (2.0, 4.0, 6.0)) == pytest.approx(6.0)
+
+
+@given(points, arrays(np.float64, 2, elements=st.floats(0.0, 1.25, width=32)))
+@modest
+def test_hypervolume_grows_by_points_not_dominated_only(front: Array, extra: Array) -> None:
+    before = metrics.hypervolume(front)
+    after = metrics.hypervolume(np.vstack([front, extra]))
+    assert after >= before - 1e-12
+    if any((p <= extra).all() for p in front):
+        assert after == pytest.approx(before, abs=1e-12)
+
+
+@given(points, st.integers(0, 1000))
+@modest
+def test_order_does_not_matter(front: Array, seed: int) -> None:
+    order = np.random.default_rng(seed).permutation(len(front))
+    reference = np.array([[0.0, 1.0], [0.4, 0.4], [1.0, 0.0]])
+    for figure in (metrics.hypervolume, metrics.spacing):
+        np.testing.assert_allclose(figure(front), figure(front[order]), rtol=1e-12, atol=1e-12)
+    for distance in (metrics.igd, metrics.igd_plus):
+        assert distance(front, reference) == pytest.approx(distance(front[order], reference))
+
+
+@given(points)
+@modest
+def test_non_dominated_is_the_definition(front: Array) -> None:
+    feasible = front[:, 0] < 1.0
+    mask = metrics.non_dominated(front, feasible)
+    for index, point in enumerate(front):
+        beaten = any(dominates(q, point) for q in front[feasible])
+        repeated = any((q == point).all() for q in front[:index][feasible[:index]])
+        assert mask[index] == (feasible[index] and not beaten and not repeated)
+
+
+def test_non_dominated_refuses_what_is_not_finite() -> None:
+    values = [[np.nan, 0.0], [-np.inf, 0.0], [1.0, 1.0], [np.inf, -1.0]]
+    np.testing.assert_array_equal(metrics.non_dominated(values), [False, False, True, False])
+    np.testing.assert_array_equal(metrics.front_of(values), [[1.0, 1.0]])
+    assert len(metrics.front_of([[np.nan, 1.0]])) == 0
+
+
+def test_front_is_sorted() -> None:
+    values = [[3.0, 1.0], [1.0, 3.0], [2.0, 2.0], [2.0, 2.5]]
+    np.testing.assert_array_equal(metrics.front_of(values), [[1.0, 3.0], [2.0, 2.0], [3.0, 1.0]])
+    np.testing.assert_array_equal(
+        metrics.front_of(values, [True, False, False, True]), [[2.0, 2.5], [3.0, 1.0]]
+    )
+
+
+def test_igd_is_the_mean_euclidean_distance() -> None:
+    reference = [[0.0, 0.0], [3.0, 4.0], [0.0, 2.0]]
+    # Distances to (0, 0): 0, 5, 2.
+    assert metrics.igd([[0.0, 0.0]], reference) == pytest.approx(7.0 / 3.0)
+    # Only excess counts: (3, 4) and (0, 2) are dominated by (0, 0).
+    assert metrics.igd_plus([[0.0, 0.0]], reference) == 0.0
+    # From (1, 3): to (0, 0) sqrt(10), to (3, 4) nothing, to (0, 2) sqrt(2).
+    expected = (math.sqrt(10.0) + math.sqrt(2.0)) / 3.0
+    assert metrics.igd_plus([[1.0, 3.0]], reference) == pytest.approx(expected)
+    assert metrics.igd(np.empty((0, 2)), reference) == math.inf
+    assert metrics.igd_plus(np.empty((0, 2)), reference) == math.inf
+
+
+@given(points, points)
+@modest
+def test_igd_against_its_formula(front: Array, reference: Array) -> None:
+    difference = front[None] - reference[:, None]
+    distance = np.linalg.norm(difference, axis=2).min(axis=1).mean()
+    excess = np.linalg.norm(np.maximum(difference, 0.0), axis=2).min(axis=1).mean()
+    assert metrics.igd(front, reference) == pytest.approx(distance, abs=1e-12)
+    assert metrics.igd_plus(front, reference) == pytest.approx(excess, abs=1e-12)
+
+
+def test_spacing_by_hand() -> None:
+    # L1 distances to the nearest neighbour: 2, 2, 4; mean 8/3; squares 4/9 + 4/9 + 16/9; n - 1.
+    front = [[0.0, 4.0], [1.0, 3.0], [3.0, 1.0]]
+    assert metrics.spacing(front) == pytest.approx(math.sqrt(24.0 / 9.0 / 2.0))
+    assert metrics.spacing([[0.0, 2.0], [1.0, 1.0], [2.0, 0.0]]) == 0.0
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_spacing_needs_three_points(count: int) -> None:
+    assert math.isnan(metrics.spacing(np.zeros((count, 2))))
+
+
+def test_normalise() -> None:
+    values = metrics.normalise([[2.0, -1.0], [6.0, 3.0]], [2.0, 1.0], [4.0, 2.0])
+    np.testing.assert_array_equal(values, [[0.0, -2.0], [2.0, 2.0]])
+    with pytest.raises(ValueError, match="must exceed"):
+        metrics.normalise([[0.0, 0.0]], [0.0, 1.0], [1.0, 1.0])
+
+
+def test_feasible_figures() -> None:
+    assert metrics.feasible_count([True, False, True]) == 2
+    assert metrics.feasible_share([True, False, True, False]) == 0.5
+    assert math.isnan(metrics.feasible_share([]))
+
+
+def test_best_so_far() -> None:
+    objectives = [[1.0, 1.0], [5.0, 9.0], [7.0, 3.0], [4.0, np.nan], [6.0, 6.0]]
+    history = metrics.best_so_far(objectives, [False, True, True, True, True])
+    nan = np.nan
+    np.testing.assert_array_equal(history, [[nan, nan], [5, 9], [5, 3], [5, 3], [5, 3]])
+
+
+@given(points, st.data())
+@modest
+def test_hypervolume_history_is_that_of_each_prefix(front: Array, data: st.DataObject) -> None:
+    feasible = np.array(
+        data.draw(st.lists(st.booleans(), min_size=len(front), max_size=len(front)))
+    )
+    expected = [metrics.hypervolume(front[: k + 1][feasible[: k + 1]]) for k in range(len(front))]
+    history = metrics.hypervolume_history(front, feasible)
+    np.testing.assert_allclose(history, expected, atol=1e-12)
+
+
+def test_hypervolume_history_ignores_what_is_not_finite() -> None:
+    values = [[np.nan, 0.0], [-np.inf, 0.5], [0.1, 0.1]]
+    np.testing.assert_allclose(metrics.hypervolume_history(values, [True] * 3), [0, 0, 1.0])
+
+
+def test_excess_above_static() -> None:
+    np.testing.assert_allclose(
+        metrics.excess_above_static([[0.55, 0.5], [0.5, 0.75]], [0.5, 0.5]), [[10, 0], [0, 50]]
+    )

@@ -1,0 +1,95 @@
+"""The balanced solution, the static hold and the payload that a carry could bear."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybrid_opt.campaign.replica import front_rows
+from hybrid_opt.campaign.results import Replica
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.static_hold import payload_limit, static_hold
+from hybrid_opt.indicators.selection import balanced, peak_normal_forces, select
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
+from tests.hybrid_opt.campaign.fake import RACK
+
+CELL = RACK.with_name("transfer.toml")
+
+
+@pytest.fixture(scope="module")
+def evaluator() -> CandidateEvaluator:
+    return CandidateEvaluator(load(CELL))
+
+
+def replica_of(evaluator: CandidateEvaluator, count: int) -> Replica:
+    x = np.random.default_rng(8).uniform(evaluator.lower, evaluator.upper, (count, evaluator.n_var))
+    found = evaluator.evaluate(x)
+    generation = np.ones(count, dtype=np.int64)
+    return Replica("random", 0, found, generation, front_rows(found), 0.0)
+
+
+def test_balanced_is_the_least_mean() -> None:
+    assert balanced(np.array([[50.0, 70.0], [59.0, 60.0], [80.0, 30.0], [55.0, 55.0]])) == 3
+    assert balanced(np.array([[50.0, 60.0], [55.0, 55.0]])) == 1
+    assert balanced(np.array([[50.0, 60.0], [55.02, 55.02]])) == 0
+    assert balanced(np.array([[50.0, 60.0], [55.01, 55.01]])) == 1
+
+
+def test_selected_is_the_least_mean_of_the_front(evaluator: CandidateEvaluator) -> None:
+    static = static_hold(evaluator.workcell)
+    replica = replica_of(evaluator, 300)
+    assert len(replica.front_rows) > 1
+    selected = select(evaluator, replica, static)
+    assert selected is not None
+    reference = evaluator.workcell.task.reference_force
+    means = (replica.front * reference).mean(axis=1)
+    assert selected.row == replica.front_rows[np.argmin(means)]
+    np.testing.assert_allclose(selected.peak_normal_force, selected.objectives * reference)
+    outputs = evaluator.outputs(selected.x[None])
+    normal = outputs["normal_force"][0]
+    np.testing.assert_array_equal(selected.minimum_normal_force, normal.min(axis=0))
+    excess = 100.0 * (selected.peak_normal_force / static.normal_force - 1.0)
+    np.testing.assert_allclose(selected.excess_above_static, excess)
+    assert excess.min() <= selected.mean_excess_above_static <= excess.max()
+    whole = np.linalg.norm(outputs["contact_force"][0].reshape(-1, 2, 3), axis=2).max(axis=0)
+    expected = payload_limit(evaluator.workcell, whole)
+    assert selected.figures["payload_limit"] == pytest.approx(expected, rel=1e-12)
+
+
+def test_peaks_do_not_depend_on_how_many_are_asked_for(evaluator: CandidateEvaluator) -> None:
+    x = np.random.default_rng(2).uniform(evaluator.lower, evaluator.upper, (300, evaluator.n_var))
+    together = peak_normal_forces(evaluator, x)
+    assert together.shape == (300, 2)
+    np.testing.assert_array_equal(peak_normal_forces(evaluator, x[280:]), together[280:])
+
+
+def test_an_empty_front_selects_nothing(evaluator: CandidateEvaluator) -> None:
+    replica = replica_of(evaluator, 5)
+    empty = replace(replica, front_rows=np.empty(0, dtype=np.intp))
+    assert select(evaluator, empty, static_hold(evaluator.workcell)) is None
+
+
+def with_friction(cell: Workcell, friction: float, mass: float) -> Workcell:
+    first, second = (replace(contact, friction=friction) for contact in cell.contacts)
+    return replace(cell, contacts=(first, second), payload=replace(cell.payload, mass=mass))
+
+
+@given(st.floats(0.2, 1.5), st.floats(1.0, 30.0))
+def test_static_hold_in_closed_form(friction: float, mass: float) -> None:
+    cell = with_friction(load(RACK), friction, mass)
+    hold = static_hold(cell)
+    weight = 9.81 * mass
+    np.testing.assert_allclose(hold.normal_force, weight / (2.0 * friction), rtol=1e-9)
+    whole = 0.5 * weight * np.sqrt(1.0 + 1.0 / friction**2)
+    np.testing.assert_allclose(hold.contact_force, whole, rtol=1e-9)
+
+
+def test_static_payload_of_the_paper() -> None:
+    # 2 * 117.68 N / (9.81 m/s^2 * sqrt 2)
+    hold = static_hold(with_friction(load(RACK), 1.0, 10.0))
+    assert hold.payload_limit == pytest.approx(16.965, abs=5e-4)

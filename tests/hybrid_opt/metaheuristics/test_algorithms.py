@@ -1,0 +1,243 @@
+"""What every search algorithm promises, whatever its name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pymoo.algorithms.moo.nsga2 import NSGA2
+from pymoo.core.problem import Problem
+from pymoo.optimize import minimize
+from pymoo.problems.multi.tnk import TNK
+
+from hybrid_opt.indicators import metrics
+from hybrid_opt.metaheuristics import SearchResult, make, names, search, settings_of
+from hybrid_opt.metaheuristics.guarded import violation_of
+from symbolic.errors import SettingsError
+
+NAMES = names()
+
+
+class Counting(Problem):  # type: ignore[misc]
+    """Two paraboloids in 3 variables; optionally a constraint and values that are not finite.
+
+    broken: share of points (by a fixed stripe pattern of x0) that return NaN or infinity.
+    """
+
+    def __init__(
+        self, constraints: int = 0, broken: float = 0.0, upper: float = 1.0, equalities: int = 0
+    ) -> None:
+        super().__init__(
+            n_var=3, n_obj=2, n_ieq_constr=constraints, n_eq_constr=equalities, xl=0.0, xu=upper
+        )
+        self.broken = broken
+        self.calls: list[int] = []
+
+    def _evaluate(self, x: Any, out: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        self.calls.append(len(x))
+        objectives = np.column_stack([(x**2).sum(axis=1), ((x - 1.0) ** 2).sum(axis=1)])
+        stripe = (x[:, 0] * 50.0) % 1.0
+        objectives[stripe < self.broken] = np.nan
+        objectives[stripe < 0.5 * self.broken, 0] = -np.inf
+        out["F"] = objectives
+        if self.n_ieq_constr:
+            constraints = np.repeat(0.4 - x[:, :1], self.n_ieq_constr, axis=1)
+            constraints[(x[:, 1] * 50.0) % 1.0 < 0.5 * self.broken] = np.nan
+            out["G"] = constraints
+
+
+def run(name: str, problem: Problem, evaluations: int, seed: int = 3, **options: Any) -> Any:
+    return search(problem, make(name, **options), evaluations, seed)
+
+
+def bits(result: SearchResult) -> bytes:
+    return b"".join(
+        array.tobytes()
+        for points in (result.evaluated, result.front)
+        for array in (points.decisions, points.objectives, points.violation)
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("evaluations", [1, 39, 40, 41, 137])
+def test_budget_is_spent_exactly(name: str, evaluations: int) -> None:
+    problem = Counting()
+    result = run(name, problem, evaluations)
+    assert sum(problem.calls) == evaluations == len(result.evaluated)
+    assert result.evaluated.generation[-1] == len(problem.calls)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_budget_is_exact_under_pymoo_minimize(name: str) -> None:
+    problem = Counting()
+    minimize(problem, make(name), ("n_eval", 95), seed=1)
+    assert sum(problem.calls) == 95
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_generation_is_one_call(name: str) -> None:
+    problem = Counting()
+    size = 100 if name == "random" else 40
+    run(name, problem, 2 * size + 7)
+    assert problem.calls == [size, size, 7]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("constraints", [0, 1])
+def test_same_seed_same_bits(name: str, constraints: int) -> None:
+    np.random.seed(1)  # noqa: NPY002
+    first = run(name, Counting(constraints), 300, seed=11)
+    np.random.seed(2)  # noqa: NPY002
+    second = run(name, Counting(constraints), 300, seed=11)
+    assert bits(first) == bits(second)
+    assert bits(first) != bits(run(name, Counting(constraints), 300, seed=12))
+
+
+def test_seed_and_generator_agree() -> None:
+    by_seed = run("mopso", Counting(), 120, seed=5)
+    by_generator = search(Counting(), make("mopso"), 120, np.random.default_rng(5))
+    assert bits(by_seed) == bits(by_generator)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("constraints", [0, 1, 3])
+def test_front_holds_finite_feasible_points_only(name: str, constraints: int) -> None:
+    result = run(name, Counting(constraints, broken=0.3), 400)
+    assert np.isinf(result.evaluated.violation).any()
+    assert len(result.front) > 0
+    assert np.isfinite(result.front.objectives).all()
+    if constraints:
+        assert (result.front.decisions[:, 0] >= 0.4).all()
+    assert metrics.non_dominated(result.front.objectives).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("constraints", [0, 1])
+def test_nothing_finite_gives_an_empty_front(name: str, constraints: int) -> None:
+    result = run(name, Counting(constraints, broken=2.0), 130)
+    assert len(result.front) == 0
+    assert not result.evaluated.feasible.any()
+    assert len(result.evaluated) == 130
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_broken_points_are_recorded_as_they_were(name: str) -> None:
+    result = run(name, Counting(broken=0.3), 200)
+    objectives = Counting(broken=0.3).evaluate(result.evaluated.decisions)
+    np.testing.assert_array_equal(result.evaluated.objectives, objectives)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_warm_start_is_evaluated_first(name: str) -> None:
+    initial = np.array([[0.5, 0.5, 0.5], [0.1, 0.2, 0.3]])
+    result = run(name, Counting(), 60, initial=initial)
+    np.testing.assert_array_equal(result.evaluated.decisions[:2], initial)
+    without = run(name, Counting(), 60)
+    np.testing.assert_array_equal(
+        result.evaluated.decisions[2:40], without.evaluated.decisions[2:40]
+    )
+
+
+@pytest.mark.parametrize(
+    ("initial", "message"),
+    [
+        ([[0.5, 0.5]], "of 3 values"),
+        (np.full((41, 3), 0.5), "at most 40"),
+        ([[0.5, 1.5, 0.5]], "outside the bounds"),
+        ([[0.5, np.nan, 0.5]], "outside the bounds"),
+    ],
+)
+def test_wrong_warm_start_is_refused(initial: Any, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        run("nsga2", Counting(), 60, initial=np.asarray(initial))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_budget_is_spent_when_only_duplicates_are_left(name: str) -> None:
+    problem = Counting(upper=0.0)
+    assert len(run(name, problem, 130).evaluated) == 130
+    assert sum(problem.calls) == 130
+
+
+def test_nsga2_is_pymoos() -> None:
+    ours = search(TNK(), make("nsga2", {"population": 20}), 200, 4).front.objectives
+    theirs = minimize(TNK(), NSGA2(pop_size=20), ("n_eval", 200), seed=4).F
+    np.testing.assert_array_equal(metrics.front_of(ours), metrics.front_of(theirs))
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "random"])
+def test_search_beats_random(name: str) -> None:
+    def median(algorithm: str) -> float:
+        fronts = [run(algorithm, TNK(), 600, seed).front.objectives for seed in range(5)]
+        return float(np.median([metrics.hypervolume(f, (1.2, 1.2)) for f in fronts]))
+
+    assert median(name) > median("random")
+
+
+def test_observer_sees_every_point_once() -> None:
+    seen: list[Any] = []
+    result = search(Counting(), make("nsga2"), 90, 1, observe=seen.append)
+    np.testing.assert_array_equal(
+        np.concatenate([batch.decisions for batch in seen]), result.evaluated.decisions
+    )
+
+
+def test_records_are_read_only() -> None:
+    result = run("random", Counting(), 5)
+    with pytest.raises(ValueError, match="read-only"):
+        result.evaluated.objectives[0, 0] = 0.0
+
+
+def test_violation_sums_what_is_exceeded() -> None:
+    objectives = np.array([[0.0, 1.0], [0.0, 1.0], [np.nan, 1.0], [0.0, -np.inf], [1e30, 0.0]])
+    constraints = np.array([[-1.0, -2.0], [0.5, 0.25], [-1.0, -1.0], [-1.0, -1.0], [-1.0, -1.0]])
+    np.testing.assert_array_equal(
+        violation_of(objectives, constraints), [0.0, 0.75, np.inf, np.inf, np.inf]
+    )
+    unconstrained = violation_of(objectives[:1], np.empty((1, 0)))
+    np.testing.assert_array_equal(unconstrained, [0.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("nsga3", None, "unknown algorithm 'nsga3'; known are nsga2, mopso"),
+        ("mopso", {"swarn": 4}, "unknown setting swarn; known are swarm, archive"),
+        ("mopso", {"swarm": 0}, "swarm is 0; allowed is 1 to"),
+        ("mopso", {"inertia": float("nan")}, "inertia is nan"),
+        ("mopso", {"swarm": "many"}, "swarm is 'many'; allowed are whole"),
+        ("mopso", {"swarm": 12.5}, "swarm is 12.5; allowed are whole"),
+        ("mopso", {"inertia": "much"}, "wrong type"),
+        ("nsga2", {"population": 2}, "population is 2"),
+        ("nsga2", {"mutation_probability": 1.5}, "mutation_probability is 1.5"),
+        ("random", {"batch": 0}, "batch is 0"),
+    ],
+)
+def test_wrong_settings_are_told(name: str, settings: Any, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        make(name, settings)
+
+
+def test_settings_override_defaults() -> None:
+    settings = settings_of("mopso", {"swarm": 7})
+    assert settings.swarm == 7  # type: ignore[union-attr]
+    assert settings.inertia == 0.4  # type: ignore[union-attr]
+
+
+def test_an_algorithm_runs_once() -> None:
+    algorithm = make("nsga2")
+    search(Counting(), algorithm, 40, 1)
+    with pytest.raises(SettingsError, match="already ran"):
+        search(Counting(), algorithm, 40, 1)
+
+
+def test_a_budget_is_needed() -> None:
+    with pytest.raises(SettingsError, match="at least 1 is needed"):
+        search(Counting(), make("nsga2"), 0, 1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_equalities_are_refused(name: str) -> None:
+    with pytest.raises(SettingsError, match="1 equality constraints"):
+        run(name, Counting(equalities=1), 40)

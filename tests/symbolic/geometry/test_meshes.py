@@ -1,0 +1,145 @@
+"""Meshes: every point of the mesh lies in a convex piece, and bad files are refused clearly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import ConvexHull
+
+from symbolic.array import Array
+from symbolic.errors import CollisionModelError
+from symbolic.geometry.meshes import MOST_FACES, CollisionModelWarning, convex_pieces
+from symbolic.geometry.pieces import Hull
+from tests.robots import ur10_urdf
+
+MESHES = ur10_urdf().parents[1] / "meshes" / "ur10" / "collision"
+ONES = np.ones(3)
+
+
+def outside(points: Array, pieces: tuple[Hull, ...]) -> Array:
+    """Distance of each point from the nearest piece's half-spaces; at most 0 inside one."""
+    depth = [
+        (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1)
+        for hull in (ConvexHull(piece.vertices) for piece in pieces)
+    ]
+    return np.asarray(np.min(depth, axis=0))
+
+
+def angle_profile() -> trimesh.Trimesh:
+    polygon = [(0, 0), (1, 0), (1, 0.1), (0.1, 0.1), (0.1, 1), (0, 1)]
+    lower, upper = (np.array([(x, y, z) for x, y in polygon]) for z in (0.0, 0.5))
+    vertices = np.vstack([lower, upper])
+    caps = [(0, 3, 1), (1, 3, 2), (0, 5, 3), (3, 5, 4)]
+    faces = caps + [tuple(6 + k for k in reversed(face)) for face in caps]
+    for k in range(6):
+        n = (k + 1) % 6
+        faces += [(k, n, n + 6), (k, n + 6, k + 6)]
+    mesh = trimesh.Trimesh(vertices, faces)
+    mesh.fix_normals()
+    return mesh
+
+
+@pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+@pytest.mark.parametrize("name", sorted(path.name for path in MESHES.glob("*.stl")))
+def test_pieces_of_the_ur10_contain_its_meshes(name: str) -> None:
+    mesh = trimesh.load_mesh(MESHES / name)
+    pieces = convex_pieces(MESHES / name, ONES)
+    points, _ = trimesh.sample.sample_surface(mesh, 3000, seed=1)
+    assert outside(np.vstack([points, mesh.vertices]), pieces).max() < 1e-9
+    hull_volume = ConvexHull(mesh.vertices).volume
+    assert sum(ConvexHull(piece.vertices).volume for piece in pieces) < 1.3 * hull_volume
+
+
+def test_a_concave_mesh_is_cut_at_its_corner(tmp_path: Path) -> None:
+    path = tmp_path / "angle.stl"
+    mesh = angle_profile()
+    mesh.export(path)
+    pieces = convex_pieces(path, ONES)
+    volume = sum(ConvexHull(piece.vertices).volume for piece in pieces)
+    assert mesh.is_watertight
+    assert volume < 1.5 * mesh.volume < ConvexHull(mesh.vertices).volume
+    block = np.random.default_rng(4).uniform(0.0, (1.0, 1.0, 0.5), (4000, 3))
+    inside = block[(block[:, 0] < 0.1) | (block[:, 1] < 0.1)]
+    surface, _ = trimesh.sample.sample_surface(mesh, 3000, seed=2)
+    assert outside(np.vstack([inside, surface, mesh.vertices]), pieces).max() < 1e-9
+
+
+def test_faces_of_a_hull_point_outwards() -> None:
+    (hull,) = convex_pieces(MESHES / "base.stl", ONES)
+    corners = hull.vertices[hull.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outward = np.einsum("ij,ij->i", normals, corners[:, 0] - hull.vertices.mean(axis=0))
+    assert np.all(outward > 0.0)
+
+
+@pytest.mark.parametrize("scale", [(0.5, 1.0, 2.0), (-1.0, 1.0, 1.0)])
+def test_the_scale_is_applied(tmp_path: Path, scale: tuple[float, float, float]) -> None:
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
+    (hull,) = convex_pieces(path, np.array(scale))
+    assert np.ptp(hull.vertices, axis=0) == pytest.approx(np.abs(scale) * (1.0, 2.0, 3.0))
+
+
+def test_a_mesh_with_holes_is_used_as_its_hull_with_a_warning(tmp_path: Path) -> None:
+    path = tmp_path / "open.stl"
+    mesh = angle_profile()
+    mesh.update_faces(np.arange(len(mesh.faces)) > 2)
+    mesh.export(path)
+    with pytest.warns(CollisionModelWarning, match=r"1 part\(s\).*not watertight.*Close the holes"):
+        (hull,) = convex_pieces(path, ONES)
+    assert ConvexHull(hull.vertices).volume == pytest.approx(ConvexHull(mesh.vertices).volume)
+
+
+def write_flat(path: Path) -> None:
+    trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)]).export(path)
+
+
+def write_empty(path: Path) -> None:
+    path.write_text("solid nothing\nendsolid nothing\n")
+
+
+def write_nonsense(path: Path) -> None:
+    path.write_bytes(b"not a mesh at all")
+
+
+def write_millimetres(path: Path) -> None:
+    trimesh.creation.box((300.0, 200.0, 100.0)).export(path)
+
+
+def write_endless(path: Path) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=7)
+    assert len(mesh.faces) > MOST_FACES
+    mesh.export(path)
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (write_flat, "flat.*give it a thickness"),
+        (write_empty, "cannot be read|empty"),
+        (write_nonsense, "cannot be read|empty"),
+        (write_millimetres, "enormous.*300 m across.*millimetres"),
+        (write_endless, "enormous.*327680 triangles.*simplify"),
+    ],
+)
+def test_unusable_meshes_are_refused(tmp_path: Path, write: object, message: str) -> None:
+    path = tmp_path / "bad.stl"
+    assert callable(write)
+    write(path)
+    with pytest.raises(CollisionModelError, match=message):
+        convex_pieces(path, ONES)
+
+
+def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CollisionModelError, match=r"gone\.stl: mesh file not found"):
+        convex_pieces(tmp_path / "gone.stl", ONES)
+
+
+def test_vertices_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "nan.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 nan 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
+    with pytest.raises(CollisionModelError, match="not finite"):
+        convex_pieces(path, ONES)

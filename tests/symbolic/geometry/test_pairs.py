@@ -1,0 +1,216 @@
+"""Bodies against Pinocchio's own reading of the URDF; pairs and the reasons they are left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from symbolic.array import Array
+from symbolic.errors import CollisionModelError
+from symbolic.geometry.bodies import _link_pieces, collision_bodies
+from symbolic.geometry.coal_shapes import coal_distance
+from symbolic.geometry.pairs import build_geometry
+from symbolic.geometry.pieces import Capsule, Hull, Piece, support
+from symbolic.workcell.records import Body, Box, CollisionSettings, Cylinder, IgnoredPair, Sphere
+from tests.symbolic.geometry.collision_cells import (
+    geometry_of,
+    placed_pieces,
+    rack,
+    random_configurations,
+    ur10_cell,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+
+
+def directions(n: int) -> Array:
+    u = np.random.default_rng(5).normal(size=(n, 3))
+    return np.asarray(u / np.linalg.norm(u, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("name", ["rack", "ur10"])
+def test_links_stand_where_pinocchio_puts_them(name: str) -> None:
+    """Support of every link in the world against Pinocchio's geometry model."""
+    geometry = geometry_of(name)
+    robot = geometry.workcell.robots[0]
+    model = pin.buildModelFromUrdf(str(robot.urdf))
+    shapes = pin.buildGeomFromUrdf(
+        model,
+        str(robot.urdf),
+        pin.GeometryType.COLLISION,
+        package_dirs=[str(folder) for folder in robot.package_dirs],
+    )
+    data, shape_data = model.createData(), shapes.createData()
+    q = np.array([0.3, -0.4, 0.5, -0.6, 0.7, -0.8])
+    pin.updateGeometryPlacements(model, data, shapes, shape_data, q)
+    pieces = placed_pieces(geometry, np.zeros(6), q, q)
+    found = {body.name: placed for body, placed in zip(geometry.bodies, pieces, strict=True)}
+    u = directions(60)
+    expected: dict[str, Array] = {}
+    for item, placed in zip(shapes.geometryObjects, shape_data.oMg, strict=True):
+        name_of_link = f"{robot.name}/{model.frames[item.parentFrame].name}"
+        T = robot.T_world_base @ placed.homogeneous
+        value = _support(item, T, u)
+        expected[name_of_link] = np.fmax(expected.get(name_of_link, value), value)
+    assert len(expected) == {"rack": 7, "ur10": 8}[name]
+    for link, value in expected.items():
+        own = np.max([support(piece, u) for piece in found[link]], axis=0)
+        assert own == pytest.approx(value, abs=2e-6), link
+
+
+def _support(item: pin.GeometryObject, T: Array, u: Array) -> Array:
+    shape = item.geometry
+    if hasattr(shape, "halfSide"):
+        piece = Piece(Box(2.0 * shape.halfSide), T)
+    elif hasattr(shape, "halfLength"):
+        piece = Piece(Cylinder(shape.radius, 2.0 * shape.halfLength), T)
+    else:
+        vertices = np.asarray(shape.vertices())
+        piece = Piece(Hull(vertices, np.zeros((0, 3), dtype=np.int64)), T)
+    return support(piece, u)
+
+
+def test_every_pair_is_listed_once() -> None:
+    for name in ("rack", "ur10"):
+        geometry = geometry_of(name)
+        n = len(geometry.bodies)
+        listed = [(pair.first, pair.second) for pair in geometry.active]
+        listed += [(pair.first, pair.second) for pair in geometry.excluded]
+        assert len(listed) == len(set(listed)) == n * (n - 1) // 2
+        assert all(pair.reason for pair in geometry.excluded)
+
+
+@pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
+def test_pairs_out_of_reach_never_meet(name: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+    geometry = geometry_of(name, tmp_path_factory.getbasetemp() / name)
+    proven = [p for p in geometry.excluded if p.reason.startswith(("out of reach", "never meet"))]
+    assert proven
+    configurations = random_configurations(geometry, 150, np.random.default_rng(6))
+    arm_only = [
+        pair
+        for pair in proven
+        if "payload" not in (geometry.bodies[pair.first].name, geometry.bodies[pair.second].name)
+    ]
+    for pose, q_1, q_2 in zip(*configurations, strict=True):
+        pieces = placed_pieces(geometry, pose, q_1, q_2)
+        for pair in arm_only:
+            assert coal_distance(pieces[pair.first], pieces[pair.second]) > 0.0, pair
+
+
+def test_pairs_that_count_as_touching_do() -> None:
+    geometry = geometry_of("ur10")
+    always = [pair for pair in geometry.excluded if pair.reason.startswith("touch in all")]
+    configurations = random_configurations(geometry, 50, np.random.default_rng(7))
+    for pose, q_1, q_2 in zip(*configurations, strict=True):
+        pieces = placed_pieces(geometry, pose, q_1, q_2)
+        for pair in always:
+            assert coal_distance(pieces[pair.first], pieces[pair.second]) <= 0.0, pair
+
+
+def reason(first: str, second: str) -> str:
+    geometry = geometry_of("rack")
+    pair = {geometry.index(first), geometry.index(second)}
+    return next((p.reason for p in geometry.excluded if {p.first, p.second} == pair), "")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ("left/link_2", "left/link_3", "neighbours"),
+        ("left/pad", "payload", "held by the grasp: touching"),
+        ("left/link_6", "payload", "held by the grasp: gap 200.0 mm"),
+        ("left/base_link", "ground", "both stand still: touching"),
+        ("middle board", "ground", "both stand still: gap 580.0 mm"),
+        ("left/link_1", "right/link_1", "out of reach"),
+        ("left/link_4", "left/link_6", "never meet"),
+        ("left/link_6", "left/pad", "they move as one body"),
+        ("left/link_4", "middle board", ""),
+        ("left/pad", "right/pad", ""),
+        ("payload", "middle board", ""),
+        ("left/link_4", "payload", ""),
+    ],
+)
+def test_reasons_of_the_rack(first: str, second: str, expected: str) -> None:
+    found = reason(first, second)
+    assert found.startswith(expected)
+    assert bool(found) == bool(expected)
+
+
+def test_the_user_may_leave_out_a_pair_with_a_reason() -> None:
+    settings = CollisionSettings(ignored=(IgnoredPair("payload", "ground", "never that low"),))
+    geometry = build_geometry(replace(rack(), collision=settings))
+    assert ("payload", "ground") not in geometry.pair_names
+    assert "ignored in the file: never that low" in [pair.reason for pair in geometry.excluded]
+    wrong = CollisionSettings(ignored=(IgnoredPair("payload", "celing", ""),))
+    with pytest.raises(CollisionModelError, match=r"'celing'.*ground"):
+        build_geometry(replace(rack(), collision=wrong))
+
+
+def test_bodies_need_different_names_and_a_size() -> None:
+    cell = rack()
+    twin = replace(cell, environment=(*cell.environment, cell.environment[0]))
+    with pytest.raises(CollisionModelError, match=r"share the name.*bottom board"):
+        collision_bodies(twin)
+    dot = Body("dot", Sphere(0.0), np.eye(4))
+    with pytest.raises(CollisionModelError, match="'dot': sphere radius is 0 m"):
+        collision_bodies(replace(cell, environment=(dot,)))
+
+
+URDF = """<robot name="x"><link name="a">{link}</link>{rest}</robot>"""
+
+
+@pytest.mark.parametrize(
+    ("geometry", "message"),
+    [
+        ("<torus/>", "'torus' is unknown"),
+        ("", "without geometry"),
+        ('<box size="1 2"/>', "'1 2' where 3 number"),
+        ('<sphere radius="big"/>', "'big' where 1 number"),
+        ('<mesh filename="package://no/where.stl"/>', "not found; package folders.*none given"),
+    ],
+)
+def test_urdf_shapes_that_cannot_be_used_are_named(
+    tmp_path: Path, geometry: str, message: str
+) -> None:
+    path = tmp_path / "x.urdf"
+    shape = f"<collision><geometry>{geometry}</geometry></collision>"
+    path.write_text(URDF.format(link=shape, rest=""))
+    with pytest.raises(CollisionModelError, match=f"link 'a' of x.urdf: .*{message}"):
+        _link_pieces(replace(rack().robots[0], urdf=path))
+
+
+def test_capsules_and_origins_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "x.urdf"
+    shape = (
+        '<collision><origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>'
+        '<geometry><capsule radius="0.1" length="0.4"/></geometry></collision>'
+    )
+    path.write_text(URDF.format(link=shape, rest='<link name="bare"/>'))
+    links = _link_pieces(replace(rack().robots[0], urdf=path))
+    (piece,) = links["a"]
+    assert piece.shape == Capsule(0.1, 0.4)
+    assert piece.centre == pytest.approx([1, 2, 3])
+    assert piece.rotation @ [1, 0, 0] == pytest.approx([0, 1, 0])
+    assert links["bare"] == ()
+
+
+def test_the_ur10_has_bodies_for_all_its_links() -> None:
+    names = [body.name for body in collision_bodies(ur10_cell()) if body.group == "robot 1"]
+    assert names == [
+        f"left/{link}"
+        for link in (
+            "base_link",
+            "shoulder_link",
+            "upper_arm_link",
+            "forearm_link",
+            "wrist_1_link",
+            "wrist_2_link",
+            "wrist_3_link",
+            "ee_link",
+            "pad",
+        )
+    ]

@@ -1,0 +1,273 @@
+"""An arm along the box path: targets, Newton's method, honesty of its residual, joint torques."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from symbolic.array import Array
+from symbolic.physics.rotation import rotation_matrix
+from symbolic.robot.arm import (
+    MAX_JOINT_STEP,
+    NEWTON_STEPS,
+    REACH_TOLERANCE,
+    flange_target,
+    follow_function,
+    joint_torque,
+    limit_margin,
+    manipulability,
+    newton_step,
+    pose_error,
+    track_function,
+)
+from tests.plain.arm import PlainArm
+from tests.plain.motion import rotation
+from tests.symbolic.cells import call, gofa_model, hand_cell, start_posture
+
+CELL = hand_cell()
+ARMS = tuple(PlainArm(r, c) for r, c in zip(CELL.robots, CELL.contacts, strict=True))
+
+_q = ca.SX.sym("q", 6)
+_R, _p = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
+
+
+def step_function() -> ca.Function:
+    model = gofa_model()
+    result = _q
+    for _ in range(NEWTON_STEPS):
+        result = newton_step(model, result, _R, _p)
+    _, residual = pose_error(_R, _p, *model.placement(result))
+    return ca.Function("step", [_q, _R, _p], [result, residual])
+
+
+def box_pose(arm: PlainArm, q: Array) -> Array:
+    """Box pose (6,) whose contact the pad of an arm is at."""
+    world = (
+        pin.SE3(arm.robot.T_world_base)
+        * arm.place(q)
+        * pin.SE3(arm.robot.T_flange_pad)
+        * pin.SE3(arm.contact.T_box_pad).inverse()
+    )
+    return np.concatenate([world.translation, Rotation.from_matrix(world.rotation).as_euler("xyz")])
+
+
+def random_posture(rng: np.random.Generator, margin: float = 0.2) -> Array:
+    robot = CELL.robots[0]
+    return rng.uniform(robot.position_lower + margin, robot.position_upper - margin)
+
+
+@pytest.mark.parametrize("arm", [0, 1])
+def test_flange_target_puts_the_pad_on_its_contact(arm: int) -> None:
+    rng = np.random.default_rng(arm)
+    position, rpy = ca.SX.sym("position", 3), ca.SX.sym("rpy", 3)
+    R, p = flange_target(CELL.robots[arm], CELL.contacts[arm], position, rotation_matrix(rpy))
+    function = ca.Function("target", [position, rpy], [R, p])
+    for _ in range(20):
+        pose = np.concatenate([rng.uniform(-1, 1, 3), rng.uniform(-3, 3, 3)])
+        R_value, p_value = (np.array(v) for v in function(pose[:3], pose[3:]))
+        expected = ARMS[arm].flange_target(pose)
+        np.testing.assert_allclose(R_value, expected.rotation, atol=1e-14)
+        np.testing.assert_allclose(p_value[:, 0], expected.translation, atol=1e-14)
+
+
+@given(axis=st.integers(0, 2), angle=st.floats(-np.pi, np.pi), shift=st.floats(-1.0, 1.0))
+@settings(max_examples=60, deadline=None)
+def test_residual_vanishes_for_equal_placements_only(axis: int, angle: float, shift: float) -> None:
+    """In particular not for half a turn, where the sine of the error angle vanishes."""
+    R = Rotation.from_rotvec(angle * np.eye(3)[axis]).as_matrix()
+    right, residual = pose_error(ca.DM(R), ca.DM([shift, 0, 0]), ca.DM(np.eye(3)), ca.DM([0, 0, 0]))
+    expected = np.hypot(shift, 2 * np.sin(angle / 2))
+    assert float(residual) == pytest.approx(expected, abs=1e-12)
+    np.testing.assert_allclose(np.array(right)[3:, 0], np.sin(angle) * np.eye(3)[axis], atol=1e-12)
+
+
+def test_newton_converges_quadratically() -> None:
+    rng = np.random.default_rng(3)
+    model = gofa_model()
+    once = ca.Function("once", [_q, _R, _p], [newton_step(model, _q, _R, _p)])
+    q = np.array([0.3, -0.6, 0.4, 0.5, 1.0, 0.2])
+    target = ARMS[0].place(q).copy()
+    guess, errors = q + 0.02 * rng.normal(size=6), []
+    for _ in range(5):
+        errors.append(np.abs(guess - q).max())
+        guess = np.array(once(guess, target.rotation, target.translation))[:, 0]
+    assert errors[4] < 1e-12
+    for before, after in pairwise(errors):
+        assert after < 5.0 * before**2 + 1e-13
+
+
+def test_a_singular_posture_keeps_its_joints_and_shows_its_residual() -> None:
+    """Stretched arm and aligned wrist: the Jacobian has no inverse."""
+    q = np.zeros(6)
+    q[2] = -np.arctan2(0.534, 0.110)
+    target = ARMS[0].place(q).copy()
+    found, residual = step_function()(
+        q, target.rotation, target.translation + np.array([0.1, 0.0, 0.3])
+    )
+    assert np.all(np.isfinite(found.full()))
+    assert float(residual) > 0.01
+
+
+def test_ten_thousand_random_poses_are_never_wrongly_reported_as_reached() -> None:
+    """Poses of random postures, Newton from a disturbed posture; Pinocchio judges the outcome."""
+    rng = np.random.default_rng(11)
+    count = 10_000
+    true = np.array([random_posture(rng, 0.0) for _ in range(count)])
+    # From a sample's usual distance to one from which two steps cannot arrive.
+    guess = true + rng.normal(size=(count, 6)) * 10.0 ** rng.uniform(-4, 0, (count, 1))
+    targets = [ARMS[0].place(q).copy() for q in true]
+    R = np.hstack([t.rotation for t in targets])
+    p = np.column_stack([t.translation for t in targets])
+    found, residual = (v.full() for v in step_function().map(count)(guess.T, R, p))
+    reached = residual[0] <= REACH_TOLERANCE
+    assert 0.2 < reached.mean() < 0.8
+    for q, target, claimed in zip(found.T, targets, residual[0], strict=True):
+        actual = ARMS[0].residual(q, target)
+        assert actual == pytest.approx(claimed, abs=1e-11, rel=1e-6)
+
+
+def test_limit_margin_is_the_least_distance_to_a_limit() -> None:
+    robot = CELL.robots[0]
+    margin = ca.Function("margin", [_q], [limit_margin(robot, _q)])
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        q = rng.uniform(-6.0, 6.0, 6)
+        expected = np.min([q - robot.position_lower, robot.position_upper - q])
+        assert float(margin(q)) == pytest.approx(expected, abs=1e-15)
+
+
+def test_manipulability_is_the_size_of_the_jacobian_determinant() -> None:
+    measure = ca.Function("measure", [_q], [manipulability(gofa_model().jacobian(_q))])
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        q = random_posture(rng)
+        ARMS[0].place(q)
+        expected = abs(np.linalg.det(ARMS[0].jacobian(q)))
+        assert float(measure(q)) == pytest.approx(expected, rel=1e-9, abs=1e-13)
+
+
+@pytest.mark.parametrize("arm", [0, 1])
+def test_joint_torques_do_the_work_of_the_contact_wrench(arm: int) -> None:
+    """Virtual work: tau . dq = f . dp + m . d(angle) of the contact point, by differences."""
+    rng = np.random.default_rng(arm)
+    q_symbol, R_symbol, wrench_symbol = (
+        ca.SX.sym("q", 6),
+        ca.SX.sym("R", 3, 3),
+        ca.SX.sym("wrench", 6),
+    )
+    torque = joint_torque(
+        CELL.robots[arm],
+        CELL.contacts[arm],
+        gofa_model().jacobian(q_symbol),
+        R_symbol,
+        wrench_symbol,
+    )
+    function = ca.Function("torque", [q_symbol, R_symbol, wrench_symbol], [torque])
+    plain = ARMS[arm]
+
+    def contact(q: Array) -> pin.SE3:
+        return pin.SE3(plain.robot.T_world_base) * plain.place(q) * plain.T_flange_pad
+
+    for _ in range(5):
+        q, wrench, h = random_posture(rng), rng.normal(size=6) * 50.0, 1e-6
+        R = rotation(box_pose(plain, q)[3:])
+        tau = np.array(function(q, R, wrench))[:, 0]
+        for joint in range(6):
+            dq = h * np.eye(6)[joint]
+            after, before = contact(q + dq), contact(q - dq)
+            turn = Rotation.from_matrix(after.rotation @ before.rotation.T).as_rotvec()
+            moved = np.concatenate([after.translation - before.translation, turn]) / (2 * h)
+            assert tau[joint] == pytest.approx(wrench @ moved, abs=1e-5)
+
+
+def straight_path(arm: int, end: Array, samples: int = 40) -> tuple[Array, Array]:
+    start = CELL.task.waypoints[0].lower
+    poses = start + np.linspace(0.0, 1.0, samples)[:, None] * (end - start)
+    return start_posture(CELL)[arm], poses
+
+
+@pytest.mark.parametrize("arm", [0, 1])
+def test_follows_a_reachable_path_to_within_its_tolerance(arm: int) -> None:
+    start, poses = straight_path(arm, np.array([-0.4, 0.05, 0.8, 0.1, 0.1, -0.1]))
+    follow = follow_function(CELL.robots[arm], gofa_model(), CELL.contacts[arm], 40, "follow")
+    result = call(follow, start, poses, np.zeros((40, 6)))
+    assert not result["lost"].any()
+    for q, pose in zip(result["q"], poses, strict=True):
+        assert ARMS[arm].residual(q, ARMS[arm].flange_target(pose)) < REACH_TOLERANCE
+
+
+def test_the_first_step_of_a_coarse_path_is_reached_as_well() -> None:
+    """The second sample has no motion before it; its prediction must make up for that."""
+    start, poses = straight_path(0, np.array([-0.4, 0.0, 0.8, 0.0, 0.0, 0.0]), samples=30)
+    follow = follow_function(CELL.robots[0], gofa_model(), CELL.contacts[0], 30, "follow")
+    result = call(follow, start, poses, np.zeros((30, 6)))
+    assert result["ik_residual"][1] < 1e-9
+    assert not result["lost"].any()
+
+
+def test_an_arm_that_lost_the_path_stays_lost_even_when_it_finds_back() -> None:
+    start = start_posture(CELL)[0]
+    pose = CELL.task.waypoints[0].lower
+    # Out of reach and back again.
+    x = np.concatenate([np.linspace(0.0, -1.5, 40), np.linspace(-1.5, 0.0, 40), np.zeros(40)])
+    poses = np.tile(pose, (120, 1))
+    poses[:, 0] = x
+    follow = follow_function(CELL.robots[0], gofa_model(), CELL.contacts[0], 120, "follow")
+    result = call(follow, start, poses, np.zeros((120, 6)))
+    first = int(np.argmax(result["lost"]))
+    assert result["lost"][:first].max() == 0.0
+    assert result["lost"][first:].min() == 1.0
+    assert result["ik_residual"][first:].max() > 0.1
+    # It waits where it was, and its residual says how far off that is.
+    assert np.all(result["q"][first:] == result["q"][first - 1])
+    held = result["q"][first - 1]
+    for pose, residual in zip(poses[first:], result["ik_residual"][first:], strict=True):
+        assert residual == pytest.approx(ARMS[0].residual(held, ARMS[0].flange_target(pose)))
+
+
+def test_a_jump_to_another_branch_counts_as_lost() -> None:
+    """The sample is reached, but by a change of joints that no motion makes."""
+    track = track_function(CELL.robots[0], gofa_model(), CELL.contacts[0], "track")
+    start, pose = start_posture(CELL)[0], CELL.task.waypoints[0].lower
+    previous = start + 2.0 * MAX_JOINT_STEP * np.eye(6)[0]
+    # Extrapolation from these two lands exactly on the posture that holds the box.
+    before = 2.0 * previous - start
+    assert ARMS[0].residual(start, ARMS[0].flange_target(pose)) < REACH_TOLERANCE
+    result = call(track, np.concatenate([previous, before, [0.0]]), pose, np.zeros(6))
+    assert result["lost"][0] == 1.0
+    np.testing.assert_array_equal(result["q"], previous)
+
+
+def test_agrees_with_the_plain_arm() -> None:
+    start, poses = straight_path(1, np.array([-0.4, 0.05, 0.8, 0.1, 0.1, -0.1]))
+    wrenches = np.random.default_rng(0).normal(size=(40, 6)) * 30.0
+    follow = follow_function(CELL.robots[1], gofa_model(), CELL.contacts[1], 40, "follow")
+    expected = ARMS[1].follow(start, poses, wrenches)
+    for name, value in call(follow, start, poses, wrenches).items():
+        np.testing.assert_allclose(value, expected[name], atol=1e-8, rtol=1e-8, err_msg=name)
+
+
+def test_turning_base_and_box_together_changes_nothing_for_the_arm() -> None:
+    turn = 0.7
+    R = Rotation.from_euler("z", turn).as_matrix()
+    robot, contact = CELL.robots[0], CELL.contacts[0]
+    T = np.eye(4)
+    T[:3, :3] = R
+    turned_robot = replace(robot, T_world_base=T @ robot.T_world_base)
+    start, poses = straight_path(0, np.array([-0.4, 0.05, 0.8, 0.1, 0.1, -0.1]))
+    turned_poses = np.column_stack([poses[:, :3] @ R.T, poses[:, 3:] + [0.0, 0.0, turn]])
+    wrenches = np.random.default_rng(0).normal(size=(40, 6)) * 30.0
+    turned_wrenches = (wrenches.reshape(-1, 3) @ R.T).reshape(-1, 6)
+    here = follow_function(robot, gofa_model(), contact, 40, "here")
+    there = follow_function(turned_robot, gofa_model(), contact, 40, "there")
+    expected = call(here, start, poses, wrenches)
+    for name, value in call(there, start, turned_poses, turned_wrenches).items():
+        np.testing.assert_allclose(value, expected[name], atol=1e-9, err_msg=name)

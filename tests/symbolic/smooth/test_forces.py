@@ -1,0 +1,88 @@
+"""Forces of the smooth problem against the candidate evaluator, derivatives against differences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from symbolic.array import Array
+from symbolic.functions.candidate import candidate_function
+from symbolic.smooth.forces import force_functions, pressure_functions, sample_blocks
+from symbolic.smooth.problem import branch_coefficients
+from symbolic.workcell.records import TimeLaw, Workcell
+from tests.symbolic.cells import hand_cell, hand_model
+
+
+def cell_with(time_law: TimeLaw, samples: int = 12) -> Workcell:
+    cell = hand_cell()
+    return replace(cell, task=replace(cell.task, time_law=time_law, samples=samples))
+
+
+def random_x(cell: Workcell, seed: int) -> Array:
+    return np.random.default_rng(seed).uniform(cell.task.lower, cell.task.upper)
+
+
+def split_of(cell: Workcell, functions: Mapping[str, ca.Function], x: Array) -> Array:
+    """(samples, 2) from the blocks, put in the samples' order."""
+    split = np.full((cell.task.samples, 2), np.nan)
+    for block in sample_blocks(cell.task):
+        value = functions[f"force_{block.name}_value"]
+        for samples, basis in zip(block.samples, block.basis, strict=True):
+            split[samples] = np.array(value(x, basis.T)).reshape(-1, 2)
+    return split
+
+
+@pytest.mark.parametrize("time_law", ["constant", "ramped"])
+@pytest.mark.parametrize("samples", [5, 6, 12])
+def test_the_largest_branch_is_the_evaluators_normal_force(time_law: TimeLaw, samples: int) -> None:
+    cell = cell_with(time_law, samples)
+    evaluate = candidate_function(hand_model(cell))
+    coefficients, functions = branch_coefficients(cell), force_functions(cell)
+    for seed in range(5):
+        x = random_x(cell, seed)
+        outputs = dict(zip(evaluate.name_out(), evaluate(x), strict=True))
+        expected = np.array(outputs["normal_force"]).T
+        forces = np.einsum("rbk,nk->nrb", coefficients, split_of(cell, functions, x)).max(axis=2)
+        np.testing.assert_allclose(forces, expected, rtol=1e-10, atol=1e-9)
+
+
+@pytest.mark.parametrize("quantity", ["force", "pressure"])
+@pytest.mark.parametrize("time_law", ["constant", "ramped"])
+def test_derivatives_are_those_of_the_values(time_law: TimeLaw, quantity: str) -> None:
+    cell = cell_with(time_law)
+    functions = {**force_functions(cell), **pressure_functions(cell)}
+    rng = np.random.default_rng(3)
+    step = 1e-6
+    for block in sample_blocks(cell.task):
+        value, gradient, hessian = (
+            functions[f"{quantity}_{block.name}_{kind}"]
+            for kind in ("value", "gradient", "hessian")
+        )
+        x, basis = random_x(cell, 1), block.basis[len(block.basis) // 2].T
+        weight = rng.normal(size=value.size1_out(0))
+        slopes, curvature = [], []
+        for direction in np.eye(cell.task.n_var):
+            ahead, behind = x + step * direction, x - step * direction
+            slopes.append((np.array(value(ahead, basis)) - np.array(value(behind, basis)))[:, 0])
+            curvature.append(
+                (np.array(gradient(ahead, basis)) - np.array(gradient(behind, basis))) @ weight
+            )
+        exact = np.array(gradient(x, basis))
+        np.testing.assert_allclose(np.array(slopes) / (2 * step), exact, rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(
+            np.array(curvature) / (2 * step),
+            np.array(hessian(x, basis, weight)),
+            rtol=1e-5,
+            atol=1e-3,
+        )
+
+
+def test_every_sample_is_served_once() -> None:
+    for samples in (5, 6, 7, 100):
+        blocks = sample_blocks(cell_with("constant", samples).task)
+        served = np.concatenate([block.samples.ravel() for block in blocks])
+        assert sorted(served.tolist()) == list(range(samples))

@@ -1,0 +1,145 @@
+"""Rows at places of the path: values against their definitions, reach through the closure."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from symbolic.array import Array
+from symbolic.cell_model import CellModel, build_cell_model
+from symbolic.geometry.clearance import screening_functions
+from symbolic.physics.rotation import rotation_matrix
+from symbolic.robot.arm import flange_target, manipulability, pose_error
+from symbolic.smooth.rows import RowFunctions, RowKind, solve_function
+from symbolic.workcell.file import load
+from tests.symbolic.workcell.samples import RACK
+
+STILL = np.zeros(6)
+"""The rate of rows that do not depend on it."""
+
+
+@cache
+def model() -> CellModel:
+    return build_cell_model(load(RACK))
+
+
+@cache
+def rows() -> RowFunctions:
+    return RowFunctions(model())
+
+
+def pose_near_start(seed: int) -> Array:
+    start = model().workcell.task.waypoints[0].lower
+    away = np.array([-0.15, 0.0, 0.03, 0.0, 0.0, 0.0])
+    spread = np.array([0.1, 0.04, 0.03, 0.1, 0.1, 0.1])
+    return np.asarray(start + away + spread * np.random.default_rng(seed).uniform(-1, 1, 6))
+
+
+def joints_at(pose: Array) -> tuple[Array, Array]:
+    first, second = (
+        np.array(solve_function(model(), arm)(pose, model().start[arm])).ravel() for arm in (0, 1)
+    )
+    return first, second
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20)
+def test_solved_joints_hold_the_box(seed: int) -> None:
+    pose = pose_near_start(seed)
+    for arm, q in enumerate(joints_at(pose)):
+        cell = model().workcell
+        target = flange_target(
+            cell.robots[arm], cell.contacts[arm], pose[:3], rotation_matrix(pose[3:])
+        )
+        residual = pose_error(*target, *model().robots[arm].placement(q))[1]
+        assert float(residual) < 1e-8
+
+
+def test_a_smooth_clearance_never_exceeds_the_sharp_bound() -> None:
+    placements = (model().robots[0].joint_placements, model().robots[1].joint_placements)
+    sharp = screening_functions(model().geometry, placements)["clearance"]
+    for seed in range(3):
+        pose = pose_near_start(seed)
+        q = joints_at(pose)
+        bounds = np.array(sharp(pose, *q)).ravel()
+        for index in range(0, len(bounds), 7):
+            smooth = float(rows().value(RowKind("clearance", index))(pose, STILL, *q))
+            assert smooth <= bounds[index] + 1e-12
+            assert smooth >= bounds[index] - 0.1
+
+
+def test_the_largest_separation_is_the_sharp_bound() -> None:
+    placements = (model().robots[0].joint_placements, model().robots[1].joint_placements)
+    sharp = screening_functions(model().geometry, placements)["clearance"]
+    names = model().geometry.pair_names
+    assert {"top board", "pallet in front"} <= {names[index][1] for index in rows().separable()}
+    for seed in range(3):
+        pose = pose_near_start(seed)
+        bounds = np.array(sharp(pose, *joints_at(pose))).ravel()
+        for index in rows().separable():
+            gaps = np.array(rows().separations(index)(pose)).ravel()
+            assert gaps.max() == pytest.approx(bounds[index], abs=2e-4)
+            for direction in (0, len(gaps) - 1):
+                kind = RowKind("separation", index, direction=direction)
+                value = float(rows().value(kind)(pose, STILL, STILL, STILL))
+                assert value == pytest.approx(gaps[direction], abs=1e-15)
+
+
+def test_a_passing_row_is_the_height_at_which_the_gaps_meet() -> None:
+    index = next(k for k in rows().separable() if model().geometry.pair_names[k][1] == "top board")
+    pose = np.array([-0.34, 0.01, 0.86, 0.01, 0.05, 0.02])
+    rate = np.array([-2e-3, 1e-4, 2e-3, 1e-4, -2e-4, 1e-4])
+    gaps = rows().separations(index)
+
+    def along(steps: float) -> Array:
+        return np.array(gaps(pose + steps * rate)).ravel()
+
+    slopes = (along(1e-4) - along(-1e-4)) / 2e-4
+    before, after = int(np.argmin(slopes)), int(np.argmax(slopes))
+    meeting = (along(0.0)[before] - along(0.0)[after]) / (slopes[after] - slopes[before])
+    kind = RowKind("passing", index, direction=before, after=after)
+    height = float(rows().value(kind)(pose, rate, STILL, STILL))
+    assert height == pytest.approx(along(0.0)[before] + meeting * slopes[before], abs=1e-7)
+
+
+@pytest.mark.parametrize("arm", [0, 1])
+def test_joint_rows_are_their_definitions(arm: int) -> None:
+    pose = pose_near_start(1)
+    q = joints_at(pose)
+    robot = model().workcell.robots[arm]
+    for joint in range(6):
+        lower = float(rows().value(RowKind("lower", joint, arm))(pose, STILL, *q))
+        upper = float(rows().value(RowKind("upper", joint, arm))(pose, STILL, *q))
+        assert lower == pytest.approx(q[arm][joint] - robot.position_lower[joint])
+        assert upper == pytest.approx(robot.position_upper[joint] - q[arm][joint])
+    jacobian = np.array(model().robots[arm].jacobian(q[arm]))
+    share = abs(np.linalg.det(jacobian)) / robot.min_manipulability
+    value = float(rows().value(RowKind("singularity", -1, arm))(pose, STILL, *q))
+    assert value == pytest.approx(share**2 - 1.0, rel=1e-9)
+    assert float(manipulability(jacobian)) == pytest.approx(abs(np.linalg.det(jacobian)))
+
+
+def test_compiled_functions_take_the_place_of_their_names() -> None:
+    frequent = rows().frequent()
+    replaced = RowFunctions(model(), frequent)
+    kind = RowKind("singularity", -1, 0)
+    assert replaced.hessian(kind) is frequent["hessian_singularity_0_1"]
+    assert all(name == function.name() for name, function in frequent.items())
+
+
+def test_rows_know_their_arms() -> None:
+    names = model().geometry.pair_names
+    for index, pair in enumerate(names):
+        expected = tuple(
+            arm
+            for arm, robot in enumerate(model().workcell.robots)
+            if any(
+                name.startswith(f"{robot.name}/") and not name.endswith("base_link")
+                for name in pair
+            )
+        )
+        assert rows().arms(RowKind("clearance", index)) == expected

@@ -1,0 +1,211 @@
+"""Each wrong entry of a workcell file is told with its key path, the find and the remedy."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from symbolic.errors import WorkcellError
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
+from tests.symbolic.workcell.problem_cases import CASES, put
+from tests.symbolic.workcell.samples import GOFA, RACK, sample_data, write
+
+
+def problems_of(path: Path) -> list[str]:
+    with pytest.raises(WorkcellError) as caught:
+        load(path)
+    assert str(path) in str(caught.value)
+    assert all(problem in str(caught.value) for problem in caught.value.problems)
+    return list(caught.value.problems)
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "key_path", "words"),
+    CASES,
+    ids=[f"{index}-{case[2]}" for index, case in enumerate(CASES)],
+)
+def test_problem(tmp_path: Path, where: str, value: Any, key_path: str, words: str) -> None:
+    data = sample_data()
+    put(data, where, value)
+    found = problems_of(write(tmp_path, data))
+    assert any(problem.startswith(f"{key_path}: ") and words in problem for problem in found), found
+    for problem in found:
+        assert problem.isprintable(), problem
+
+
+def test_the_unchanged_data_is_valid(tmp_path: Path) -> None:
+    assert load(write(tmp_path, sample_data())).name == sample_data()["name"]
+
+
+def test_one_mistake_is_one_problem(tmp_path: Path) -> None:
+    data = sample_data()
+    put(data, "payload.size[0]", 300)
+    put(data, "contacts[0].spin", 45)
+    found = problems_of(write(tmp_path, data))
+    assert [problem.split(":")[0] for problem in found] == ["payload.size[0]", "contacts[0].spin"]
+
+
+def test_a_missing_section_does_not_blame_others(tmp_path: Path) -> None:
+    data = sample_data()
+    del data["payload"]
+    assert problems_of(write(tmp_path, data)) == ["payload: is missing"]
+
+
+def test_many_problems_at_once(tmp_path: Path) -> None:
+    data = sample_data()
+    wrong: list[tuple[str, Any, str]] = [
+        ("robots[0].flange", "tol0", "robots[0].flange"),
+        ("robots[1].base.rpy[2]", 90, "robots[1].base.rpy[2]"),
+        ("payload.mass", -1, "payload.mass"),
+        ("contacts[0].xyz[1]", 0.3, "contacts[0].xyz"),
+        ("task.samples", 2, "task.samples"),
+        ("task.extra", 2, "task.extra"),
+        ("task.goal[2]", 3.0, "task.goal"),
+        ("environment[3].size[0]", -1, "environment[3].size[0]"),
+        ("collision.tolerance", 5, "collision.tolerance"),
+    ]
+    for where, value, _ in wrong:
+        put(data, where, value)
+    found = problems_of(write(tmp_path, data))
+    told = {problem.split(": ")[0] for problem in found}
+    # The goal cannot be judged while both arms are described wrongly.
+    assert told == {path for _, _, path in wrong} - {"task.goal"}
+
+
+def test_both_arms_and_all_poses_are_judged(tmp_path: Path) -> None:
+    data = sample_data()
+    data["task"]["start"][2] = data["task"]["goal"][2] = 2.6
+    found = problems_of(write(tmp_path, data))
+    assert [problem.split(": ")[0] for problem in found] == ["task.start", "task.goal"] * 2
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"name = ", "not valid TOML"),
+        (b"name = 'a'\nname = 'b'", "not valid TOML"),
+        (b"name = '\xff'", "byte 8 is not UTF-8"),
+        (b"a = " + b"[" * 100_000, "nested too deeply"),
+        (b"", "name: is missing"),
+    ],
+)
+def test_unusable_files(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_bytes(content)
+    assert any(words in problem for problem in problems_of(path))
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    assert "No such file" in problems_of(tmp_path / "none.toml")[0]
+    assert "cannot be read" in problems_of(tmp_path)[0]
+
+
+UrdfChange = Callable[[str], str]
+URDF_CASES: list[tuple[str, UrdfChange, str, str]] = [
+    ("not xml", lambda text: text[:200], "robots[0].urdf", "not readable XML"),
+    ("no robot", lambda _: "<a/>", "robots[0].urdf", "Pinocchio cannot read"),
+    ("no links", lambda _: "<robot name='a'/>", "robots[0].urdf", "Pinocchio cannot read"),
+    (
+        "prismatic",
+        lambda text: text.replace('"joint_4" type="revolute"', '"joint_4" type="prismatic"'),
+        "robots[0].urdf",
+        "'joint_4' is of kind PX; allowed are revolute",
+    ),
+    (
+        "continuous",
+        lambda text: text.replace('"joint_4" type="revolute"', '"joint_4" type="continuous"'),
+        "robots[0].urdf",
+        "allowed are revolute joints with limits",
+    ),
+    (
+        "branched",
+        lambda text: text.replace('<parent link="link_5"/>', '<parent link="link_4"/>'),
+        "robots[0].urdf",
+        "does not follow the joint before it",
+    ),
+    (
+        "no effort",
+        lambda text: text.replace('effort="390"', 'effort="0"'),
+        "robots[0].torque_max",
+        "the URDF gives 0 for joint 1",
+    ),
+    (
+        "range reversed",
+        lambda text: text.replace('upper="1.483529864195180"', 'upper="-5"'),
+        "robots[0].position_lower[2]",
+        "not below its upper limit -5 rad",
+    ),
+    (
+        "mesh missing",
+        lambda text: text.replace(
+            '<box size="0.161 0.093 0.707"/>', '<mesh filename="package://a/b.stl"/>'
+        ),
+        "robots[0].urdf",
+        "collision mesh 'package://a/b.stl' that it names does not exist",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("change", "key_path", "words"),
+    [case[1:] for case in URDF_CASES],
+    ids=[case[0] for case in URDF_CASES],
+)
+def test_unusable_urdf(tmp_path: Path, change: UrdfChange, key_path: str, words: str) -> None:
+    text = GOFA.read_text(encoding="utf-8")
+    assert change(text) != text
+    (tmp_path / "arm.urdf").write_text(change(text), encoding="utf-8")
+    data = sample_data()
+    data["robots"][0]["urdf"] = "arm.urdf"
+    found = problems_of(write(tmp_path, data))
+    assert any(p.startswith(f"{key_path}: ") and words in p for p in found), found
+
+
+def test_further_checks_run_on_a_valid_cell_only(tmp_path: Path) -> None:
+    seen: list[str] = []
+
+    def no_solution(workcell: Workcell) -> list[str]:
+        seen.append(workcell.name)
+        return ["task.start: no joint angles reach it; allowed is a pose within reach"]
+
+    with pytest.raises(WorkcellError, match=r"task\.start: no joint angles"):
+        load(RACK, checks=[no_solution])
+    data = sample_data()
+    put(data, "payload.mass", -1)
+    with pytest.raises(WorkcellError, match=r"payload\.mass"):
+        load(write(tmp_path, data), checks=[no_solution])
+    assert len(seen) == 1
+
+
+NUMBERS = [-1, 0, 1e308, 10**400, float("nan"), True]
+ARRAYS = [[], [[]], [{}], [0.0] * 3, [0.0] * 6, ["a"] * 6, [[0.0] * 3] * 3, [True] * 3]
+ODD_VALUES = [*NUMBERS, *ARRAYS, "", "x", "a\0", {}, {"a": {}}]
+
+
+def key_paths(data: Any, path: str = "") -> list[str]:
+    """Every key path of nested tables and arrays."""
+    if isinstance(data, dict):
+        inner = [(f"{path}.{key}".lstrip("."), value) for key, value in data.items()]
+    elif isinstance(data, list):
+        inner = [(f"{path}[{index}]", value) for index, value in enumerate(data)]
+    else:
+        return []
+    return [found for key, value in inner for found in (key, *key_paths(value, key))]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.sampled_from(key_paths(sample_data())), st.sampled_from(ODD_VALUES))
+def test_odd_values_raise_no_other_error(path: str, value: Any) -> None:
+    data = sample_data()
+    put(data, path, value)
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(WorkcellError):
+        # Some odd values are right where they stand, e.g. zero for an angle.
+        assert load(write(Path(folder), data)).digest
