@@ -32,6 +32,8 @@ from codegen.errors import CodegenError
 FORMAT = 1
 """Part of every key; rises when what is stored changes its meaning."""
 
+_SOURCES = {".py", ".c", ".h"}
+
 _STALE_SECONDS = 24 * 3600.0
 
 
@@ -46,12 +48,17 @@ def digest(*parts: str | bytes) -> str:
 
 
 def source_digest(*packages: str) -> str:
-    """SHA-256 over the Python sources of installed packages, none of which is imported."""
+    """SHA-256 over the Python and C sources of installed packages, none of which is imported."""
     total: list[str | bytes] = []
     for package in packages:
         spec = importlib.util.find_spec(package)
         folders = [] if spec is None else spec.submodule_search_locations or []
-        for file in sorted(path for folder in folders for path in Path(folder).rglob("*.py")):
+        for file in sorted(
+            path
+            for folder in folders
+            for path in Path(folder).rglob("*")
+            if path.suffix in _SOURCES
+        ):
             total += [f"{package}/{file.name}", file.read_bytes()]
     return digest(*total)
 

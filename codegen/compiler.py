@@ -20,14 +20,16 @@ FLAGS = (
     # CasADi's own entry points stay visible, so that `casadi.external` can use a library as well.
     "-DGCC_HASCLASSVISIBILITY",
     "-fno-math-errno",
-    # Without fused multiply-adds the compiled results equal CasADi's own to the last bit, whatever
-    # the processor. Fusing them, or the machine's own instruction set (-march=native), made no
-    # candidate faster, so a library also serves other machines that share the cache. Never
-    # -ffast-math: NaN must stay NaN.
+    # Without fused multiply-adds the results are the same to the last bit, whatever the processor.
+    # Never -ffast-math: NaN must stay NaN.
     "-ffp-contract=off",
     # Evaluations of functions with memory (solvers) that may run at once in one process.
     "-DCASADI_MAX_NUM_THREADS=128",
 )
+
+MACHINE_FLAGS = ("-march=native", "-mcpu=native")
+"""The machine's own instruction set, as compilers name it: the first that one accepts is used.
+What it stands for is part of a library's key, so machines that share a cache keep their own."""
 
 SMALL_SOURCE = 600_000
 LARGE_SOURCE = 2_000_000
@@ -45,15 +47,19 @@ class Compiler:
     Attributes:
         command: its absolute path, then arguments that the user's CC carries.
         version: everything that it says of itself, target included.
+        machine: the flag for the machine's own instruction set; empty if it knows none.
+        instructions: what it defines for that set.
     """
 
     command: tuple[str, ...]
     version: str
+    machine: tuple[str, ...] = ()
+    instructions: str = ""
 
     @property
     def identity(self) -> str:
-        """Text that changes with the compiler, its version and its target."""
-        return "\n".join([*self.command, self.version])
+        """Text that changes with the compiler, its version, its target and the machine."""
+        return "\n".join([*self.command, self.version, *self.machine, self.instructions])
 
     def compile(self, source: Path, library: Path, level: int) -> None:
         """Compile one C file into a shared library at optimisation `level` (0 to 3).
@@ -61,7 +67,8 @@ class Compiler:
         Raises:
             CodegenError: the compiler refused the source, could not write, or was killed.
         """
-        command = [*self.command, f"-O{level}", *FLAGS, "-o", str(library), str(source), "-lm"]
+        flags = [f"-O{level}", *FLAGS, *self.machine]
+        command = [*self.command, *flags, "-o", str(library), str(source), "-lm"]
         # The compiler's own temporary files stay in the build folder and go away with it.
         environment = os.environ | {"TMPDIR": str(source.parent), "LC_ALL": "C"}
         try:
@@ -104,16 +111,22 @@ def _find(cc: str, path: str) -> Compiler | None:
         if executable is None:
             continue
         full = (os.path.abspath(executable), *command[1:])
-        version = _version(full)
-        if version is not None:
-            return Compiler(full, version)
+        said = _ask(full, "-v")
+        if said is None:
+            continue
+        for flag in MACHINE_FLAGS:
+            defined = _ask(full, flag, "-dM", "-E", "-x", "c", os.devnull)
+            if defined is not None:
+                return Compiler(full, said, (flag,), defined)
+        return Compiler(full, said)
     return None
 
 
-def _version(command: tuple[str, ...]) -> str | None:
+def _ask(command: tuple[str, ...], *arguments: str) -> str | None:
+    """What a compiler says to these arguments; None where it refuses."""
     try:
         said = subprocess.run(
-            [*command, "-v"],
+            [*command, *arguments],
             env=os.environ | {"LC_ALL": "C"},
             stdin=subprocess.DEVNULL,
             capture_output=True,

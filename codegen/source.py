@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
 from itertools import accumulate
 
 import casadi as ca
@@ -126,7 +127,10 @@ def c_source(function: ca.Function) -> str:
         .replace("@N_OUT@", str(function.n_out()))
         .replace("@OFFSETS@", ", ".join(map(str, accumulate(sizes, initial=0))))
     )
-    return generated + driver
+    # Our arithmetic comes after the library's declarations, which it shadows.
+    include = "#include <math.h>\n"
+    arithmetic = files("codegen").joinpath("c/arithmetic.h").read_text()
+    return generated.replace(include, include + arithmetic, 1) + driver
 
 
 def operations(function: ca.Function) -> int:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -144,7 +145,7 @@ def test_two_processes_at_once_build_once(cache: Cache, tmp_path: Path) -> None:
     log = tmp_path / "log"
     compiler = tmp_path / "counting-cc"
     compiler.write_text(
-        f'#!/bin/sh\ncase "$*" in -v) ;; *) echo "$*" >> "{log}"; sleep 0.3 ;; esac\n'
+        f'#!/bin/sh\ncase "$*" in -v|*" -E "*) ;; *) echo "$*" >> "{log}"; sleep 0.3 ;; esac\n'
         'exec gcc "$@"\n'
     )
     compiler.chmod(0o755)
@@ -171,7 +172,7 @@ def test_killed_build_leaves_the_cache_usable(
     started, go_on = tmp_path / "started", tmp_path / "go_on"
     compiler = tmp_path / "slow-cc"
     compiler.write_text(
-        '#!/bin/sh\ncase "$*" in -v) exec gcc -v ;; esac\n'
+        '#!/bin/sh\ncase "$*" in -v|*" -E "*) exec gcc "$@" ;; esac\n'
         f'gcc "$@"\ntouch "{started}"\n'
         f'while [ ! -e "{go_on}" ]; do sleep 0.05; done\n'
     )
@@ -231,7 +232,7 @@ def test_compiler_that_fails_is_told(
 ) -> None:
     compiler = tmp_path / "full-cc"
     compiler.write_text(
-        '#!/bin/sh\ncase "$*" in -v) exec gcc -v ;; esac\n'
+        '#!/bin/sh\ncase "$*" in -v|*" -E "*) exec gcc "$@" ;; esac\n'
         'echo "cc1: fatal error: No space left on device" >&2\nexit 1\n'
     )
     compiler.chmod(0o755)
@@ -277,3 +278,26 @@ def test_operations_count_nested_calls() -> None:
     # Input, output and the two calls.
     assert operations(called_twice) == 2 * own + 2
     assert operations(step.mapaccum(100)) >= 100 * own
+
+
+def test_libraries_are_kept_apart_by_instruction_set(
+    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = 'case "$*" in *" -E "*) echo "#define __OTHER__ 1" ;; *) exec gcc "$@" ;; esac'
+    ignorant = 'case "$*" in *native*) exit 1 ;; *) exec gcc "$@" ;; esac'
+    found = []
+    for k, script in enumerate(('exec gcc "$@"', other, ignorant)):
+        compiler = tmp_path / f"cc-{k}"
+        compiler.write_text(f"#!/bin/sh\n{script}\n")
+        compiler.chmod(0o755)
+        monkeypatch.setenv("CC", str(compiler))
+        assert build(functions(), cache).functions["norm"]([3.0, 4.0, 0.0, 0.0])["y"] == 5.0
+        one = find_compiler()
+        assert one is not None
+        found.append(one)
+    own, of_another, without = found
+    assert len(own.machine) == 1
+    assert own.machine == of_another.machine
+    assert of_another.instructions == "#define __OTHER__ 1\n" != own.instructions
+    assert without.machine == ()
+    assert replace(own, instructions=of_another.instructions).identity != own.identity

@@ -311,3 +311,15 @@ def test_a_forked_child_has_threads_of_its_own(cache: Cache, tmp_path: Path) -> 
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
     np.testing.assert_array_equal(np.load(reply), expected)
+
+
+def test_maximum_and_minimum_yield_to_numbers(cache: Cache) -> None:
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    function = ca.Function("extremes", [x, y], [ca.fmax(x, y), ca.fmin(x, y)])
+    compiled = compile_function(function, cache)
+    values = np.array([-np.inf, -1.5, 0.0, 2.0, np.inf, np.nan])
+    for a in values:
+        for b in values:
+            high, low = compiled(a, b).values()
+            np.testing.assert_array_equal(high, np.fmax(a, b))
+            np.testing.assert_array_equal(low, np.fmin(a, b))
