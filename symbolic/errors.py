@@ -8,6 +8,10 @@ class DualArmError(Exception):
     """Root of all errors raised on purpose by this project; the text says what to do."""
 
 
+class OutsideError(DualArmError):
+    """A file from outside is not taken; the text says why, but not which file it is."""
+
+
 class WorkcellError(DualArmError):
     """A workcell description is wrong.
 
@@ -25,6 +29,20 @@ class WorkcellError(DualArmError):
 
 class RobotModelError(DualArmError):
     """A robot's URDF cannot be turned into the model that a computation needs."""
+
+
+class UrdfError(RobotModelError):
+    """A URDF file is wrong.
+
+    Attributes:
+        file: its name, without its folder.
+        problems: every problem found, each `element attribute: what was found; what is allowed`.
+    """
+
+    def __init__(self, file: str, problems: tuple[str, ...]) -> None:
+        self.file = file
+        self.problems = problems
+        super().__init__("\n".join(f"{file}: {problem}" for problem in problems))
 
 
 class BridgeError(DualArmError):

@@ -13,8 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_opt.errors import ResultsError
+from symbolic import outside
+from symbolic.errors import OutsideError
 
 LOCK = ".lock"
+
+MOST_BYTES = 512 * outside.MEBIBYTE
+"""Largest file of a results folder that is read."""
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
@@ -76,21 +81,21 @@ def read_json(path: Path) -> Any:
         ResultsError: the file cannot be read or is not JSON.
     """
     try:
-        return json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:
-        raise ResultsError(f"{path}: damaged, not JSON ({error})") from error
+        return outside.json_value(read_bytes(path))
+    except OutsideError as error:
+        raise ResultsError(f"{path}: damaged ({error})") from error
 
 
 def read_bytes(path: Path) -> bytes:
     """A file's content.
 
     Raises:
-        ResultsError: it cannot be read.
+        ResultsError: it cannot be read, is no regular file, or larger than `MOST_BYTES`.
     """
     try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be read ({error.strerror})") from error
+        return outside.read_bytes(path, MOST_BYTES)
+    except OutsideError as error:
+        raise ResultsError(f"{path}: {error}") from error
 
 
 def sha256(content: bytes) -> str:

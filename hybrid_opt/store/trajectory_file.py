@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,9 @@ import numpy as np
 
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.functions import workcell_functions
+from symbolic import outside
 from symbolic.array import Array
-from symbolic.errors import BundleError
+from symbolic.errors import BundleError, OutsideError
 from symbolic.workcell.archive import (
     CellArchive,
     archive_cell,
@@ -28,11 +29,16 @@ from symbolic.workcell.archive import (
     archive_to_json,
     unpack_cell,
 )
+from symbolic.workcell.reader import shown, text_problem
 from symbolic.workcell.records import Workcell
 
 FORMAT = "dual-arm-carry trajectory"
 VERSION = 1
-MAX_FILE_BYTES = 512 * 2**20
+MAX_FILE_BYTES = 256 * outside.MEBIBYTE
+LARGEST_DECISION = 100.0
+"""Largest value of a decision vector and of a start posture [m, rad]: no cell has larger ones."""
+
+MOST_NUMBERS = 10_000
 _KEYS = {"format", "version", "decision", "start", "figures", "provenance", "cell"}
 
 
@@ -115,12 +121,12 @@ def read_trajectory(path: str | Path) -> StoredTrajectory:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ResultsError(f"{path}: larger than {MAX_FILE_BYTES // 2**20} MiB")
-        data = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
+        content = outside.read_bytes(path, MAX_FILE_BYTES)
+    except OutsideError as error:
+        raise ResultsError(f"{path}: {error}") from error
+    try:
+        data = outside.json_value(content)
+    except OutsideError as error:
         raise ResultsError(f"{path}: not a trajectory file: {error}") from error
     try:
         return _checked(data)
@@ -132,9 +138,9 @@ def _checked(data: Any) -> StoredTrajectory:
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise ResultsError(f"not a trajectory file: `format` is not {FORMAT!r}")
     if data.get("version") != VERSION:
-        raise ResultsError(f"version {data.get('version')!r}; this program reads {VERSION}")
+        raise ResultsError(f"version {shown(data.get('version'))}; this program reads {VERSION}")
     if set(data) != _KEYS:
-        odd = ", ".join(sorted(set(data) ^ _KEYS))
+        odd = ", ".join(map(shown, sorted(set(data) ^ _KEYS)[:10]))
         raise ResultsError(f"keys missing or unknown: {odd}")
     start = data["start"]
     if not isinstance(start, list) or len(start) != 2:
@@ -143,17 +149,35 @@ def _checked(data: Any) -> StoredTrajectory:
         raise ResultsError("figures and provenance: expected objects")
     return StoredTrajectory(
         x=_vector(data["decision"], "decision"),
-        start=np.array([_vector(row, "start", 6) for row in start]),
-        figures={name: _figure(name, value) for name, value in data["figures"].items()},
+        start=np.array([_vector(row, f"start[{i}]", 6) for i, row in enumerate(start)]),
+        figures=_figures(data["figures"]),
         provenance=data["provenance"],
         cell=archive_from_json(data["cell"]),
     )
 
 
 def _vector(value: Any, name: str, length: int | None = None) -> Array:
-    if not isinstance(value, Sequence) or (length is not None and len(value) != length):
+    if not isinstance(value, list) or (length is not None and len(value) != length):
         raise ResultsError(f"{name}: expected {length or 'an array of'} numbers")
-    return np.array([_figure(f"{name}[{k}]", entry) for k, entry in enumerate(value)])
+    if len(value) > MOST_NUMBERS:
+        raise ResultsError(f"{name}: {len(value)} numbers; allowed are {MOST_NUMBERS}")
+    numbers = np.array([_figure(f"{name}[{k}]", entry) for k, entry in enumerate(value)])
+    for k in np.flatnonzero(np.abs(numbers) > LARGEST_DECISION):
+        raise ResultsError(
+            f"{name}[{k}]: found {numbers[k]:g}; allowed is {-LARGEST_DECISION:g} to "
+            f"{LARGEST_DECISION:g}"
+        )
+    return numbers
+
+
+def _figures(figures: dict[str, Any]) -> dict[str, float]:
+    if len(figures) > MOST_NUMBERS:
+        raise ResultsError(f"figures: {len(figures)} of them; allowed are {MOST_NUMBERS}")
+    for name in figures:
+        problem = text_problem(name)
+        if problem:
+            raise ResultsError(f"figures: found the name {shown(name)}; {problem}")
+    return {name: _figure(f"figures.{name}", value) for name, value in figures.items()}
 
 
 def _figure(name: str, value: Any) -> float:
@@ -165,11 +189,7 @@ def _figure(name: str, value: Any) -> float:
             number = math.inf
         if math.isfinite(number):
             return number
-    raise ResultsError(f"{name}: found {str(value)[:60]}; expected a finite number")
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not allowed")
+    raise ResultsError(f"{name}: found {shown(value)}; expected a finite number")
 
 
 def _write(path: Path, text: str) -> None:

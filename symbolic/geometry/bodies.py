@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -13,8 +11,10 @@ import pinocchio as pin
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.pieces import Capsule, Piece, check_piece
-from symbolic.robot.urdf import arm_model, resolve_mesh
-from symbolic.workcell.records import Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
+from symbolic.robot.urdf import arm_model, link_frame, resolve_mesh
+from symbolic.robot.urdf_file import UrdfMesh, read_urdf
+from symbolic.workcell.reader import shown
+from symbolic.workcell.records import Box, Mesh, Robot, Shape, Workcell
 
 Group = Literal["robot 1", "robot 2", "payload", "environment"]
 PAYLOAD = "payload"
@@ -109,7 +109,7 @@ def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model), np.zeros(model.nv))
     joints = range(1, model.njoints)
-    flange = model.frames[model.getFrameId(robot.flange)]
+    flange = model.frames[link_frame(model, robot.flange)]
     T_flange_box = robot.T_flange_pad @ np.linalg.inv(contact.T_box_pad)
     return ArmGeometry(
         T_world_root=robot.T_world_base,
@@ -139,10 +139,9 @@ def _robot_bodies(robot: Robot, i: int) -> list[CollisionBody]:
     model = arm_model(robot)
     bodies = []
     for link, pieces in _link_pieces(robot).items():
-        if pieces:
-            frame, T = _attachment(model, link, robot, i)
-            moved = tuple(piece.moved(T) for piece in pieces)
-            bodies.append(CollisionBody(f"{robot.name}/{link}", group, frame, moved))
+        frame, T = _attachment(model, link, robot, i)
+        moved = tuple(piece.moved(T) for piece in pieces)
+        bodies.append(CollisionBody(f"{robot.name}/{link}", group, frame, moved))
     frame, T = _attachment(model, robot.flange, robot, i)
     for tool in robot.tool:
         owner = f"tool {tool.name!r} of robot {robot.name!r}"
@@ -153,7 +152,7 @@ def _robot_bodies(robot: Robot, i: int) -> list[CollisionBody]:
 
 def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Frame, Array]:
     """The frame that a link is fixed to and the link's pose in it."""
-    frame = model.frames[model.getFrameId(link)]
+    frame = model.frames[link_frame(model, link)]
     placement: Array = frame.placement.homogeneous
     if frame.parentJoint == 0:
         return WORLD, robot.T_world_base @ placement
@@ -161,63 +160,24 @@ def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Fram
 
 
 def _link_pieces(robot: Robot) -> dict[str, tuple[Piece, ...]]:
-    """The collision pieces of every link of a URDF, in the link's frame."""
-    root = ElementTree.parse(robot.urdf).getroot()
+    """The collision pieces of every link of a URDF that has any, in the link's frame."""
     links = {}
-    for link in root.iter("link"):
-        name = str(link.get("name"))
-        owner = f"link {name!r} of {robot.urdf.name}"
+    for link, collisions in read_urdf(robot.urdf).collisions.items():
+        owner = f"link {link!r} of {robot.urdf.name}"
         pieces: list[Piece] = []
-        for collision in link.findall("collision"):
-            origin = collision.find("origin")
-            pose = np.eye(4)
-            if origin is not None:
-                pose[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), 3, owner)
-                pose[:3, :3] = pin.rpy.rpyToMatrix(_numbers(origin.get("rpy", "0 0 0"), 3, owner))
-            shape = _urdf_shape(collision.find("geometry"), robot, owner)
-            pieces += shape_pieces(shape, pose, owner)
-        links[name] = tuple(pieces)
+        for collision in collisions:
+            shape = collision.shape
+            found = _located(shape, robot, owner) if isinstance(shape, UrdfMesh) else shape
+            pieces += shape_pieces(found, collision.pose, owner)
+        links[link] = tuple(pieces)
     return links
 
 
-def _urdf_shape(geometry: ElementTree.Element | None, robot: Robot, owner: str) -> Shape | Capsule:
-    element = next(iter(geometry), None) if geometry is not None else None
-    if element is None:
-        raise CollisionModelError(f"{owner}: a collision shape without geometry; add or remove it")
-    match element.tag:
-        case "box":
-            return Box(_numbers(element.get("size", ""), 3, owner))
-        case "sphere":
-            return Sphere(_number(element, "radius", owner))
-        case "cylinder":
-            return Cylinder(_number(element, "radius", owner), _number(element, "length", owner))
-        case "capsule":
-            return Capsule(_number(element, "radius", owner), _number(element, "length", owner))
-        case "mesh":
-            address = element.get("filename", "")
-            path = resolve_mesh(address, robot.urdf, robot.package_dirs)
-            if path is None:
-                looked = ", ".join(map(str, robot.package_dirs)) or "none given"
-                raise CollisionModelError(
-                    f"{owner}: mesh {address!r} not found; package folders looked in: {looked}"
-                )
-            return Mesh(Path(path), _numbers(element.get("scale", "1 1 1"), 3, owner))
-        case tag:
-            raise CollisionModelError(
-                f"{owner}: collision geometry {tag!r} is unknown; use box, cylinder, sphere, "
-                "capsule or mesh"
-            )
-
-
-def _number(element: ElementTree.Element, key: str, owner: str) -> float:
-    return float(_numbers(element.get(key, ""), 1, owner)[0])
-
-
-def _numbers(text: str, count: int, owner: str) -> Array:
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.zeros(0)
-    if len(values) != count:
-        raise CollisionModelError(f"{owner}: found {text!r} where {count} number(s) belong")
-    return values
+def _located(mesh: UrdfMesh, robot: Robot, owner: str) -> Mesh:
+    path = resolve_mesh(mesh.address, robot.urdf, robot.package_dirs)
+    if path is None:
+        looked = ", ".join(map(str, robot.package_dirs)) or "none given"
+        raise CollisionModelError(
+            f"{owner}: mesh {shown(mesh.address)} not found; package folders looked in: {looked}"
+        )
+    return Mesh(path, mesh.scale)

@@ -15,7 +15,7 @@ import pinocchio
 
 from symbolic.array import Array
 from symbolic.robot import bridge
-from symbolic.robot.urdf import N_JOINTS, arm_model
+from symbolic.robot.urdf import N_JOINTS, arm_model, link_frame
 from symbolic.workcell.records import Robot
 
 
@@ -45,7 +45,7 @@ class RobotModel:
     @property
     def flange_id(self) -> int:
         """Index of the flange among the frames of `model`."""
-        return int(self.model.getFrameId(self.flange))
+        return link_frame(self.model, self.flange)
 
     @cached_property
     def kinematics(self) -> casadi.Function:

@@ -1,33 +1,22 @@
-"""A robot's URDF as a serial arm of six revolute joints, and the files the URDF names."""
+"""A robot's URDF as a serial arm of six revolute joints, and the files the URDF names.
+
+`symbolic.robot.urdf_file` reads and checks the file.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pinocchio as pin
 
 from symbolic.errors import RobotModelError
+from symbolic.robot.urdf_file import read_urdf
 from symbolic.workcell.reader import suggestion
 from symbolic.workcell.records import Robot
 
 N_JOINTS = 6
-
-
-@dataclass(frozen=True)
-class UrdfContent:
-    """What a URDF says about shapes.
-
-    Attributes:
-        collision_links: links that have a collision shape.
-        collision_meshes, visual_meshes: mesh addresses as written.
-    """
-
-    collision_links: tuple[str, ...]
-    collision_meshes: tuple[str, ...]
-    visual_meshes: tuple[str, ...]
 
 
 def reduced_model(urdf: Path, locked_joints: Iterable[tuple[str, float]] = ()) -> pin.Model:
@@ -38,10 +27,11 @@ def reduced_model(urdf: Path, locked_joints: Iterable[tuple[str, float]] = ()) -
         locked_joints: names of single-axis joints and their positions [rad or m].
 
     Raises:
-        RobotModelError: the file cannot be read as a URDF, or a locked joint does not exist.
+        UrdfError: the file cannot be read, or something in it is wrong.
+        RobotModelError: a locked joint does not exist.
     """
     try:
-        model = pin.buildModelFromUrdf(str(urdf))
+        model = pin.buildModelFromXML(read_urdf(urdf).kinematics)
     except (ValueError, RuntimeError, IndexError) as error:
         raise RobotModelError(f"Pinocchio cannot read {urdf.name}: {_first_line(error)}") from error
     configuration = pin.neutral(model)
@@ -111,25 +101,9 @@ def flange_problem(model: pin.Model, flange: str) -> str:
     return ""
 
 
-def read_urdf_content(urdf: Path) -> UrdfContent:
-    """The links with collision shapes and the mesh files that a URDF names.
-
-    Raises:
-        RobotModelError: the file is not XML.
-    """
-    try:
-        root = ElementTree.parse(urdf).getroot()
-    except (ElementTree.ParseError, OSError, ValueError) as error:
-        raise RobotModelError(f"{urdf.name} is not readable XML: {_first_line(error)}") from error
-    return UrdfContent(
-        collision_links=tuple(
-            str(link.get("name"))
-            for link in root.iter("link")
-            if link.find("collision") is not None
-        ),
-        collision_meshes=_meshes(root, "collision"),
-        visual_meshes=_meshes(root, "visual"),
-    )
+def link_frame(model: pin.Model, link: str) -> int:
+    """Index of a link's frame; a joint may have the same name."""
+    return int(model.getFrameId(link, pin.FrameType.BODY))
 
 
 def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
@@ -143,12 +117,9 @@ def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path
         candidates = [folder / rest for folder in package_dirs]
     else:
         candidates = [urdf.parent / address.removeprefix("file://")]
-    return next((candidate.resolve() for candidate in candidates if candidate.is_file()), None)
-
-
-def _meshes(root: ElementTree.Element, kind: str) -> tuple[str, ...]:
-    found = (mesh.get("filename", "") for mesh in root.findall(f"link/{kind}/geometry/mesh"))
-    return tuple(dict.fromkeys(found))
+    return next(
+        (candidate.resolve() for candidate in candidates if os.path.exists(candidate)), None
+    )
 
 
 def _carried_by_last(model: pin.Model, frame: pin.Frame) -> bool:

@@ -21,14 +21,16 @@ from typing import Any
 
 import numpy as np
 
+from symbolic import outside
 from symbolic.errors import BundleError, DualArmError, RobotModelError
-from symbolic.robot.urdf import read_urdf_content
+from symbolic.robot.urdf_file import read_urdf
 from symbolic.workcell.file import load
+from symbolic.workcell.reader import shown
 from symbolic.workcell.records import Workcell
 from symbolic.workcell.references import CellCollector, joined, parse_toml, references
 
 MAX_FILES = 1000
-MAX_TOTAL_BYTES = 256 * 2**20
+MAX_TOTAL_BYTES = outside.CELL_BYTES
 MAX_PLAIN_BYTES = 256 * 2**10
 """Text up to this size is stored as it is, anything else compressed."""
 
@@ -105,7 +107,12 @@ def unpack_cell(archive: CellArchive, folder: Path, check_digest: bool = True) -
     for name in (*archive.files, *archive.folders, archive.workcell):
         _check_name(name)
     for name in archive.folders:
-        (root / name).mkdir(parents=True, exist_ok=True)
+        try:
+            (root / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BundleError(
+                f"stored folder {shown(name)} cannot be unpacked ({error.strerror})"
+            ) from error
     for name, content in archive.files.items():
         target = root / name
         try:
@@ -113,7 +120,9 @@ def unpack_cell(archive: CellArchive, folder: Path, check_digest: bool = True) -
             with target.open("xb") as file:
                 file.write(content)
         except OSError as error:
-            raise BundleError(f"stored file {name!r} cannot be unpacked: {error}") from error
+            raise BundleError(
+                f"stored file {shown(name)} cannot be unpacked ({error.strerror})"
+            ) from error
     _check_references(archive, root)
     try:
         workcell = load(root / archive.workcell)
@@ -147,6 +156,8 @@ def archive_from_json(data: Any) -> CellArchive:
         raise BundleError(f"cell.files: expected 1 to {MAX_FILES} files")
     if not isinstance(folders, list) or not all(isinstance(name, str) for name in folders):
         raise BundleError("cell.folders: expected texts")
+    if len(folders) > MAX_FILES:
+        raise BundleError(f"cell.folders: expected at most {MAX_FILES} folders")
     if not isinstance(data["workcell"], str) or not isinstance(data["digest"], str):
         raise BundleError("cell.workcell and cell.digest: expected texts")
     files: dict[str, bytes] = {}
@@ -154,7 +165,7 @@ def archive_from_json(data: Any) -> CellArchive:
     for index, entry in enumerate(entries):
         name, content = _file_from_json(entry, index, room)
         if name in files:
-            raise BundleError(f"cell.files[{index}]: {name!r} is stored twice")
+            raise BundleError(f"cell.files[{index}]: {shown(name)} is stored twice")
         files[name] = content
         room -= len(content)
     if data["workcell"] not in files:
@@ -193,14 +204,16 @@ def _file_from_json(entry: Any, index: int, room: int) -> tuple[str, bytes]:
     if len(content) > room:
         raise BundleError(f"{where}: the files exceed {MAX_TOTAL_BYTES // 2**20} MiB unpacked")
     if hashlib.sha256(content).hexdigest() != entry["sha256"]:
-        raise BundleError(f"{where}: the content of {entry['path']!r} is damaged")
+        raise BundleError(f"{where}: the content of {shown(entry['path'])} is damaged")
     return entry["path"], content
 
 
 def _check_name(name: str) -> None:
     parts = name.split("/")
     if not all(_SAFE_PART.fullmatch(part) and part not in (".", "..") for part in parts):
-        raise BundleError(f"stored path {name!r} is not allowed; only plain relative paths are")
+        raise BundleError(
+            f"stored path {shown(name)} is not allowed; only plain relative paths are"
+        )
 
 
 def _check_references(archive: CellArchive, root: Path) -> None:
@@ -209,19 +222,21 @@ def _check_references(archive: CellArchive, root: Path) -> None:
     for reference, package_dirs in references(parse_toml(archive.files[archive.workcell])):
         target = joined(base, reference)
         if target not in archive.files:
-            raise BundleError(f"the stored workcell names {reference!r}, which is not stored")
+            raise BundleError(f"the stored workcell names {shown(reference)}, which is not stored")
         if package_dirs is None:
             continue
         folders = [joined(base, entry) for entry in package_dirs]
         try:
-            named = read_urdf_content(root / target)
+            named = read_urdf(root / target)
         except RobotModelError as error:
-            raise BundleError(f"the stored {target!r} is not valid: {error}") from error
+            raise BundleError(f"the stored {shown(target)} is not valid: {error}") from error
         for address in (*named.collision_meshes, *named.visual_meshes):
             relative = address.removeprefix("package://").removeprefix("file://")
             bases = folders if address.startswith("package://") else [posixpath.dirname(target)]
             if any(_leads_out(joined(folder, relative)) for folder in bases):
-                raise BundleError(f"the stored {target!r} names {address!r}, not stored with it")
+                raise BundleError(
+                    f"the stored {shown(target)} names {shown(address)}, not stored with it"
+                )
 
 
 def _leads_out(path: str) -> bool:

@@ -13,7 +13,8 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.errors import RobotModelError
 from symbolic.physics.pose import inverse, pose_matrix
-from symbolic.robot.urdf import arm_model, read_urdf_content
+from symbolic.robot.urdf import arm_model, link_frame
+from symbolic.robot.urdf_file import read_urdf
 from symbolic.workcell.reader import Problems, suggestion
 from symbolic.workcell.records import Robot, Workcell
 
@@ -32,7 +33,7 @@ def body_names(workcell: Workcell) -> dict[str, tuple[str, ...]]:
         "environment": tuple(body.name for body in workcell.environment),
     }
     for robot in workcell.robots:
-        links = read_urdf_content(robot.urdf).collision_links
+        links = read_urdf(robot.urdf).collision_links
         tools = tuple(body.name for body in robot.tool)
         names[robot.name] = tuple(f"{robot.name}/{name}" for name in (*links, *tools))
     return names
@@ -47,7 +48,7 @@ def check_names(workcell: Workcell, problems: Problems) -> None:
         path = f"robots[{index}]"
         links: list[tuple[str, str]] = []
         if problems.clean(f"{path}.urdf"):
-            content = read_urdf_content(robot.urdf)
+            content = read_urdf(robot.urdf)
             links = [(f"a link of {robot.urdf.name}", link) for link in content.collision_links]
         tools = [(f"{path}.tool[{i}].name", body.name) for i, body in enumerate(robot.tool)]
         _check_unique([*links, *tools], problems)
@@ -164,7 +165,7 @@ def stretched_length(robot: Robot) -> tuple[Array, float]:
     """
     model = arm_model(robot)
     shoulder = robot.T_world_base @ np.append(model.jointPlacements[1].translation, 1.0)
-    flange = model.frames[model.getFrameId(robot.flange)].placement.translation
+    flange = model.frames[link_frame(model, robot.flange)].placement.translation
     offsets = [model.jointPlacements[joint].translation for joint in range(2, model.njoints)]
     return shoulder[:3], float(sum(np.linalg.norm(offset) for offset in [*offsets, flange]))
 

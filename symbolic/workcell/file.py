@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-from symbolic.errors import WorkcellError
-from symbolic.robot.urdf import read_urdf_content, resolve_mesh
+from symbolic import outside
+from symbolic.errors import OutsideError, WorkcellError
+from symbolic.robot.urdf import resolve_mesh
+from symbolic.robot.urdf_file import read_urdf
 from symbolic.workcell.checks import check_all
 from symbolic.workcell.reader import Problems, Table
 from symbolic.workcell.records import Body, Mesh, Robot, Workcell
@@ -32,38 +32,20 @@ def load(path: str | Path, checks: Sequence[Check] = ()) -> Workcell:
         WorkcellError: with all problems of the file, each with its key path.
     """
     path = Path(path)
-    content = _read_bytes(path)
-    data = _parse(path, content)
+    try:
+        source = outside.resolved(path)
+        content = outside.read_bytes(source, outside.WORKCELL_BYTES)
+        data = outside.toml_tables(content)
+    except OutsideError as error:
+        raise WorkcellError(str(path), (f"file: {error}",)) from error
     problems = Problems()
-    workcell = _build(Table(data, "", problems), path.resolve(), content)
+    workcell = _build(Table(data, "", problems), source, content)
     if workcell is None or problems.found:
         raise WorkcellError(str(path), problems.messages())
     further = tuple(problem for check in checks for problem in check(workcell))
     if further:
         raise WorkcellError(str(path), further)
     return workcell
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        reason = error.strerror or "it is not a file"
-        raise WorkcellError(
-            str(path), (f"file: cannot be read ({reason}); allowed is a TOML file",)
-        ) from error
-
-
-def _parse(path: Path, content: bytes) -> dict[str, Any]:
-    try:
-        return tomllib.loads(content.decode("utf-8"))
-    except UnicodeDecodeError as error:
-        problem = f"file: byte {error.start} is not UTF-8; allowed is TOML in UTF-8"
-    except tomllib.TOMLDecodeError as error:
-        problem = f"file: not valid TOML: {error}"
-    except RecursionError:
-        problem = "file: nested too deeply; allowed is the layout of docs/workcell.md"
-    raise WorkcellError(str(path), (problem,))
 
 
 def _build(table: Table, source: Path, content: bytes) -> Workcell | None:
@@ -79,6 +61,12 @@ def _build(table: Table, source: Path, content: bytes) -> Workcell | None:
     table.close()
     if len(robots) != 2 or len(contacts) != 2:
         return None
+    arms = [robot for robot, _ in robots]
+    try:
+        identity = "" if problems.found else digest(content, arms, environment)
+    except OutsideError as error:
+        problems.add("file", str(error))
+        identity = ""
     workcell = Workcell(
         name=name,
         robots=(robots[0][0], robots[1][0]),
@@ -89,7 +77,7 @@ def _build(table: Table, source: Path, content: bytes) -> Workcell | None:
         collision=collision,
         start_branch=(robots[0][1], robots[1][1]),
         source=source,
-        digest="" if problems.found else digest(content, [r for r, _ in robots], environment),
+        digest=identity,
     )
     check_all(workcell, problems)
     return workcell
@@ -100,18 +88,41 @@ def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Body])
 
     Where the files stand does not matter, only what is in them: the file's own bytes, per robot
     its URDF and the meshes the URDF names, and the meshes of tools and environment, in order.
+
+    Raises:
+        OutsideError: one of them cannot be read, or together they are too large.
     """
-    parts = [content]
-    for robot in robots:
-        parts.append(robot.urdf.read_bytes())
-        urdf = read_urdf_content(robot.urdf)
-        for address in (*urdf.collision_meshes, *urdf.visual_meshes):
-            mesh = resolve_mesh(address, robot.urdf, robot.package_dirs)
-            parts.append(b"" if mesh is None else mesh.read_bytes())
-    bodies = (*(body for robot in robots for body in robot.tool), *environment)
-    shapes = (body.shape for body in bodies)
-    parts.extend(shape.path.read_bytes() for shape in shapes if isinstance(shape, Mesh))
-    outer = hashlib.sha256()
-    for part in parts:  # fixed-length inner digests keep the parts apart
+    outer = hashlib.sha256(hashlib.sha256(content).digest())
+    room = outside.CELL_BYTES
+    # Fixed-length inner digests keep the parts apart.
+    for path, most in _named(robots, environment):
+        part = b"" if path is None else _content(path, most)
+        room -= len(part)
+        if room < 0:
+            raise OutsideError(
+                "the files that it names are together larger than "
+                f"{outside.megabytes(outside.CELL_BYTES)}; simplify the meshes"
+            )
         outer.update(hashlib.sha256(part).digest())
     return outer.hexdigest()
+
+
+def _content(path: Path, most: int) -> bytes:
+    try:
+        return outside.read_bytes(path, most)
+    except OutsideError as error:
+        raise OutsideError(f"names {path.name}, which {error}") from error
+
+
+def _named(
+    robots: Sequence[Robot], environment: Sequence[Body]
+) -> Iterator[tuple[Path | None, int]]:
+    """Every file that a workcell names, None for a missing one, and its largest size."""
+    for robot in robots:
+        yield robot.urdf, outside.URDF_BYTES
+        urdf = read_urdf(robot.urdf)
+        for address in (*urdf.collision_meshes, *urdf.visual_meshes):
+            yield resolve_mesh(address, robot.urdf, robot.package_dirs), outside.MESH_BYTES
+    for body in (*(body for robot in robots for body in robot.tool), *environment):
+        if isinstance(body.shape, Mesh):
+            yield body.shape.path, outside.MESH_BYTES

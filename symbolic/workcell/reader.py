@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+import reprlib
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +20,14 @@ import numpy as np
 from symbolic.array import Array
 
 MAX_NAME_LENGTH = 80
+MOST_PROBLEMS = 100
+"""So many problems of a file are told, the rest is counted."""
+
+MOST_UNKNOWN = 10
+"""So many unknown keys of one table are told."""
+
+LONGEST_WORD = 200
+"""Longest word for which a similar one is looked for."""
 
 
 @dataclass(frozen=True)
@@ -27,27 +36,22 @@ class Quantity:
 
     Attributes:
         unit: SI unit, empty for a pure number.
-        low, high: allowed range, ends included unless `low_open`.
-        low_open: whether `low` itself is excluded.
+        low, high: allowed range, ends included.
         mistaken: units that people write by mistake, each (name, factor to `unit`).
     """
 
     unit: str
     low: float
     high: float
-    low_open: bool = False
     mistaken: tuple[tuple[str, float], ...] = ()
 
     def contains(self, value: float) -> bool:
         """Whether the value is finite and within the range."""
-        above = value > self.low if self.low_open else value >= self.low
-        return math.isfinite(value) and above and value <= self.high
+        return math.isfinite(value) and self.low <= value <= self.high
 
     def allowed(self) -> str:
         """The range in words."""
         unit = f" {self.unit}" if self.unit else ""
-        if self.low_open:
-            return f"more than {self.low:g} up to {self.high:g}{unit}"
         return f"{self.low:g} to {self.high:g}{unit}"
 
     def suspicion(self, value: float) -> str:
@@ -67,9 +71,17 @@ class Problems:
 
     found: list[tuple[str, str]] = field(default_factory=list)
 
+    uncounted: int = 0
+
     def add(self, path: str, text: str) -> None:
-        """Record that the value at `path` is wrong; `text` says what is found and allowed."""
-        self.found.append((path, text))
+        """Record that the value at `path` is wrong; `text` says what is found and allowed.
+
+        After `MOST_PROBLEMS` they are only counted.
+        """
+        if len(self.found) < MOST_PROBLEMS:
+            self.found.append((path, text))
+        else:
+            self.uncounted += 1
 
     def clean(self, *prefixes: str) -> bool:
         """Whether nothing was found at, below or above any of these key paths."""
@@ -80,8 +92,9 @@ class Problems:
         )
 
     def messages(self) -> tuple[str, ...]:
-        """All problems as `key.path: text`."""
-        return tuple(f"{path}: {text}" for path, text in self.found)
+        """All problems as `key.path: text`, and how many more there are."""
+        told = tuple(f"{path}: {text}" for path, text in self.found)
+        return (*told, f"and {self.uncounted} more") if self.uncounted else told
 
 
 def _is_within(path: str, prefix: str) -> bool:
@@ -97,14 +110,29 @@ def read_only(values: Any) -> Array:
 
 def suggestion(word: str, candidates: Iterable[str]) -> str:
     """A 'did you mean' for a misspelt word, or an empty string."""
+    if len(word) > LONGEST_WORD:
+        return ""
     close = difflib.get_close_matches(word, list(candidates), n=1, cutoff=0.6)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def shown(value: Any) -> str:
     """A value as a short single line for a message, control characters escaped."""
-    text = repr(value)
+    text = _short.repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+class _Short(reprlib.Repr):
+    """Looks only as far into a value as a message can show."""
+
+    def repr_int(self, x: int, level: int) -> str:
+        """Python refuses to write out numbers of thousands of digits."""
+        return repr(x) if x.bit_length() < 200 else f"a number of {x.bit_length()} bits"
+
+
+_short = _Short()
+_short.maxlevel, _short.maxstring, _short.maxother = 4, 200, 200
+_short.maxlist = _short.maxdict = 60
 
 
 _REQUIRED: Any = object()
@@ -147,14 +175,18 @@ class Table:
 
     def close(self) -> None:
         """Record every key that nobody asked for."""
-        for key in self._data:
-            if key not in self._known:
-                hint = suggestion(key, self._known - set(self._data))
-                allowed = ", ".join(sorted(self._known))
-                self.problems.add(
-                    self.at(key if key.isprintable() else shown(key)),
-                    f"unknown key{hint or f'; allowed keys are {allowed}'}",
-                )
+        unknown = [key for key in self._data if key not in self._known]
+        allowed = ", ".join(sorted(self._known))
+        for key in unknown[:MOST_UNKNOWN]:
+            hint = suggestion(key, self._known - set(self._data))
+            self.problems.add(
+                self.at(key if key.isprintable() and len(key) <= MAX_NAME_LENGTH else shown(key)),
+                f"unknown key{hint or f'; allowed keys are {allowed}'}",
+            )
+        if len(unknown) > MOST_UNKNOWN:
+            self.problems.add(
+                self.path or "file", f"{len(unknown) - MOST_UNKNOWN} further unknown keys"
+            )
 
     def number(self, key: str, quantity: Quantity, default: float | None = None) -> float:
         """A finite number within the quantity's range."""

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import posixpath
-import tomllib
 from collections.abc import Iterator, Mapping
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from symbolic.errors import BundleError, RobotModelError
-from symbolic.robot.urdf import read_urdf_content, resolve_mesh
+from symbolic import outside
+from symbolic.errors import BundleError, OutsideError, RobotModelError
+from symbolic.robot.urdf import resolve_mesh
+from symbolic.robot.urdf_file import parse_urdf
 from symbolic.workcell.records import Workcell
 
 
@@ -19,7 +20,7 @@ class CellCollector:
 
     def __init__(self, source: Path) -> None:
         self._source = source
-        self._text = source.read_bytes().decode("utf-8")
+        self._text = outside.text(_content(source, outside.WORKCELL_BYTES))
         self._files: dict[str, bytes] = {}
         self._folders: list[str] = []
         self._moved = 0
@@ -37,7 +38,7 @@ class CellCollector:
             )
         for reference, package_dirs in references(data):
             if package_dirs is None:
-                content = (self._source.parent / reference).read_bytes()
+                content = _content(self._source.parent / reference, outside.MESH_BYTES)
                 self._files[self._place(reference)] = content
 
     def layout(self) -> tuple[str, dict[str, bytes], tuple[str, ...]]:
@@ -74,9 +75,9 @@ class CellCollector:
 
     def _with_meshes(self, path: Path, place: str, packages: list[tuple[Path, str]]) -> bytes:
         """Add the meshes of a URDF; its content with absolute addresses replaced."""
-        content = path.read_bytes()
+        content = _content(path, outside.URDF_BYTES)
         try:
-            named = read_urdf_content(path)
+            named = parse_urdf(content, path.name)
         except RobotModelError as error:
             raise BundleError(str(error)) from error
         for address in dict.fromkeys((*named.collision_meshes, *named.visual_meshes)):
@@ -85,7 +86,7 @@ class CellCollector:
                     mesh = resolve_mesh(address, path, (folder,))
                     if mesh is not None:
                         rest = address.removeprefix("package://")
-                        self._files[joined(folder_place, rest)] = mesh.read_bytes()
+                        self._files[joined(folder_place, rest)] = _content(mesh, outside.MESH_BYTES)
                         break
                 continue
             mesh = resolve_mesh(address, path, ())
@@ -99,10 +100,19 @@ class CellCollector:
                 content = _replaced(content.decode("utf-8"), address, relative, path.name).encode(
                     "utf-8"
                 )
-                self._files[moved] = mesh.read_bytes()
+                self._files[moved] = _content(mesh, outside.MESH_BYTES)
             else:
-                self._files[joined(posixpath.dirname(place), target)] = mesh.read_bytes()
+                self._files[joined(posixpath.dirname(place), target)] = _content(
+                    mesh, outside.MESH_BYTES
+                )
         return content
+
+
+def _content(path: Path, most: int) -> bytes:
+    try:
+        return outside.read_bytes(path, most)
+    except OutsideError as error:
+        raise BundleError(f"{path} {error}") from error
 
 
 def _replaced(text: str, reference: str, moved: str, file: str) -> str:
@@ -128,9 +138,9 @@ def parse_toml(content: bytes) -> dict[str, Any]:
         BundleError: it is not TOML.
     """
     try:
-        return tomllib.loads(content.decode("utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise BundleError(f"the stored workcell is not valid TOML: {error}") from error
+        return outside.toml_tables(content)
+    except OutsideError as error:
+        raise BundleError(f"the stored workcell: {error}") from error
 
 
 def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]]:

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
+from symbolic import outside
 from symbolic.array import Array
-from symbolic.errors import RobotModelError
+from symbolic.errors import OutsideError, RobotModelError, UrdfError
 from symbolic.robot.urdf import (
     N_JOINTS,
-    UrdfContent,
     flange_problem,
-    read_urdf_content,
     reduced_model,
     resolve_mesh,
     structure_problem,
 )
+from symbolic.robot.urdf_file import read_urdf
 from symbolic.workcell import quantities as quantity
 from symbolic.workcell.reader import Quantity, Table, read_only, shown
 from symbolic.workcell.records import Robot
@@ -37,7 +38,7 @@ def read_robot(table: Table, folder: Path) -> tuple[Robot, int]:
     name = table.text("name")
     if "/" in name:
         problems.add(table.at("name"), f"found {name!r}; allowed is a name without '/'")
-    urdf = read_file(table, "urdf", folder)
+    urdf = read_file(table, "urdf", folder, outside.URDF_BYTES)
     package_dirs = _read_folders(table, folder)
     locked = _read_locked(table)
     flange = table.text("flange")
@@ -75,7 +76,7 @@ def _read_folders(table: Table, folder: Path) -> tuple[Path, ...]:
         return ()
     folders = []
     for index, entry in enumerate(value):
-        if not isinstance(entry, str) or "\0" in entry or not (folder / entry).is_dir():
+        if not isinstance(entry, str) or not os.path.isdir(folder / entry):
             table.problems.add(
                 f"{path}[{index}]",
                 f"found {shown(entry)}; allowed is a folder, its path relative to the workcell "
@@ -99,8 +100,11 @@ def _read_model(
     if not problems.clean(table.at("urdf"), table.at("locked_joints")):
         return None
     try:
-        read_urdf_content(urdf)  # tells bad XML better than Pinocchio does
         reduced_model(urdf)
+    except UrdfError as error:
+        for problem in error.problems:
+            problems.add(table.at("urdf"), f"{error.file}: {problem}")
+        return None
     except RobotModelError as error:
         problems.add(table.at("urdf"), str(error))
         return None
@@ -123,14 +127,20 @@ def _read_model(
 def _check_meshes(table: Table, urdf: Path, package_dirs: tuple[Path, ...]) -> None:
     if not table.problems.clean(table.at("urdf"), table.at("package_dirs")):
         return
-    content: UrdfContent = read_urdf_content(urdf)
-    for address in content.collision_meshes:
-        if resolve_mesh(address, urdf, package_dirs) is None:
+    for address in read_urdf(urdf).collision_meshes:
+        path = resolve_mesh(address, urdf, package_dirs)
+        named = f"the collision mesh {shown(address)} that it names"
+        if path is None:
             table.problems.add(
                 table.at("urdf"),
-                f"the collision mesh {shown(address)} that it names does not exist; package:// "
+                f"{named} does not exist; package:// "
                 "addresses are looked up in the folders of package_dirs, others beside the URDF",
             )
+            continue
+        try:
+            outside.require(path, outside.MESH_BYTES)
+        except OutsideError as error:
+            table.problems.add(table.at("urdf"), f"{named} {error}")
 
 
 def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array]:

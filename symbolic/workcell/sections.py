@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from symbolic import outside
 from symbolic.array import Array
+from symbolic.errors import OutsideError
 from symbolic.physics.pose import pose_matrix, transform
 from symbolic.workcell import quantities as quantity
 from symbolic.workcell.reader import Problems, Table, checked_vector, read_only, shown
@@ -56,7 +58,7 @@ def read_body(table: Table, folder: Path) -> Body:
     elif kind == "sphere":
         shape = Sphere(table.number("radius", quantity.SHAPE_SIZE))
     elif kind == "mesh":
-        path = read_file(table, "path", folder)
+        path = read_file(table, "path", folder, outside.MESH_BYTES)
         scale = table.vector("scale", (quantity.SCALE,) * 3, (1.0, 1.0, 1.0), scalar_fills=True)
         shape = Mesh(path, scale)
     if kind:  # without a kind nobody can say which keys are unknown
@@ -64,24 +66,29 @@ def read_body(table: Table, folder: Path) -> Body:
     return Body(name, shape, pose)
 
 
-def read_file(table: Table, key: str, folder: Path) -> Path:
-    """The absolute path of a file named relative to `folder`; it has to be readable."""
+def read_file(table: Table, key: str, folder: Path, most: int) -> Path:
+    """The absolute path of a file named relative to `folder`; it has to be readable.
+
+    Args:
+        table, key: where it is named.
+        folder: what its path is relative to.
+        most: its largest size [bytes].
+    """
     value = table.raw(key)
     if value is None:
         return folder
     if not isinstance(value, str) or not value or "\0" in value:
         table.problems.add(table.at(key), f"found {shown(value)}; allowed is the path of a file")
         return folder
-    path = (folder / value).resolve()
     try:
-        with path.open("rb"):
-            pass
-    except OSError as error:
+        path = outside.resolved(folder / value)
+        outside.require(path, most)
+    except OutsideError as error:
         table.problems.add(
             table.at(key),
-            f"found {shown(value)}, which cannot be read ({error.strerror}); allowed is a file, "
-            "its path relative to the workcell file",
+            f"found {shown(value)}, which {error}; paths are relative to the workcell file",
         )
+        return folder
     return path
 
 

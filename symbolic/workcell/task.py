@@ -62,10 +62,12 @@ def _waypoints(table: Table) -> list[Waypoint]:
     problems = table.problems
     if "fixed" in table:
         pose = table.vector("fixed", quantity.POSE)
-        for key in ("lower", "upper", "count"):
-            if key in table:
+        beside = [key for key in ("lower", "upper", "count") if key in table]
+        if beside:
+            for key in beside:
                 table.raw(key)
-                problems.add(table.at(key), "found beside 'fixed'; allowed is one or the other")
+            listed = " and ".join(map(repr, beside))
+            problems.add(table.at("fixed"), f"found beside {listed}; allowed is one or the other")
         table.close()
         return [Waypoint(pose, pose)]
     lower = table.vector("lower", quantity.POSE)

@@ -99,6 +99,13 @@ def test_writing_replaces_in_one_step_and_refuses_bad_values(tmp_path: Path) -> 
         ({"decision": [1.0, None]}, "decision"),
         ({"decision": [10**400]}, "finite"),
         ({"decision": 1.0}, "decision"),
+        ({"decision": [1e308]}, r"decision\[0\]: found 1e\+308; allowed is -100 to 100"),
+        ({"decision": [0.0] * 10_001}, "decision: 10001 numbers"),
+        ({"figures": {"a\u001b": 1.0}}, "control character"),
+        ({"figures": {"a" * 5000: 1.0}}, "5000 characters"),
+        ({"provenance": {"a\ud800": 1}}, "half a surrogate pair"),
+        ({"provenance": {"a": ["\udc00"]}}, "half a surrogate pair"),
+        ({"x" * 5000: 1}, "keys missing or unknown: 'xxx"),
         ({"start": [[0.0] * 6]}, "start"),
         ({"start": [[0.0] * 6, [0.0] * 5]}, "start"),
         ({"figures": []}, "figures"),
@@ -129,6 +136,8 @@ def test_a_decision_vector_of_another_cell_is_refused(tmp_path: Path) -> None:
         b"[" * 100_000,
         pickle.dumps({"format": "dual-arm-carry trajectory"}),
         b'{"a": ' + b"9" * 10_000 + b"}",
+        b'{"a": 1e999}',
+        b"[" + b"1," * 1_000_001 + b"1]",
     ],
 )
 def test_other_files_are_refused_with_their_name(content: bytes, tmp_path: Path) -> None:
@@ -148,5 +157,5 @@ def test_enormous_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("hybrid_opt.store.trajectory_file.MAX_FILE_BYTES", 100)
     path = tmp_path / "t.json"
     path.write_text(document(), encoding="utf-8")
-    with pytest.raises(ResultsError, match="larger"):
+    with pytest.raises(ResultsError, match="too large"):
         read_trajectory(path)

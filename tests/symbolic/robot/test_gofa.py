@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from symbolic.robot.urdf import flange_problem, read_urdf_content, reduced_model, structure_problem
+from symbolic.robot.urdf import flange_problem, reduced_model, structure_problem
+from symbolic.robot.urdf_file import read_urdf
 from tests.symbolic.workcell.samples import GOFA
 
 # ABB's working-range positions: joint angles [deg] -> centre of the flange [m].
@@ -91,7 +92,7 @@ def test_gravity_torque_at_full_stretch_with_payload(model: pin.Model) -> None:
 
 
 def test_every_link_has_a_shape() -> None:
-    content = read_urdf_content(GOFA)
+    content = read_urdf(GOFA)
     assert content.collision_links == ("base_link", *(f"link_{i}" for i in range(1, 7)))
     assert content.collision_meshes == content.visual_meshes == ()
 

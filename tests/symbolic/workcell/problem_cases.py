@@ -70,15 +70,22 @@ CASES: list[tuple[str, Any, str, str]] = [
     ("task.goal[2]", float("inf"), "task.goal[2]", "found inf"),
     ("robots[0].base.xyz[1]", float("-inf"), "robots[0].base.xyz[1]", "found -inf"),
     # not positive
-    ("payload.size[1]", 0.0, "payload.size[1]", "allowed is more than 0"),
-    ("payload.mass", -1.0, "payload.mass", "allowed is more than 0"),
-    ("contacts[0].friction", 0, "contacts[0].friction", "allowed is more than 0"),
-    ("contacts[0].patch_radius", 0, "contacts[0].patch_radius", "allowed is more than 0"),
-    ("environment[0].size[2]", 0, "environment[0].size[2]", "allowed is more than 0"),
-    ("robots[0].tool[0].length", -0.1, "robots[0].tool[0].length", "allowed is more than 0"),
-    ("robots[0].acceleration_max", 0, "robots[0].acceleration_max", "allowed is more than 0"),
-    ("task.reference_speed", 0, "task.reference_speed", "allowed is more than 0"),
+    ("payload.size[1]", 0.0, "payload.size[1]", "allowed is 0.001 to 5 m"),
+    ("payload.mass", -1.0, "payload.mass", "allowed is 0.001 to 500 kg"),
+    ("contacts[0].friction", 0, "contacts[0].friction", "allowed is 0.001 to 5"),
+    ("contacts[0].patch_radius", 0, "contacts[0].patch_radius", "allowed is 0.0001 to 0.5 m"),
+    ("environment[0].size[2]", 0, "environment[0].size[2]", "allowed is 1e-06 to 10 m"),
+    ("robots[0].tool[0].length", -0.1, "robots[0].tool[0].length", "allowed is 1e-06 to 10 m"),
+    (
+        "robots[0].acceleration_max",
+        0,
+        "robots[0].acceleration_max",
+        "allowed is 0.001 to 200 rad/s^2",
+    ),
+    ("task.reference_speed", 0, "task.reference_speed", "allowed is 0.001 to 10 m/s"),
     ("collision.tolerance", -0.001, "collision.tolerance", "allowed is 0 to 0.1 m"),
+    ("task.reference_speed", 1e-320, "task.reference_speed", "allowed is 0.001 to 10 m/s"),
+    ("task.samples", int("1" * 4000), "task.samples", "a number of 13285 bits"),
     # another unit
     ("payload.size[0]", 300, "payload.size[0]", "looks like mm: 300 mm are 0.3 m"),
     ("payload.mass", 10_000, "payload.mass", "looks like g: 10000 g are 10 kg"),
@@ -139,7 +146,7 @@ CASES: list[tuple[str, Any, str, str]] = [
     ),
     ("task.waypoints", [], "task.waypoints", "at least one free waypoint"),
     ("task.waypoints", [{"fixed": ZERO_POSE}], "task.waypoints", "at least one free waypoint"),
-    ("task.waypoints[0].fixed", ZERO_POSE, "task.waypoints[0].lower", "found beside 'fixed'"),
+    ("task.waypoints[0].fixed", ZERO_POSE, "task.waypoints[0].fixed", "found beside 'lower' and"),
     ("task.waypoints[0].count", 0, "task.waypoints[0].count", "whole number 1 to"),
     ("task.waypoints[0].count", 97, "task.waypoints", "found 101 poses"),
     (
@@ -200,7 +207,7 @@ CASES: list[tuple[str, Any, str, str]] = [
         "found 2 rad for joint 'joint_3', not below its upper limit",
     ),
     ("robots[0].position_lower", -1.0, "robots[0].position_lower", "an array of 6 numbers"),
-    ("robots[0].min_manipulability", 0, "robots[0].min_manipulability", "more than 0 up"),
+    ("robots[0].min_manipulability", 0, "robots[0].min_manipulability", "1e-09 to 10 m^3"),
     # other files, collision pairs
     (
         "environment[0]",

@@ -111,8 +111,8 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 UrdfChange = Callable[[str], str]
 URDF_CASES: list[tuple[str, UrdfChange, str, str]] = [
     ("not xml", lambda text: text[:200], "robots[0].urdf", "not readable XML"),
-    ("no robot", lambda _: "<a/>", "robots[0].urdf", "Pinocchio cannot read"),
-    ("no links", lambda _: "<robot name='a'/>", "robots[0].urdf", "Pinocchio cannot read"),
+    ("no robot", lambda _: "<a/>", "robots[0].urdf", "its root is <a>"),
+    ("no links", lambda _: "<robot name='a'/>", "robots[0].urdf", "has no links"),
     (
         "prismatic",
         lambda text: text.replace('"joint_4" type="revolute"', '"joint_4" type="prismatic"'),

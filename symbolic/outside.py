@@ -1,0 +1,258 @@
+"""The one door for files from outside: what is no plain file of a sensible size stays outside.
+
+Every file that the project did not write in the same breath is read here, whatever its format:
+a workcell, a URDF, a mesh, a stored result, a trajectory, an entry of the cache. A path may lead
+through symbolic links to anything; what is opened is looked at before it is read. Texts are UTF-8.
+JSON and TOML are measured (depth, number of values) before a parser builds them.
+
+The messages say what was found and what to do, but not in which file: whoever asked knows its
+name and where it was named.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from symbolic.errors import OutsideError
+
+MEBIBYTE = 2**20
+
+WORKCELL_BYTES = 1 * MEBIBYTE
+URDF_BYTES = 16 * MEBIBYTE
+MESH_BYTES = 64 * MEBIBYTE
+CELL_BYTES = 128 * MEBIBYTE
+"""Largest workcell file, URDF, mesh, and sum of all files that one workcell names."""
+
+MOST_VALUES = 1_000_000
+"""Most values of one JSON document: each takes up to about 200 bytes once it is read."""
+
+MOST_DEPTH = 50
+"""Deepest nesting of JSON and TOML values."""
+
+_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISSOCK, "a socket"),
+)
+_STRING_OR_BRACKET = re.compile(r'"(?:[^"\\]++|\\.)*+"?|[\[{]|[\]}]', re.DOTALL)
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+_KEY_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![\w\"'-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{MOST_DEPTH},}}")
+
+
+def resolved(path: Path) -> Path:
+    """The absolute path of an existing file, symbolic links followed.
+
+    Raises:
+        OutsideError: there is none, or the links lead in a circle.
+    """
+    try:
+        return path.resolve(strict=True)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise OutsideError(f"cannot be read ({_reason(error)})") from error
+
+
+def read_bytes(path: Path, most: int) -> bytes:
+    """A regular file's content.
+
+    Args:
+        path: the file, or a symbolic link to it.
+        most: largest size that is taken [bytes].
+
+    Raises:
+        OutsideError: it cannot be read, is no regular file, or is larger.
+    """
+    with _opened(path) as handle:
+        return _content(handle, most)
+
+
+def require(path: Path, most: int) -> None:
+    """Refuse a file that `read_bytes` would refuse, without reading it.
+
+    Raises:
+        OutsideError: see `read_bytes`.
+    """
+    with _opened(path) as handle:
+        _require_regular(os.fstat(handle), most)
+
+
+def text(content: bytes) -> str:
+    """Content as text.
+
+    Raises:
+        OutsideError: it is not UTF-8.
+    """
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise OutsideError(
+            f"byte {error.start} is not UTF-8; allowed is text in UTF-8, save it so"
+        ) from error
+
+
+def json_value(content: bytes) -> Any:
+    """The value of a JSON document, every number finite and every text printable as UTF-8.
+
+    Raises:
+        OutsideError: it is not JSON, nested too deeply, holds too many values, a number that is
+            not finite, or half a surrogate pair.
+    """
+    count = sum(content.count(mark) for mark in (b",", b"[", b"{"))
+    # Quotation marks within texts count as well, so there may be more of them.
+    if count > MOST_VALUES or content.count(b'"') > 8 * MOST_VALUES:
+        raise OutsideError(f"holds more than {MOST_VALUES} values; allowed are so many")
+    found = text(content)
+    depth = _json_depth(found)
+    if depth > MOST_DEPTH:
+        raise OutsideError(f"nested {depth} deep; allowed is {MOST_DEPTH}")
+    try:
+        value = json.loads(found, parse_constant=_refuse_constant, parse_float=_finite)
+    except ValueError as error:
+        raise OutsideError(f"not JSON: {_one_line(error)}") from error
+    if _SURROGATE.search(found):
+        _refuse_surrogates(value)
+    return value
+
+
+def toml_tables(content: bytes) -> dict[str, Any]:
+    """The tables of a TOML document.
+
+    Raises:
+        OutsideError: it is not TOML or nested too deeply.
+    """
+    found = text(content)
+    if found.startswith("\ufeff"):
+        raise OutsideError("begins with a byte order mark; save it as UTF-8 without one")
+    if _LONG_KEY.search(found):
+        raise OutsideError(f"a key of more than {MOST_DEPTH} parts; {_TOO_DEEP}")
+    try:
+        tables = tomllib.loads(found)
+    except RecursionError as error:
+        raise OutsideError(_TOO_DEEP) from error
+    except ValueError as error:  # also from numbers with too many digits
+        raise OutsideError(f"not valid TOML: {_one_line(error)}") from error
+    if _depth(tables) > MOST_DEPTH:
+        raise OutsideError(_TOO_DEEP)
+    return tables
+
+
+_TOO_DEEP = f"nested too deeply; allowed is a depth of {MOST_DEPTH}"
+
+
+def megabytes(size: float) -> str:
+    """A size in words people compare with their file manager."""
+    return f"{size / MEBIBYTE:.3g} MiB"
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    try:
+        # Without O_NONBLOCK the opening of a pipe would wait for somebody to write to it.
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+        try:
+            yield handle
+        finally:
+            os.close(handle)
+    except (OSError, ValueError) as error:
+        raise OutsideError(f"cannot be read ({_reason(error)})") from error
+
+
+def _require_regular(found: os.stat_result, most: int) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        kind = next((name for test, name in _KINDS if test(found.st_mode)), "no regular file")
+        raise OutsideError(f"cannot be read (it is {kind}); allowed is a regular file")
+    if found.st_size > most:
+        raise OutsideError(
+            f"is too large ({megabytes(found.st_size)}); allowed are {megabytes(most)}"
+        )
+
+
+def _content(handle: int, most: int) -> bytes:
+    found = os.fstat(handle)
+    _require_regular(found, most)
+    content = bytearray()
+    # A file may grow meanwhile, and some of /proc do not tell their size.
+    while len(content) <= most and (part := os.read(handle, min(found.st_size + 1, 2**24))):
+        content += part
+    if len(content) > most:
+        raise OutsideError(f"is too large; allowed are {megabytes(most)}")
+    return bytes(content)
+
+
+def _json_depth(document: str) -> int:
+    depth = deepest = 0
+    for match in _STRING_OR_BRACKET.finditer(document):
+        mark = document[match.start()]
+        if mark in "[{":
+            depth += 1
+            deepest = max(deepest, depth)
+        elif mark in "]}":
+            depth -= 1
+    return deepest
+
+
+def _depth(value: Any) -> int:
+    """Depth of nested tables and arrays, without recursion."""
+    level, layer = 0, [value]
+    while layer:
+        level += 1
+        layer = [
+            inner
+            for outer in layer
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+            if isinstance(inner, dict | list)
+        ]
+    return level
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _finite(digits: str) -> float:
+    number = float(digits)
+    if math.isinf(number):
+        raise ValueError(f"{digits[:60]} is no finite number")
+    return number
+
+
+def _refuse_surrogates(value: Any) -> None:
+    """A text that no file and no terminal can hold would only be found out when it is written."""
+    left = [value]
+    while left:
+        one = left.pop()
+        if isinstance(one, dict):
+            left += [*one.keys(), *one.values()]
+        elif isinstance(one, list):
+            left += one
+        elif isinstance(one, str) and not one.isascii():
+            try:
+                one.encode("utf-8")
+            except UnicodeEncodeError as error:
+                raise OutsideError(
+                    f"the text {ascii(one)[:60]} holds half a surrogate pair; write the character"
+                ) from error
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return _one_line(error) or "it is not a file"
+
+
+def _one_line(error: Exception) -> str:
+    found = (str(error).splitlines() or [""])[0]
+    if found.startswith("Exceeds the limit"):
+        return "a whole number of more than 4300 digits"
+    return found if len(found) <= 200 else f"{found[:197]}..."

@@ -1,0 +1,280 @@
+"""A URDF file as checked records, before any other library sees it.
+
+What is taken over is what this project uses: the tree of links and joints, masses and inertias,
+collision shapes, and the addresses of meshes. Everything taken is checked here, each problem with
+its element and attribute; everything else in the file is left alone. Pinocchio is given
+`Urdf.kinematics`, which holds nothing that was not checked.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import MappingProxyType
+from xml.etree import ElementTree
+
+import numpy as np
+
+from symbolic import outside
+from symbolic.array import Array
+from symbolic.errors import OutsideError, UrdfError
+from symbolic.geometry.pieces import Capsule
+from symbolic.physics.pose import pose_matrix
+from symbolic.robot.urdf_elements import Part, parse_elements
+from symbolic.robot.urdf_tree import tree_problem
+from symbolic.workcell import quantities as quantity
+from symbolic.workcell.reader import Problems, read_only, shown
+from symbolic.workcell.records import Box, Cylinder, Sphere
+
+MOST_LINKS = 500
+JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+SMALLEST_AXIS = 1e-6
+LARGEST_GYRATION = 10.0
+"""No inertia is larger than that of its mass at this distance [m]."""
+
+INERTIA_SLACK = 1e-6
+"""Published inertias are rounded, and those of small covers often wrong by more than they are: so
+much below zero a principal moment may lie [kg m^2]; a hundredth of it at larger ones."""
+
+_DECLARED = re.compile(r"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([^"']*)["']""")
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+@dataclass(frozen=True)
+class UrdfMesh:
+    """A mesh by its address as written; scale: (3,) factor per axis."""
+
+    address: str
+    scale: Array
+
+
+@dataclass(frozen=True)
+class UrdfCollision:
+    """A collision shape of a link; pose: (4, 4) in the link's frame."""
+
+    shape: Box | Cylinder | Sphere | Capsule | UrdfMesh
+    pose: Array
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """What a URDF file says, checked.
+
+    Attributes:
+        file: the file's name, without its folder.
+        collisions: by link that has any, in the order of the file.
+        collision_meshes, visual_meshes: mesh addresses as written, each once.
+        kinematics: URDF text of links with their inertias and of joints, nothing else.
+    """
+
+    file: str
+    collisions: Mapping[str, tuple[UrdfCollision, ...]]
+    collision_meshes: tuple[str, ...]
+    visual_meshes: tuple[str, ...]
+    kinematics: str
+
+    @property
+    def collision_links(self) -> tuple[str, ...]:
+        """Links that have a collision shape."""
+        return tuple(self.collisions)
+
+
+def read_urdf(path: Path) -> Urdf:
+    """Read and check a URDF file.
+
+    Raises:
+        UrdfError: the file cannot be read, is no XML in UTF-8, or an element of it is wrong; every
+            problem with its element and attribute.
+    """
+    try:
+        content = outside.read_bytes(path, outside.URDF_BYTES)
+    except OutsideError as error:
+        raise UrdfError(path.name, (str(error),)) from error
+    return parse_urdf(content, path.name)
+
+
+@lru_cache(maxsize=8)
+def parse_urdf(content: bytes, file: str) -> Urdf:
+    """The records of a URDF's content; `file` names it in messages.
+
+    Raises:
+        UrdfError: see `read_urdf`.
+    """
+    problems = Problems()
+    try:
+        root = parse_elements(_decoded(content))
+        urdf = _read(Part(root, "", problems), file)
+    except OutsideError as error:
+        raise UrdfError(file, (str(error),)) from error
+    if problems.found:
+        raise UrdfError(file, problems.messages())
+    return urdf
+
+
+def _decoded(content: bytes) -> str:
+    document = outside.text(content).removeprefix("\ufeff")
+    declared = _DECLARED.match(document[:1000])
+    if declared and declared[1].lower() not in ("utf-8", "utf8", "us-ascii", "ascii"):
+        raise OutsideError(
+            f"declares the encoding {shown(declared[1])}; allowed is UTF-8, save it so and declare "
+            'encoding="utf-8"'
+        )
+    return document
+
+
+def _read(root: Part, file: str) -> Urdf:
+    links = root.named("link")
+    joints = root.named("joint")
+    if len(links) > MOST_LINKS:
+        raise OutsideError(
+            f"has {len(links)} links; allowed are {MOST_LINKS}: remove what the arm does not need"
+        )
+    reduced = ElementTree.Element("robot", {"name": "robot"})
+    for name, link in links.items():
+        element = ElementTree.SubElement(reduced, "link", {"name": name})
+        element.extend(_inertial(link))
+    ends: dict[str, tuple[str, str]] = {}
+    for name, joint in joints.items():
+        reduced.append(_joint(joint, name, ends))
+    if root.problems.clean():
+        problem = tree_problem(tuple(links), ends)
+        if problem:
+            root.problems.add(*problem)
+    collisions = {
+        name: tuple(map(_collision, link.all("collision"))) for name, link in links.items()
+    }
+    return Urdf(
+        file=file,
+        collisions=MappingProxyType({name: found for name, found in collisions.items() if found}),
+        collision_meshes=tuple(
+            dict.fromkeys(
+                shape.shape.address
+                for found in collisions.values()
+                for shape in found
+                if isinstance(shape.shape, UrdfMesh)
+            )
+        ),
+        visual_meshes=_visual_meshes(links),
+        kinematics=ElementTree.tostring(reduced, encoding="unicode"),
+    )
+
+
+def _inertial(link: Part) -> list[ElementTree.Element]:
+    """The checked inertial element of a link, if it has one."""
+    inertial = link.child("inertial")
+    if inertial is None:
+        return []
+    kept = ElementTree.Element("inertial")
+    kept.extend(_origin(inertial))
+    mass_part = inertial.required("mass")
+    mass = mass_part.number("value", quantity.LINK_MASS)
+    matrix = inertial.required("inertia")
+    values = {key: matrix.number(key, quantity.INERTIA) for key in _MOMENTS}
+    if inertial.problems.clean(mass_part.path, matrix.path):
+        xx, xy, xz, yy, yz, zz = values.values()
+        problem = _inertia_problem(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), mass)
+        if problem:
+            inertial.problems.add(matrix.path, problem)
+    ElementTree.SubElement(kept, "mass", mass_part.written("value"))
+    ElementTree.SubElement(kept, "inertia", matrix.written(*_MOMENTS))
+    return [kept]
+
+
+def _inertia_problem(inertia: Array, mass: float) -> str:
+    moments = np.linalg.eigvalsh(inertia)
+    listed = ", ".join(f"{moment:.6g}" for moment in moments)
+    if moments[0] < -max(INERTIA_SLACK, 0.01 * moments[2]):
+        return f"found principal moments {listed} kg m^2; allowed are none below zero"
+    if moments[2] > mass * LARGEST_GYRATION**2 + INERTIA_SLACK:
+        return (
+            f"found a principal moment of {moments[2]:.6g} kg m^2 with a mass of {mass:g} kg; "
+            f"allowed is at most that mass times ({LARGEST_GYRATION:g} m)^2 (are the units kg m^2?)"
+        )
+    return ""
+
+
+def _joint(joint: Part, name: str, ends: dict[str, tuple[str, str]]) -> ElementTree.Element:
+    """The checked element of a joint; its parent and child are added to `ends`."""
+    kind = joint.choice("type", JOINT_TYPES)
+    kept = ElementTree.Element("joint", {"name": name, "type": kind})
+    parent, child = joint.required("parent"), joint.required("child")
+    ends[name] = (parent.text("link"), child.text("link"))
+    kept.extend(_origin(joint))
+    ElementTree.SubElement(kept, "parent", parent.written("link"))
+    ElementTree.SubElement(kept, "child", child.written("link"))
+    axis = joint.child("axis")
+    if axis is not None and kind not in ("fixed", "floating"):
+        direction = axis.numbers("xyz", (quantity.DIRECTION,) * 3)
+        if axis.problems.clean(axis.path) and np.linalg.norm(direction) < SMALLEST_AXIS:
+            axis.problems.add(
+                f"{axis.path} xyz",
+                f"found {shown(axis.raw('xyz'))}, an axis without length; allowed is a direction "
+                "such as '0 0 1'",
+            )
+        ElementTree.SubElement(kept, "axis", axis.written("xyz"))
+    limit = joint.child("limit")
+    if kind in ("revolute", "prismatic"):
+        limit = joint.required("limit")
+    if limit is not None:
+        for key, default in (("lower", "0"), ("upper", "0"), ("effort", None), ("velocity", None)):
+            limit.number(key, quantity.JOINT_LIMIT, default)
+        keys = ("lower", "upper", "effort", "velocity")
+        ElementTree.SubElement(kept, "limit", limit.written(*keys))
+    dynamics = joint.child("dynamics")
+    if dynamics is not None:
+        for key in ("damping", "friction"):
+            dynamics.number(key, quantity.JOINT_LIMIT, "0")
+        ElementTree.SubElement(kept, "dynamics", dynamics.written("damping", "friction"))
+    return kept
+
+
+def _origin(part: Part) -> list[ElementTree.Element]:
+    origin = part.child("origin")
+    if origin is None:
+        return []
+    _pose(part)
+    return [ElementTree.Element("origin", origin.written("xyz", "rpy"))]
+
+
+def _pose(part: Part) -> Array:
+    """(4, 4) of an element's origin; the identity where it has none."""
+    origin = part.child("origin")
+    if origin is None:
+        return read_only(np.eye(4))
+    xyz = origin.numbers("xyz", (quantity.POSITION,) * 3, "0 0 0")
+    rpy = origin.numbers("rpy", (quantity.URDF_ANGLE,) * 3, "0 0 0")
+    return read_only(pose_matrix(xyz, rpy))
+
+
+def _collision(part: Part) -> UrdfCollision:
+    pose = _pose(part)
+    shape: Box | Cylinder | Sphere | Capsule | UrdfMesh = Sphere(1.0)
+    element = part.required("geometry").only(("box", "cylinder", "sphere", "capsule", "mesh"))
+    size = quantity.SHAPE_SIZE
+    match element.tag:
+        case "box":
+            shape = Box(element.numbers("size", (size,) * 3))
+        case "sphere":
+            shape = Sphere(element.number("radius", size))
+        case "cylinder":
+            shape = Cylinder(element.number("radius", size), element.number("length", size))
+        case "capsule":
+            shape = Capsule(element.number("radius", size), element.number("length", size))
+        case "mesh":
+            scale = element.numbers("scale", (quantity.MESH_SCALE,) * 3, "1 1 1")
+            if element.problems.clean(element.path) and np.any(scale == 0.0):
+                element.problems.add(f"{element.path} scale", "is zero; allowed is none of it zero")
+            shape = UrdfMesh(element.text("filename", most=1000), scale)
+    return UrdfCollision(shape, pose)
+
+
+def _visual_meshes(links: Mapping[str, Part]) -> tuple[str, ...]:
+    found = (
+        mesh.get("filename", "")
+        for link in links.values()
+        for mesh in link.element.findall("visual/geometry/mesh")
+    )
+    return tuple(dict.fromkeys(address for address in found if address))

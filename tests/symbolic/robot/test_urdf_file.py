@@ -1,0 +1,323 @@
+"""URDF files as records: what is right is read as Pinocchio reads it, what is wrong is named."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from symbolic.errors import UrdfError
+from symbolic.robot.urdf import arm_model, link_frame, reduced_model
+from symbolic.robot.urdf_file import MOST_LINKS, UrdfMesh, parse_urdf, read_urdf
+from symbolic.workcell.records import Box, Cylinder
+from tests.robots import GOFA_URDF, robot_record, ur10_urdf
+
+GOFA = GOFA_URDF.read_text("utf-8")
+EVERY = sorted(ur10_urdf().parents[2].rglob("*.urdf"))
+# A humanoid with inertias below zero, and a file that includes others.
+REFUSED = {"romeo_laas_small.urdf": "allowed are none below zero", "ur3.urdf": "has no links"}
+
+
+@pytest.mark.parametrize("path", EVERY, ids=[path.name for path in EVERY])
+def test_published_robots_are_read_as_pinocchio_reads_them(path: Path) -> None:
+    if path.name in REFUSED:
+        with pytest.raises(UrdfError, match=REFUSED[path.name]):
+            read_urdf(path)
+        return
+    expected = pin.buildModelFromUrdf(str(path))
+    found = pin.buildModelFromXML(read_urdf(path).kinematics)
+    found.name = expected.name
+    assert found == expected
+
+
+def test_shapes_of_the_gofa_are_those_of_pinocchio() -> None:
+    model = pin.buildModelFromUrdf(str(GOFA_URDF))
+    geometry = pin.buildGeomFromUrdf(model, str(GOFA_URDF), pin.GeometryType.COLLISION)
+    urdf = read_urdf(GOFA_URDF)
+    seen = 0
+    for link, collisions in urdf.collisions.items():
+        T_joint_link = model.frames[link_frame(model, link)].placement.homogeneous
+        for index, collision in enumerate(collisions):
+            other = geometry.geometryObjects[geometry.getGeometryId(f"{link}_{index}")]
+            np.testing.assert_allclose(
+                T_joint_link @ collision.pose, other.placement.homogeneous, atol=1e-12
+            )
+            shape = collision.shape
+            if isinstance(shape, Box):
+                np.testing.assert_allclose(2.0 * other.geometry.halfSide, shape.size, atol=1e-12)
+            else:
+                assert isinstance(shape, Cylinder)
+                assert other.geometry.radius == pytest.approx(shape.radius, abs=1e-12)
+                assert 2.0 * other.geometry.halfLength == pytest.approx(shape.length, abs=1e-12)
+            seen += 1
+    assert seen == len(geometry.geometryObjects)
+
+
+def test_meshes_keep_their_address_and_scale() -> None:
+    urdf = read_urdf(ur10_urdf())
+    shapes = [found.shape for collisions in urdf.collisions.values() for found in collisions]
+    meshes = [shape for shape in shapes if isinstance(shape, UrdfMesh)]
+    assert len(meshes) == 7
+    assert urdf.collision_meshes == tuple(mesh.address for mesh in meshes)
+    assert all(address.startswith("package://") for address in urdf.collision_meshes)
+    assert all(np.array_equal(mesh.scale, np.ones(3)) for mesh in meshes)
+    assert len(urdf.visual_meshes) == 7
+
+
+def test_a_joint_may_be_named_as_a_link(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(GOFA.replace('joint name="joint_6"', 'joint name="link_6"'))
+    model = arm_model(robot_record(path))
+    assert model.frames[link_frame(model, "link_6")].type == pin.FrameType.BODY
+
+
+def swap(old: str, new: str, count: int = 1) -> Callable[[str], str]:
+    return lambda text: text.replace(old, new, count)
+
+
+MASS = '<mass value="8.411"/>'
+INERTIA = 'ixx="0.0486" ixy="0" ixz="0" iyy="0.0378" iyz="-0.0008" izz="0.0394"'
+BOX = '<box size="0.205 0.2 0.03"/>'
+LOOP = (
+    '<link name="a"/><link name="b"/>'
+    '<joint name="ab" type="fixed"><parent link="a"/><child link="b"/></joint>'
+    '<joint name="ba" type="fixed"><parent link="b"/><child link="a"/></joint></robot>'
+)
+COLLISION = (
+    '<collision>\n      <origin xyz="-0.0025 0 0.015" rpy="0 0 0"/>\n      '
+    f"<geometry>{BOX}</geometry>"
+)
+
+
+def in_collision(shape: str) -> Callable[[str], str]:
+    return swap(COLLISION, COLLISION.replace(BOX, shape))
+
+
+CASES: list[tuple[str, Callable[[str], str], str, str]] = [
+    ("mass nan", swap(MASS, '<mass value="nan"/>'), "link 'link_1'/inertial/mass value", "'nan'"),
+    (
+        "mass negative",
+        swap(MASS, '<mass value="-1"/>'),
+        "link 'link_1'/inertial/mass value",
+        "0 to 10000 kg",
+    ),
+    (
+        "mass huge",
+        swap(MASS, '<mass value="1e308"/>'),
+        "link 'link_1'/inertial/mass value",
+        "1e+308",
+    ),
+    (
+        "mass word",
+        swap(MASS, '<mass value="heavy"/>'),
+        "link 'link_1'/inertial/mass value",
+        "'heavy'",
+    ),
+    (
+        "mass underscore",
+        swap(MASS, '<mass value="1_0"/>'),
+        "link 'link_1'/inertial/mass value",
+        "'1_0'",
+    ),
+    ("mass missing", swap(MASS, ""), "link 'link_1'/inertial", "<mass> is missing"),
+    (
+        "inertia nan",
+        swap(INERTIA, INERTIA.replace("0.0486", "NaN")),
+        "link 'link_1'/inertial/inertia ixx",
+        "'NaN'",
+    ),
+    (
+        "inertia incomplete",
+        swap(INERTIA, INERTIA.replace('izz="0.0394"', "")),
+        "link 'link_1'/inertial/inertia izz",
+        "is missing",
+    ),
+    (
+        "inertia negative",
+        swap(INERTIA, INERTIA.replace("0.0486", "-0.0486")),
+        "link 'link_1'/inertial/inertia",
+        "none below zero",
+    ),
+    (
+        "inertia in kg mm^2",
+        swap(INERTIA, 'ixx="900" ixy="0" ixz="0" iyy="900" iyz="0" izz="900"'),
+        "link 'link_1'/inertial/inertia",
+        "are the units kg m^2?",
+    ),
+    (
+        "own child",
+        swap('<child link="link_3"/>', '<child link="link_2"/>'),
+        "joint 'joint_3'",
+        "same link 'link_2'",
+    ),
+    (
+        "loop beside the root",
+        swap(
+            "</robot>",
+            LOOP,
+        ),
+        "link 'a'",
+        "part of a loop",
+    ),
+    (
+        "two parents",
+        swap('<child link="link_3"/>', '<child link="link_4"/>'),
+        "joint 'joint_4'/child link",
+        "child of joint 'joint_3' already",
+    ),
+    (
+        "two roots",
+        swap("</robot>", '<link name="a"/></robot>'),
+        "robot",
+        "2 links without parent ('base_link', 'a')",
+    ),
+    (
+        "unknown link",
+        swap('<child link="link_3"/>', '<child link="lnik_3"/>'),
+        "joint 'joint_3'/child link",
+        "did you mean 'link_",
+    ),
+    (
+        "zero axis",
+        swap('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>'),
+        "joint 'joint_2'/axis xyz",
+        "an axis without length",
+    ),
+    (
+        "axis of two",
+        swap('<axis xyz="0 1 0"/>', '<axis xyz="0 1"/>'),
+        "joint 'joint_2'/axis xyz",
+        "allowed: 3 numbers",
+    ),
+    (
+        "joint type",
+        swap('"joint_4" type="revolute"', '"joint_4" type="revolut"'),
+        "joint 'joint_4' type",
+        "did you mean 'revolute'",
+    ),
+    (
+        "names twice",
+        swap('<link name="link_2">', '<link name="link_1">'),
+        "link[2] name",
+        "found 'link_1' again",
+    ),
+    ("no name", swap('<link name="link_2">', "<link>"), "link[2] name", "is missing"),
+    (
+        "shape in mm",
+        in_collision('<box size="205 200 30"/>'),
+        "link 'base_link'/collision[0]/geometry/box size[0]",
+        "205 mm are 0.205 m",
+    ),
+    (
+        "shape negative",
+        in_collision('<sphere radius="-1"/>'),
+        "link 'base_link'/collision[0]/geometry/sphere radius",
+        "found -1",
+    ),
+    (
+        "shape unknown",
+        in_collision('<cone radius="1"/>'),
+        "link 'base_link'/collision[0]/geometry",
+        "found 'cone'; allowed is one of box",
+    ),
+    ("shape empty", in_collision(""), "link 'base_link'/collision[0]/geometry", "found nothing"),
+    (
+        "mesh scaled by nan",
+        in_collision('<mesh filename="a.stl" scale="nan 1 1"/>'),
+        "link 'base_link'/collision[0]/geometry/mesh scale[0]",
+        "'nan'",
+    ),
+    (
+        "mesh scaled by zero",
+        in_collision('<mesh filename="a.stl" scale="1 0 1"/>'),
+        "link 'base_link'/collision[0]/geometry/mesh scale",
+        "none of it zero",
+    ),
+    (
+        "mesh without address",
+        in_collision("<mesh/>"),
+        "link 'base_link'/collision[0]/geometry/mesh filename",
+        "is missing",
+    ),
+    (
+        "encoding",
+        swap('encoding="utf-8"', 'encoding="ebcdic"'),
+        "declares the encoding",
+        "'ebcdic'; allowed is UTF-8",
+    ),
+    (
+        "entities",
+        swap("<robot", '<!DOCTYPE r [<!ENTITY a "b">]>\n<robot'),
+        "has a document type",
+        "remove it",
+    ),
+    (
+        "xacro",
+        swap("</robot>", '<x:a xmlns:x="http://www.ros.org/wiki/xacro"/></robot>'),
+        "holds xacro macros",
+        "expand it",
+    ),
+    (
+        "deep",
+        swap("</robot>", "<a>" * 40 + "</a>" * 40 + "</robot>"),
+        "nested too deeply",
+        "a depth of 32",
+    ),
+    ("many", swap("</robot>", "<a/>" * 100_001 + "</robot>"), "has more than 100000 elements", ""),
+]
+
+
+@pytest.mark.parametrize(
+    ("change", "place", "words"),
+    [case[1:] for case in CASES],
+    ids=[case[0] for case in CASES],
+)
+def test_what_is_wrong_is_named(change: Callable[[str], str], place: str, words: str) -> None:
+    changed = change(GOFA)
+    assert changed != GOFA
+    with pytest.raises(UrdfError) as caught:
+        parse_urdf(changed.encode(), "arm.urdf")
+    assert any(p.startswith(place) and words in p for p in caught.value.problems), caught.value
+    assert str(caught.value).startswith("arm.urdf: ")
+
+
+def test_an_origin_in_millimetres_is_told() -> None:
+    start = GOFA.index('<joint name="joint_3"')
+    changed = GOFA[:start] + GOFA[start:].replace("0 0 0.707", "0 0 707", 1)
+    with pytest.raises(UrdfError, match=r"joint 'joint_3'/origin xyz\[2\].*707 mm are 0.707 m"):
+        parse_urdf(changed.encode(), "arm.urdf")
+
+
+def chain(links: int) -> str:
+    parts = ['<robot name="chain"><link name="l0"/>']
+    for k in range(1, links):
+        parts.append(
+            f'<link name="l{k}"/><joint name="j{k}" type="fixed"><parent link="l{k - 1}"/>'
+        )
+        parts.append(f'<child link="l{k}"/></joint>')
+    return "".join([*parts, "</robot>"])
+
+
+def test_a_long_chain_is_refused_and_does_not_crash(tmp_path: Path) -> None:
+    path = tmp_path / "chain.urdf"
+    path.write_text(chain(MOST_LINKS))
+    assert reduced_model(path).njoints == 1
+    for links, words in ((MOST_LINKS + 1, "has 501 links"), (50_000, "more than 100000 elements")):
+        path.write_text(chain(links))
+        start = time.monotonic()
+        with pytest.raises(UrdfError, match=words):
+            reduced_model(path)
+        assert time.monotonic() - start < 10.0
+
+
+def test_nothing_is_said_on_the_terminal(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(GOFA.replace("</robot>", LOOP))
+    with pytest.raises(UrdfError):
+        reduced_model(path)
+    reduced_model(GOFA_URDF)
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,177 @@
+"""What may come in from outside, and that everything else is refused at once and with a reason."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import socket
+import time
+import tomllib
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from symbolic import outside
+from symbolic.errors import OutsideError
+
+MOST = 1000
+
+
+def test_a_regular_file_comes_in_also_through_links(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"content")
+    (tmp_path / "link").symlink_to(path)
+    (tmp_path / "second").symlink_to(tmp_path / "link")
+    assert outside.read_bytes(path, MOST) == b"content"
+    assert outside.read_bytes(tmp_path / "second", MOST) == b"content"
+    assert outside.resolved(tmp_path / "second") == path.resolve()
+
+
+def test_the_limit_is_exact(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"x" * MOST)
+    assert len(outside.read_bytes(path, MOST)) == MOST
+    path.write_bytes(b"x" * (MOST + 1))
+    for refuse in (outside.read_bytes, outside.require):
+        with pytest.raises(OutsideError, match=r"is too large .* allowed are"):
+            refuse(path, MOST)
+
+
+def test_a_file_that_hides_its_size_is_read_no_further() -> None:
+    maps = Path("/proc/self/maps")
+    assert maps.stat().st_size == 0
+    with pytest.raises(OutsideError, match="is too large"):
+        outside.read_bytes(maps, 10)
+    assert outside.read_bytes(maps, 10_000_000)
+
+
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(str(tmp_path / "socket"))
+        (tmp_path / "loop").symlink_to(tmp_path / "loop")
+        odd = [
+            (tmp_path / "pipe", "it is a pipe"),
+            (Path("/dev/zero"), "it is a device"),
+            (tmp_path, "it is a folder"),
+            (tmp_path / "socket", "No such device"),
+            (tmp_path / "loop", "symbolic links|Symlink loop"),
+            (tmp_path / "gone", "No such file"),
+            (tmp_path / ("x" * 5000), "File name too long"),
+            (tmp_path / "a\0b", "null byte"),
+        ]
+        start = time.monotonic()
+        for path, words in odd:
+            with pytest.raises(OutsideError, match=rf"cannot be read \(.*{words}"):
+                outside.read_bytes(path, MOST)
+        assert time.monotonic() - start < 5.0
+    for path in (tmp_path / "loop", tmp_path / "gone", tmp_path / ("x" * 5000)):
+        with pytest.raises(OutsideError, match="cannot be read"):
+            outside.resolved(path)
+
+
+def test_text_is_utf8() -> None:
+    assert outside.text("ü".encode()) == "ü"
+    with pytest.raises(OutsideError, match="byte 1 is not UTF-8"):
+        outside.text("aü".encode("latin-1"))
+
+
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@given(values, st.booleans())
+def test_json_comes_in_as_written(value: Any, ascii_only: bool) -> None:
+    content = json.dumps(value, ensure_ascii=ascii_only).encode()
+    assert outside.json_value(content) == value
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_value_or_refused(content: bytes) -> None:
+    for read in (outside.json_value, outside.toml_tables):
+        with suppress(OutsideError):
+            read(content)
+
+
+@given(values)
+def test_the_depth_is_that_of_the_value(value: Any) -> None:
+    def depth(one: Any) -> int:
+        if isinstance(one, dict):
+            return 1 + max(map(depth, one.values()), default=0)
+        if isinstance(one, list):
+            return 1 + max(map(depth, one), default=0)
+        return 0
+
+    nested = value
+    for _ in range(outside.MOST_DEPTH - depth(value)):
+        nested = [nested]
+    assert outside.json_value(json.dumps(nested).encode()) == nested
+    with pytest.raises(OutsideError, match="nested 51 deep; allowed is 50"):
+        outside.json_value(json.dumps([nested]).encode())
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "not JSON"),
+        (b"{", "not JSON"),
+        (b"NaN", "NaN is no JSON number"),
+        (b"[1e400]", "1e400 is no finite number"),
+        (b"-Infinity", "no JSON number"),
+        (b"9" * 5000, "whole number of more than 4300 digits"),
+        (b'"\\ud800"', "half a surrogate pair"),
+        (b'{"\\udfff": 1}', "half a surrogate pair"),
+        (b'[[{"a": "x\\uD800y"}]]', "half a surrogate pair"),
+        (b"[" * 100_000, "nested 100000 deep"),
+        (b"[" + b"0," * outside.MOST_VALUES + b"0]", "more than 1000000 values"),
+        (b"[" + b'"",' * 100 + b'"\xff"]', "not UTF-8"),
+    ],
+)
+def test_other_json_is_refused(content: bytes, words: str) -> None:
+    with pytest.raises(OutsideError, match=words):
+        outside.json_value(content)
+
+
+def test_whole_surrogate_pairs_and_escaped_ones_are_text() -> None:
+    assert outside.json_value(b'"\\ud83d\\ude00"') == "\U0001f600"
+    assert outside.json_value(b'"\\\\ud800"') == "\\ud800"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"a = ", "not valid TOML"),
+        (b"\xef\xbb\xbfa = 1", "byte order mark"),
+        (b"a.b = 1\na = 2", "not valid TOML"),
+        (b"a = " + b"9" * 5000, "whole number of more than 4300 digits"),
+        (b"a = " + b"[" * 100_000, "nested too deeply"),
+        (b"a = " + b"[" * 60 + b"]" * 60, "nested too deeply; allowed is a depth of 50"),
+        (b"a" + b".a" * 100_000 + b" = 1", "more than 50 parts"),
+        (b"[" + b'"a" . ' * 100_000 + b"a]", "more than 50 parts"),
+        (b"x = {" + b"'a'." * 60 + b"a = 1}", "more than 50 parts"),
+    ],
+)
+def test_other_toml_is_refused(content: bytes, words: str) -> None:
+    start = time.monotonic()
+    with pytest.raises(OutsideError, match=words):
+        outside.toml_tables(content)
+    assert time.monotonic() - start < 10.0
+
+
+def test_toml_comes_in_as_a_plain_reader_has_it() -> None:
+    content = b"# " + b"a.b, " * 100 + b"\nx = [" + b"0.1, " * 1000 + b"]\na.b.c = '...'\n"
+    found = outside.toml_tables(content)
+    assert found == tomllib.loads(content.decode())
+    assert math.isclose(sum(found["x"]), 100.0)
