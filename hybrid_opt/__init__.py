@@ -1,1 +1,73 @@
-"""Collision checking, the optimisation problem, the searches, their metrics, polish and timing."""
+"""The library. `import hybrid_opt as ho` and work with a cell; docs/library.md shows how.
+
+`Cell` is the only resource. `search` and `polish` make a `Front`, a front gives a `Carry`,
+`time_path` makes a `Timing` of it, and `export` writes that for robots. Rooms, in the order of the
+data: evaluate, collision, metaheuristics, indicators, polishing, timing, store; work and campaign
+carry out whole studies; display is how objects look in a notebook.
+
+Names are imported when they are first used, so that `import hybrid_opt` takes no time.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hybrid_opt.carry import Carry
+    from hybrid_opt.cell import Cell
+    from hybrid_opt.door import SearchSettings, polish, save, search, time_every_way, time_path
+    from hybrid_opt.evaluate.objectives import Objective
+    from hybrid_opt.front import Front
+    from hybrid_opt.polishing.records import PolishSettings
+    from hybrid_opt.store.export.formats import export
+    from hybrid_opt.timing.records import Timing, TimingLimits
+    from symbolic.errors import DualArmError
+
+__all__ = [
+    "Carry",
+    "Cell",
+    "DualArmError",
+    "Front",
+    "Objective",
+    "PolishSettings",
+    "SearchSettings",
+    "Timing",
+    "TimingLimits",
+    "export",
+    "polish",
+    "save",
+    "search",
+    "time_every_way",
+    "time_path",
+]
+
+_HOMES = {
+    "Carry": "hybrid_opt.carry",
+    "Cell": "hybrid_opt.cell",
+    "DualArmError": "symbolic.errors",
+    "Front": "hybrid_opt.front",
+    "Objective": "hybrid_opt.evaluate.objectives",
+    "PolishSettings": "hybrid_opt.polishing.records",
+    "SearchSettings": "hybrid_opt.door",
+    "Timing": "hybrid_opt.timing.records",
+    "TimingLimits": "hybrid_opt.timing.records",
+    "export": "hybrid_opt.store.export.formats",
+    "polish": "hybrid_opt.door",
+    "save": "hybrid_opt.door",
+    "search": "hybrid_opt.door",
+    "time_every_way": "hybrid_opt.door",
+    "time_path": "hybrid_opt.door",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'hybrid_opt' has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

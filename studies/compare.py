@@ -21,7 +21,7 @@ from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign,
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
-from studies.summary import reference_front, reference_point
+from studies.summary import reference_front
 from studies.terminal_summary import title
 from symbolic.array import Array
 from symbolic.errors import DualArmError
@@ -141,7 +141,7 @@ def _searched(replica: Replica, reference: Array) -> dict[str, float]:
     return {
         "feasible_share": metrics.feasible_share(replica.evaluations.feasible),
         "non_dominated": float(len(front)),
-        "hypervolume": metrics.hypervolume(front, reference_point(reference.shape[1])),
+        "hypervolume": metrics.hypervolume(front, metrics.reference_point(reference.shape[1])),
         "igd": metrics.igd(front, reference),
         "spacing": metrics.spacing(front),
     }

@@ -10,12 +10,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from hybrid_opt.store.export import FORMATS, export_trajectory, sample_trajectory
+from hybrid_opt.store.export import FORMATS, export
 from hybrid_opt.store.replay import Replay, replay
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
-from hybrid_opt.timing import TimingModel
-from studies.timing_stage import timed_trajectory
-from studies.timing_text import timings
+from hybrid_opt.timing import TimingModel, timed_trajectory
+from studies.timing_text import timing_json, timing_text
 from symbolic.errors import DualArmError, SettingsError
 
 TIMINGS = {"closest": "closest to reference", "fastest": "fastest", "force": "force limited"}
@@ -91,23 +90,14 @@ def _time(
     if options.use == "force" and options.export and options.force_limit is None:
         raise SettingsError("--use force needs --force-limit")
     timed = timed_trajectory(model, stored.x, options.force_limit, options.force_curve)
-    document, text = timed.document(), timed.text()
+    document, text = timing_json(timed), timing_text(timed)
     if options.export:
-        timing = timings(timed.report)[TIMINGS[options.use]]
-        step = options.step if options.step is not None else DEFAULT_STEP[options.export]
-        paths = export_trajectory(
-            sample_trajectory(model, timing, step),
-            options.export,
-            options.output,
-            Path(options.file).stem,
-        )
+        timing = timed.report.timings[TIMINGS[options.use]]
+        stem = Path(options.file).stem
+        paths = export(timing, options.export, options.output, stem, options.step)
         document["exported"] = [str(path) for path in paths]
         text += "\n\nExported " + ", ".join(str(path) for path in paths)
     return document, text
-
-
-DEFAULT_STEP = {"csv": 0.01, "json": 0.01, "ros2": 0.02, "rapid": 0.1}
-"""Time step [s] where none is given."""
 
 
 def _replay_json(stored: StoredTrajectory, replayed: Replay) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def front_figures(front: Array, reference: Array) -> dict[str, Any]:
     """Indicators of a front's objectives (k, n_obj)."""
     return {
         "non_dominated": len(front),
-        "hypervolume": metrics.hypervolume(front, reference_point(reference.shape[1])),
+        "hypervolume": metrics.hypervolume(front, metrics.reference_point(reference.shape[1])),
         "igd": metrics.igd(front, reference),
         "igd_plus": metrics.igd_plus(front, reference),
         "spacing": metrics.spacing(front),
@@ -102,11 +102,6 @@ def replica_figures(
         "best_so_far": best_steps(metrics.best_so_far(found.objectives, feasible)),
         "selected": _selected_entry(selected, file),
     }
-
-
-def reference_point(n_obj: int) -> tuple[float, ...]:
-    """The paper's reference point of the hypervolume, for any number of objectives."""
-    return (metrics.REFERENCE_POINT[0],) * n_obj
 
 
 def best_steps(history: Array) -> list[list[float]]:
@@ -160,7 +155,9 @@ def campaign_summary(
         "reference_front": {
             "file": reference_front_file(results.root).relative_to(results.root).as_posix(),
             "points": len(reference),
-            "hypervolume": metrics.hypervolume(reference, reference_point(len(results.objectives))),
+            "hypervolume": metrics.hypervolume(
+                reference, metrics.reference_point(len(results.objectives))
+            ),
         },
         "algorithms": {
             name: {

@@ -19,7 +19,7 @@ from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.static_hold import static_hold
 from hybrid_opt.indicators.attainment import attainment_surfaces
-from hybrid_opt.indicators.selection import Selected, select, select_polished
+from hybrid_opt.indicators.selection import Selected, select
 from hybrid_opt.store.files import storing, write_atomically, write_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.summary import campaign_summary, polished_figures, reference_front, replica_figures
@@ -51,12 +51,12 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
     with progress.stage("summary", len(results.replicas), "replicas") as advance:
         for replica in results.replicas:
             key = replica.algorithm, replica.replica
-            selected = select(evaluator, replica, static)
+            selected = select(evaluator, replica.front_x, replica.front_rows)
             file = _store_selected(folder, selected_file(folder.root, *key), key, selected)
             entry = replica_figures(replica, reference, selected, file)
             front = polished[key]
             if front is not None:
-                chosen = select_polished(evaluator, front, static)
+                chosen = select(evaluator, front.x)
                 path = polished_selected_file(folder.root, *key)
                 file = _store_selected(folder, path, key, chosen)
                 entry["polished"] = polished_figures(front, reference, chosen, file)

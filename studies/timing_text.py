@@ -6,48 +6,22 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.timing import ForceCurve, Timing, TimingReport
-from hybrid_opt.timing.robustness import KILOGRAM_FORCE, Margin, PayloadSensitivity
+from hybrid_opt.timing import ForceCurve, TimedTrajectory, Timing
+from hybrid_opt.timing.robustness import KILOGRAM_FORCE, Margin
 from hybrid_opt.timing.use import joint_use
-from symbolic.workcell.records import Workcell
 
 
-def timings(report: TimingReport) -> dict[str, Timing]:
-    """The report's timings by name, the search's first."""
-    named = {
-        "search": report.judged.timing,
-        "closest to reference": report.closest,
-        "fastest": report.fastest,
-    }
-    return named | ({"force limited": report.force_limited} if report.force_limited else {})
-
-
-def timing_json(
-    report: TimingReport,
-    payload: dict[str, PayloadSensitivity],
-    margins: tuple[Margin, ...],
-    curve: ForceCurve | None,
-    workcell: Workcell,
-) -> dict[str, Any]:
+def timing_json(timed: TimedTrajectory) -> dict[str, Any]:
     """Everything as JSON values; infinite durations become null."""
     return {
-        "nominal_duration": report.nominal_duration,
-        "timings": {
-            name: _one_json(timing, report, payload, workcell, name)
-            for name, timing in timings(report).items()
-        },
-        "margins": [vars(margin) for margin in margins],
-        "force_curve": None if curve is None else _curve_json(curve),
+        "nominal_duration": timed.report.nominal_duration,
+        "timings": {name: _one_json(timing) for name, timing in timed.report.timings.items()},
+        "margins": [vars(margin) for margin in timed.margins],
+        "force_curve": None if timed.curve is None else _curve_json(timed.curve),
     }
 
 
-def _one_json(
-    timing: Timing,
-    report: TimingReport,
-    payload: dict[str, PayloadSensitivity],
-    workcell: Workcell,
-    name: str,
-) -> dict[str, Any]:
+def _one_json(timing: Timing) -> dict[str, Any]:
     document: dict[str, Any] = {
         "status": timing.status.value,
         "reason": timing.reason,
@@ -65,17 +39,17 @@ def _one_json(
         return document
     return document | {
         "duration": timing.duration,
-        "objectives": report.objectives[name].tolist(),
-        "payload_limit": payload[name].payload_limit,
-        "peak_normal_force": carry.normal_force.max(axis=0).tolist(),
-        "peak_resultant_force": payload[name].resultant.tolist(),
-        "least_friction_margin": carry.friction_margin(workcell).min(axis=0).tolist(),
-        "peak_pressure_shift": carry.pressure_shift.max(axis=0).tolist(),
+        "objectives": carry.force_ratio.tolist(),
+        "payload_limit": carry.payload_limit,
+        "peak_normal_force": carry.peak_normal_force.tolist(),
+        "peak_resultant_force": carry.peak_resultant_force.tolist(),
+        "least_friction_margin": carry.friction_margin.min(axis=0).tolist(),
+        "peak_pressure_shift": carry.peak_pressure_shift.tolist(),
         "peak_point_moment_residual": float(
             np.linalg.norm(carry.point_moment_residual, axis=1).max()
         ),
         "peak_moment_residual": float(np.linalg.norm(carry.moment_residual, axis=1).max()),
-        "joint_use": {key: use.tolist() for key, use in joint_use(carry, workcell).items()},
+        "joint_use": {key: use.tolist() for key, use in joint_use(carry, carry.workcell).items()},
     }
 
 
@@ -96,25 +70,17 @@ def _curve_json(curve: ForceCurve) -> dict[str, Any]:
     }
 
 
-def timing_text(
-    report: TimingReport,
-    payload: dict[str, PayloadSensitivity],
-    margins: tuple[Margin, ...],
-    curve: ForceCurve | None,
-    workcell: Workcell,
-) -> str:
+def timing_text(timed: TimedTrajectory) -> str:
     """A table of the timings, their reasons, the margins and the force curve."""
+    report, margins, curve = timed.report, timed.margins, timed.curve
     lines = [
         f"Timing (at the reference speeds without ramps: {report.nominal_duration:.3f} s)",
         f"  {'':<21}{'status':<17}{'s':>8}{'N1/Nref':>9}{'N2/Nref':>9}"
         f"{'payload':>10}{'torque':>8}{'shift':>8}",
     ]
-    for name, timing in timings(report).items():
-        lines.append(
-            f"  {name:<21}{timing.status.value:<17}"
-            + _figures(name, timing, report, payload, workcell)
-        )
-    lines += [f"  {name}: {timing.reason}" for name, timing in timings(report).items()]
+    for name, timing in report.timings.items():
+        lines.append(f"  {name:<21}{timing.status.value:<17}{_figures(timing)}")
+    lines += [f"  {name}: {timing.reason}" for name, timing in report.timings.items()]
     if margins:
         lines += ["", "Margins under the timing closest to the reference speed"]
         lines += [f"  {_margin(margin)}" for margin in margins]
@@ -129,22 +95,16 @@ def timing_text(
     return "\n".join(lines)
 
 
-def _figures(
-    name: str,
-    timing: Timing,
-    report: TimingReport,
-    payload: dict[str, PayloadSensitivity],
-    workcell: Workcell,
-) -> str:
+def _figures(timing: Timing) -> str:
     carry = timing.carry
     if carry is None:
         return f"{'-':>8}"
-    first, second = report.objectives[name]
-    torque = joint_use(carry, workcell)["joint torque"].max()
+    first, second = carry.force_ratio
+    torque = joint_use(carry, carry.workcell)["joint torque"].max()
     shift = 1e3 * float(carry.pressure_shift.max())
     return (
         f"{timing.duration:8.3f}{first:9.4f}{second:9.4f}"
-        f"{payload[name].payload_limit:7.2f} kg{100.0 * torque:6.1f} %{shift:5.1f} mm"
+        f"{carry.payload_limit:7.2f} kg{100.0 * torque:6.1f} %{shift:5.1f} mm"
     )
 
 

@@ -17,7 +17,7 @@ from hybrid_opt.campaign.journal import decode_generation, encode_generation
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
-from hybrid_opt.indicators.metrics import non_dominated
+from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.problem import CarryProblem, Evaluator, disarmed
 from symbolic.array import Array
 from symbolic.workcell.archive import CellArchive, archive_from_json, archive_to_json, unpack_cell
@@ -122,8 +122,7 @@ def run_replica(
 
 def front_rows(evaluations: Evaluations) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
     """(k,) rows of the feasible candidates that none dominates, by increasing objectives."""
-    rows = np.flatnonzero(non_dominated(evaluations.objectives, evaluations.feasible))
-    return rows[np.lexsort(evaluations.objectives[rows].T[::-1])]
+    return metrics.front_rows(evaluations.objectives, evaluations.feasible)
 
 
 class _Recording:

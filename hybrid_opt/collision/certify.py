@@ -23,7 +23,7 @@ MOST_ROUNDS = 14
 """Halvings of the grid after which a path counts as not smooth."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Certificate:
     """The result of a certification.
 
@@ -42,6 +42,13 @@ class Certificate:
     motion: MotionVerdict | None
     points: int
     deviation: float
+
+    def __repr__(self) -> str:
+        if self.is_free:
+            return f"Certificate: free of collisions along the whole path ({self.points} points)"
+        contact = self.at_sample or (None if self.motion is None else self.motion.contact)
+        who = f"{contact.first} and {contact.second}" if contact is not None else "undecided"
+        return f"Certificate: not free at u = {self.at_parameter:.4f}, {who}"
 
 
 def certify(

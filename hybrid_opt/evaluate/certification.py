@@ -17,7 +17,6 @@ from symbolic.array import Array
 from symbolic.errors import DualArmError
 from symbolic.physics.path import path_basis
 from symbolic.robot.arm import REACH_TOLERANCE
-from symbolic.workcell.records import Task
 
 
 class LostPathError(DualArmError):
@@ -36,14 +35,6 @@ class SampledPath:
     waypoints: Array
     q_1: Array
     q_2: Array
-
-
-def waypoints_of(task: Task, x: Array) -> Array:
-    """All waypoints (n_waypoints, 6) of a decision vector (n_var,), angles unwrapped."""
-    points = np.array([waypoint.lower for waypoint in task.waypoints])
-    points[list(task.free_indices)] = x.reshape(-1, 6)
-    points[:, 3:] = np.unwrap(points[:, 3:], axis=0)
-    return points
 
 
 def configurations(

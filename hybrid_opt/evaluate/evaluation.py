@@ -8,29 +8,27 @@ The same evaluation also returns each constraint's violation for constraint domi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
+from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.collision.verdict import Verdict
-from hybrid_opt.evaluate.certification import (
-    LostPathError,
-    SampledPath,
-    certificate,
-    waypoints_of,
-)
+from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificate
 from hybrid_opt.evaluate.functions import workcell_functions
-from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, select_objectives
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective, select_objectives
+from hybrid_opt.evaluate.time_law import carry_under_time_law
 from hybrid_opt.indicators.metrics import non_dominated
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.functions.candidate import CONSTRAINTS
 from symbolic.geometry.pairs import build_geometry
+from symbolic.workcell.decision import waypoints_of
 from symbolic.workcell.records import Workcell
 
 COLLISION = "collision"
@@ -47,7 +45,7 @@ FEASIBLE = -1
 """`Evaluations.reason` of a feasible candidate."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evaluations:
     """Verdicts on n candidates; every array has a leading axis over them.
 
@@ -77,6 +75,30 @@ class Evaluations:
     def __len__(self) -> int:
         return len(self.x)
 
+    def judgement(self, row: int, objective_names: Sequence[str]) -> Judgement:
+        """The verdict on one candidate in words."""
+        feasible = bool(self.feasible[row])
+        return Judgement(
+            feasible=feasible,
+            reason="" if feasible else REASONS[int(self.reason[row])],
+            position=None if feasible else float(self.position[row]),
+            objectives=dict(zip(objective_names, self.objectives[row].tolist(), strict=True)),
+        )
+
+    @property
+    def infeasible_by_reason(self) -> dict[str, int]:
+        """Infeasible candidates by the constraint violated first, the most frequent first."""
+        counts = {name: int(np.sum(self.reason == i)) for i, name in enumerate(REASONS)}
+        found = sorted(counts.items(), key=lambda item: -item[1])
+        return {name: count for name, count in found if count}
+
+    def __repr__(self) -> str:
+        share = 100.0 * float(self.feasible.mean()) if len(self) else 0.0
+        counts = [f"{c} {n.replace('_', ' ')}" for n, c in self.infeasible_by_reason.items()]
+        return f"{len(self)} candidates, {share:.1f} % feasible" + "".join(
+            f"; {count}" for count in counts
+        )
+
     def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Evaluations:
         return Evaluations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
@@ -86,32 +108,32 @@ class CandidateEvaluator:
 
     Attributes:
         workcell: the cell.
-        objective_names: the selected objectives.
+        objectives, objective_names: what is minimised, and its names.
         functions: the cell's compiled functions by name.
         checker: FCL's verdict on samples.
         n_var, lower, upper: size and bounds of the decision vector.
-        count: candidates evaluated so far.
     """
 
     def __init__(
         self,
         workcell: Workcell,
-        objectives: tuple[str, ...] = PAPER_OBJECTIVES,
+        objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
         threads: int = 1,
         functions: Mapping[str, NumericFunction] | None = None,
     ) -> None:
         """Load or build the compiled functions.
 
         Args:
+            objectives: what to minimise, by name or as one's own record.
             functions: those of `symbolic.functions.cell`, if not to be loaded or built here.
 
         Raises:
-            SettingsError: an objective is unknown.
+            SettingsError: an objective is unknown or there twice.
             DualArmError: the model cannot be built (see `symbolic.cell_model`, `codegen`).
         """
         self.workcell = workcell
-        self.objective_names = objectives
-        self._objectives = select_objectives(objectives)
+        self.objectives = select_objectives(objectives)
+        self.objective_names = tuple(objective.name for objective in self.objectives)
         self._threads = threads
         self.functions = workcell_functions(workcell) if functions is None else functions
         self._candidate = self.functions["candidate"]
@@ -119,7 +141,6 @@ class CandidateEvaluator:
         self.n_var = workcell.task.n_var
         self.lower = workcell.task.lower
         self.upper = workcell.task.upper
-        self.count = 0
 
     def outputs(self, x: Array) -> dict[str, Array]:
         """Every per-sample output for decision vectors (n, n_var), see
@@ -134,8 +155,19 @@ class CandidateEvaluator:
         """
         x = self._checked(x)
         outputs = self.outputs(x)
-        self.count += len(x)
         return self._judge(x, outputs)
+
+    def carry(self, x: Array) -> Carry:
+        """One decision vector (n_var,) with its verdict, under the task's time law.
+
+        Raises:
+            SettingsError: x has the wrong shape.
+        """
+        x = self._checked(x)[:1]
+        outputs = self.outputs(x)
+        judgement = self._judge(x, outputs).judgement(0, self.objective_names)
+        single = {name: values[0] for name, values in outputs.items()}
+        return carry_under_time_law(self.workcell, self.functions, x[0], single, judgement)
 
     def certificate(self, x: Array) -> Certificate:
         """The continuous verdict on one decision vector (n_var,).
@@ -198,7 +230,7 @@ class CandidateEvaluator:
     def _judge(self, x: Array, outputs: dict[str, Array]) -> Evaluations:
         n = len(x)
         values = np.column_stack(
-            [objective.evaluate(outputs, self.workcell) for objective in self._objectives]
+            [objective.evaluate(outputs, self.workcell) for objective in self.objectives]
         )
         n_constraints = len(CONSTRAINTS)
         violation = np.zeros((n, len(REASONS)))

@@ -7,13 +7,14 @@ one for every infeasible candidate) meaningful for any selection of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.workcell.decision import waypoints_of
 from symbolic.workcell.records import Workcell
 
 Outputs = Mapping[str, Array]
@@ -99,9 +100,7 @@ def _time_average(values: Array, time: Array) -> Array:
 def _polygon_time(workcell: Workcell) -> float:
     """Time [s] along the hand-made trajectory's straight pieces at the reference speeds."""
     task = workcell.task
-    points = np.array([waypoint.lower for waypoint in task.waypoints])
-    points[list(task.free_indices)] = task.initial
-    steps = np.diff(points, axis=0)
+    steps = np.diff(waypoints_of(task, task.initial), axis=0)
     lengths = np.linalg.norm(steps[:, :3], axis=1) / task.reference_speed
     turns = np.linalg.norm(steps[:, 3:], axis=1) / task.reference_angular_speed
     return float(np.maximum(lengths, turns).sum())
@@ -122,17 +121,19 @@ OBJECTIVES: dict[str, Objective] = {
 """All objectives by name."""
 
 
-def select_objectives(names: tuple[str, ...]) -> tuple[Objective, ...]:
-    """The named objectives in order.
+def select_objectives(wanted: Sequence[str | Objective]) -> tuple[Objective, ...]:
+    """The wanted objectives in order: named ones of `OBJECTIVES`, and records of one's own.
 
     Raises:
         SettingsError: a name is unknown or given twice, or none is given.
     """
-    unknown = [name for name in names if name not in OBJECTIVES]
+    unknown = [name for name in wanted if isinstance(name, str) and name not in OBJECTIVES]
     if unknown:
         raise SettingsError(
             f"unknown objective {', '.join(unknown)}; known are {', '.join(OBJECTIVES)}"
         )
+    found = tuple(OBJECTIVES[entry] if isinstance(entry, str) else entry for entry in wanted)
+    names = [objective.name for objective in found]
     if not names or len(set(names)) != len(names):
-        raise SettingsError(f"objectives {names}: name at least one, each once")
-    return tuple(OBJECTIVES[name] for name in names)
+        raise SettingsError(f"objectives {', '.join(names)}: name at least one, each once")
+    return found

@@ -1,4 +1,5 @@
-"""The forces of holding the payload still, which no carry can stay far below."""
+"""The forces of holding the payload still, which no carry can stay far below, and what a force
+says of the payload that could be carried."""
 
 from __future__ import annotations
 
@@ -39,13 +40,24 @@ def static_hold(workcell: Workcell) -> StaticHold:
     return StaticHold(normal, whole, payload_limit(workcell, whole))
 
 
-def payload_limit(workcell: Workcell, contact_force: Array) -> float:
-    """Payload [kg] at which a robot's whole force reaches its reference force.
+def mass_at_reference(workcell: Workcell, force: Array) -> Array:
+    """(2,) payload [kg] at which a force of each robot reaches its reference force.
 
     Forces along an unchanged motion are proportional to the mass (paper Figure 12).
 
     Args:
         workcell: the cell.
-        contact_force: (2,) peak magnitudes with the workcell's own mass [N].
+        force: (2,) peak forces with the workcell's own mass [N].
     """
-    return float(workcell.payload.mass * (workcell.task.reference_force / contact_force).min())
+    mass: Array = workcell.payload.mass * (workcell.task.reference_force / force)
+    return mass
+
+
+def payload_limit(workcell: Workcell, contact_force: Array) -> float:
+    """Payload [kg] at which the first robot's whole force reaches its reference force.
+
+    Args:
+        workcell: the cell.
+        contact_force: (2,) peak magnitudes of the whole forces, with the workcell's own mass [N].
+    """
+    return float(mass_at_reference(workcell, contact_force).min())

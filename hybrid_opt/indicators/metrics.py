@@ -55,11 +55,22 @@ def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> M
     return mask
 
 
+def front_rows(objectives: ArrayLike, feasible: ArrayLike | None = None) -> NDArray[np.intp]:
+    """(k,) rows of the non-dominated feasible points, by increasing objectives."""
+    values = np.asarray(objectives, dtype=np.float64)
+    rows = np.flatnonzero(non_dominated(values, feasible))
+    return rows[np.lexsort(values[rows].T[::-1])]
+
+
+def reference_point(n_obj: int) -> tuple[float, ...]:
+    """The paper's reference point of the hypervolume, for any number of objectives."""
+    return (REFERENCE_POINT[0],) * n_obj
+
+
 def front_of(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Array:
     """(k, n_obj) the non-dominated feasible objectives, by increasing first objective."""
     values = np.asarray(objectives, dtype=np.float64)
-    front = values[non_dominated(values, feasible)]
-    return np.asarray(front[np.lexsort(front.T[::-1])])
+    return np.asarray(values[front_rows(values, feasible)])
 
 
 def hypervolume(front: ArrayLike, reference: ArrayLike = REFERENCE_POINT) -> float:

@@ -1,22 +1,21 @@
-"""The balanced solution of a front: the least mean of both robots' peak normal forces.
+"""Selecting one carry of a front: the balanced one, or the least force of one robot.
 
-Where one robot can relieve the other at no cost, a polished front is flat: many points have the
-same mean to five digits. Of such points the most even one is selected, which leaves most room for
-payload.
+The balanced carry has the least mean of both robots' peak normal forces. Where one robot can
+relieve the other at no cost, a polished front is flat: many points have the same mean to five
+digits. Of such points the most even one is selected, which leaves most room for payload.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hybrid_opt.campaign.polish_stage import PolishedReplica
-from hybrid_opt.campaign.results import Replica
+from hybrid_opt.carry import Carry
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.static_hold import StaticHold
-from hybrid_opt.indicators.metrics import excess_above_static
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from symbolic.array import Array
 
@@ -29,26 +28,51 @@ _CHUNK = 256
 
 @dataclass(frozen=True)
 class Selected:
-    """A front's balanced solution.
+    """A front's balanced carry.
 
     Attributes:
         row: its row among the replica's evaluations, or in the polished front.
-        x: (n_var,) decision vector.
-        objectives: (n_obj,).
-        peak_normal_force, minimum_normal_force: (2,) of each robot along the carry [N].
-        excess_above_static: (2,) of the peaks above the static hold [%].
-        mean_excess_above_static: of the mean of both peaks above that of the static hold [%].
-        figures: those that are stored with its trajectory.
+        carry: the carry with its verdict, under the task's time law.
     """
 
     row: int
-    x: Array
-    objectives: Array
-    peak_normal_force: Array
-    minimum_normal_force: Array
-    excess_above_static: Array
-    mean_excess_above_static: float
-    figures: Mapping[str, float]
+    carry: Carry
+
+    @property
+    def x(self) -> Array:
+        """(n_var,) decision vector."""
+        return self.carry.x
+
+    @property
+    def objectives(self) -> Array:
+        """(n_obj,) without penalty."""
+        assert self.carry.judgement is not None
+        return np.array(list(self.carry.judgement.objectives.values()))
+
+    @property
+    def peak_normal_force(self) -> Array:
+        """(2,) of each robot along the carry [N]."""
+        return self.carry.peak_normal_force
+
+    @property
+    def minimum_normal_force(self) -> Array:
+        """(2,) of each robot along the carry [N]."""
+        return np.asarray(self.carry.normal_force.min(axis=0))
+
+    @cached_property
+    def excess_above_static(self) -> Array:
+        """(2,) of the peaks above the static hold [%]."""
+        return self.carry.excess_above_static
+
+    @cached_property
+    def mean_excess_above_static(self) -> float:
+        """Of the mean of both peaks above that of the static hold [%]."""
+        return self.carry.mean_excess_above_static
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """Those that are stored with its trajectory."""
+        return trajectory_figures(self.carry)
 
 
 def balanced(peak_normal_force: Array) -> int:
@@ -59,40 +83,20 @@ def balanced(peak_normal_force: Array) -> int:
     return int(np.argmin(np.where(equal, peak_normal_force.max(axis=1), np.inf)))
 
 
-def select(evaluator: CandidateEvaluator, replica: Replica, static: StaticHold) -> Selected | None:
-    """The balanced solution of a replica's front, None where the front is empty."""
-    if len(replica.front_rows) == 0:
-        return None
-    row = int(replica.front_rows[balanced(peak_normal_forces(evaluator, replica.front_x))])
-    found = replica.evaluations
-    return _selected(evaluator, row, found.x[row], found.objectives[row], static)
-
-
-def select_polished(
-    evaluator: CandidateEvaluator, front: PolishedReplica, static: StaticHold
+def select(
+    evaluator: CandidateEvaluator, x: Array, rows: NDArray[np.intp] | None = None
 ) -> Selected | None:
-    """The balanced solution of a polished front, by its row in that front."""
-    if len(front.x) == 0:
+    """The balanced carry of a front, None where the front is empty.
+
+    Args:
+        x: (k, n_var) the front's decision vectors.
+        rows: (k,) what `Selected.row` names them by, None for their places in the front.
+    """
+    if len(x) == 0:
         return None
-    row = balanced(peak_normal_forces(evaluator, front.x))
-    return _selected(evaluator, row, front.x[row], front.objectives[row], static)
-
-
-def _selected(
-    evaluator: CandidateEvaluator, row: int, x: Array, objectives: Array, static: StaticHold
-) -> Selected:
-    normal = evaluator.outputs(x[None])["normal_force"][0]
-    peak = normal.max(axis=0)
-    return Selected(
-        row,
-        x,
-        objectives,
-        peak,
-        normal.min(axis=0),
-        excess_above_static(peak, static.normal_force),
-        float(excess_above_static(peak.mean(), static.normal_force.mean())),
-        trajectory_figures(evaluator, x),
-    )
+    index = balanced(peak_normal_forces(evaluator, x))
+    row = index if rows is None else int(rows[index])
+    return Selected(row, evaluator.carry(x[index]))
 
 
 def peak_normal_forces(evaluator: CandidateEvaluator, x: Array) -> Array:

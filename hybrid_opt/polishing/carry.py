@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybrid_opt.evaluate.certification import waypoints_of
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from symbolic.array import Array
 from symbolic.physics.path import path_basis
 from symbolic.robot.arm import REACH_TOLERANCE
+from symbolic.workcell.decision import waypoints_of
 
 PER_SAMPLE = 4
 """Places per interval between samples. What dips between two places is covered by the distance

@@ -63,9 +63,9 @@ def replay(stored: StoredTrajectory, folder: Path) -> Replay:
     named = [name.removeprefix("objective_") for name in stored.figures]
     objectives = tuple(name for name in named if name in OBJECTIVES)
     evaluator = CandidateEvaluator(workcell, objectives or PAPER_OBJECTIVES)
-    recomputed = trajectory_figures(evaluator, stored.x)
-    outputs = evaluator.outputs(stored.x[None])
-    start = np.array([outputs[f"q_{arm}"][0, 0] for arm in (1, 2)])
+    carry = evaluator.carry(stored.x)
+    recomputed = trajectory_figures(carry)
+    start = np.array([arm.q[0] for arm in carry.arms])
     return Replay(
         workcell,
         tuple(

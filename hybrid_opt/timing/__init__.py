@@ -3,19 +3,22 @@
 from hybrid_opt.timing.analysis import (
     ForceCurve,
     JudgedTiming,
-    TimingReport,
     closest_to_reference_timing,
     duration_against_force_limit,
     fastest_timing,
     force_limited_timing,
     judge_timing,
-    report_timing,
 )
 from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.overview import (
+    TimedTrajectory,
+    TimingReport,
+    report_timing,
+    timed_trajectory,
+)
 from hybrid_opt.timing.records import (
     Excess,
     Place,
-    TimedCarry,
     Timing,
     TimingLimits,
     TimingStatus,
@@ -27,7 +30,7 @@ __all__ = [
     "ForceCurve",
     "JudgedTiming",
     "Place",
-    "TimedCarry",
+    "TimedTrajectory",
     "Timing",
     "TimingLimits",
     "TimingModel",
@@ -40,4 +43,5 @@ __all__ = [
     "judge_timing",
     "report_timing",
     "time_path",
+    "timed_trajectory",
 ]

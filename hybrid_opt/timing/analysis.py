@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hybrid_opt.carry import Carry
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_check import path_failure
-from hybrid_opt.timing.point_limits import duration_at_speed_limits
-from hybrid_opt.timing.records import Place, TimedCarry, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, joint_use, limit_use, worst
+from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, joint_at, joint_use, limit_use, worst
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
@@ -30,8 +30,8 @@ class JudgedTiming:
     Attributes:
         timing: status `OK` or `EXCEEDED` (also for a carry that starts or ends at speed), or why
             the path itself fails; with every limit's use.
-        joint_use: (12,) worst use of each joint by constraint, both arms in order.
-        start_speed, end_speed: joint speeds (12,) that the timing asks for at its ends, where a
+        joint_use: (all joints,) worst use of each joint by constraint, both arms in order.
+        start_speed, end_speed: (all joints,) that the timing asks for at its ends, where a
             robot stands still [rad/s].
     """
 
@@ -82,21 +82,23 @@ def judge_timing(model: TimingModel, x: Array) -> JudgedTiming:
     timing = Timing(status, reason, place, carry, use)
     if failure is not None:
         timing = replace(failure, carry=carry, use=use)
-    return JudgedTiming(timing, joint_use(carry, model.workcell), carry.q_rate[0], carry.q_rate[-1])
+    q_rate = carry.side_by_side("q_rate")
+    return JudgedTiming(timing, joint_use(carry, model.workcell), q_rate[0], q_rate[-1])
 
 
-def _jump(model: TimingModel, carry: TimedCarry) -> Place | None:
+def _jump(model: TimingModel, carry: Carry) -> Place | None:
     """The joint that moves fastest, for its limit, at the carry's ends; None where all rest."""
     limit = np.concatenate([robot.velocity_max for robot in model.workcell.robots])
-    ends = np.abs(carry.q_rate[[0, -1]]) / limit
+    ends = np.abs(carry.side_by_side("q_rate")[[0, -1]]) / limit
     if float(ends.max()) < REST_SPEED:
         return None
     end, joint = np.unravel_index(int(np.argmax(ends)), ends.shape)
+    arm, index = joint_at(model.joint_names, int(joint))
     sample = 0 if end == 0 else len(carry.time) - 1
     return Place(
         "start from rest" if end == 0 else "stop at rest",
-        model.workcell.robots[joint // 6].name,
-        model.joint_names[joint // 6][joint % 6],
+        model.workcell.robots[arm].name,
+        model.joint_names[arm][index],
         sample,
         float(carry.parameter[sample]),
     )
@@ -154,57 +156,4 @@ def duration_against_force_limit(model: TimingModel, x: Array, points: int = 12)
         tuple(timing.status for timing in timings),
         static,
         top,
-    )
-
-
-@dataclass(frozen=True)
-class TimingReport:
-    """A trajectory under the search's timing and under timings that robots can drive.
-
-    Attributes:
-        judged: the search's own timing.
-        nominal_duration: at the reference speeds without ramps [s].
-        fastest, closest: see the functions of those names.
-        force_limited: with the given limit, None without one.
-        objectives: (2,) peak normal forces over the reference forces by timing, the search's
-            beside the real ones.
-    """
-
-    judged: JudgedTiming
-    nominal_duration: float
-    fastest: Timing
-    closest: Timing
-    force_limited: Timing | None
-    objectives: dict[str, Array]
-
-
-def report_timing(model: TimingModel, x: Array, force: float | None = None) -> TimingReport:
-    """All timings of a trajectory beside one another.
-
-    Args:
-        force: limit on the normal forces for the force-limited timing [N].
-
-    Raises:
-        SettingsError: x does not fit the workcell, or the limit is not a positive force.
-    """
-    judged = judge_timing(model, x)
-    fastest = fastest_timing(model, x)
-    closest = closest_to_reference_timing(model, x)
-    limited = None if force is None else force_limited_timing(model, x, force)
-    timings = {"search": judged.timing, "fastest": fastest, "closest to reference": closest}
-    if limited is not None:
-        timings["force limited"] = limited
-    return TimingReport(
-        judged=judged,
-        nominal_duration=duration_at_speed_limits(
-            model, model.path_motion(x), TimingLimits(reference_speed=True)
-        ),
-        fastest=fastest,
-        closest=closest,
-        force_limited=limited,
-        objectives={
-            name: timing.carry.objectives(model.workcell)
-            for name, timing in timings.items()
-            if timing.carry is not None
-        },
     )

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.build import build, compile_function, load_or_build
+from codegen.build import build, load_or_build
 from codegen.cache import Cache, digest
 from codegen.function import NumericFunction
+from hybrid_opt.carry import ArmMotion, Carry, joints_of
 from hybrid_opt.evaluate.functions import workcell_functions, workcell_key
-from hybrid_opt.timing.records import TimedCarry
+from hybrid_opt.evaluate.time_law import carry_under_time_law
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
@@ -32,11 +33,13 @@ REFINEMENT = 10
 
 @dataclass(frozen=True)
 class PathMotion:
-    """Geometry of a carry at samples of the path parameter; arms side by side (12 joints).
+    """Geometry of the path of a decision vector x (n_var,) at samples of the path parameter.
 
-    `symbolic.physics.path_motion` describes the quantities.
+    Joints of both arms stand side by side. `symbolic.physics.path_motion` describes the
+    quantities.
     """
 
+    x: Array
     parameter: Array
     pose: Array
     pose_first: Array
@@ -60,7 +63,8 @@ class PathMotion:
 
     def at(self, samples: NDArray[np.intp]) -> PathMotion:
         """The given samples in the given order."""
-        return PathMotion(*[getattr(self, f.name)[samples] for f in fields(self)])
+        sampled = {f.name: getattr(self, f.name)[samples] for f in fields(self) if f.name != "x"}
+        return PathMotion(self.x, **sampled)
 
 
 _BOX = (
@@ -73,7 +77,7 @@ _BOX = (
     "force_by_acceleration",
     "force_by_speed",
 )
-_ARMS = tuple(f.name for f in fields(PathMotion) if f.name not in (*_BOX, "parameter"))
+_ARMS = tuple(f.name for f in fields(PathMotion) if f.name not in (*_BOX, "x", "parameter"))
 
 
 class TimingModel:
@@ -129,21 +133,22 @@ class TimingModel:
         Raises:
             SettingsError: x has the wrong shape or is not finite.
         """
-        out = self._functions["path_motion"](self._checked(x))
+        x = self._checked(x)
+        out = self._functions["path_motion"](x)
         n = len(out["pose"])
         values = {name: out[name] for name in _BOX}
         for name in _ARMS:
             both = [out[f"{name}_{arm}"].reshape(n, -1) for arm in (1, 2)]
             values[name] = np.concatenate(both, axis=1)
         values["wrench_torque"] = values["wrench_torque"].reshape(n, 2, 6, 6)
-        return PathMotion(parameter=np.linspace(0.0, 1.0, n), **values)
+        return PathMotion(x=x, parameter=np.linspace(0.0, 1.0, n), **values)
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
         """`symbolic.physics.payload_load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
         return self._functions["load"].batch(pose, rate, second_rate)
 
     def uncertain_load(
-        self, carry: TimedCarry, friction: Array, centre_of_mass: Array
+        self, carry: Carry, friction: Array, centre_of_mass: Array
     ) -> dict[str, Array]:
         """Loads of a carry with other friction coefficients (2,) and centre of mass (3,) [m]."""
         return self._functions["uncertain_load"].batch(
@@ -169,64 +174,51 @@ class TimingModel:
         )
         return self.load(motion.pose, rate, second)
 
-    def carry(
-        self, motion: PathMotion, time: Array, speed: Array, acceleration: Array
-    ) -> TimedCarry:
+    def carry(self, motion: PathMotion, time: Array, speed: Array, acceleration: Array) -> Carry:
         """The carry with the given timing (n,) at the samples of `motion`."""
         load = self.drive(motion, speed, acceleration)
         v, w, a = speed[:, None], speed[:, None] ** 2, acceleration[:, None]
         own = motion.torque_by_acceleration * a + motion.torque_by_speed * w
-        return TimedCarry(
+        joints = (
+            motion.q,
+            motion.q_first * v,
+            motion.q_second * w + motion.q_first * a,
+            contact_torque(motion.wrench_torque, load),
+            own + motion.torque_at_rest,
+        )
+        split = [joints_of(self.workcell, values) for values in joints]
+        return Carry(
+            workcell=self.workcell,
+            x=motion.x,
+            timing="limits",
             parameter=motion.parameter,
             time=time,
             pose=motion.pose,
             rate=motion.pose_first * v,
             second_rate=motion.pose_second * w + motion.pose_first * a,
-            q=motion.q,
-            q_rate=motion.q_first * v,
-            q_second=motion.q_second * w + motion.q_first * a,
             **_loads(load),
-            contact_torque=contact_torque(motion.wrench_torque, load),
-            own_torque=own + motion.torque_at_rest,
+            arms=(
+                ArmMotion(*[first for first, _ in split]),
+                ArmMotion(*[second for _, second in split]),
+            ),
+            judgement=None,
         )
 
-    def search_carry(self, x: Array) -> TimedCarry:
-        """The carry as the search sees it: the task's own time law and samples.
-
-        Joint rates are second-order finite differences on the law's times, as the paper takes
-        the box's (one-sided at the ends).
-        """
+    def search_carry(self, x: Array) -> Carry:
+        """The carry under the task's own time law, see `hybrid_opt.evaluate.time_law`."""
         x = self._checked(x)
-        out = self._candidate(x)
-        time = out["time"].reshape(-1)
-        q = np.concatenate([out["q_1"], out["q_2"]], axis=1)
-        q_rate = np.gradient(q, time, axis=0, edge_order=2)
-        q_second = np.gradient(q_rate, time, axis=0, edge_order=2)
-        own = [
-            self._functions[f"inverse_dynamics_{i + 1}"]
-            .batch(*[np.ascontiguousarray(v[:, 6 * i : 6 * i + 6]) for v in (q, q_rate, q_second)])
-            .popitem()[1]
-            for i in (0, 1)
-        ]
-        return TimedCarry(
-            parameter=np.linspace(0.0, 1.0, len(time)),
-            time=time,
-            pose=out["pose"],
-            rate=out["rate"],
-            second_rate=out["second_rate"],
-            q=q,
-            q_rate=q_rate,
-            q_second=q_second,
-            **_loads(self.load(out["pose"], out["rate"], out["second_rate"])),
-            contact_torque=np.concatenate([out["joint_torque_1"], out["joint_torque_2"]], axis=1),
-            own_torque=np.concatenate(own, axis=1),
-        )
+        functions = self._search_functions
+        return carry_under_time_law(self.workcell, functions, x, functions["candidate"](x))
 
     @cached_property
-    def _candidate(self) -> NumericFunction:
+    def _search_functions(self) -> Mapping[str, NumericFunction]:
         if self._cell_model is None:
-            return workcell_functions(self.workcell, self._cache)["candidate"]
-        return compile_function(candidate_function(self._cell_model), self._cache)
+            return workcell_functions(self.workcell, self._cache)
+        made = {"candidate": candidate_function(self._cell_model)} | {
+            f"inverse_dynamics_{i + 1}": robot.inverse_dynamics
+            for i, robot in enumerate(self._cell_model.robots)
+        }
+        return build(made, self._cache).functions
 
     def _checked(self, x: Array) -> Array:
         x = np.ascontiguousarray(x, dtype=float)

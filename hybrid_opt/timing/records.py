@@ -1,13 +1,13 @@
-"""Records of the timing: limits, statuses, places on the path, and a carry with its loads."""
+"""Records of the timing: limits, statuses, places on the path, and a timing itself."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from hybrid_opt.carry import Carry
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Workcell
 
 
 class TimingStatus(StrEnum):
@@ -92,70 +92,7 @@ class Excess:
     place: Place
 
 
-@dataclass(frozen=True)
-class TimedCarry:
-    """A carry with its timing and every physical quantity; n samples, world frame.
-
-    At the joint between two pieces of constant path acceleration a sample stands twice, once for
-    each side. The second arm's joints follow the first's.
-
-    Attributes:
-        parameter: (n,) path parameter u.
-        time: (n,) [s].
-        pose, rate, second_rate: (n, 6) box pose and its time derivatives.
-        q, q_rate, q_second: (n, 12) joints and their time derivatives [rad, s].
-        angular_velocity, angular_acceleration: (n, 3) of the box [rad/s, rad/s^2].
-        normal_force, tangential_force: (n, 2) [N].
-        contact_force: (n, 2, 3) force of each robot on the box [N].
-        pressure_shift: (n, 2) [m].
-        point_moment_residual: (n, 3) moment missing with the forces at the nominal points [N m].
-        moment_residual: (n, 3) moment missing with the pressure shifted [N m].
-        contact_torque: (n, 12) joint torques of the contact wrench alone [N m].
-        own_torque: (n, 12) joint torques of the bare arm's motion and weight [N m].
-    """
-
-    parameter: Array
-    time: Array
-    pose: Array
-    rate: Array
-    second_rate: Array
-    q: Array
-    q_rate: Array
-    q_second: Array
-    angular_velocity: Array
-    angular_acceleration: Array
-    normal_force: Array
-    tangential_force: Array
-    contact_force: Array
-    pressure_shift: Array
-    point_moment_residual: Array
-    moment_residual: Array
-    contact_torque: Array
-    own_torque: Array
-
-    @property
-    def duration(self) -> float:
-        """Time from the first to the last sample [s]."""
-        return float(self.time[-1] - self.time[0])
-
-    @property
-    def torque(self) -> Array:
-        """(n, 12) joint torques of the arm and the contact wrench together [N m]."""
-        return self.contact_torque + self.own_torque
-
-    def objectives(self, workcell: Workcell) -> Array:
-        """(2,) peak normal forces over the reference forces, the paper's objectives (Eq. 60)."""
-        peaks: Array = self.normal_force.max(axis=0) / workcell.task.reference_force
-        return peaks
-
-    def friction_margin(self, workcell: Workcell) -> Array:
-        """(n, 2) friction left at each contact, mu N - F_t [N]; zero where a cone is tight."""
-        friction = [contact.friction for contact in workcell.contacts]
-        margin: Array = self.normal_force * friction - self.tangential_force
-        return margin
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Timing:
     """A timing of a path, or why there is none.
 
@@ -174,7 +111,7 @@ class Timing:
     status: TimingStatus
     reason: str
     place: Place | None
-    carry: TimedCarry | None
+    carry: Carry | None
     use: dict[str, Excess] = field(default_factory=dict)
     grid_speed: Array | None = None
     iterations: int = 0
@@ -185,6 +122,16 @@ class Timing:
     def ok(self) -> bool:
         """Whether the timing respects every limit."""
         return self.status is TimingStatus.OK
+
+    def __repr__(self) -> str:
+        from hybrid_opt.display.timing import timing_text
+
+        return timing_text(self)
+
+    def _repr_html_(self) -> str:
+        from hybrid_opt.display.timing import timing_html
+
+        return timing_html(self)
 
     @property
     def duration(self) -> float:

@@ -1,6 +1,6 @@
 """How much a carry could bear: heavier payloads, less friction, wrong centres of mass.
 
-All functions are pure and judge a `TimedCarry`, so under the search's timing as under a real one.
+All functions are pure and judge a `Carry`, so under the search's timing as under a real one.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from hybrid_opt.carry import Carry
+from hybrid_opt.evaluate.static_hold import mass_at_reference, static_hold
 from hybrid_opt.timing.model import TimingModel, contact_torque
-from hybrid_opt.timing.records import TimedCarry
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
 
@@ -79,34 +80,21 @@ class Margin:
     fails: str
 
 
-def payload_sensitivity(model: TimingModel, carry: TimedCarry) -> PayloadSensitivity:
+def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
     """Forces against payload mass for an unchanged timing."""
-    workcell = model.workcell
-    mass, reference = workcell.payload.mass, workcell.task.reference_force
-    resultant = np.linalg.norm(carry.contact_force, axis=2).max(axis=0)
-    normal = carry.normal_force.max(axis=0)
+    workcell = carry.workcell
+    resultant, normal = carry.peak_resultant_force, carry.peak_normal_force
     return PayloadSensitivity(
-        mass,
+        workcell.payload.mass,
         resultant,
         normal,
-        mass * reference / resultant,
-        mass * reference / normal,
-        static_payload_limit(model),
+        mass_at_reference(workcell, resultant),
+        mass_at_reference(workcell, normal),
+        static_hold(workcell).payload_limit,
     )
 
 
-def static_payload_limit(model: TimingModel) -> float:
-    """Payload [kg] whose level hold at rest brings a robot's |f_i| to its reference force.
-
-    With equal friction coefficients mu it is 2 f / (g sqrt(1 + 1 / mu^2)).
-    """
-    still = np.zeros((1, 6))
-    force = model.load(still, still, still)["contact_force"].reshape(2, 3)
-    share = np.linalg.norm(force, axis=1) / model.workcell.payload.mass
-    return float((model.workcell.task.reference_force / share).min())
-
-
-def robustness_margins(model: TimingModel, carry: TimedCarry) -> tuple[Margin, ...]:
+def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     """How far friction, centre of mass and patch size may be off before the carry fails.
 
     The forces are allocated anew for the changed values (the robots squeeze as hard as it takes);
@@ -133,12 +121,13 @@ class _Judge:
         centre: (3,) nominal centre of mass [m].
     """
 
-    def __init__(self, model: TimingModel, carry: TimedCarry) -> None:
+    def __init__(self, model: TimingModel, carry: Carry) -> None:
         self.workcell = model.workcell
         self.friction = np.array([contact.friction for contact in model.workcell.contacts])
         self.centre = np.array(model.workcell.payload.centre_of_mass)
         self._model = model
         self._carry = carry
+        self._own_torque = carry.side_by_side("own_torque")
         self._wrench_torque = model.wrench_torque(carry.q, carry.pose)
         self._torque_max = np.concatenate([robot.torque_max for robot in model.workcell.robots])
         self._radius = np.array([contact.patch_radius for contact in model.workcell.contacts])
@@ -146,7 +135,7 @@ class _Judge:
     def failure(self, friction: Array, centre: Array) -> str:
         """What is exceeded most, or '' where everything holds."""
         load = self._model.uncertain_load(self._carry, friction, centre)
-        torque = contact_torque(self._wrench_torque, load) + self._carry.own_torque
+        torque = contact_torque(self._wrench_torque, load) + self._own_torque
         reference = self.workcell.task.reference_force
         use = {
             "normal force": float((load["normal_force"] / reference).max()),
@@ -178,7 +167,7 @@ def _centre_margin(judge: _Judge, axis: int, sign: float) -> Margin:
     return Margin(name, "m", nominal, nominal + sign * offset, fails)
 
 
-def _patch_margins(carry: TimedCarry, workcell: Workcell) -> list[Margin]:
+def _patch_margins(carry: Carry, workcell: Workcell) -> list[Margin]:
     """The least patch radius is the largest pressure shift, because no force depends on it."""
     return [
         Margin(
@@ -189,7 +178,7 @@ def _patch_margins(carry: TimedCarry, workcell: Workcell) -> list[Margin]:
             "pressure shift",
         )
         for robot, contact, shift in zip(
-            workcell.robots, workcell.contacts, carry.pressure_shift.max(axis=0), strict=True
+            workcell.robots, workcell.contacts, carry.peak_pressure_shift, strict=True
         )
     ]
 

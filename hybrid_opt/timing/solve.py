@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_opt.carry import Carry
 from hybrid_opt.timing import rows as rows_of
 from hybrid_opt.timing.adapter import SolverFailure, fastest_speed
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
 from hybrid_opt.timing.path_check import path_failure
 from hybrid_opt.timing.point_limits import POINT_TOLERANCE, PointLimits
-from hybrid_opt.timing.records import Place, TimedCarry, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.rows import STAGE_POINTS, PointRows
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_ratios, limit_use, worst
 from symbolic.array import Array
@@ -196,7 +197,7 @@ class _Problem:
             slowed=factor,
         )
 
-    def _refined(self, squared: Array) -> TimedCarry:
+    def _refined(self, squared: Array) -> Carry:
         """The carry at `REFINEMENT` samples per stage, both ends of every stage included."""
         stages = self._model.stages
         share = np.linspace(0.0, 1.0, REFINEMENT + 1)

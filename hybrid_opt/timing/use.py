@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybrid_opt.timing.records import Excess, Place, TimedCarry, TimingLimits
+from hybrid_opt.carry import Carry
+from hybrid_opt.timing.records import Excess, Place, TimingLimits
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
 
@@ -21,12 +22,12 @@ FORCE_FLOOR = 1e-9
 """A contact with less normal force than this carries nothing [N]."""
 
 
-def limit_ratios(carry: TimedCarry, workcell: Workcell, limits: TimingLimits) -> dict[str, Array]:
+def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict[str, Array]:
     """Every limited quantity over its limit at every sample.
 
     Returns:
-        By constraint (n, 12) for joints, (n, 2) for contacts, (n, 1) for the box; only the limits
-        that apply.
+        By constraint (n, all joints) for joints, (n, 2) for contacts, (n, 1) for the box; only the
+        limits that apply.
     """
     robots, payload, task = workcell.robots, workcell.payload, workcell.task
 
@@ -37,8 +38,8 @@ def limit_ratios(carry: TimedCarry, workcell: Workcell, limits: TimingLimits) ->
     radius = np.array([contact.patch_radius for contact in workcell.contacts])
     linear, angular = _norm(carry.rate[:, :3]), _norm(carry.angular_velocity)
     ratios = {
-        "joint velocity": np.abs(carry.q_rate) / joints("velocity_max"),
-        "joint acceleration": np.abs(carry.q_second) / joints("acceleration_max"),
+        "joint velocity": np.abs(carry.side_by_side("q_rate")) / joints("velocity_max"),
+        "joint acceleration": np.abs(carry.side_by_side("q_second")) / joints("acceleration_max"),
         "payload velocity": linear / payload.velocity_max,
         "payload acceleration": _norm(carry.second_rate[:, :3]) / payload.acceleration_max,
         "payload angular velocity": angular / payload.angular_velocity_max,
@@ -60,7 +61,7 @@ def limit_ratios(carry: TimedCarry, workcell: Workcell, limits: TimingLimits) ->
 
 
 def limit_use(
-    carry: TimedCarry,
+    carry: Carry,
     workcell: Workcell,
     limits: TimingLimits,
     joint_names: tuple[tuple[str, ...], tuple[str, ...]],
@@ -75,8 +76,8 @@ def limit_use(
         sample, column = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
         robot, joint = "", ""
         if name in JOINT_CONSTRAINTS:
-            robot = workcell.robots[column // 6].name
-            joint = joint_names[column // 6][column % 6]
+            arm, index = joint_at(joint_names, int(column))
+            robot, joint = workcell.robots[arm].name, joint_names[arm][index]
         elif name in CONTACT_CONSTRAINTS:
             robot = workcell.robots[column].name
         place = Place(name, robot, joint, int(sample), float(carry.parameter[sample]))
@@ -84,8 +85,8 @@ def limit_use(
     return use
 
 
-def joint_use(carry: TimedCarry, workcell: Workcell) -> dict[str, Array]:
-    """Worst use of every joint's limits over the carry, (12,) per joint constraint.
+def joint_use(carry: Carry, workcell: Workcell) -> dict[str, Array]:
+    """Worst use of every joint's limits over the carry, (all joints,) per joint constraint.
 
     Beside the three limits, `contact torque` is the share of the contact wrench alone.
     """
@@ -93,6 +94,12 @@ def joint_use(carry: TimedCarry, workcell: Workcell) -> dict[str, Array]:
     use = {name: ratios[name].max(axis=0) for name in JOINT_CONSTRAINTS}
     limit = np.concatenate([robot.torque_max for robot in workcell.robots])
     return use | {"contact torque": (np.abs(carry.contact_torque) / limit).max(axis=0)}
+
+
+def joint_at(joint_names: tuple[tuple[str, ...], ...], column: int) -> tuple[int, int]:
+    """Arm and joint of a column, both arms' joints side by side."""
+    first = len(joint_names[0])
+    return (0, column) if column < first else (1, column - first)
 
 
 def worst(use: dict[str, Excess]) -> Excess:

@@ -14,7 +14,7 @@ from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign,
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.selection import balanced, peak_normal_forces
-from hybrid_opt.timing import TimingModel
+from hybrid_opt.timing import TimingModel, timed_trajectory
 from hybrid_opt.timing.robustness import payload_sensitivity
 from hybrid_opt.work.children import in_children
 from studies.report.reach import reach_map
@@ -27,7 +27,6 @@ from studies.report.records import (
     TimedSelection,
 )
 from studies.terminal_summary import title
-from studies.timing_stage import timed_trajectory
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 
@@ -127,7 +126,7 @@ def carry_of(evaluator: CandidateEvaluator, model: TimingModel, x: Array, label:
     """One trajectory (n_var,) in detail."""
     found = evaluator.evaluate(x[None])
     timed = model.search_carry(x)
-    sensitivity = payload_sensitivity(model, timed)
+    sensitivity = payload_sensitivity(timed)
     return Carry(label, x, found.objectives[0], timed, sensitivity, bool(found.feasible[0]))
 
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.timing import TimedCarry, TimingModel
+from hybrid_opt import carry
+from hybrid_opt.timing import TimingModel
 from studies.report.figures_cell import motion_points
 from studies.report.records import AlgorithmRuns, Carry, Front, ReportData
 from studies.report.solids import Solid, cell_solids
@@ -97,18 +98,14 @@ class PageData:
             for row in rows.tolist()
         ]
 
-    def _add(self, label: str, timed: TimedCarry, objectives: Array) -> int:
-        workcell = self._data.workcell
-        peaks = timed.normal_force.max(axis=0)
-        whole = np.linalg.norm(timed.contact_force, axis=2).max(axis=0)
-        limit = workcell.payload.mass * (workcell.task.reference_force / whole).min()
+    def _add(self, label: str, timed: carry.Carry, objectives: Array) -> int:
         self._trajectories.append(
             {
                 "label": label,
                 "objectives": [float(value) for value in objectives],
-                "peaks": [round(float(value), 4) for value in peaks],
+                "peaks": [round(float(value), 4) for value in timed.peak_normal_force],
                 "duration": round(timed.duration, 5),
-                "payloadLimit": round(float(limit), 4),
+                "payloadLimit": round(timed.payload_limit, 4),
                 "torqueUse": [
                     round(float(value), 3)
                     for value in 100.0 * np.abs(timed.contact_torque).max(axis=0) / self._limit
@@ -128,7 +125,7 @@ def _fronts(algorithm: AlgorithmRuns, symbol: str) -> list[tuple[str, Front, str
     return found
 
 
-def _samples(timed: TimedCarry) -> Array:
+def _samples(timed: carry.Carry) -> Array:
     """(k, 23) time, pose, joints, normal forces and pressure shifts at some of the samples."""
     n = len(timed.time)
     peaks = [

@@ -8,8 +8,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from hybrid_opt import carry
 from hybrid_opt.evaluate.evaluation import Evaluations
-from hybrid_opt.timing import ForceCurve, TimedCarry, TimingReport
+from hybrid_opt.timing import ForceCurve, TimingReport
 from hybrid_opt.timing.robustness import Margin, PayloadSensitivity
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
@@ -32,7 +33,7 @@ class Carry:
     label: str
     x: Array
     objectives: Array
-    timed: TimedCarry
+    timed: carry.Carry
     sensitivity: PayloadSensitivity
     feasible: bool
 

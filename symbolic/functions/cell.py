@@ -15,6 +15,7 @@ def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
     """The functions by name.
 
     candidate: the evaluator of a whole candidate (`symbolic.functions.candidate`).
+    inverse_dynamics_i: of each arm i = 1, 2 (`symbolic.robot.model`).
     posture: both arms at one box pose (`symbolic.robot.arm.posture_function`).
     clearance, piece_poses, motion: collision bounds, placements and bounds of the motion
     (`symbolic.geometry.clearance.screening_functions`).
@@ -26,6 +27,7 @@ def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
     placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
     return {
         "candidate": candidate_function(model),
+        **{f"inverse_dynamics_{i + 1}": model.robots[i].inverse_dynamics for i in (0, 1)},
         "posture": posture_function(model.workcell.robots, model.robots, model.workcell.contacts),
         **screening_functions(model.geometry, placements),
     }

@@ -16,8 +16,8 @@ def timing_functions(
     """Functions for the timing of one workcell.
 
     path_motion: see `symbolic.physics.path_motion`, at that many samples. load, uncertain_load: see
-    `symbolic.physics.payload_load`. inverse_dynamics_i and arm_i per arm i = 1, 2: see
-    `symbolic.robot.model` and `symbolic.physics.path_motion.arm_derivative_function`.
+    `symbolic.physics.payload_load`. arm_i per arm i = 1, 2: see
+    `symbolic.physics.path_motion.arm_derivative_function`.
 
     Raises:
         DualArmError: the cell's model cannot be built.
@@ -31,6 +31,5 @@ def timing_functions(
     for i, (robot, robot_model, contact) in enumerate(
         zip(workcell.robots, model.robots, workcell.contacts, strict=True), start=1
     ):
-        functions[f"inverse_dynamics_{i}"] = robot_model.inverse_dynamics
         functions[f"arm_{i}"] = arm_derivative_function(robot, robot_model, contact, f"arm_{i}")
     return functions

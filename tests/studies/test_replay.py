@@ -23,7 +23,7 @@ from tests.symbolic.cells import rack_cell
 def document() -> str:
     cell = rack_cell()
     x = cell.task.initial.reshape(-1)
-    figures = trajectory_figures(CandidateEvaluator(cell), x)
+    figures = trajectory_figures(CandidateEvaluator(cell).carry(x))
     with TemporaryDirectory() as folder:
         path = Path(folder) / "t.json"
         write_trajectory(path, cell, x, figures, {"algorithm": "hand-made", "seed": 1})

@@ -9,114 +9,141 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
+from hybrid_opt.carry import Carry
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.export.rapid import rapid_modules
-from hybrid_opt.store.export.samples import SampledTrajectory
+from hybrid_opt.store.export.samples import sample_timing
+from hybrid_opt.store.trajectory_file import FORMAT as TRAJECTORY_FORMAT
+from hybrid_opt.timing.model import joint_names
+from hybrid_opt.timing.records import Timing
 from symbolic.errors import SettingsError
 
 JSON_FORMAT = "dual-arm-carry timed trajectory"
 JSON_VERSION = 1
 _POSE = ("x [m]", "y [m]", "z [m]", "roll [rad]", "pitch [rad]", "yaw [rad]")
 _JOINT_QUANTITIES = (
-    ("position", "rad"),
-    ("velocity", "rad/s"),
-    ("acceleration", "rad/s^2"),
+    ("q", "position", "rad"),
+    ("q_rate", "velocity", "rad/s"),
+    ("q_second", "acceleration", "rad/s^2"),
 )
+"""Of `hybrid_opt.carry.ArmMotion`, with the files' words and units."""
+
+_HEAD = 200
+"""Characters at the beginning of a file that tell what it is."""
 
 
-def export_trajectory(
-    trajectory: SampledTrajectory, form: str, folder: str | Path, stem: str = "trajectory"
+def export(
+    timing: Timing,
+    form: str,
+    folder: str | Path,
+    stem: str = "trajectory",
+    step: float | None = None,
 ) -> tuple[Path, ...]:
-    """Write a trajectory in one of `FORMATS` into a folder, which is made where missing.
+    """Write a timing in one of `FORMATS` into a folder, which is made where missing.
 
     Args:
+        timing: one that robots can drive.
         form: name of the format.
         stem: beginning of the file names.
+        step: time between samples [s], None for the format's own in `DEFAULT_STEP`.
 
     Returns:
         The files written.
 
     Raises:
-        SettingsError: the format is unknown.
-        ResultsError: a file cannot be written.
+        SettingsError: the format is unknown, the step out of range, or the timing fails.
+        ResultsError: a file cannot be written, or another file of this project is in its place.
     """
     if form not in FORMATS:
         raise SettingsError(f"unknown format {form!r}; known are {', '.join(FORMATS)}")
+    carry = sample_timing(timing, DEFAULT_STEP[form] if step is None else step)
     folder = Path(folder)
-    paths = []
-    for suffix, text in FORMATS[form](trajectory).items():
-        path = folder / f"{stem}{suffix}"
+    contents = {folder / f"{stem}{end}": text for end, text in FORMATS[form](carry).items()}
+    for path in contents:
+        _refuse_to_replace_a_trajectory(path)
+    for path, text in contents.items():
         try:
             folder.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8", newline="")
         except OSError as error:
             raise ResultsError(f"{path}: cannot be written ({error.strerror})") from error
-        paths.append(path)
-    return tuple(paths)
+    return tuple(contents)
 
 
-def csv_text(trajectory: SampledTrajectory) -> str:
+def _refuse_to_replace_a_trajectory(path: Path) -> None:
+    """A stored trajectory is the only copy of a result; an export can be made again."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            begin = file.read(_HEAD)
+    except OSError:
+        return
+    if f'"{TRAJECTORY_FORMAT}"' in begin:
+        raise ResultsError(
+            f"{path} is a stored trajectory, which an export would replace; choose another "
+            "folder or file name"
+        )
+
+
+def csv_text(carry: Carry) -> str:
     """One row per time step, one column per quantity, named with its unit."""
+    robots = [robot.name for robot in carry.workcell.robots]
+    names = [joint_names(robot) for robot in carry.workcell.robots]
     header = ["time [s]", *(f"box {name}" for name in _POSE)]
-    for quantity, unit in _JOINT_QUANTITIES:
-        for robot, joints in zip(trajectory.robots, trajectory.joints, strict=True):
-            header += [f"{robot}/{joint} {quantity} [{unit}]" for joint in joints]
-    header += [f"{robot} normal force [N]" for robot in trajectory.robots]
-    columns = [
-        trajectory.time[:, None],
-        trajectory.pose,
-        *(getattr(trajectory, quantity).reshape(-1, 12) for quantity, _ in _JOINT_QUANTITIES),
-        trajectory.normal_force,
-    ]
+    columns = [carry.time[:, None], carry.pose]
+    for quantity, word, unit in _JOINT_QUANTITIES:
+        for robot, joints in zip(robots, names, strict=True):
+            header += [f"{robot}/{joint} {word} [{unit}]" for joint in joints]
+        columns.append(carry.side_by_side(quantity))
+    header += [f"{robot} normal force [N]" for robot in robots]
+    columns.append(carry.normal_force)
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(header)
-    for row in zip(*columns, strict=True):
-        writer.writerow([repr(float(value)) for part in row for value in part])
+    for row in np.concatenate(columns, axis=1).tolist():
+        writer.writerow([repr(value) for value in row])
     return file.getvalue()
 
 
-def json_text(trajectory: SampledTrajectory) -> str:
+def json_text(carry: Carry) -> str:
     """Everything in one object, numbers in full precision."""
     document = {
         "format": JSON_FORMAT,
         "version": JSON_VERSION,
-        "workcell": trajectory.name,
-        "time": trajectory.time.tolist(),
-        "box": {"pose": trajectory.pose.tolist()},
+        "workcell": carry.workcell.name,
+        "time": carry.time.tolist(),
+        "box": {"pose": carry.pose.tolist()},
         "robots": [
             {
-                "name": robot,
-                "joints": list(trajectory.joints[i]),
-                **{
-                    quantity: getattr(trajectory, quantity)[:, i].tolist()
-                    for quantity, _ in _JOINT_QUANTITIES
-                },
-                "normal_force": trajectory.normal_force[:, i].tolist(),
+                "name": robot.name,
+                "joints": list(joint_names(robot)),
+                **{word: getattr(arm, name).tolist() for name, word, _ in _JOINT_QUANTITIES},
+                "normal_force": carry.normal_force[:, i].tolist(),
             }
-            for i, robot in enumerate(trajectory.robots)
+            for i, (robot, arm) in enumerate(zip(carry.workcell.robots, carry.arms, strict=True))
         ],
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
-def joint_trajectory(trajectory: SampledTrajectory, arm: int) -> dict[str, Any]:
+def joint_trajectory(carry: Carry, arm: int) -> dict[str, Any]:
     """One arm as a ROS 2 trajectory_msgs/msg/JointTrajectory."""
+    motion = carry.arms[arm]
     points = [
         {
-            "positions": trajectory.position[k, arm].tolist(),
-            "velocities": trajectory.velocity[k, arm].tolist(),
-            "accelerations": trajectory.acceleration[k, arm].tolist(),
+            "positions": motion.q[k].tolist(),
+            "velocities": motion.q_rate[k].tolist(),
+            "accelerations": motion.q_second[k].tolist(),
             "effort": [],
             "time_from_start": _duration(float(time)),
         }
-        for k, time in enumerate(trajectory.time)
+        for k, time in enumerate(carry.time)
     ]
     return {
         "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
-        "joint_names": list(trajectory.joints[arm]),
+        "joint_names": list(joint_names(carry.workcell.robots[arm])),
         "points": points,
     }
 
@@ -127,31 +154,34 @@ def _duration(seconds: float) -> dict[str, int]:
     return {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
 
 
-def _csv(trajectory: SampledTrajectory) -> dict[str, str]:
-    return {".csv": csv_text(trajectory)}
+def _csv(carry: Carry) -> dict[str, str]:
+    return {".csv": csv_text(carry)}
 
 
-def _json(trajectory: SampledTrajectory) -> dict[str, str]:
-    return {".json": json_text(trajectory)}
+def _json(carry: Carry) -> dict[str, str]:
+    return {".json": json_text(carry)}
 
 
-def _ros2(trajectory: SampledTrajectory) -> dict[str, str]:
+def _ros2(carry: Carry) -> dict[str, str]:
     return {
         f"_arm{arm + 1}.yaml": yaml.safe_dump(
-            joint_trajectory(trajectory, arm), sort_keys=False, default_flow_style=None
+            joint_trajectory(carry, arm), sort_keys=False, default_flow_style=None
         )
-        for arm in (0, 1)
+        for arm in range(len(carry.arms))
     }
 
 
-def _rapid(trajectory: SampledTrajectory) -> dict[str, str]:
-    return {f"_T_ROB{arm + 1}.mod": text for arm, text in enumerate(rapid_modules(trajectory))}
+def _rapid(carry: Carry) -> dict[str, str]:
+    return {f"_T_ROB{arm + 1}.mod": text for arm, text in enumerate(rapid_modules(carry))}
 
 
-FORMATS: Mapping[str, Callable[[SampledTrajectory], dict[str, str]]] = {
+FORMATS: Mapping[str, Callable[[Carry], dict[str, str]]] = {
     "csv": _csv,
     "json": _json,
     "ros2": _ros2,
     "rapid": _rapid,
 }
 """From a sampled trajectory to file contents by the ending of their names."""
+
+DEFAULT_STEP = {"csv": 0.01, "json": 0.01, "ros2": 0.02, "rapid": 0.1}
+"""Time step [s] of each format where none is given."""

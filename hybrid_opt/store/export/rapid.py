@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybrid_opt.store.export.samples import SampledTrajectory
+from hybrid_opt.carry import Carry
 from symbolic.errors import SettingsError
 
 TASKS = ("T_ROB1", "T_ROB2")
@@ -24,29 +24,29 @@ ZONE = "z1"
 _LINE_LENGTH = 60
 
 
-def rapid_modules(trajectory: SampledTrajectory) -> tuple[str, str]:
+def rapid_modules(carry: Carry) -> tuple[str, str]:
     """The modules of both tasks.
 
     Raises:
         SettingsError: the time step is too short or the trajectory too long for RAPID.
     """
-    moves = len(trajectory.time) - 1
-    step = float(trajectory.time[1])
+    moves = len(carry.time) - 1
+    step = float(carry.time[1])
     if step < LEAST_MOVE_TIME or moves > MAX_MOVES:
         raise SettingsError(
             f"{moves} moves of {step:g} s are too many or too short for RAPID; choose a time "
             f"step of at least {LEAST_MOVE_TIME:g} s that gives at most {MAX_MOVES} moves"
         )
-    return _module(trajectory, 0), _module(trajectory, 1)
+    return _module(carry, 0), _module(carry, 1)
 
 
-def _module(trajectory: SampledTrajectory, arm: int) -> str:
-    degrees = np.rad2deg(trajectory.position[:, arm])
+def _module(carry: Carry, arm: int) -> str:
+    degrees = np.rad2deg(carry.arms[arm].q)
     lines = [
         f"MODULE Carry{arm + 1}",
-        f"  ! {_comment(trajectory.name)}",
-        f"  ! Robot {_comment(trajectory.robots[arm])} in task {TASKS[arm]}",
-        f"  ! {len(trajectory.time)} positions, {float(trajectory.time[-1]):.3f} s",
+        f"  ! {_comment(carry.workcell.name)}",
+        f"  ! Robot {_comment(carry.workcell.robots[arm].name)} in task {TASKS[arm]}",
+        f"  ! {len(carry.time)} positions, {float(carry.time[-1]):.3f} s",
         f'  PERS tasks carryTasks{{2}} := [["{TASKS[0]}"],["{TASKS[1]}"]];',
         "  VAR syncident carryStart;",
         "  VAR syncident carryEnd;",
@@ -56,7 +56,7 @@ def _module(trajectory: SampledTrajectory, arm: int) -> str:
         "    SyncMoveOn carryStart, carryTasks;",
     ]
     for k in range(1, len(degrees)):
-        time = float(trajectory.time[k] - trajectory.time[k - 1])
+        time = float(carry.time[k] - carry.time[k - 1])
         zone = ZONE if k < len(degrees) - 1 else "fine"
         lines.append(
             f"    MoveAbsJ {_target(degrees[k])} \\ID:={10 * k} \\NoEOffs, "

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.carry import ArmMotion, Carry
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -18,36 +18,12 @@ LARGEST_STEP = 1.0
 """Range of the time step [s]."""
 
 
-@dataclass(frozen=True)
-class SampledTrajectory:
-    """Joint motion of both arms and the box's motion at even time steps; n samples.
+def sample_timing(timing: Timing, step: float) -> Carry:
+    """A timing's carry at even time steps, from time 0.
 
-    Attributes:
-        name: the workcell's name.
-        robots: names of the two robots.
-        joints: names of each robot's joints.
-        time: (n,) [s], from 0; the last step may be shorter by rounding of the duration.
-        position, velocity, acceleration: (n, 2, 6) of the joints [rad, s].
-        pose: (n, 6) of the box: x, y, z [m], roll, pitch, yaw [rad].
-        normal_force: (n, 2) [N].
-    """
-
-    name: str
-    robots: tuple[str, str]
-    joints: tuple[tuple[str, ...], tuple[str, ...]]
-    time: Array
-    position: Array
-    velocity: Array
-    acceleration: Array
-    pose: Array
-    normal_force: Array
-
-
-def sample_trajectory(model: TimingModel, timing: Timing, step: float) -> SampledTrajectory:
-    """A timing at even time steps.
-
-    Joints follow cubic Hermite pieces between the timing's own samples, which are denser than any
-    sensible step; the acceleration is that of the pieces.
+    Joints and box follow cubic Hermite pieces between the timing's own samples, which are denser
+    than any sensible step; rates and accelerations are those of the pieces. Everything else is
+    interpolated linearly.
 
     Args:
         step: time between samples [s]; it is shrunk so that whole steps fill the duration.
@@ -64,21 +40,39 @@ def sample_trajectory(model: TimingModel, timing: Timing, step: float) -> Sample
             "robots can drive"
         )
     keep = np.concatenate([[True], np.diff(carry.time) > 0.0])
-    time = carry.time[keep]
+    time = carry.time[keep] - carry.time[0]
     grid = np.linspace(0.0, carry.duration, math.ceil(carry.duration / step - 1e-9) + 1)
-    joints = CubicHermiteSpline(time, carry.q[keep], carry.q_rate[keep])
+
+    def between(values: Array) -> Array:
+        flat = values[keep].reshape(len(time), -1)
+        columns = [np.interp(grid, time, column) for column in flat.T]
+        return np.stack(columns, axis=1).reshape(len(grid), *values.shape[1:])
+
+    def arm_between(arm: ArmMotion) -> ArmMotion:
+        joints = CubicHermiteSpline(time, arm.q[keep], arm.q_rate[keep])
+        return ArmMotion(
+            joints(grid),
+            joints(grid, 1),
+            joints(grid, 2),
+            between(arm.contact_torque),
+            between(arm.own_torque),
+        )
+
     box = CubicHermiteSpline(time, carry.pose[keep], carry.rate[keep])
-    shape = (len(grid), 2, 6)
-    return SampledTrajectory(
-        name=model.workcell.name,
-        robots=(model.workcell.robots[0].name, model.workcell.robots[1].name),
-        joints=model.joint_names,
+    return replace(
+        carry,
+        parameter=between(carry.parameter),
         time=grid,
-        position=joints(grid).reshape(shape),
-        velocity=joints(grid, 1).reshape(shape),
-        acceleration=joints(grid, 2).reshape(shape),
         pose=box(grid),
-        normal_force=np.stack(
-            [np.interp(grid, time, carry.normal_force[keep, i]) for i in (0, 1)], axis=1
-        ),
+        rate=box(grid, 1),
+        second_rate=box(grid, 2),
+        angular_velocity=between(carry.angular_velocity),
+        angular_acceleration=between(carry.angular_acceleration),
+        normal_force=between(carry.normal_force),
+        tangential_force=between(carry.tangential_force),
+        contact_force=between(carry.contact_force),
+        pressure_shift=between(carry.pressure_shift),
+        point_moment_residual=between(carry.point_moment_residual),
+        moment_residual=between(carry.moment_residual),
+        arms=(arm_between(carry.arms[0]), arm_between(carry.arms[1])),
     )

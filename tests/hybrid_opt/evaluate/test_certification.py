@@ -11,7 +11,6 @@ from hybrid_opt.evaluate.certification import (
     LostPathError,
     SampledPath,
     configurations,
-    waypoints_of,
 )
 from hybrid_opt.evaluate.evaluation import BETWEEN_SAMPLES, REASONS, CandidateEvaluator
 from hybrid_opt.indicators.metrics import non_dominated
@@ -20,6 +19,7 @@ from symbolic.array import Array
 from symbolic.physics.pose import inverse, pose_matrix
 from symbolic.robot.arm import box_flange
 from symbolic.robot.model import build_robot_model
+from symbolic.workcell.decision import waypoints_of
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 

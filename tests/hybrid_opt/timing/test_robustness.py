@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hybrid_opt.carry import Carry
+from hybrid_opt.evaluate.static_hold import static_hold
 from hybrid_opt.timing import TimingModel, closest_to_reference_timing, force_limited_timing
-from hybrid_opt.timing.records import TimedCarry
 from hybrid_opt.timing.robustness import (
     Margin,
     payload_sensitivity,
     robustness_margins,
-    static_payload_limit,
 )
 from symbolic.workcell.records import Workcell
 from tests.hybrid_opt.timing.cells import hand_timing, initial, near_initial, timing_of
 from tests.symbolic.cells import hand_cell, with_contacts, with_payload
 
 
-def carry(model: TimingModel, x: np.ndarray | None = None) -> TimedCarry:
+def carry(model: TimingModel, x: np.ndarray | None = None) -> Carry:
     return model.search_carry(initial() if x is None else x)
 
 
@@ -28,18 +28,18 @@ def by_name(margins: tuple[Margin, ...]) -> dict[str, Margin]:
 
 def test_static_payload_limit_has_a_closed_form() -> None:
     # (m g / 2) sqrt(1 + 1 / mu^2) = 12 kgf
-    assert static_payload_limit(hand_timing()) == pytest.approx(16.9648, abs=1e-4)
+    assert static_hold(hand_cell()).payload_limit == pytest.approx(16.9648, abs=1e-4)
     for mu in (0.5, 0.8):
-        model = timing_of(with_contacts(hand_cell(), friction=(mu, mu)), stages=20)
+        cell = with_contacts(hand_cell(), friction=(mu, mu))
         expected = 2.0 * 117.68 / (9.81 * np.sqrt(1.0 + 1.0 / mu**2))
-        assert static_payload_limit(model) == pytest.approx(expected, rel=1e-9)
+        assert static_hold(cell).payload_limit == pytest.approx(expected, rel=1e-9)
 
 
 def test_forces_are_proportional_to_the_mass() -> None:
     """The payload at the limit, carried for real: its resultant is the limit."""
     x = near_initial(np.random.default_rng(2), 1)[0]
     cell = hand_cell()
-    sensitivity = payload_sensitivity(hand_timing(), carry(hand_timing(), x))
+    sensitivity = payload_sensitivity(carry(hand_timing(), x))
     mass = sensitivity.payload_limit
     heavy = with_payload(cell, mass=mass, inertia=cell.payload.inertia * mass / cell.payload.mass)
     force = np.linalg.norm(carry(timing_of(heavy, 20), x).contact_force, axis=2).max()
@@ -53,8 +53,8 @@ def test_slow_carries_bear_almost_the_static_payload() -> None:
     model = hand_timing()
     timing = force_limited_timing(model, initial(), 1.001 * 49.05)
     assert timing.carry is not None
-    limit = payload_sensitivity(model, timing.carry).payload_limit
-    static = static_payload_limit(model)
+    limit = payload_sensitivity(timing.carry).payload_limit
+    static = static_hold(model.workcell).payload_limit
     assert 0.995 * static < limit < static
 
 

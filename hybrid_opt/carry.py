@@ -1,0 +1,222 @@
+"""One carry: how box and arms move, and the forces between them, under one timing.
+
+`Cell.carry` gives a candidate under the task's own time law, as a search sees it; `time_path` gives
+one under a timing that robots can drive; exports take one at even time steps. All are this record.
+What both robots have alike (forces) has an axis over the robots; what belongs to an arm's joints,
+of which arms may have different numbers, is in `arms`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from hybrid_opt.evaluate.static_hold import payload_limit, static_hold
+from hybrid_opt.indicators.metrics import excess_above_static
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The evaluator's verdict on one candidate, on the task's samples.
+
+    Attributes:
+        feasible: whether it satisfies every constraint.
+        reason: the constraint violated first along the path, '' if none is.
+        position: path parameter in [0, 1] of that first violation, None if there is none.
+        objectives: values by name, without penalty.
+    """
+
+    feasible: bool
+    reason: str
+    position: float | None
+    objectives: Mapping[str, float]
+
+    def __str__(self) -> str:
+        if self.position is None:
+            return "feasible"
+        where = f"at {100.0 * self.position:.0f} % of the path"
+        return f"infeasible, {self.reason.replace('_', ' ')} {where}"
+
+
+@dataclass(frozen=True, eq=False)
+class ArmMotion:
+    """One arm along a carry, n samples; arrays are read-only.
+
+    Attributes:
+        q, q_rate, q_second: (n, n_joints) joint positions and their time derivatives [rad, s].
+        contact_torque: (n, n_joints) joint torques of the contact wrench alone [N m].
+        own_torque: (n, n_joints) joint torques of the bare arm's motion and weight [N m].
+    """
+
+    q: Array
+    q_rate: Array
+    q_second: Array
+    contact_torque: Array
+    own_torque: Array
+
+    def __post_init__(self) -> None:
+        _set_read_only(self)
+
+    @property
+    def torque(self) -> Array:
+        """(n, n_joints) joint torques of the arm and the contact wrench together [N m]."""
+        return self.contact_torque + self.own_torque
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Carry:
+    """A carry with its timing and every physical quantity; n samples, world frame, read-only.
+
+    At the joint between two pieces of constant path acceleration a sample may stand twice, once
+    for each side.
+
+    Attributes:
+        workcell: the cell.
+        x: (n_var,) decision vector.
+        timing: the task's time law, 'constant' or 'ramped', or 'limits' where a timing was found.
+        parameter: (n,) path parameter u.
+        time: (n,) [s].
+        pose, rate, second_rate: (n, 6) box pose [m, rad] and its time derivatives.
+        angular_velocity, angular_acceleration: (n, 3) of the box [rad/s, rad/s^2].
+        normal_force, tangential_force: (n, 2) [N].
+        contact_force: (n, 2, 3) force of each robot on the box [N].
+        pressure_shift: (n, 2) [m].
+        point_moment_residual: (n, 3) moment missing with the forces at the nominal points [N m].
+        moment_residual: (n, 3) moment missing with the pressure shifted [N m].
+        arms: the motion of each robot's joints.
+        judgement: the evaluator's verdict on the candidate, None where it was not asked for.
+    """
+
+    workcell: Workcell
+    x: Array
+    timing: str
+    parameter: Array
+    time: Array
+    pose: Array
+    rate: Array
+    second_rate: Array
+    angular_velocity: Array
+    angular_acceleration: Array
+    normal_force: Array
+    tangential_force: Array
+    contact_force: Array
+    pressure_shift: Array
+    point_moment_residual: Array
+    moment_residual: Array
+    arms: tuple[ArmMotion, ArmMotion]
+    judgement: Judgement | None = None
+
+    def __post_init__(self) -> None:
+        _set_read_only(self)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def peak_normal_force(self) -> Array:
+        """(2,) largest normal force of each robot [N]."""
+        return np.asarray(self.normal_force.max(axis=0))
+
+    @property
+    def mean_normal_force(self) -> Array:
+        """(2,) normal force of each robot averaged over time [N]."""
+        return np.asarray(np.trapezoid(self.normal_force, self.time, axis=0) / self.duration)
+
+    @property
+    def force_ratio(self) -> Array:
+        """(2,) peak normal forces over the reference forces, the paper's objectives (Eq. 60)."""
+        return np.asarray(self.peak_normal_force / self.workcell.task.reference_force)
+
+    @property
+    def peak_resultant_force(self) -> Array:
+        """(2,) largest magnitude of each robot's whole force [N]."""
+        return np.asarray(np.linalg.norm(self.contact_force, axis=2).max(axis=0))
+
+    @property
+    def payload_limit(self) -> float:
+        """Payload at which the first robot's whole force reaches its reference force [kg]."""
+        return payload_limit(self.workcell, self.peak_resultant_force)
+
+    @property
+    def excess_above_static(self) -> Array:
+        """(2,) how far the peak normal forces lie above the static hold [%]."""
+        return excess_above_static(self.peak_normal_force, static_hold(self.workcell).normal_force)
+
+    @property
+    def mean_excess_above_static(self) -> float:
+        """How far the mean of both peaks lies above that of the static hold [%]."""
+        still = static_hold(self.workcell).normal_force.mean()
+        return float(excess_above_static(self.peak_normal_force.mean(), still))
+
+    @property
+    def friction_margin(self) -> Array:
+        """(n, 2) friction left at each contact, mu N - F_t [N]; zero where a cone is tight."""
+        friction = [contact.friction for contact in self.workcell.contacts]
+        return np.asarray(self.normal_force * friction - self.tangential_force)
+
+    @property
+    def peak_pressure_shift(self) -> Array:
+        """(2,) largest shift of each centre of pressure [m]."""
+        return np.asarray(self.pressure_shift.max(axis=0))
+
+    @property
+    def peak_contact_torque_use(self) -> Array:
+        """(2,) per arm the largest joint torque of the contact wrench over that joint's limit."""
+        return np.array(
+            [
+                float((np.abs(arm.contact_torque) / robot.torque_max).max())
+                for arm, robot in zip(self.arms, self.workcell.robots, strict=True)
+            ]
+        )
+
+    @property
+    def q(self) -> Array:
+        """(n, all joints) both arms' joint positions side by side [rad]."""
+        return self.side_by_side("q")
+
+    @property
+    def contact_torque(self) -> Array:
+        """(n, all joints) joint torques of the contact wrenches, both arms side by side [N m]."""
+        return self.side_by_side("contact_torque")
+
+    @property
+    def torque(self) -> Array:
+        """(n, all joints) whole joint torques, both arms side by side [N m]."""
+        return self.side_by_side("torque")
+
+    def side_by_side(self, name: str) -> Array:
+        """(n, all joints) a quantity of `ArmMotion` with the second arm's joints after the
+        first's."""
+        return np.concatenate([getattr(arm, name) for arm in self.arms], axis=1)
+
+    def __repr__(self) -> str:
+        from hybrid_opt.display.carry import carry_text
+
+        return carry_text(self)
+
+    def _repr_html_(self) -> str:
+        from hybrid_opt.display.carry import carry_html
+
+        return carry_html(self)
+
+
+def joints_of(workcell: Workcell, values: Array) -> tuple[Array, Array]:
+    """Columns of both arms (n, all joints), side by side, as (n, n_joints) of each."""
+    first = len(workcell.robots[0].velocity_max)
+    return values[:, :first], values[:, first:]
+
+
+def _set_read_only(record: object) -> None:
+    for field in fields(record):  # type: ignore[arg-type]
+        value = getattr(record, field.name)
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)

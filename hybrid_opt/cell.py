@@ -1,0 +1,170 @@
+"""A dual-arm cell, ready to be worked with: its description, and its compiled functions on demand.
+
+The only resource of the library. Everything it computes is returned as a frozen record.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective
+from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
+from symbolic.array import Array
+from symbolic.geometry.pairs import CellGeometry
+from symbolic.workcell.decision import initial_decision
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
+
+if TYPE_CHECKING:
+    # Not imported at run time before they are needed: a search needs none of them.
+    from hybrid_opt.collision.certify import Certificate
+    from hybrid_opt.polishing.functions import PolishFunctions
+    from hybrid_opt.timing.model import TimingModel
+
+
+class Cell:
+    """A workcell with its compiled functions, each set loaded or built when first needed.
+
+    A first use compiles; later ones, also by other programs, load what was compiled. Not to be
+    shared between threads.
+
+    Attributes:
+        workcell: the description.
+        threads: candidates that are evaluated at the same time.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
+        threads: int = 1,
+    ) -> None:
+        """Describe a cell; nothing is compiled yet.
+
+        Args:
+            objectives: what searches minimise: names of `OBJECTIVES`, or records of one's own.
+            threads: for the evaluation of candidates; has no influence on results.
+        """
+        self.workcell = workcell
+        self.threads = threads
+        self._objectives = tuple(objectives)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
+        threads: int = 1,
+    ) -> Cell:
+        """The cell of a workcell file.
+
+        Raises:
+            WorkcellError: the file is wrong; the message lists every problem.
+        """
+        return cls(load(Path(path)), objectives, threads)
+
+    @cached_property
+    def evaluator(self) -> CandidateEvaluator:
+        """What judges candidates.
+
+        Raises:
+            SettingsError: an objective is unknown.
+            DualArmError: the model cannot be built.
+        """
+        return CandidateEvaluator(self.workcell, self._objectives, self.threads)
+
+    @cached_property
+    def timing_model(self) -> TimingModel:
+        """What times carries."""
+        from hybrid_opt.timing.model import TimingModel
+
+        return TimingModel(self.workcell)
+
+    @cached_property
+    def polish_functions(self) -> PolishFunctions:
+        """What polishes are assembled from."""
+        from hybrid_opt.polishing.functions import polish_functions
+
+        return polish_functions(self.workcell)
+
+    @cached_property
+    def static_hold(self) -> StaticHold:
+        """The forces of holding the payload level and still."""
+        return static_hold(self.workcell)
+
+    @property
+    def geometry(self) -> CellGeometry:
+        """The collision bodies and the pairs of them that are checked."""
+        return self.evaluator.checker.geometry
+
+    @property
+    def objective_names(self) -> tuple[str, ...]:
+        """What searches minimise."""
+        return self.evaluator.objective_names
+
+    @property
+    def n_var(self) -> int:
+        """Number of decision variables, six per free waypoint."""
+        return self.workcell.task.n_var
+
+    @property
+    def lower(self) -> Array:
+        """(n_var,) lower bounds of the decision vector [m, rad]."""
+        return self.workcell.task.lower
+
+    @property
+    def upper(self) -> Array:
+        """(n_var,) upper bounds of the decision vector [m, rad]."""
+        return self.workcell.task.upper
+
+    @property
+    def initial(self) -> Array:
+        """(n_var,) the hand-made trajectory of the workcell file."""
+        return initial_decision(self.workcell.task)
+
+    def evaluate(self, x: Array) -> Evaluations:
+        """Verdicts on decision vectors (n, n_var), on the task's samples.
+
+        Raises:
+            SettingsError: x has the wrong shape.
+        """
+        return self.evaluator.evaluate(x)
+
+    def carry(self, x: Array) -> Carry:
+        """One decision vector (n_var,) in detail, with its verdict, under the task's time law.
+
+        Raises:
+            SettingsError: x has the wrong shape.
+        """
+        return self.evaluator.carry(x)
+
+    def certify(self, x: Array | Carry) -> Certificate:
+        """The verdict on the collisions of one carry along its continuous path.
+
+        Args:
+            x: (n_var,) decision vector, or a carry.
+
+        Raises:
+            SettingsError: x has the wrong shape.
+            LostPathError: an arm loses the path, so that no more can be said.
+        """
+        return self.evaluator.certificate(x.x if isinstance(x, Carry) else x)
+
+    def __repr__(self) -> str:
+        task, payload = self.workcell.task, self.workcell.payload
+        robots = " and ".join(repr(robot.name) for robot in self.workcell.robots)
+        wanted = ", ".join(o if isinstance(o, str) else o.name for o in self._objectives)
+        return (
+            f"Cell {self.workcell.name!r}: robots {robots} carry {payload.mass:g} kg along "
+            f"{len(task.waypoints)} poses, {len(task.free_indices)} of them free "
+            f"({task.n_var} variables); minimises {wanted}"
+        )
+
+    def _repr_html_(self) -> str:
+        return f"<p>{html.escape(repr(self))}</p>"

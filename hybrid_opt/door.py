@@ -1,0 +1,141 @@
+"""What is done with a cell: search, polish, time, export, store. `hybrid_opt` exports all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt import metaheuristics
+from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
+from hybrid_opt.front import Front
+from hybrid_opt.metaheuristics.problem import CarryProblem, ConstraintHandling
+from hybrid_opt.polishing.front import FrontPolisher
+from hybrid_opt.polishing.records import PolishSettings
+from hybrid_opt.store.trajectory_figures import trajectory_figures
+from hybrid_opt.store.trajectory_file import write_trajectory
+from hybrid_opt.timing.overview import TimedTrajectory, timed_trajectory
+from hybrid_opt.timing.records import Timing, TimingLimits
+from hybrid_opt.timing.solve import time_path as solve_timing
+from symbolic.array import Array
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How a search is done.
+
+    Attributes:
+        algorithm: values that differ from the algorithm's defaults, see
+            `hybrid_opt.metaheuristics.settings`.
+        constraint_handling: 'penalty' (the paper's) or 'constraints'.
+        initial: (k, n_var) decision vectors that the first generation starts with, the rest being
+            uniformly random; None for the cell's hand-made trajectory. Random search takes none.
+    """
+
+    algorithm: Mapping[str, object] = field(default_factory=dict)
+    constraint_handling: ConstraintHandling = "penalty"
+    initial: Array | None = None
+
+
+def search(
+    cell: Cell,
+    algorithm: str = "nsga2",
+    *,
+    evaluations: int = 1000,
+    rng: np.random.Generator,
+    settings: SearchSettings | None = None,
+) -> Front:
+    """Search for the carries of least objectives.
+
+    Args:
+        algorithm: one of `hybrid_opt.metaheuristics.names()`.
+        evaluations: candidates that may be evaluated.
+        rng: the search's only randomness; the same state gives the same front to the bit.
+        settings: see there; None for the defaults.
+
+    Raises:
+        SettingsError: an unknown algorithm or a value that is not allowed.
+    """
+    settings = settings or SearchSettings()
+    initial = cell.initial[None] if settings.initial is None else settings.initial
+    made = metaheuristics.make(
+        algorithm, settings.algorithm, None if algorithm == "random" else initial
+    )
+    problem = CarryProblem(cell.evaluator, settings.constraint_handling)
+    metaheuristics.search(problem, made, evaluations, rng)
+    return Front.of_search(cell, algorithm, cell.evaluator.certified(problem.evaluations))
+
+
+def polish(
+    cell: Cell,
+    front: Front,
+    *,
+    rng: np.random.Generator,
+    settings: PolishSettings | None = None,
+    jobs: int = 1,
+) -> Front:
+    """Improve a front of the paper's two objectives with IPOPT.
+
+    Args:
+        rng: spreads the starts of some attempts.
+        settings: see `hybrid_opt.polishing.records`; None for the defaults.
+        jobs: processes; they have no influence on the result.
+
+    Raises:
+        SettingsError: the cell's objectives are not both peak forces.
+    """
+    polisher = FrontPolisher(cell.evaluator, settings or PolishSettings(), cell.polish_functions)
+    done = polisher.polish(front.x, rng, jobs)
+    title = f"{front.title}, polished"
+    return Front(cell, title, done.x, done.objectives, front.evaluations, done)
+
+
+def time_path(cell: Cell, carry: Carry | Array, limits: TimingLimits | None = None) -> Timing:
+    """The fastest timing from rest to rest that robots can drive.
+
+    Args:
+        carry: the carry whose path is timed, or its decision vector (n_var,).
+        limits: beyond the cell's own speeds and accelerations, which always hold; None for the
+            joint torques and the contact patches.
+
+    Raises:
+        SettingsError: the carry does not fit the cell.
+    """
+    return solve_timing(cell.timing_model, _decision(carry), limits or TimingLimits())
+
+
+def time_every_way(
+    cell: Cell,
+    carry: Carry | Array,
+    *,
+    force_limit: float | None = None,
+    curve_points: int | None = None,
+) -> TimedTrajectory:
+    """The search's timing and the drivable ones of a carry side by side, with margins.
+
+    Args:
+        force_limit: normal force [N] of a force-limited timing, None for no such timing.
+        curve_points: points of the curve of duration against force limit, None for no curve.
+    """
+    return timed_trajectory(cell.timing_model, _decision(carry), force_limit, curve_points)
+
+
+def save(carry: Carry, path: str | Path, provenance: Mapping[str, Any] | None = None) -> None:
+    """Store a carry of `Cell.carry` with its whole cell in one file; see docs/export.md.
+
+    Args:
+        path: the file, replaced where it exists.
+        provenance: JSON values that say how it came about.
+
+    Raises:
+        ResultsError: the workcell was changed after reading, or the file cannot be written.
+    """
+    write_trajectory(path, carry.workcell, carry.x, trajectory_figures(carry), provenance or {})
+
+
+def _decision(carry: Carry | Array) -> Array:
+    return carry.x if isinstance(carry, Carry) else carry

@@ -1,0 +1,130 @@
+"""A front: the feasible carries that no other one dominates, as a search or a polish left them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.evaluation import Evaluations
+from hybrid_opt.indicators import metrics
+from hybrid_opt.indicators.selection import balanced, peak_normal_forces
+from hybrid_opt.polishing.records import PolishedFront
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Front:
+    """Non-dominated feasible carries of a cell, by increasing first objective; read-only arrays.
+
+    Every member is proven free of collisions between the samples too.
+
+    Attributes:
+        cell: the cell.
+        title: how it came about, as 'nsga2' or 'nsga2, polished'.
+        x: (k, n_var) decision vectors.
+        objectives: (k, n_obj).
+        evaluations: every candidate of the search, in order.
+        polished: what the polish did, None without one.
+    """
+
+    cell: Cell
+    title: str
+    x: Array
+    objectives: Array
+    evaluations: Evaluations
+    polished: PolishedFront | None = None
+
+    def __post_init__(self) -> None:
+        for array in (self.x, self.objectives):
+            array.setflags(write=False)
+
+    @classmethod
+    def of_search(cls, cell: Cell, title: str, evaluations: Evaluations) -> Front:
+        """The front among evaluated candidates that `CandidateEvaluator.certified` went through."""
+        rows = metrics.front_rows(evaluations.objectives, evaluations.feasible)
+        return cls(cell, title, evaluations.x[rows], evaluations.objectives[rows], evaluations)
+
+    @property
+    def objective_names(self) -> tuple[str, ...]:
+        """Names of the objectives."""
+        return self.cell.objective_names
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __getitem__(self, index: int) -> Carry:
+        """A member in detail, by its place on the front."""
+        return self.cell.carry(self.x[index])
+
+    def __iter__(self) -> Iterator[Carry]:
+        return (self[index] for index in range(len(self)))
+
+    def balanced(self) -> Carry:
+        """The member of least mean of both robots' peak normal forces, see
+        `hybrid_opt.indicators.selection`.
+
+        Raises:
+            SettingsError: the front is empty.
+        """
+        return self[balanced(self._peaks())]
+
+    def lowest_force(self, robot: int) -> Carry:
+        """The member of least peak normal force of one robot.
+
+        Args:
+            robot: 0 or 1.
+
+        Raises:
+            SettingsError: the front is empty, or there is no such robot.
+        """
+        if robot not in (0, 1):
+            raise SettingsError(f"robot {robot!r}; allowed are 0 and 1")
+        return self[int(np.argmin(self._peaks()[:, robot]))]
+
+    def lowest(self, objective: str) -> Carry:
+        """The member with the least value of one of the objectives.
+
+        Raises:
+            SettingsError: the front is empty, or was not searched for that objective.
+        """
+        if objective not in self.objective_names:
+            raise SettingsError(
+                f"objective {objective!r}; this front has {', '.join(self.objective_names)}"
+            )
+        self._require_members()
+        return self[int(np.argmin(self.objectives[:, self.objective_names.index(objective)]))]
+
+    def hypervolume(self, reference: Array | None = None) -> float:
+        """Volume that the front dominates up to a reference point (n_obj,), the paper's 1.1."""
+        point = metrics.reference_point(len(self.objective_names))
+        return metrics.hypervolume(self.objectives, point if reference is None else reference)
+
+    def spacing(self) -> float:
+        """Unevenness of the front, see `hybrid_opt.indicators.metrics.spacing`."""
+        return metrics.spacing(self.objectives)
+
+    def _peaks(self) -> Array:
+        self._require_members()
+        return peak_normal_forces(self.cell.evaluator, self.x)
+
+    def _require_members(self) -> None:
+        if len(self) == 0:
+            raise SettingsError(
+                "the front is empty: no feasible candidate was found; give the search more "
+                "evaluations or the task wider bounds"
+            )
+
+    def __repr__(self) -> str:
+        from hybrid_opt.display.front import front_text
+
+        return front_text(self)
+
+    def _repr_html_(self) -> str:
+        from hybrid_opt.display.front import front_html
+
+        return front_html(self)

@@ -1,0 +1,116 @@
+"""The one record of a carry: its figures against the compiled outputs and closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hybrid_opt.carry import Carry, joints_of
+from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.evaluation import REASONS
+from symbolic.workcell.file import load
+from tests.hybrid_opt.campaign.fake import RACK
+
+
+@cache
+def cell() -> Cell:
+    return Cell.load(RACK)
+
+
+@cache
+def initial() -> Carry:
+    return cell().carry(cell().initial)
+
+
+def test_it_holds_what_the_compiled_function_returned() -> None:
+    carry, outputs = initial(), cell().evaluator.outputs(cell().initial)
+    assert len(carry) == cell().workcell.task.samples
+    for name in ("pose", "rate", "second_rate", "normal_force", "pressure_shift"):
+        np.testing.assert_array_equal(getattr(carry, name), outputs[name][0])
+    for i, arm in enumerate(carry.arms):
+        np.testing.assert_array_equal(arm.q, outputs[f"q_{i + 1}"][0])
+        np.testing.assert_array_equal(arm.contact_torque, outputs[f"joint_torque_{i + 1}"][0])
+        np.testing.assert_array_equal(arm.torque, arm.contact_torque + arm.own_torque)
+    np.testing.assert_array_equal(carry.contact_force.reshape(-1, 6), outputs["contact_force"][0])
+
+
+def test_its_own_torques_hold_the_arms_up() -> None:
+    """Against Pinocchio's inverse dynamics, joint by joint along the carry."""
+    import pinocchio as pin
+
+    from symbolic.cell_model import build_cell_model
+
+    models = build_cell_model(cell().workcell).robots
+    for arm, robot in zip(initial().arms, models, strict=True):
+        data = robot.model.createData()
+        for k in (0, 37, len(initial()) - 1):
+            torque = pin.rnea(robot.model, data, arm.q[k], arm.q_rate[k], arm.q_second[k])
+            np.testing.assert_allclose(arm.own_torque[k], torque, atol=1e-8)
+
+
+def test_figures_have_closed_forms() -> None:
+    carry, task = initial(), cell().workcell.task
+    still = 9.81 * cell().workcell.payload.mass / (2.0 * cell().workcell.contacts[0].friction)
+    np.testing.assert_allclose(
+        carry.excess_above_static, 100.0 * (carry.normal_force.max(axis=0) / still - 1.0)
+    )
+    assert carry.mean_excess_above_static == pytest.approx(carry.excess_above_static.mean())
+    np.testing.assert_allclose(
+        carry.force_ratio, list(cell().evaluate(cell().initial).objectives[0])
+    )
+    whole = np.sqrt((carry.contact_force**2).sum(axis=2)).max(axis=0)
+    assert carry.payload_limit == pytest.approx(10.0 * min(task.reference_force / whole))
+    assert carry.friction_margin.min() > -1e-6
+    even = replace(carry, time=np.linspace(0.0, 1.0, len(carry)))
+    inner = carry.normal_force[1:-1].sum(axis=0) + carry.normal_force[[0, -1]].sum(axis=0) / 2.0
+    np.testing.assert_allclose(even.mean_normal_force, inner / (len(carry) - 1))
+
+
+def test_arms_may_stand_side_by_side() -> None:
+    carry = initial()
+    both = carry.side_by_side("q_rate")
+    assert both.shape == (len(carry), 12)
+    first, second = joints_of(carry.workcell, both)
+    np.testing.assert_array_equal(first, carry.arms[0].q_rate)
+    np.testing.assert_array_equal(second, carry.arms[1].q_rate)
+
+
+def test_a_carry_cannot_be_changed() -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        initial().pose[0, 0] = 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        initial().arms[0].q[0, 0] = 1.0
+
+
+def test_the_verdict_is_that_of_the_evaluation() -> None:
+    rng = np.random.default_rng(3)
+    x = rng.uniform(cell().lower, cell().upper, (40, cell().n_var))
+    found = cell().evaluate(x)
+    assert 0 < found.feasible.sum() < len(x)
+    for row in range(len(x)):
+        judgement = cell().carry(x[row]).judgement
+        assert judgement is not None
+        assert judgement.feasible == found.feasible[row]
+        assert list(judgement.objectives.values()) == found.objectives[row].tolist()
+        if not judgement.feasible:
+            assert judgement.reason == REASONS[found.reason[row]]
+            assert judgement.position == found.position[row]
+            assert judgement.reason.replace("_", " ") in repr(cell().carry(x[row]))
+
+
+def test_it_prints_its_figures() -> None:
+    text = repr(initial())
+    assert "feasible" in text
+    assert f"{initial().payload_limit:.3f} kg" in text
+    page = initial()._repr_html_()
+    assert "<svg" in page
+    assert "payload limit" in page
+
+
+def test_names_cannot_become_markup() -> None:
+    evil = replace(load(RACK), name="<script>alert(1)</script>")
+    carry = replace(initial(), workcell=evil)
+    assert "<script" not in carry._repr_html_()

@@ -1,0 +1,163 @@
+"""The front door: a cell is searched, polished, timed, exported and stored with a few calls."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hybrid_opt as ho
+from hybrid_opt.campaign.replica import ReplicaTask, run_replica
+from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.indicators import metrics
+from hybrid_opt.store.trajectory_file import read_trajectory
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.workcell.records import Workcell
+from tests.hybrid_opt.campaign.fake import RACK
+
+EVALUATIONS = 120
+
+
+@cache
+def cell() -> ho.Cell:
+    return ho.Cell.load(RACK)
+
+
+@cache
+def front() -> ho.Front:
+    rng = CampaignSettings().replica_rng("nsga2", 0)
+    return ho.search(cell(), "nsga2", evaluations=EVALUATIONS, rng=rng)
+
+
+@cache
+def polished() -> ho.Front:
+    rng = np.random.default_rng(1)
+    return ho.polish(cell(), front(), rng=rng, settings=ho.PolishSettings(points=2))
+
+
+def test_everything_that_is_promised_is_there() -> None:
+    assert set(ho.__all__) <= set(dir(ho))
+    for name in ho.__all__:
+        assert getattr(ho, name).__name__ == name
+    with pytest.raises(AttributeError, match="no attribute 'Front2'"):
+        _ = ho.Front2
+
+
+def test_importing_it_imports_nothing_slow() -> None:
+    program = "import sys, hybrid_opt; print(*sys.modules)"
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    slow = {"numpy", "casadi", "pinocchio", "fcl", "pymoo", "scipy", "toppra", "matplotlib"}
+    assert not slow & set(run.stdout.split())
+
+
+def test_a_search_is_the_one_that_a_campaign_runs() -> None:
+    settings = CampaignSettings(algorithms=("nsga2",), evaluations=EVALUATIONS)
+    task = ReplicaTask(settings, "nsga2", 0, cell().initial)
+    outcome = run_replica(cell().evaluator, task, lambda block: None)
+    rows = outcome.front.decode().splitlines()[1:]
+    assert len(rows) == len(front()) > 1
+    again = run_replica(cell().evaluator, task, lambda block: None)
+    assert again.evaluations == outcome.evaluations
+    assert len(front().evaluations) == EVALUATIONS
+    for row, objectives in zip(rows, front().objectives, strict=True):
+        assert all(repr(float(value)) in row for value in objectives)
+
+
+def test_a_front_is_proven_and_not_dominated() -> None:
+    assert metrics.non_dominated(front().objectives).all()
+    assert (np.diff(front().objectives[:, 0]) > 0.0).all()
+    for carry in front():
+        assert carry.judgement is not None
+        assert carry.judgement.feasible
+        assert cell().certify(carry).is_free
+    counts = front().evaluations.infeasible_by_reason
+    assert sum(counts.values()) == np.sum(~front().evaluations.feasible)
+
+
+def test_selections() -> None:
+    peaks = np.array([carry.peak_normal_force for carry in front()])
+    mean = front().balanced().peak_normal_force.mean()
+    assert mean == pytest.approx(peaks.mean(axis=1).min(), rel=3e-4)
+    for robot in (0, 1):
+        assert front().lowest_force(robot).peak_normal_force[robot] == peaks[:, robot].min()
+    np.testing.assert_array_equal(front().lowest("peak_force_2").x, front().lowest_force(1).x)
+    with pytest.raises(SettingsError, match="allowed are 0 and 1"):
+        front().lowest_force(2)
+    with pytest.raises(SettingsError, match="this front has peak_force_1"):
+        front().lowest("duration")
+
+
+def test_an_empty_front_says_so() -> None:
+    empty = ho.search(
+        cell(),
+        "random",
+        evaluations=1,
+        rng=np.random.default_rng(0),
+    )
+    if len(empty):
+        pytest.fail("this candidate was to be infeasible")
+    assert "0 carries" in repr(empty)
+    assert "<svg" not in empty._repr_html_()
+    with pytest.raises(SettingsError, match="front is empty"):
+        empty.balanced()
+
+
+def test_a_polish_makes_it_better() -> None:
+    assert polished().hypervolume() > front().hypervolume()
+    assert polished().title == "nsga2, polished"
+    assert polished().polished is not None
+    assert "of 2 attempts" in repr(polished())
+
+
+def test_a_front_prints_and_draws_itself() -> None:
+    assert f"{len(front())} carries" in repr(front())
+    page = front()._repr_html_()
+    assert page.count("<circle") > len(front())
+    assert "level and still" in page
+
+
+def test_a_carry_is_timed_and_exported(tmp_path: Path) -> None:
+    carry = front().balanced()
+    timing = ho.time_path(cell(), carry, ho.TimingLimits(force=52.0))
+    assert timing.ok
+    assert timing.carry is not None
+    assert timing.carry.peak_normal_force.max() <= 52.0 * 1.005
+    np.testing.assert_array_equal(timing.carry.x, carry.x)
+    assert "joint acceleration" in repr(timing)
+    assert "<table" in timing._repr_html_()
+    files = ho.export(timing, "ros2", tmp_path)
+    assert all(file.stat().st_size > 1000 for file in files)
+    every = ho.time_every_way(cell(), carry.x, force_limit=52.0)
+    assert every.report.timings["force limited"].duration == pytest.approx(timing.duration)
+
+
+def test_a_carry_is_stored_with_its_cell(tmp_path: Path) -> None:
+    carry = front().balanced()
+    ho.save(carry, tmp_path / "carry.json", {"algorithm": "nsga2"})
+    stored = read_trajectory(tmp_path / "carry.json")
+    np.testing.assert_array_equal(stored.x, carry.x)
+    assert stored.figures["payload_limit"] == carry.payload_limit
+    assert stored.unpack(tmp_path).digest == cell().workcell.digest
+
+
+def _height(outputs: Mapping[str, Array], _: Workcell) -> Array:
+    return np.asarray(outputs["pose"][:, :, 2].max(axis=1) / 2.0)
+
+
+def test_objectives_of_ones_own() -> None:
+    tall = ho.Objective("height", "largest height / 2 m", _height)
+    mine = ho.Cell.load(RACK, objectives=("peak_force_1", tall))
+    assert mine.objective_names == ("peak_force_1", "height")
+    carry = mine.carry(mine.initial)
+    assert carry.judgement is not None
+    assert carry.judgement.objectives["height"] == carry.pose[:, 2].max() / 2
+    with pytest.raises(SettingsError, match="each once"):
+        ho.Cell.load(RACK, objectives=(tall, tall)).carry(mine.initial)
