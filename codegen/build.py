@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from codegen.cache import FORMAT, Cache, Entry, digest, source_digest
-from codegen.compiled import CompiledFunction
-from codegen.compiler import FLAGS, Compiler, default_level, find_compiler
+from codegen.compiled import CompiledFunction, warn_one_lane
+from codegen.compiler import FLAGS, LANE_FLAGS, Compiler, default_level, find_compiler
 from codegen.errors import CodegenError
 from codegen.function import NumericFunction, available_cores
 from codegen.interpreted import InterpretedFunction, warn_interpreted
@@ -62,7 +62,11 @@ class Build:
 
 
 def compile_function(
-    function: ca.Function, cache: Cache | None = None, *, level: int | None = None
+    function: ca.Function,
+    cache: Cache | None = None,
+    *,
+    level: int | None = None,
+    lanes: int = 1,
 ) -> NumericFunction:
     """Compile one CasADi function, or take it from the cache.
 
@@ -70,6 +74,7 @@ def compile_function(
         function: any function that CasADi can write as C; sparse inputs and outputs become dense.
         cache: where libraries are kept; by default the user's (`codegen.cache.default_folder`).
         level: optimisation level 0 to 3; by default by the size of the source.
+        lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
 
     Returns:
         A `CompiledFunction`, or without a C compiler an `InterpretedFunction`, with one warning
@@ -79,7 +84,7 @@ def compile_function(
         CodegenError: it cannot be generated, compiled, cached or loaded.
     """
     levels = None if level is None else {"function": level}
-    return build({"function": function}, cache, levels=levels).functions["function"]
+    return build({"function": function}, cache, levels=levels, lanes=lanes).functions["function"]
 
 
 def build(
@@ -89,6 +94,7 @@ def build(
     levels: Mapping[str, int] | None = None,
     jobs: int = 0,
     rebuild: bool = False,
+    lanes: int = 1,
 ) -> Build:
     """Compile a set of CasADi functions, several at once.
 
@@ -98,6 +104,7 @@ def build(
         levels: optimisation level per name, where the default by size is not wanted.
         jobs: compilers that run at once; 0 for one per core.
         rebuild: compile also what is in the cache.
+        lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
 
     Raises:
         CodegenError: see `compile_function`.
@@ -109,9 +116,9 @@ def build(
     with ThreadPoolExecutor(jobs or available_cores()) as pool:
         futures = []
         for name, function in functions.items():
-            source = _Source.of(function)
+            source = _Source.of(function, lanes)
             level = (levels or {}).get(name)
-            level = default_level(len(source.text)) if level is None else level
+            level = default_level(source.own_bytes) if level is None else level
             futures.append(pool.submit(_compile, source, compiler, cache, level, rebuild))
         built = [future.result() for future in futures]
     reports = tuple(
@@ -139,6 +146,7 @@ def load_or_build(
     cache: Cache | None = None,
     *,
     levels: Mapping[str, int] | None = None,
+    lanes: int = 1,
 ) -> dict[str, NumericFunction]:
     """A set of functions by the key of what they are made from.
 
@@ -150,6 +158,7 @@ def load_or_build(
         make: makes the functions.
         cache: where libraries are kept; by default the user's.
         levels: optimisation level per name, where the default by size is not wanted.
+        lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
 
     Raises:
         CodegenError: see `compile_function`; and whatever `make` raises.
@@ -158,13 +167,13 @@ def load_or_build(
     if compiler is None:
         return _interpreted(make()).functions
     cache = cache or Cache()
-    found = _load_set(key, compiler, cache)
+    found = _load_set(key, lanes, compiler, cache)
     if found is not None:
         return found
-    with cache.lock(_set_key(key, compiler)):
-        found = _load_set(key, compiler, cache)
+    with cache.lock(_set_key(key, lanes, compiler)):
+        found = _load_set(key, lanes, compiler, cache)
         if found is None:
-            found = build_set(key, make(), cache, levels=levels).functions
+            found = build_set(key, make(), cache, levels=levels, lanes=lanes).functions
         return found
 
 
@@ -176,22 +185,30 @@ def build_set(
     built = build(functions, cache, **options)
     compiler = find_compiler()
     if compiler is not None:
-        cache.write_record(_set_key(key, compiler), {"members": built.keys})
+        key = _set_key(key, options.get("lanes", 1), compiler)
+        cache.write_record(key, {"members": built.keys})
     return built
 
 
 @dataclass(frozen=True)
 class _Source:
+    """C to compile, and without lanes if that fails. own_bytes: what CasADi generated of it."""
+
     signature: Signature
     operations: int
     text: str
+    own_bytes: int
+    without_lanes: str | None
 
     @classmethod
-    def of(cls, function: ca.Function) -> _Source:
+    def of(cls, function: ca.Function, lanes: int) -> _Source:
         from codegen.source import c_source, dense, operations
 
         densified = dense(function)
-        return cls(Signature.of(densified), operations(function), c_source(densified))
+        text = c_source(densified)
+        signature, count, own = Signature.of(densified), operations(function), len(text)
+        wide = c_source(densified, lanes)
+        return cls(signature, count, wide, own, None if wide == text else text)
 
 
 def _compile(
@@ -199,15 +216,22 @@ def _compile(
 ) -> tuple[CompiledFunction, Entry, bool]:
     signature = source.signature
     # Names and shapes are part of the C text, except which of two equal layouts they mean.
-    key = digest(
-        str(FORMAT), compiler.identity, str(level), *FLAGS, str(signature.to_json()), source.text
-    )
+    flags = () if source.without_lanes is None else LANE_FLAGS
+    names = str(signature.to_json())
+    key = digest(str(FORMAT), compiler.identity, str(level), *FLAGS, *flags, names, source.text)
 
     def make(library: Path) -> dict[str, Any]:
         text = library.parent / f"{signature.name}.c"
         text.write_text(source.text)
         start = time.perf_counter()
-        compiler.compile(text, library, level)
+        try:
+            compiler.compile(text, library, level, flags)
+        except CodegenError as error:
+            if source.without_lanes is None:
+                raise
+            text.write_text(source.without_lanes)
+            compiler.compile(text, library, level)
+            warn_one_lane(signature.name, str(error))
         return {
             "signature": signature.to_json(),
             "operations": source.operations,
@@ -237,8 +261,10 @@ def _load(key: str, cache: Cache) -> tuple[CompiledFunction, Entry] | None:
         return None
 
 
-def _load_set(key: str, compiler: Compiler, cache: Cache) -> dict[str, NumericFunction] | None:
-    record = cache.read_record(_set_key(key, compiler))
+def _load_set(
+    key: str, lanes: int, compiler: Compiler, cache: Cache
+) -> dict[str, NumericFunction] | None:
+    record = cache.read_record(_set_key(key, lanes, compiler))
     if record is None:
         return None
     functions: dict[str, NumericFunction] = {}
@@ -250,9 +276,15 @@ def _load_set(key: str, compiler: Compiler, cache: Cache) -> dict[str, NumericFu
     return functions
 
 
-def _set_key(key: str, compiler: Compiler) -> str:
+def _set_key(key: str, lanes: int, compiler: Compiler) -> str:
     return digest(
-        "set", str(FORMAT), key, compiler.identity, version("casadi"), source_digest("codegen")
+        "set",
+        str(FORMAT),
+        key,
+        str(lanes),
+        compiler.identity,
+        version("casadi"),
+        source_digest("codegen"),
     )
 
 

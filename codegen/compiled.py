@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import warnings
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -22,6 +23,9 @@ from symbolic.array import Array
 _CHUNKS_PER_THREAD = 4
 """Pieces of a batch per thread: small enough to even out threads that are held up."""
 
+_ALIGNMENT = 64
+"""Bytes to which work memory is aligned: the widest vector."""
+
 # Under short names for speed; NumPy arrays are buffers, which their type does not say.
 _writable: Any = ctypes.c_char.from_buffer
 _address_of = ctypes.addressof
@@ -38,6 +42,8 @@ class CompiledFunction(NumericFunction):
 
     Attributes:
         library: the shared library's path.
+        lanes: evaluations of a batch that run side by side; 1 where it was built without lanes,
+            or where they do not give the bits of single evaluations.
     """
 
     def __init__(self, signature: Signature, library: Path) -> None:
@@ -64,6 +70,16 @@ class CompiledFunction(NumericFunction):
         self._once.restype = self._run.restype = ctypes.c_longlong
         self._work_sizes = tuple(int(size) for size in sizes)
         self._idle: deque[_Work] = deque()
+        self.lanes = 1
+        self._run_lanes, self._idle_lanes = self._run, deque[_Work]()
+        if hasattr(loaded, "dual_arm_run_lanes"):
+            self._run_lanes = loaded.dual_arm_run_lanes
+            self._run_lanes.argtypes = self._run.argtypes
+            self._run_lanes.restype = ctypes.c_longlong
+            self.lanes = int(loaded.dual_arm_lanes())
+            if not self._lanes_agree():
+                self.lanes = 1
+                warn_one_lane(self.name, "lanes and single evaluations differ")
 
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
         work = self._take_work()
@@ -129,8 +145,15 @@ class CompiledFunction(NumericFunction):
             future.result()
 
     def _run_chunk(self, ports_address: int, begin: int, end: int) -> None:
-        work = self._take_work()
-        self._finish(work, self._run(ports_address, work.address, begin, end), of=" of the batch")
+        if self.lanes > 1 and end - begin > 1:
+            work = self._take_lane_work()
+            status = self._run_lanes(ports_address, work.address, begin, end)
+            self._idle_lanes.append(work)
+        else:
+            work = self._take_work()
+            status = self._run(ports_address, work.address, begin, end)
+            self._idle.append(work)
+        self._check(status, " of the batch")
 
     def _take_work(self) -> _Work:
         try:
@@ -138,8 +161,37 @@ class CompiledFunction(NumericFunction):
         except IndexError:
             return _Work(self._work_sizes, len(self.input_names), len(self.output_names))
 
+    def _take_lane_work(self) -> _Work:
+        try:
+            return self._idle_lanes.pop()
+        except IndexError:
+            arg, res, iw, w = self._work_sizes
+            w += sum(map(_size, (*self.input_shapes, *self.output_shapes)))
+            n_in, n_out = len(self.input_names), len(self.output_names)
+            return _Work((arg, res, iw, w * self.lanes), n_in, n_out)
+
+    def _lanes_agree(self) -> bool:
+        """Whether a ragged batch in lanes gives the bits of single evaluations."""
+        rng = np.random.default_rng(0)
+        n = self.lanes + 1
+        inputs = [rng.normal(0.0, 0.5, (n, *shape)) for shape in self.input_shapes]
+        together = [np.empty((n, *shape)) for shape in self.output_shapes]
+        apart = [np.empty((n, *shape)) for shape in self.output_shapes]
+        batched = [True] * len(inputs)
+        if not inputs:
+            return True
+        self._evaluate_batch(inputs, batched, together, n, 1)
+        for k in range(n):
+            rows = slice(k, k + 1)
+            one = [output[rows] for output in apart]
+            self._evaluate_batch([array[rows] for array in inputs], batched, one, 1, 1)
+        return all(map(_same, together, apart))
+
     def _finish(self, work: _Work, status: int, of: str = "") -> None:
         self._idle.append(work)
+        self._check(status, of)
+
+    def _check(self, status: int, of: str) -> None:
         if status == _SUCCESS:
             return
         if status == _TOO_MANY:
@@ -148,7 +200,7 @@ class CompiledFunction(NumericFunction):
 
 
 class _Work:
-    """Work memory of one evaluation at a time, with the addresses the driver wants."""
+    """Work memory of one thread at a time, with the addresses the driver wants."""
 
     def __init__(self, sizes: Sequence[int], n_in: int, n_out: int) -> None:
         arg, res, iw, w = sizes
@@ -156,14 +208,33 @@ class _Work:
             (ctypes.c_void_p * (arg + 1))(),
             (ctypes.c_void_p * (res + 1))(),
             (ctypes.c_longlong * (iw + 1))(),
-            (ctypes.c_double * (w + 1))(),
+            (ctypes.c_double * (w + _ALIGNMENT // 8 + 1))(),
         ]
-        self._pointers = (ctypes.c_void_p * 4)(*[ctypes.addressof(m) for m in self._memory])
+        addresses = [ctypes.addressof(memory) for memory in self._memory]
+        addresses[3] += -addresses[3] % _ALIGNMENT
+        self._pointers = (ctypes.c_void_p * 4)(*addresses)
         self.address = ctypes.addressof(self._pointers)
         self.inputs = (ctypes.c_longlong * (n_in + 1))()
         self.inputs_address = ctypes.addressof(self.inputs)
         self.ports = (ctypes.c_longlong * (2 * (n_in + n_out)))()
         self.ports_address = ctypes.addressof(self.ports)
+
+
+_warned = False
+
+
+def warn_one_lane(name: str, reason: str) -> None:
+    """Tell once per process that a function runs one evaluation at a time."""
+    global _warned
+    if _warned:
+        return
+    _warned = True
+    warnings.warn(
+        f"{name}: batches are evaluated one by one, which is slower: {reason}; another compiler "
+        "(environment variable CC) may do better",
+        RuntimeWarning,
+        stacklevel=3,
+    )
 
 
 _threads: dict[int, ThreadPoolExecutor] = {}
@@ -185,6 +256,12 @@ def _address(array: Array) -> int:
         return _address_of(_writable(array))
     except TypeError:  # read-only
         return int(array.ctypes.data)
+
+
+def _same(a: Array, b: Array) -> bool:
+    """Whether two arrays hold the same bits, NaN equal to NaN whatever its bits."""
+    unlike = a.view(np.int64) != b.view(np.int64)
+    return not (unlike & ~(np.isnan(a) & np.isnan(b))).any()
 
 
 def _size(shape: Sequence[int]) -> int:

@@ -27,6 +27,14 @@ FLAGS = (
     "-DCASADI_MAX_NUM_THREADS=128",
 )
 
+LANE_FLAGS = (
+    # GCC 12 makes wrong code of loops over four lanes when it vectorises them (AVX-512VL); what is
+    # written in lanes gains nothing from it.
+    "-fno-tree-vectorize",
+    "-fno-tree-slp-vectorize",
+    "-Wno-psabi",
+)
+
 MACHINE_FLAGS = ("-march=native", "-mcpu=native")
 """The machine's own instruction set, as compilers name it: the first that one accepts is used.
 What it stands for is part of a library's key, so machines that share a cache keep their own."""
@@ -61,14 +69,17 @@ class Compiler:
         """Text that changes with the compiler, its version, its target and the machine."""
         return "\n".join([*self.command, self.version, *self.machine, self.instructions])
 
-    def compile(self, source: Path, library: Path, level: int) -> None:
+    def compile(self, source: Path, library: Path, level: int, flags: tuple[str, ...] = ()) -> None:
         """Compile one C file into a shared library at optimisation `level` (0 to 3).
+
+        Args:
+            flags: further ones.
 
         Raises:
             CodegenError: the compiler refused the source, could not write, or was killed.
         """
-        flags = [f"-O{level}", *FLAGS, *self.machine]
-        command = [*self.command, *flags, "-o", str(library), str(source), "-lm"]
+        own = [f"-O{level}", *FLAGS, *self.machine]
+        command = [*self.command, *own, *flags, "-o", str(library), str(source), "-lm"]
         # The compiler's own temporary files stay in the build folder and go away with it.
         environment = os.environ | {"TMPDIR": str(source.parent), "LC_ALL": "C"}
         try:

@@ -2,84 +2,13 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from itertools import accumulate
 
 import casadi as ca
 
 from codegen.errors import CodegenError
-
-_DRIVER = """
-#if defined(__GNUC__)
-#define DUAL_ARM_EXPORT __attribute__((visibility("default")))
-#else
-#define DUAL_ARM_EXPORT
-#endif
-
-/* An argument or result: its first candidate, and the step to the next in doubles. */
-typedef struct { casadi_real* base; long long step; } dual_arm_port;
-
-/* Work memory of one thread. */
-typedef struct {
-  const casadi_real** arg; casadi_real** res; casadi_int* iw; casadi_real* w;
-} dual_arm_work;
-
-static volatile int dual_arm_lock = 0;
-
-static void dual_arm_acquire(void) { while (__sync_lock_test_and_set(&dual_arm_lock, 1)) {} }
-
-DUAL_ARM_EXPORT void dual_arm_load(void) { @NAME@_incref(); }
-
-DUAL_ARM_EXPORT void dual_arm_sizes(long long* sizes) {
-  casadi_int arg, res, iw, w;
-  @NAME@_work(&arg, &res, &iw, &w);
-  sizes[0] = arg; sizes[1] = res; sizes[2] = iw; sizes[3] = w;
-}
-
-/* Evaluate once: arguments by address, results one after the other in a block. Returns as
-   dual_arm_run. */
-DUAL_ARM_EXPORT long long dual_arm_once(const casadi_real* const* inputs, casadi_real* block,
-                                        const dual_arm_work* work) {
-  static const long long offsets[] = {@OFFSETS@};
-  long long failed = -1;
-  int mem, i;
-  dual_arm_acquire();
-  mem = @NAME@_checkout();
-  __sync_lock_release(&dual_arm_lock);
-  if (mem < 0) return -2;
-  for (i = 0; i < @N_IN@; ++i) work->arg[i] = inputs[i];
-  for (i = 0; i < @N_OUT@; ++i) work->res[i] = block + offsets[i];
-  if (@NAME@(work->arg, work->res, work->iw, work->w, mem)) failed = 0;
-  dual_arm_acquire();
-  @NAME@_release(mem);
-  __sync_lock_release(&dual_arm_lock);
-  return failed;
-}
-
-/* Evaluate candidates begin to end. Returns -1, or the first candidate that failed, or -2 where
-   too many evaluations run at once. */
-DUAL_ARM_EXPORT long long dual_arm_run(const dual_arm_port* ports, const dual_arm_work* work,
-                                       long long begin, long long end) {
-  const dual_arm_port* results = ports + @N_IN@;
-  long long failed = -1, k;
-  int mem, i;
-  dual_arm_acquire();
-  mem = @NAME@_checkout();
-  __sync_lock_release(&dual_arm_lock);
-  if (mem < 0) return -2;
-  for (k = begin; k < end; ++k) {
-    for (i = 0; i < @N_IN@; ++i)
-      work->arg[i] = ports[i].base ? ports[i].base + k * ports[i].step : 0;
-    for (i = 0; i < @N_OUT@; ++i)
-      work->res[i] = results[i].base ? results[i].base + k * results[i].step : 0;
-    if (@NAME@(work->arg, work->res, work->iw, work->w, mem)) { failed = k; break; }
-  }
-  dual_arm_acquire();
-  @NAME@_release(mem);
-  __sync_lock_release(&dual_arm_lock);
-  return failed;
-}
-"""
+from codegen.lanes import lane_text
+from codegen.runtime import runtime
 
 
 def dense(function: ca.Function) -> ca.Function:
@@ -105,32 +34,62 @@ def dense(function: ca.Function) -> ca.Function:
     )
 
 
-def c_source(function: ca.Function) -> str:
-    """C text of a dense CasADi function: what CasADi generates, then the batch driver.
+def c_source(function: ca.Function, lanes: int = 1) -> str:
+    """C text of a dense CasADi function: what CasADi generates, then the batch drivers.
+
+    Args:
+        function: any that CasADi can write as C.
+        lanes: 1 for one evaluation at a time; otherwise batches are also evaluated in lanes, as
+            many as given, or for 0 as many as suit the machine that compiles.
 
     Raises:
         CodegenError: CasADi cannot write this function as C (a callback, an external solver).
     """
+    include = "#include <math.h>\n"
+    generated = generated_c(function)
+    in_lanes = None if lanes == 1 else lane_text(generated, "lanes")
+    before, after = [include, runtime("arithmetic.h")], [_filled(runtime("driver.c"), function)]
+    if in_lanes is not None:
+        width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
+        before += [runtime("one_lane.h"), width, runtime("lanes.h")]
+        lane_driver = _filled(runtime("lane_driver.c"), function)
+        after += [
+            "\n#if DUAL_ARM_LANES > 1\n" + in_lanes.text + "#endif\n\n",
+            lane_driver.replace("@LANE_FUNCTION@", in_lanes.entry),
+        ]
+    # Our arithmetic comes after the library's declarations, which it shadows.
+    return generated.replace(include, "".join(before), 1) + "\n" + "".join(after)
+
+
+def generated_c(function: ca.Function) -> str:
+    """What CasADi generates for a dense function.
+
+    Raises:
+        CodegenError: CasADi cannot write this function as C.
+    """
     try:
         generator = ca.CodeGenerator(function.name(), {"main": False, "mex": False})
         generator.add(function)
-        generated = str(generator.dump())
+        return str(generator.dump())
     except RuntimeError as error:
         reason = str(error).splitlines()[-1]
         raise CodegenError(
             f"{function.name()}: CasADi cannot generate C for it: {reason}"
         ) from error
-    sizes = [function.numel_out(i) for i in range(function.n_out())]
-    driver = (
-        _DRIVER.replace("@NAME@", function.name())
-        .replace("@N_IN@", str(function.n_in()))
-        .replace("@N_OUT@", str(function.n_out()))
-        .replace("@OFFSETS@", ", ".join(map(str, accumulate(sizes, initial=0))))
+
+
+def _filled(driver: str, function: ca.Function) -> str:
+    """A driver with the names and sizes of a function."""
+    n_in, n_out = function.n_in(), function.n_out()
+    inputs = [function.numel_in(i) for i in range(n_in)]
+    outputs = [function.numel_out(i) for i in range(n_out)]
+    return (
+        driver.replace("@NAME@", function.name())
+        .replace("@N_IN@", str(n_in))
+        .replace("@N_OUT@", str(n_out))
+        .replace("@OFFSETS@", ", ".join(map(str, accumulate(outputs, initial=0))))
+        .replace("@SIZES@", ", ".join(map(str, [*inputs, *outputs, 0])))
     )
-    # Our arithmetic comes after the library's declarations, which it shadows.
-    include = "#include <math.h>\n"
-    arithmetic = files("codegen").joinpath("c/arithmetic.h").read_text()
-    return generated.replace(include, include + arithmetic, 1) + driver
 
 
 def operations(function: ca.Function) -> int:

@@ -74,7 +74,7 @@ def _run(options: argparse.Namespace) -> int:
 
         workcell = load(options.workcell)
         made = cell_functions(workcell)
-        built = build_set(workcell_key(workcell), made, cache, rebuild=options.check)
+        built = build_set(workcell_key(workcell), made, cache, rebuild=options.check, lanes=0)
         if options.check:
             bounds = {"x": (workcell.task.lower, workcell.task.upper)}
             rng = np.random.default_rng(options.seed)

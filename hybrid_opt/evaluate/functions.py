@@ -34,8 +34,8 @@ def workcell_functions(
 
     if not workcell.digest:
         # Not read from a file: nothing identifies it but the functions themselves.
-        return build(make(), cache).functions
-    return load_or_build(workcell_key(workcell), make, cache)
+        return build(make(), cache, lanes=0).functions
+    return load_or_build(workcell_key(workcell), make, cache, lanes=0)
 
 
 def workcell_key(workcell: Workcell) -> str:

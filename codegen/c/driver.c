@@ -1,0 +1,69 @@
+#if defined(__GNUC__)
+#define DUAL_ARM_EXPORT __attribute__((visibility("default")))
+#else
+#define DUAL_ARM_EXPORT
+#endif
+
+/* An argument or result: its first candidate, and the step to the next in doubles. */
+typedef struct { casadi_real* base; long long step; } dual_arm_port;
+
+/* Work memory of one thread. */
+typedef struct {
+  const casadi_real** arg; casadi_real** res; casadi_int* iw; casadi_real* w;
+} dual_arm_work;
+
+static volatile int dual_arm_lock = 0;
+
+static void dual_arm_acquire(void) { while (__sync_lock_test_and_set(&dual_arm_lock, 1)) {} }
+
+DUAL_ARM_EXPORT void dual_arm_load(void) { @NAME@_incref(); }
+
+DUAL_ARM_EXPORT void dual_arm_sizes(long long* sizes) {
+  casadi_int arg, res, iw, w;
+  @NAME@_work(&arg, &res, &iw, &w);
+  sizes[0] = arg; sizes[1] = res; sizes[2] = iw; sizes[3] = w;
+}
+
+/* Evaluate once: arguments by address, results one after the other in a block. Returns as
+   dual_arm_run. */
+DUAL_ARM_EXPORT long long dual_arm_once(const casadi_real* const* inputs, casadi_real* block,
+                                        const dual_arm_work* work) {
+  static const long long offsets[] = {@OFFSETS@};
+  long long failed = -1;
+  int mem, i;
+  dual_arm_acquire();
+  mem = @NAME@_checkout();
+  __sync_lock_release(&dual_arm_lock);
+  if (mem < 0) return -2;
+  for (i = 0; i < @N_IN@; ++i) work->arg[i] = inputs[i];
+  for (i = 0; i < @N_OUT@; ++i) work->res[i] = block + offsets[i];
+  if (@NAME@(work->arg, work->res, work->iw, work->w, mem)) failed = 0;
+  dual_arm_acquire();
+  @NAME@_release(mem);
+  __sync_lock_release(&dual_arm_lock);
+  return failed;
+}
+
+/* Evaluate candidates begin to end. Returns -1, or the first candidate that failed, or -2 where
+   too many evaluations run at once. */
+DUAL_ARM_EXPORT long long dual_arm_run(const dual_arm_port* ports, const dual_arm_work* work,
+                                       long long begin, long long end) {
+  const dual_arm_port* results = ports + @N_IN@;
+  long long failed = -1, k;
+  int mem, i;
+  dual_arm_acquire();
+  mem = @NAME@_checkout();
+  __sync_lock_release(&dual_arm_lock);
+  if (mem < 0) return -2;
+  for (k = begin; k < end; ++k) {
+    for (i = 0; i < @N_IN@; ++i)
+      work->arg[i] = ports[i].base ? ports[i].base + k * ports[i].step : 0;
+    for (i = 0; i < @N_OUT@; ++i)
+      work->res[i] = results[i].base ? results[i].base + k * results[i].step : 0;
+    if (@NAME@(work->arg, work->res, work->iw, work->w, mem)) { failed = k; break; }
+  }
+  dual_arm_acquire();
+  @NAME@_release(mem);
+  __sync_lock_release(&dual_arm_lock);
+  return failed;
+}
