@@ -1,13 +1,18 @@
 """What one sample of the box motion asks of the two contacts, as one CasADi function.
 
-Joins rotation, force allocation and centre of pressure (paper Section 4.4).
+Joins rotation, force allocation and centre of pressure (paper Section 4.4). With the allocation
+`joint` the paper's result is kept wherever its shifts stay within the patches and leave no moment,
+and `symbolic.physics.joint_allocation` takes over where not.
 """
 
 from __future__ import annotations
 
 import casadi as ca
+import numpy as np
 
+from symbolic.expression import Expression
 from symbolic.physics.contact_forces import allocate, required_force
+from symbolic.physics.joint_allocation import allocate_jointly, balance_of
 from symbolic.physics.pressure import pressure_shift, required_moment
 from symbolic.physics.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.workcell.records import Workcell
@@ -36,6 +41,22 @@ required_moment, point_moment_residual, moment_residual (3,): about the centre o
 nominal contact point, world axes [N, N m].
 """
 
+_ALLOCATED = (
+    "normal_force",
+    "tangential_force",
+    "contact_force",
+    "pressure_shift",
+    "shift_vector",
+    "point_moment_residual",
+    "moment_residual",
+    "wrench_1",
+    "wrench_2",
+)
+"""The outputs that depend on the allocation."""
+
+RESIDUAL_TOLERANCE = 1e-9
+"""Moment that counts as carried, as a share of the force times the distance of the contacts."""
+
 
 def load_function(workcell: Workcell) -> ca.Function:
     """Contact forces and centres of pressure from a box pose and its time derivatives.
@@ -43,9 +64,10 @@ def load_function(workcell: Workcell) -> ca.Function:
     Inputs: pose, rate, second_rate (6,) as in `symbolic.physics.time_law.TimedPath`.
     Outputs: see `LOAD_OUTPUTS`.
     """
-    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    friction = ca.SX([contact.friction for contact in workcell.contacts])
-    centre_of_mass = ca.SX(ca.DM(workcell.payload.centre_of_mass))
+    kind = ca.SX if workcell.task.allocation == "paper" else ca.MX
+    motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    friction = kind([contact.friction for contact in workcell.contacts])
+    centre_of_mass = kind(ca.DM(workcell.payload.centre_of_mass))
     return ca.Function(
         "load",
         motion,
@@ -75,6 +97,13 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
     Inputs: pose, rate, second_rate (6,); friction (2,) coefficients of the contacts;
     centre_of_mass (3,) in the box frame [m]. Outputs: see `LOAD_OUTPUTS`.
     """
+    if workcell.task.allocation == "paper":
+        return paper_load_function(workcell)
+    return _joint_load_function(workcell)
+
+
+def paper_load_function(workcell: Workcell) -> ca.Function:
+    """`uncertain_load_function` by the paper's allocation, whatever the workcell's own is."""
     pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
     friction, centre_of_mass = ca.SX.sym("friction", 2), ca.SX.sym("centre_of_mass", 3)
     payload, contacts = workcell.payload, workcell.contacts
@@ -116,6 +145,93 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
     )
 
 
-def _length(vector: ca.SX) -> ca.SX:
+def _joint_load_function(workcell: Workcell) -> ca.Function:
+    """The paper's result where the patches suffice for it, and the joint allocation elsewhere."""
+    sizes = {"pose": 6, "rate": 6, "second_rate": 6, "friction": 2, "centre_of_mass": 3}
+    inputs = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
+    found = paper_load_function(workcell)(*inputs.values())
+    paper = dict(zip(LOAD_OUTPUTS, found, strict=True))
+    points = [contact.T_box_pad[:3, 3] for contact in workcell.contacts]
+    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
+    force = paper["contact_force"][:3] + paper["contact_force"][3:]
+    distance = float(np.linalg.norm(points[0] - points[1]))
+    allowed = RESIDUAL_TOLERANCE * distance * ca.norm_2(force)
+    shifted = ca.mmax(paper["pressure_shift"] / radius) <= 1.0
+    suffices = ca.logic_and(shifted, ca.norm_2(paper["moment_residual"]) <= allowed)
+    kept = [paper[name] for name in _ALLOCATED]
+    passed = [ca.MX.sym(name, value.shape[0]) for name, value in zip(_ALLOCATED, kept, strict=True)]
+    asked = [inputs["pose"], force, paper["required_moment"], inputs["friction"]]
+    asked.append(inputs["centre_of_mass"])
+    unused = [ca.MX.sym("unused", value.shape[0]) for value in asked]
+    anew = _joint_sample_function(workcell)
+    choice = ca.Function.if_else(
+        "allocation",
+        ca.Function("keep", [*unused, *passed], passed),
+        ca.Function("anew", [*unused, *passed], anew(*unused)),
+    )
+    chosen = choice(suffices, *asked, *kept)
+    outputs = paper | dict(zip(_ALLOCATED, chosen, strict=True))
+    return ca.Function(
+        "uncertain_load",
+        list(inputs.values()),
+        [outputs[name] for name in LOAD_OUTPUTS],
+        list(sizes),
+        list(LOAD_OUTPUTS),
+    )
+
+
+def _joint_sample_function(workcell: Workcell) -> ca.Function:
+    """pose, force, moment (world), friction and centre of mass to the outputs `_ALLOCATED`."""
+    sizes = (("pose", 6), ("force", 3), ("moment", 3), ("friction", 2), ("centre_of_mass", 3))
+    pose, force, moment, friction, centre_of_mass = (ca.MX.sym(*entry) for entry in sizes)
+    T_box_pads = [contact.T_box_pad for contact in workcell.contacts]
+    axes = ca.mtimes(_rotation_function()(pose[3:]), ca.DM(T_box_pads[0][:3, :3]))
+    arms = [
+        ca.mtimes(ca.DM(T_box_pads[0][:3, :3].T), ca.DM(T[:3, 3]) - centre_of_mass)
+        for T in T_box_pads
+    ]
+    needed = (ca.mtimes(axes.T, force), ca.mtimes(axes.T, moment))
+    held = allocate_jointly(
+        balance_of(*needed, (arms[0], arms[1])),
+        friction,
+        ca.DM([contact.patch_radius for contact in workcell.contacts]),
+    )
+    forces = [
+        ca.vertcat(tangent, sign * held.normal[i])
+        for i, (tangent, sign) in enumerate(((held.tangent_1, 1.0), (held.tangent_2, -1.0)))
+    ]
+    shifts = [ca.vertcat(shift, 0.0) for shift in (held.shift_1, held.shift_2)]
+    moments = [
+        ca.cross(shift, at) + ca.vertcat(0.0, 0.0, held.torsion[i])
+        for i, (shift, at) in enumerate(zip(shifts, forces, strict=True))
+    ]
+    point = needed[1] - ca.cross(arms[0], forces[0]) - ca.cross(arms[1], forces[1])
+    world = ca.mtimes(axes, ca.horzcat(*forces, *shifts, *moments, point, point - sum(moments)))
+    first, second, shift_1, shift_2, moment_1, moment_2, before, left = ca.horzsplit(world)
+    outputs = {
+        "normal_force": held.normal,
+        "tangential_force": ca.vertcat(_length(held.tangent_1), _length(held.tangent_2)),
+        "contact_force": ca.vertcat(first, second),
+        "pressure_shift": ca.vertcat(_length(held.shift_1), _length(held.shift_2)),
+        "shift_vector": ca.vertcat(shift_1, shift_2),
+        "point_moment_residual": before,
+        "moment_residual": left,
+        "wrench_1": ca.vertcat(first, moment_1),
+        "wrench_2": ca.vertcat(second, moment_2),
+    }
+    return ca.Function(
+        "joint_sample",
+        [pose, force, moment, friction, centre_of_mass],
+        [outputs[name] for name in _ALLOCATED],
+    )
+
+
+def _rotation_function() -> ca.Function:
+    """rpy (3,) to R_world_box, as expressions of one kind need it within those of the other."""
+    rpy = ca.SX.sym("rpy", 3)
+    return ca.Function("rotation", [rpy], [rotation_matrix(rpy)])
+
+
+def _length(vector: Expression) -> Expression:
     """Length with a finite derivative at zero; 1e-12 m is far below any patch."""
     return ca.sqrt(ca.sumsqr(vector) + 1e-24)

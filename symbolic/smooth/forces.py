@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from symbolic.array import Array
 from symbolic.physics.contact_forces import split_force
 from symbolic.physics.path import PathBasis, sample_basis, waypoint_matrix
-from symbolic.physics.payload_load import LOAD_OUTPUTS, load_function, resultant_force
+from symbolic.physics.payload_load import LOAD_OUTPUTS, paper_load_function, resultant_force
 from symbolic.physics.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.physics.time_law import timed_path
 from symbolic.workcell.records import Task, Workcell
@@ -150,7 +150,10 @@ def _values(
 def _margin_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate (6,) of a sample to 1 - (shift / patch radius)^2 (2,)."""
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    shift = load_function(workcell)(*motion)[LOAD_OUTPUTS.index("pressure_shift")]
+    friction = ca.DM([contact.friction for contact in workcell.contacts])
+    # Where the patches suffice the joint allocation is the paper's, so that these rows keep to it.
+    load = paper_load_function(workcell)(*motion, friction, workcell.payload.centre_of_mass)
+    shift = load[LOAD_OUTPUTS.index("pressure_shift")]
     radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
     return ca.Function("sample_margin", motion, [1.0 - (shift / radius) ** 2])
 

@@ -19,6 +19,7 @@ from symbolic.workcell.reader import Problems, suggestion
 from symbolic.workcell.records import Robot, Workcell
 
 PAYLOAD_BODY = "payload"
+PATCH_OVERLAP = 0.9  # [1], how far patches that carry moments together may stand beside one another
 REACH_SLACK = 1e-6  # [m], rounding of a flange exactly at full stretch
 
 
@@ -78,6 +79,23 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
             "contacts[1].xyz",
             f"lies on the {_face_name(second)} face, contacts[0] on the {_face_name(first)} face; "
             "allowed are opposite faces, the force model holds for opposite normals only",
+        )
+    elif workcell.task.allocation == "joint" and problems.clean("task.allocation"):
+        _check_overlap(workcell, problems)
+
+
+def _check_overlap(workcell: Workcell, problems: Problems) -> None:
+    """The joint allocation carries any moment by pressing harder, which the patches' overlap,
+    seen along the normal, makes possible."""
+    apart = workcell.contacts[0].T_box_pad[:3, 3] - workcell.contacts[1].T_box_pad[:3, 3]
+    normal = workcell.contacts[0].T_box_pad[:3, 2]
+    offset = float(np.linalg.norm(apart - (apart @ normal) * normal))
+    room = sum(contact.patch_radius for contact in workcell.contacts)
+    if offset >= PATCH_OVERLAP * room:
+        problems.add(
+            "contacts[1].xyz",
+            f"faces a point {offset:g} m beside contacts[0]; task.allocation = 'joint' allows less "
+            f"than {PATCH_OVERLAP:g} of both patch radii together, {PATCH_OVERLAP * room:g} m here",
         )
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from symbolic.array import Array
 
 TimeLaw = Literal["constant", "ramped"]
+Allocation = Literal["paper", "joint"]
 
 
 @dataclass(frozen=True)
@@ -193,6 +194,8 @@ class Task:
         reference_force: (2,) [N], normalises each robot's normal force.
         initial: (n_free, 6), the hand-made trajectory's free waypoints.
         allowed_contacts: contacts that are no collisions, see AllowedContact.
+        allocation: 'paper' (least forces first, then the moments) or 'joint' (the least forces
+            that carry the moments as well).
     """
 
     waypoints: tuple[Waypoint, ...]
@@ -204,6 +207,7 @@ class Task:
     reference_force: Array
     initial: Array
     allowed_contacts: tuple[AllowedContact, ...]
+    allocation: Allocation = "paper"
 
     @property
     def free_indices(self) -> tuple[int, ...]:

@@ -9,13 +9,14 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.workcell import quantities as quantity
 from symbolic.workcell.reader import Table, checked_vector, read_only, shown
-from symbolic.workcell.records import AllowedContact, Task, TimeLaw, Waypoint
+from symbolic.workcell.records import Allocation, AllowedContact, Task, TimeLaw, Waypoint
 
 MIN_SAMPLES = 5
 MAX_SAMPLES = 10_000
 MAX_WAYPOINTS = 100
 COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
 TIME_LAWS = ("constant", "ramped")
+ALLOCATIONS = ("paper", "joint")
 
 
 def read_task(table: Table) -> Task:
@@ -47,6 +48,7 @@ def read_task(table: Table) -> Task:
         reference_force=table.vector("reference_force", (quantity.FORCE,) * 2, scalar_fills=True),
         initial=_read_initial(table, [w for w in waypoints if not w.is_fixed]),
         allowed_contacts=tuple(_allowed_contact(e) for e in table.tables("allowed_contacts")),
+        allocation=cast("Allocation", table.choice("allocation", ALLOCATIONS, "paper")),
     )
     table.close()
     return task

@@ -60,6 +60,7 @@ CASES: list[tuple[str, Any, str, str]] = [
     ("robots[0].package_dirs", "x", "robots[0].package_dirs", "allowed is an array of folders"),
     ("environment[0].kind", "cube", "environment[0].kind", "'box', 'cylinder', 'sphere', 'mesh'"),
     ("environment[0].kind", "boxx", "environment[0].kind", "did you mean 'box'?"),
+    ("task.allocation", "conic", "task.allocation", "allowed is one of 'paper', 'joint'"),
     ("task.time_law", "toppra", "task.time_law", "allowed is one of 'constant', 'ramped'"),
     ("task.samples", 4, "task.samples", "found 4; allowed is a whole number 5 to"),
     ("task.samples", 50.0, "task.samples", "allowed is a whole number"),

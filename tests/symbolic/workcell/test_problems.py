@@ -209,3 +209,16 @@ def test_odd_values_raise_no_other_error(path: str, value: Any) -> None:
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(WorkcellError):
         # Some odd values are right where they stand, e.g. zero for an angle.
         assert load(write(Path(folder), data)).digest
+
+
+def test_the_joint_allocation_asks_for_pads_that_face_one_another(tmp_path: Path) -> None:
+    """Of both radii of 31.5 mm, 0.9 are 56.7 mm."""
+    data = sample_data()
+    put(data, "task.allocation", "joint")
+    put(data, "contacts[1].xyz", [0.056, -0.20, 0.0])
+    assert load(write(tmp_path, data)).task.allocation == "joint"
+    put(data, "contacts[1].xyz", [0.058, -0.20, 0.0])
+    (found,) = problems_of(write(tmp_path, data))
+    assert found.startswith("contacts[1].xyz: faces a point 0.058 m beside contacts[0]")
+    put(data, "task.allocation", "paper")
+    assert load(write(tmp_path, data)).task.allocation == "paper"

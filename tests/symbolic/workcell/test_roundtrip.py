@@ -94,6 +94,7 @@ def assert_same_task(cell: Workcell, data: dict[str, Any]) -> None:
     centres = np.mean(free, axis=1)
     np.testing.assert_allclose(task.initial, np.array(data.get("initial", centres)), atol=1e-15)
     assert task.samples == data.get("samples", 100)
+    assert task.allocation == data.get("allocation", "paper")
     assert task.time_law == data.get("time_law", "constant")
     assert task.reference_speed == data["reference_speed"]
     assert task.reference_angular_speed == data.get("reference_angular_speed", 0.5)
