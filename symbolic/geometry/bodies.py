@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -10,13 +12,16 @@ import pinocchio as pin
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
-from symbolic.geometry.pieces import Capsule, Piece, check_piece
+from symbolic.geometry.pieces import Capsule, Hull, Piece, check_piece
 from symbolic.robot.urdf import arm_model, link_frame, resolve_mesh
 from symbolic.robot.urdf_file import UrdfMesh, read_urdf
 from symbolic.workcell.reader import shown
 from symbolic.workcell.records import Box, Mesh, Robot, Shape, Workcell
 
 Group = Literal["robot 1", "robot 2", "payload", "environment"]
+MOST_CORNERS = 100_000
+"""Most corners of all convex pieces of meshes: the sorting of pairs then takes about 15 s."""
+
 PAYLOAD = "payload"
 """Name of the payload's body."""
 
@@ -85,18 +90,20 @@ def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
     Raises:
         CollisionModelError: a shape or mesh is unusable, or two bodies share a name.
     """
-    bodies = [body for i in (0, 1) for body in _robot_bodies(workcell.robots[i], i)]
+    meshes = MeshReader()
+    bodies = [body for i in (0, 1) for body in _robot_bodies(workcell.robots[i], i, meshes)]
     payload = Piece(Box(np.asarray(workcell.payload.size)), np.eye(4))
     bodies.append(CollisionBody(PAYLOAD, "payload", BOX, (payload,)))
     for obstacle in workcell.environment:
         owner = f"environment body {obstacle.name!r}"
-        pieces = shape_pieces(obstacle.shape, obstacle.pose, owner)
+        pieces = shape_pieces(obstacle.shape, obstacle.pose, owner, meshes)
         bodies.append(CollisionBody(obstacle.name, "environment", WORLD, pieces))
     for body in bodies:
         for piece in body.pieces:
             check_piece(piece, f"collision body {body.name!r}")
-    names = [body.name for body in bodies]
-    repeated = sorted({name for name in names if names.count(name) > 1})
+    _check_effort(bodies, workcell.collision.most_pieces)
+    counts = Counter(body.name for body in bodies)
+    repeated = sorted(name for name, count in counts.items() if count > 1)
     if repeated:
         raise CollisionModelError(f"collision bodies share the name(s) {repeated}; rename them")
     return tuple(bodies)
@@ -121,31 +128,86 @@ def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
     )
 
 
-def shape_pieces(shape: Shape | Capsule, pose: Array, owner: str) -> tuple[Piece, ...]:
+def _check_effort(bodies: list[CollisionBody], most_pieces: int) -> None:
+    """Refuse more pieces and corners than the sorting of pairs gets through in some seconds."""
+    pieces = sum(len(body.pieces) for body in bodies)
+    largest = max(bodies, key=lambda body: len(body.pieces))
+    if pieces > most_pieces:
+        raise CollisionModelError(
+            f"the cell's bodies have {pieces} convex pieces, {len(largest.pieces)} of them "
+            f"{largest.name!r}; allowed are {most_pieces}: simplify the meshes, or raise "
+            "collision.most_pieces in the workcell file and wait"
+        )
+    corners = {body.name: sum(map(_corners, body.pieces)) for body in bodies}
+    if sum(corners.values()) > MOST_CORNERS:
+        name = max(corners, key=lambda name: corners[name])
+        raise CollisionModelError(
+            f"the convex pieces of the cell's meshes have {sum(corners.values())} corners, "
+            f"{corners[name]} of them {name!r}; allowed are {MOST_CORNERS}: simplify the meshes "
+            "for collision checking"
+        )
+
+
+def _corners(piece: Piece) -> int:
+    return len(piece.shape.vertices) if isinstance(piece.shape, Hull) else 0
+
+
+class MeshReader:
+    """The meshes of one cell: each is read and cut once, within `MOST_FACES` triangles together."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[Path, tuple[float, ...]], tuple[Hull, ...]] = {}
+        self._triangles = 0
+
+    def hulls(self, mesh: Mesh) -> tuple[Hull, ...]:
+        """The convex pieces of a mesh.
+
+        Raises:
+            CollisionModelError: see `symbolic.geometry.meshes.read_mesh`; and all meshes so far
+                have too many triangles.
+        """
+        # Not imported at the top: trimesh takes long to start, and most cells have no meshes.
+        from symbolic.geometry.meshes import MOST_FACES, cut, read_mesh
+
+        key = (mesh.path, tuple(mesh.scale))
+        if key not in self._known:
+            found = read_mesh(mesh.path, mesh.scale)
+            self._triangles += len(found.faces)
+            if self._triangles > MOST_FACES:
+                raise CollisionModelError(
+                    f"{mesh.path}: with its {len(found.faces)} triangles the cell's meshes have "
+                    f"{self._triangles}; allowed are {MOST_FACES} together: simplify the largest"
+                )
+            self._known[key] = cut(found, mesh.path)
+        return self._known[key]
+
+
+def shape_pieces(
+    shape: Shape | Capsule, pose: Array, owner: str, meshes: MeshReader
+) -> tuple[Piece, ...]:
     """The convex pieces of a shape at a pose (4, 4)."""
     if not isinstance(shape, Mesh):
         return (Piece(shape, pose),)
-    # Not imported at the top: trimesh takes long to start, and most cells have no meshes.
-    from symbolic.geometry.meshes import convex_pieces
-
     try:
-        return tuple(Piece(hull, pose) for hull in convex_pieces(shape.path, shape.scale))
+        return tuple(Piece(hull, pose) for hull in meshes.hulls(shape))
     except CollisionModelError as error:
         raise CollisionModelError(f"{owner}: {error}") from error
 
 
-def _robot_bodies(robot: Robot, i: int) -> list[CollisionBody]:
+def _robot_bodies(robot: Robot, i: int, meshes: MeshReader) -> list[CollisionBody]:
     group: Group = "robot 1" if i == 0 else "robot 2"
     model = arm_model(robot)
     bodies = []
-    for link, pieces in _link_pieces(robot).items():
+    for link, pieces in _link_pieces(robot, meshes).items():
         frame, T = _attachment(model, link, robot, i)
         moved = tuple(piece.moved(T) for piece in pieces)
         bodies.append(CollisionBody(f"{robot.name}/{link}", group, frame, moved))
     frame, T = _attachment(model, robot.flange, robot, i)
     for tool in robot.tool:
         owner = f"tool {tool.name!r} of robot {robot.name!r}"
-        pieces = tuple(piece.moved(T) for piece in shape_pieces(tool.shape, tool.pose, owner))
+        pieces = tuple(
+            piece.moved(T) for piece in shape_pieces(tool.shape, tool.pose, owner, meshes)
+        )
         bodies.append(CollisionBody(f"{robot.name}/{tool.name}", group, frame, pieces, True))
     return bodies
 
@@ -159,7 +221,7 @@ def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Fram
     return Frame("link", i, frame.parentJoint - 1), placement
 
 
-def _link_pieces(robot: Robot) -> dict[str, tuple[Piece, ...]]:
+def _link_pieces(robot: Robot, meshes: MeshReader) -> dict[str, tuple[Piece, ...]]:
     """The collision pieces of every link of a URDF that has any, in the link's frame."""
     links = {}
     for link, collisions in read_urdf(robot.urdf).collisions.items():
@@ -168,7 +230,7 @@ def _link_pieces(robot: Robot) -> dict[str, tuple[Piece, ...]]:
         for collision in collisions:
             shape = collision.shape
             found = _located(shape, robot, owner) if isinstance(shape, UrdfMesh) else shape
-            pieces += shape_pieces(found, collision.pose, owner)
+            pieces += shape_pieces(found, collision.pose, owner, meshes)
         links[link] = tuple(pieces)
     return links
 

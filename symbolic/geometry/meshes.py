@@ -9,21 +9,30 @@ inside; its whole hull is used, with a warning.
 from __future__ import annotations
 
 import warnings
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
+from symbolic import outside
 from symbolic.array import Array
-from symbolic.errors import CollisionModelError
+from symbolic.errors import CollisionModelError, OutsideError
 from symbolic.geometry.pieces import SMALLEST_SIZE, Hull
 
-MOST_FACES = 200_000
-"""Largest mesh that is taken [triangles]: collision shapes are simplified shapes."""
+FORMATS = ("stl", "obj", "ply", "off")
+"""Formats that are read: those that hold one mesh, and name no other file that matters."""
+
+MOST_FACES = 100_000
+"""Most triangles of one mesh, and of all meshes of a cell together: cutting them takes about 0.1 ms
+each, and collision shapes are simplified shapes."""
+
+MOST_PARTS = 400
+"""Most connected components of one mesh: each becomes a convex piece or several."""
 
 LARGEST_EXTENT = 100.0
-"""Largest extent of a mesh [m]: more is a file in millimetres without its scale."""
+"""Largest extent and coordinate of a mesh [m]: more is a file in millimetres without its scale."""
 
 CUTS = np.linspace(0.125, 0.875, 7)
 """Where planes are tried, as fractions of a part's extent."""
@@ -43,23 +52,37 @@ def convex_pieces(path: Path, scale: Array) -> tuple[Hull, ...]:
     """Convex hulls, in the mesh's frame, whose union contains the mesh.
 
     Args:
-        path: a file that trimesh reads.
+        path: a file in one of `FORMATS`.
         scale: (3,) factor per axis.
 
     Raises:
         CollisionModelError: unreadable, empty, flat, with non-finite vertices, or enormous.
     """
-    mesh = _load(path, scale)
+    return cut(read_mesh(path, scale), path)
+
+
+def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
+    """The convex pieces of a mesh of `read_mesh`; `path` names it in messages.
+
+    Raises:
+        CollisionModelError: a part has no convex hull.
+    """
     pieces: list[Hull] = []
     open_components = 0
-    for component in mesh.split(only_watertight=False, repair=False):
-        triangles = np.asarray(component.triangles, dtype=float)
-        hull_volume = _volume(triangles)
-        if component.is_watertight and component.is_winding_consistent and hull_volume > 0.0:
-            pieces.extend(_decompose(triangles, abs(float(component.volume))))
-        else:
-            open_components += 1
-            pieces.append(_hull(triangles if hull_volume > 0.0 else _thickened(triangles)))
+    try:
+        for component in mesh.split(only_watertight=False, repair=False):
+            triangles = np.asarray(component.triangles, dtype=float)
+            hull_volume = _volume(triangles)
+            if component.is_watertight and component.is_winding_consistent and hull_volume > 0.0:
+                pieces.extend(_decompose(triangles, abs(float(component.volume))))
+            else:
+                open_components += 1
+                pieces.append(_hull(triangles if hull_volume > 0.0 else _thickened(triangles)))
+    except QhullError as error:
+        raise CollisionModelError(
+            f"{path}: a part of the mesh has no convex hull; remove triangles that are points or "
+            "lines"
+        ) from error
     if open_components:
         warnings.warn(
             f"{path}: {open_components} part(s) of the mesh are not watertight; the convex hull "
@@ -76,19 +99,13 @@ def _thickened(triangles: Array) -> Array:
     return np.asarray(triangles.reshape(-1, 1, 3) + steps, dtype=float)
 
 
-def _load(path: Path, scale: Array) -> trimesh.Trimesh:
-    if not path.is_file():
-        raise CollisionModelError(f"{path}: mesh file not found; correct its path")
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # trimesh raises whatever its many readers raise
-        raise CollisionModelError(
-            f"{path}: cannot be read as a mesh ({error}); give an STL, OBJ or PLY file"
-        ) from error
-    if isinstance(mesh, trimesh.Scene):
-        mesh = mesh.to_mesh()
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise CollisionModelError(f"{path}: the mesh is empty; export triangles")
+def read_mesh(path: Path, scale: Array) -> trimesh.Trimesh:
+    """A mesh, scaled by (3,) factors, its equal vertices merged.
+
+    Raises:
+        CollisionModelError: see `convex_pieces`.
+    """
+    mesh = _read(path)
     if not np.all(np.isfinite(mesh.vertices)):
         raise CollisionModelError(f"{path}: the mesh has vertices that are not finite numbers")
     if len(mesh.faces) > MOST_FACES:
@@ -96,21 +113,62 @@ def _load(path: Path, scale: Array) -> trimesh.Trimesh:
             f"{path}: enormous mesh, {len(mesh.faces)} triangles; at most {MOST_FACES} are "
             "allowed: simplify it for collision checking"
         )
-    mesh.vertices = mesh.vertices * np.asarray(scale, dtype=float)
-    if np.prod(scale) < 0.0:
+    with np.errstate(over="ignore"):
+        mesh.vertices = np.asarray(mesh.vertices, dtype=float) * np.asarray(scale, dtype=float)
+        largest = np.abs(mesh.vertices).max()
+    if np.prod(np.sign(scale)) < 0.0:
         mesh.faces = mesh.faces[:, ::-1]
-    extents = np.ptp(mesh.vertices, axis=0)
-    if extents.max() > LARGEST_EXTENT:
+    if not largest <= LARGEST_EXTENT:
         raise CollisionModelError(
-            f"{path}: enormous mesh, {extents.max():g} m across; at most {LARGEST_EXTENT:g} m "
+            f"{path}: enormous mesh, {largest:g} m from its origin; at most {LARGEST_EXTENT:g} m "
             "is allowed: is the file in millimetres? Set its scale"
         )
+    extents = np.ptp(mesh.vertices, axis=0)
     if extents.min() < SMALLEST_SIZE:
         raise CollisionModelError(
             f"{path}: the mesh is flat, extents {np.round(extents, 9).tolist()} m; "
             "give it a thickness or use a box"
         )
     mesh.merge_vertices()
+    parts = len(
+        trimesh.graph.connected_components(
+            mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1
+        )
+    )
+    if parts > MOST_PARTS:
+        raise CollisionModelError(
+            f"{path}: {parts} separate parts; at most {MOST_PARTS} are allowed: simplify the mesh, "
+            "weld its triangles or leave small parts out"
+        )
+    return mesh
+
+
+def _read(path: Path) -> trimesh.Trimesh:
+    """The triangles of a file, nothing but their number of corners checked."""
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise CollisionModelError(
+            f"{path}: cannot be read as a mesh; allowed are the formats {', '.join(FORMATS)}"
+        )
+    try:
+        content = outside.read_bytes(path, outside.MESH_BYTES)
+    except OutsideError as error:
+        raise CollisionModelError(f"{path}: the mesh {error}; correct its path") from error
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            mesh = trimesh.load_mesh(BytesIO(content), file_type=kind, process=False)
+            if isinstance(mesh, trimesh.Scene):
+                mesh = mesh.to_mesh()
+    except Exception as error:  # trimesh raises whatever its many readers raise
+        said = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise CollisionModelError(
+            f"{path}: cannot be read as a mesh ({said}); give an STL, OBJ or PLY file"
+        ) from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise CollisionModelError(f"{path}: the mesh is empty; export triangles")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise CollisionModelError(f"{path}: the mesh has triangles whose corners it does not have")
     return mesh
 
 

@@ -104,6 +104,27 @@ def _face_name(inward_normal: Array) -> str:
     return f"{'-' if inward_normal[axis] > 0 else '+'}{'xyz'[axis]}"
 
 
+def check_shapes(workcell: Workcell, problems: Problems) -> None:
+    """There are not more collision shapes than convex pieces allowed; a mesh has at least one."""
+    most = workcell.collision.most_pieces
+    if not problems.clean("collision.most_pieces", *(f"robots[{i}].urdf" for i in (0, 1))):
+        return
+    counts = {"environment": len(workcell.environment)}
+    for index, robot in enumerate(workcell.robots):
+        counts[f"robots[{index}].tool"] = len(robot.tool)
+        collisions = read_urdf(robot.urdf).collisions.values()
+        counts[f"robots[{index}].urdf"] = sum(map(len, collisions))
+    total = sum(counts.values()) + 1
+    if total > most:
+        largest = max(counts, key=lambda path: counts[path])
+        problems.add(
+            largest,
+            f"found {counts[largest]} collision shapes, {total} in the whole cell; allowed are "
+            f"{most}: simplify or merge them, leave out what nothing can touch, or raise "
+            "collision.most_pieces and wait",
+        )
+
+
 def check_references(workcell: Workcell, problems: Problems) -> None:
     """Names in allowed contacts and ignored pairs exist."""
     if not problems.clean("environment"):
@@ -199,7 +220,14 @@ def _fixed_poses(workcell: Workcell) -> Iterator[tuple[str, Array]]:
 
 def check_all(workcell: Workcell, problems: Problems) -> None:
     """Every check across sections that needs no inverse kinematics."""
-    for check in (check_names, check_contacts, check_references, check_speeds, check_reach):
+    for check in (
+        check_shapes,
+        check_names,
+        check_contacts,
+        check_references,
+        check_speeds,
+        check_reach,
+    ):
         try:
             check(workcell, problems)
         except RobotModelError as error:  # pragma: no cover - the robots section reports it first

@@ -49,7 +49,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh file (anything trimesh reads). scale: (3,) factor per axis."""
+    """A triangle mesh file (STL, OBJ, PLY or OFF). scale: (3,) factor per axis."""
 
     path: Path
     scale: Array
@@ -246,10 +246,12 @@ class CollisionSettings:
     Attributes:
         tolerance: bodies closer than this count as colliding [m].
         ignored: pairs left out by the user.
+        most_pieces: most convex pieces of all bodies together that are worked with.
     """
 
     tolerance: float = 0.0
     ignored: tuple[IgnoredPair, ...] = ()
+    most_pieces: int = 500
 
 
 @dataclass(frozen=True)

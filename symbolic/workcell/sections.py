@@ -26,6 +26,7 @@ from symbolic.workcell.records import (
 )
 
 FACE_TOLERANCE = 1e-6  # [m], how far a contact may be written off its face; it is moved onto it
+MOST_PIECES = 20_000
 SHAPE_KINDS = ("box", "cylinder", "sphere", "mesh")
 
 
@@ -260,6 +261,7 @@ def _overhang(point: Array, size: Array, axis: int, radius: float) -> list[str]:
 def read_collision(table: Table) -> CollisionSettings:
     """How collisions are judged."""
     tolerance = table.number("tolerance", quantity.TOLERANCE, 0.0)
+    most_pieces = table.integer("most_pieces", 1, MOST_PIECES, CollisionSettings().most_pieces)
     ignored = []
     for entry in table.tables("ignored"):
         pair = IgnoredPair(entry.text("first"), entry.text("second"), entry.text("reason"))
@@ -268,4 +270,4 @@ def read_collision(table: Table) -> CollisionSettings:
             entry.problems.add(entry.path, f"pairs {pair.first!r} with itself")
         ignored.append(pair)
     table.close()
-    return CollisionSettings(tolerance, tuple(ignored))
+    return CollisionSettings(tolerance, tuple(ignored), most_pieces)

@@ -12,7 +12,7 @@ from symbolic.workcell.reader import Table, checked_vector, read_only, shown
 from symbolic.workcell.records import Allocation, AllowedContact, Task, TimeLaw, Waypoint
 
 MIN_SAMPLES = 5
-MAX_SAMPLES = 10_000
+MAX_SAMPLES = 2_000
 MAX_WAYPOINTS = 100
 COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
 TIME_LAWS = ("constant", "ramped")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -121,7 +124,7 @@ def write_endless(path: Path) -> None:
         (write_flat, "flat.*give it a thickness"),
         (write_empty, "cannot be read|empty"),
         (write_nonsense, "cannot be read|empty"),
-        (write_millimetres, "enormous.*300 m across.*millimetres"),
+        (write_millimetres, "enormous.*150 m from its origin.*millimetres"),
         (write_endless, "enormous.*327680 triangles.*simplify"),
     ],
 )
@@ -134,8 +137,68 @@ def test_unusable_meshes_are_refused(tmp_path: Path, write: object, message: str
 
 
 def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CollisionModelError, match=r"gone\.stl: mesh file not found"):
+    with pytest.raises(
+        CollisionModelError, match=r"gone\.stl: the mesh cannot be read \(No such file"
+    ):
         convex_pieces(tmp_path / "gone.stl", ONES)
+
+
+def write_loose(path: Path, count: int) -> None:
+    rng = np.random.default_rng(5)
+    corners = rng.uniform(-0.5, 0.5, (count, 1, 3)) + rng.normal(0.0, 0.01, (count, 3, 3))
+    faces = np.arange(3 * count).reshape(-1, 3)
+    trimesh.Trimesh(corners.reshape(-1, 3), faces, process=False).export(path)
+
+
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [(190_000, "enormous mesh, 190000 triangles"), (3000, "3000 separate parts; at most 400")],
+)
+def test_more_than_can_be_worked_with_is_told_at_once(
+    tmp_path: Path, count: int, message: str
+) -> None:
+    write_loose(tmp_path / "loose.stl", count)
+    start = time.monotonic()
+    with pytest.raises(CollisionModelError, match=rf"loose\.stl: {message}.*simplify"):
+        convex_pieces(tmp_path / "loose.stl", ONES)
+    assert time.monotonic() - start < 20.0
+
+
+@pytest.mark.parametrize("name", ["mesh.zip", "mesh.stl", "mesh.ply", "mesh.glb"])
+def test_an_archive_is_no_mesh(tmp_path: Path, name: str) -> None:
+    mesh = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl")
+    with zipfile.ZipFile(tmp_path / name, "w") as archive:
+        archive.writestr("box.stl", mesh)
+    with pytest.raises(CollisionModelError, match=r"cannot be read as a mesh|empty"):
+        convex_pieces(tmp_path / name, ONES)
+
+
+def test_a_header_that_promises_more_than_there_is(tmp_path: Path) -> None:
+    path = tmp_path / "m.ply"
+    for kind in ("ascii", "binary_little_endian"):
+        path.write_text(
+            f"ply\nformat {kind} 1.0\nelement vertex 1000000000\nproperty double x\n"
+            "property double y\nproperty double z\nelement face 1000000000\n"
+            "property list uchar int vertex_indices\nend_header\n0 0 0\n"
+        )
+        with pytest.raises(CollisionModelError, match=r"m\.ply"):
+            convex_pieces(path, ONES)
+
+
+def test_a_pipe_is_no_mesh(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.stl")
+    with pytest.raises(CollisionModelError, match=r"it is a pipe"):
+        convex_pieces(tmp_path / "pipe.stl", ONES)
+
+
+@pytest.mark.parametrize("scale", [(1e308, 1.0, 1.0), (-1e308, 1e308, 1e308)])
+def test_a_scale_beyond_all_bounds_is_told(
+    tmp_path: Path, scale: tuple[float, float, float]
+) -> None:
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((20.0, 20.0, 20.0)).export(path)
+    with pytest.raises(CollisionModelError, match=r"enormous mesh.*Set its scale"):
+        convex_pieces(path, np.array(scale))
 
 
 def test_vertices_that_are_no_numbers_are_refused(tmp_path: Path) -> None:

@@ -8,14 +8,23 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
-from symbolic.geometry.bodies import _link_pieces, collision_bodies
+from symbolic.geometry.bodies import MeshReader, _link_pieces, collision_bodies
 from symbolic.geometry.coal_shapes import coal_distance
 from symbolic.geometry.pairs import build_geometry
 from symbolic.geometry.pieces import Capsule, Hull, Piece, support
-from symbolic.workcell.records import Body, Box, CollisionSettings, Cylinder, IgnoredPair, Sphere
+from symbolic.workcell.records import (
+    Body,
+    Box,
+    CollisionSettings,
+    Cylinder,
+    IgnoredPair,
+    Mesh,
+    Sphere,
+)
 from tests.symbolic.geometry.collision_cells import (
     geometry_of,
     placed_pieces,
@@ -172,7 +181,7 @@ def test_a_mesh_that_is_nowhere_is_named(tmp_path: Path) -> None:
     )
     message = r"link 'a' of x\.urdf: .*not found; package folders.*none given"
     with pytest.raises(CollisionModelError, match=message):
-        _link_pieces(replace(rack().robots[0], urdf=path))
+        _link_pieces(replace(rack().robots[0], urdf=path), MeshReader())
 
 
 def test_capsules_and_origins_are_read(tmp_path: Path) -> None:
@@ -182,12 +191,36 @@ def test_capsules_and_origins_are_read(tmp_path: Path) -> None:
         '<geometry><capsule radius="0.1" length="0.4"/></geometry></collision>'
     )
     path.write_text(URDF.format(link=shape, rest='<link name="bare"/>' + JOINT))
-    links = _link_pieces(replace(rack().robots[0], urdf=path))
+    links = _link_pieces(replace(rack().robots[0], urdf=path), MeshReader())
     (piece,) = links["a"]
     assert piece.shape == Capsule(0.1, 0.4)
     assert piece.centre == pytest.approx([1, 2, 3])
     assert piece.rotation @ [1, 0, 0] == pytest.approx([0, 1, 0])
     assert list(links) == ["a"]
+
+
+def test_meshes_are_read_once_and_within_limits_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(subdivisions=3, radius=0.1).export(path)
+    ball = Body("ball", Mesh(path, np.ones(3)), np.eye(4))
+    twice = replace(rack(), environment=(ball, replace(ball, name="other")))
+    first, second = collision_bodies(twice)[-2:]
+    assert first.pieces[0].shape is second.pieces[0].shape
+    monkeypatch.setattr("symbolic.geometry.bodies.MOST_CORNERS", 1000)
+    with pytest.raises(CollisionModelError, match=r"1284 corners, 642 of them 'ball'.*simplify"):
+        collision_bodies(twice)
+    monkeypatch.setattr("symbolic.geometry.meshes.MOST_FACES", 2000)
+    larger = replace(ball, name="larger", shape=Mesh(path, 2.0 * np.ones(3)))
+    with pytest.raises(CollisionModelError, match=r"ball\.stl: with its 1280.*have 2560; allowed"):
+        collision_bodies(replace(twice, environment=(*twice.environment, larger)))
+
+
+def test_more_pieces_than_allowed_are_told() -> None:
+    few = replace(rack(), collision=CollisionSettings(most_pieces=20))
+    with pytest.raises(CollisionModelError, match=r"allowed are 20.*raise collision.most_pieces"):
+        collision_bodies(few)
 
 
 def test_the_ur10_has_bodies_for_all_its_links() -> None:

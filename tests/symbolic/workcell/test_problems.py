@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -85,6 +87,68 @@ def test_both_arms_and_all_poses_are_judged(tmp_path: Path) -> None:
     data["task"]["start"][2] = data["task"]["goal"][2] = 2.6
     found = problems_of(write(tmp_path, data))
     assert [problem.split(": ")[0] for problem in found] == ["task.start", "task.goal"] * 2
+
+
+def test_thousands_of_bodies_are_told_at_once(tmp_path: Path) -> None:
+    data = sample_data()
+    body = {"name": "x", "kind": "sphere", "radius": 0.1}
+    data["environment"] = [body | {"name": f"x{k}"} for k in range(2000)]
+    (told,) = problems_of(write(tmp_path, data))
+    assert told.startswith("environment: found 2000 collision shapes, 2041 in the whole cell;")
+    assert "raise collision.most_pieces" in told
+    data["collision"]["most_pieces"] = 2041
+    assert len(load(write(tmp_path, data)).environment) == 2000
+
+
+def test_thousands_of_unknown_keys_are_counted(tmp_path: Path) -> None:
+    data = sample_data() | {f"unknown_{k}": 1 for k in range(20_000)}
+    start = time.monotonic()
+    found = problems_of(write(tmp_path, data))
+    assert time.monotonic() - start < 10.0
+    assert len(found) == 11
+    assert found[-1] == "file: 19990 further unknown keys"
+
+
+def test_thousands_of_problems_are_counted(tmp_path: Path) -> None:
+    data = sample_data()
+    data["environment"] = [{"name": 1} for _ in range(300)]
+    found = problems_of(write(tmp_path, data))
+    assert len(found) == 101
+    assert found[-1].startswith("and ")
+
+
+@pytest.mark.parametrize("key", ["urdf", "package_dirs"])
+def test_names_of_thousands_of_letters(tmp_path: Path, key: str) -> None:
+    data = sample_data()
+    data["robots"][0][key] = "x" * 5000 if key == "urdf" else ["x" * 5000]
+    (told,) = problems_of(write(tmp_path, data))
+    assert told.startswith(f"robots[0].{key}")
+    assert len(told) < 300
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "large"])
+def test_what_is_no_plain_file_is_told(tmp_path: Path, kind: str) -> None:
+    data = sample_data()
+    odd = tmp_path / "odd"
+    match kind:
+        case "pipe":
+            os.mkfifo(odd)
+        case "device":
+            odd.symlink_to("/dev/zero")
+        case "folder":
+            odd.mkdir()
+        case "large":
+            with odd.open("wb") as file:
+                file.truncate(100 * 2**20)
+    data["robots"][0]["urdf"] = "odd"
+    data["environment"][0] = {"name": "m", "kind": "mesh", "path": "odd"}
+    first, second = problems_of(write(tmp_path, data))
+    words = {"large": "is too large (100 MiB); allowed are"}.get(kind, f"it is a {kind}")
+    assert first.startswith("robots[0].urdf: ")
+    assert second.startswith("environment[0].path: ")
+    assert words in first
+    assert words in second
+    assert words in problems_of(odd)[0]
 
 
 @pytest.mark.parametrize(
