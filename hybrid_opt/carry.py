@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from hybrid_opt.evaluate.static_hold import payload_limit, static_hold
 from hybrid_opt.indicators.metrics import excess_above_static
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
+
+if TYPE_CHECKING:
+    from hybrid_opt.display.view import CarryView
 
 
 @dataclass(frozen=True)
@@ -197,6 +201,16 @@ class Carry:
         """(n, all joints) a quantity of `ArmMotion` with the second arm's joints after the
         first's."""
         return np.concatenate([getattr(arm, name) for arm in self.arms], axis=1)
+
+    def view(self, height: int = 480) -> CarryView:
+        """The carry in three dimensions: shown in a notebook's cell, or saved as a page.
+
+        Args:
+            height: of the notebook's cell [px].
+        """
+        from hybrid_opt.display.view import CarryView
+
+        return CarryView(self, height)
 
     def __repr__(self) -> str:
         from hybrid_opt.display.carry import carry_text

@@ -7,5 +7,9 @@ class ResultsError(DualArmError):
     """Stored results are missing, damaged, or belong to another configuration."""
 
 
+class DisplayError(DualArmError):
+    """An object cannot be shown: a library that draws is missing, or a file not writable."""
+
+
 class WorkerError(DualArmError):
     """Processes or machines that work for this one were lost or do not fit."""

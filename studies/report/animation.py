@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
+from hybrid_opt.display.scene import motion_points
+from hybrid_opt.display.solids import cell_solids
 from studies.errors import ReportError
 from studies.report.drawing import ISOMETRIC, cut_faces, draw_cell, draw_path, frame_axes
-from studies.report.figures_cell import motion_points
 from studies.report.records import Carry
-from studies.report.solids import cell_solids
 from studies.report.style import in_style
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
@@ -50,7 +50,7 @@ def write_animation(geometry: CellGeometry, carry: Carry, path: Path) -> None:
 def frames(geometry: CellGeometry, carry: Carry) -> Iterator[NDArray[np.uint8]]:
     """(height, width, 3) pictures, evenly spaced in time."""
     faces = cut_faces(cell_solids(geometry))
-    points = motion_points(geometry, carry)
+    points = motion_points(geometry, carry.timed)
     timed = carry.timed
     count = max(2, round(timed.duration * FRAMES_PER_SECOND) + 1)
     moments = np.linspace(timed.time[0], timed.time[-1], count)

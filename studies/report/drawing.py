@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 
-from studies.report.solids import Solid, frame_placements
+from hybrid_opt.display.solids import Solid, frame_placements
 from studies.report.style import ARMS, GROUND, OBSTACLE, PAYLOAD
 from symbolic.array import Array
 from symbolic.geometry.bodies import Frame

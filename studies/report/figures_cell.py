@@ -8,6 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from hybrid_opt.display.scene import motion_points
+from hybrid_opt.display.solids import cell_solids, extent_points
 from studies.report.drawing import (
     FRONT,
     ISOMETRIC,
@@ -23,7 +25,6 @@ from studies.report.drawing import (
     frame_axes,
 )
 from studies.report.records import Carry, ReachMap
-from studies.report.solids import cell_solids, extent_points
 from studies.report.style import ARMS, FULL_WIDTH, new_figure, panel_label, shortened
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
@@ -117,7 +118,7 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> Figu
 def motion_sequence(geometry: CellGeometry, carry: Carry, columns: int = 2) -> Figure:
     """The cell at 0, 33, 66 and 100 % of a carry (paper Figures 14 and 15)."""
     rows = -(-len(SHARES) // columns)
-    points = motion_points(geometry, carry)
+    points = motion_points(geometry, carry.timed)
     faces = cut_faces(cell_solids(geometry))
     figure = new_figure(FULL_WIDTH, 0.37 * FULL_WIDTH * rows)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
@@ -163,14 +164,6 @@ def paths(geometry: CellGeometry, carries: tuple[tuple[Carry, str, object], ...]
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
     return figure
-
-
-def motion_points(geometry: CellGeometry, carry: Carry) -> Array:
-    """(k, 3) what a picture of a whole carry has to show, see `extent_points`."""
-    every = slice(None, None, max(1, len(carry.timed.time) // 12))
-    return extent_points(
-        geometry, cell_solids(geometry), carry.timed.pose[every], carry.timed.q[every]
-    )
 
 
 def sample_at(carry: Carry, shares: Array) -> list[int]:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybrid_opt.display.solids import Solid, cell_solids, frame_placements
 from studies.errors import ReportError
 from studies.report.records import Carry
-from studies.report.solids import Solid, cell_solids, frame_placements
 from symbolic.array import Array
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry

@@ -10,19 +10,15 @@ import base64
 import hashlib
 import html
 import json
-import zipfile
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
 
-import trimesh
-
+from hybrid_opt.display.scene import embedded_json, scene_js, three_js
 from studies.errors import ReportError
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
-
-_OWN_SCRIPTS = ("scene.js", "page.js")
 
 
 def render_page(
@@ -40,10 +36,12 @@ def render_page(
         pictures: PNG file and caption of every figure.
 
     Raises:
-        ReportError: an installed library does not hold the script that the page embeds.
+        ReportError, DisplayError: an installed library does not hold the script that the page
+            embeds.
     """
     texts = files("studies.report") / "page"
-    scripts = [plotly_js(), three_js(), *((texts / n).read_text("utf-8") for n in _OWN_SCRIPTS)]
+    own = (texts / "page.js").read_text("utf-8")
+    scripts = [plotly_js(), three_js(), scene_js(), own]
     settings = {key: data.summary[key] for key in ("workcell", "settings", "environment")}
     return Template((texts / "page.html").read_text("utf-8")).substitute(
         policy=_policy(scripts),
@@ -70,35 +68,6 @@ def plotly_js() -> str:
         return (files("plotly") / "package_data" / "plotly.min.js").read_text("utf-8")
     except (OSError, ModuleNotFoundError) as error:
         raise ReportError(f"plotly.js cannot be read ({error}); install plotly anew") from error
-
-
-def three_js() -> str:
-    """three.js as trimesh's viewer carries it, with its licence line.
-
-    Raises:
-        ReportError: the installed trimesh has no such file.
-    """
-    path = Path(trimesh.__file__).parent / "resources" / "templates" / "viewer.zip"
-    try:
-        with zipfile.ZipFile(path) as archive:
-            text = archive.read("viewer.html.template").decode("utf-8")
-    except (OSError, KeyError, zipfile.BadZipFile) as error:
-        raise ReportError(f"trimesh {trimesh.__version__}: no viewer template ({error})") from error
-    library = max(text.splitlines(), key=len)
-    if "THREE={}" not in library:
-        raise ReportError(
-            f"trimesh {trimesh.__version__}: its viewer carries three.js in another form than this "
-            "project knows; install a version that constraints.txt names"
-        )
-    return "/* three.js, Copyright 2010-2022 Three.js Authors, MIT licence */\n" + library
-
-
-def embedded_json(document: Any) -> str:
-    """JSON for a script element: no text in it can end the element or open another."""
-    text = json.dumps(document, allow_nan=False, separators=(",", ":"))
-    for letter in "<>&\u2028\u2029":
-        text = text.replace(letter, f"\\u{ord(letter):04x}")
-    return text
 
 
 def _unclosed(script: str) -> str:

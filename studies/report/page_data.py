@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import base64
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid_opt import carry
+from hybrid_opt.display.scene import packed, scene_data
 from hybrid_opt.timing import TimingModel
-from studies.report.figures_cell import motion_points
 from studies.report.records import AlgorithmRuns, Carry, Front, ReportData
-from studies.report.solids import Solid, cell_solids
 from studies.report.style import series
 from symbolic.array import Array
-from symbolic.geometry.pairs import CellGeometry
 
 MAX_SAMPLES = 60
 """Samples of a trajectory on the page; its force peaks are kept besides."""
@@ -52,7 +48,7 @@ class PageData:
             clouds.append(
                 {
                     "label": f"{algorithm.title}: feasible",
-                    "points": _packed(cloud[:, :2], np.float32),
+                    "points": packed(cloud[:, :2], np.float32),
                     "colour": look.colour,
                     "symbol": SYMBOLS[look.marker],
                 }
@@ -80,7 +76,7 @@ class PageData:
             "groups": groups,
             "clouds": clouds,
             "lists": lists,
-            **scene_data(data.geometry, data.carries[-1]),
+            **scene_data(data.geometry, data.carries[-1].timed),
         }
 
     def _add_carry(self, carry: Carry) -> int:
@@ -110,7 +106,7 @@ class PageData:
                     round(float(value), 3)
                     for value in 100.0 * np.abs(timed.contact_torque).max(axis=0) / self._limit
                 ],
-                "data": _packed(_samples(timed), np.float32),
+                "data": packed(_samples(timed), np.float32),
             }
         )
         return len(self._trajectories) - 1
@@ -141,39 +137,6 @@ def _samples(timed: carry.Carry) -> Array:
     return np.asarray(table)
 
 
-def scene_data(geometry: CellGeometry, carry: Carry) -> dict[str, Any]:
-    """Shapes, joints and a good place to look from."""
-    points = motion_points(geometry, carry)
-    lower, upper = points.min(axis=0), points.max(axis=0)
-    return {
-        "arms": [
-            {
-                "root": arm.T_world_root.ravel().tolist(),
-                "origins": [origin.ravel().tolist() for origin in arm.origins],
-                "axes": arm.axes.tolist(),
-            }
-            for arm in geometry.arms
-        ],
-        "solids": [_solid(solid) for solid in cell_solids(geometry)],
-        "view": {
-            "centre": ((lower + upper) / 2.0).tolist(),
-            "radius": float(np.linalg.norm(upper - lower)) / 2.0,
-        },
-    }
-
-
-def _solid(solid: Solid) -> dict[str, Any]:
-    return {
-        "group": solid.group,
-        "ground": solid.is_ground,
-        "kind": solid.frame.kind,
-        "robot": solid.frame.robot,
-        "joint": solid.frame.joint,
-        "vertices": _packed(solid.vertices, np.float32),
-        "faces": _packed(solid.faces, np.uint16),
-    }
-
-
 def _ranges(fronts: list[Array], rest: Array | None) -> list[list[float]]:
     """Limits of both axes around the fronts and the payload at rest."""
     points = [front for front in fronts if len(front)]
@@ -192,10 +155,3 @@ def _thinned(points: Array, count: int) -> Array:
     if len(points) <= count:
         return points
     return np.asarray(points[np.linspace(0, len(points) - 1, count).astype(int)])
-
-
-def _packed(values: NDArray[Any], kind: type[np.generic]) -> str:
-    """Little-endian numbers in base64."""
-    return base64.b64encode(
-        np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).tobytes()
-    ).decode("ascii")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
-import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -13,12 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hybrid_opt.timing import TimingModel
-from studies.errors import ReportError
-from studies.report import page
 from studies.report.generate import write_report
 from studies.report.page_data import PageData
 from studies.report.records import ReportData
@@ -104,13 +99,6 @@ def test_hostile_names_stay_text(data: ReportData, tmp_path: Path, text: str) ->
     assert count[0] == count[1]
 
 
-@given(st.recursive(st.text() | st.integers(), lambda inner: st.lists(inner, max_size=3)))
-def test_embedded_json_reads_back_and_ends_no_element(value: object) -> None:
-    embedded = page.embedded_json([value, "</script>", "<!--"])
-    assert not set("<>&\u2028\u2029") & set(embedded)
-    assert json.loads(embedded)[0] == value
-
-
 def test_data_of_the_page_are_the_trajectories(data: ReportData) -> None:
     document = PageData(data, TimingModel(data.workcell)).document()
     front = data.algorithms[0].shown.front
@@ -148,11 +136,3 @@ def test_every_file_of_the_report_is_written(report: Path, text: str) -> None:
         assert [f"{name}.{suffix}" for suffix in ("csv", "md", "tex")] == [
             entry for entry in tables if entry.startswith(f"{name}.")
         ]
-
-
-def test_a_library_without_its_script_is_told(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("trimesh.__file__", str(tmp_path / "__init__.py"))
-    with pytest.raises(ReportError, match="trimesh"):
-        page.three_js()

@@ -72,12 +72,12 @@
       else this.arms[solid.robot][solid.joint].turning.add(mesh);
     }
 
-    /* pose: x y z roll pitch yaw; q: twelve joints. */
+    /* pose: x y z roll pitch yaw; q: all joints, the second arm's after the first's. */
     place(pose, q) {
       this.box.position.set(pose[0], pose[1], pose[2]);
       this.box.rotation.set(pose[3], pose[4], pose[5], "ZYX");
-      this.arms.forEach((arm, i) => arm.forEach((joint, j) =>
-        joint.turning.quaternion.setFromAxisAngle(joint.axis, q[6 * i + j])));
+      this.arms.flat().forEach((joint, k) =>
+        joint.turning.quaternion.setFromAxisAngle(joint.axis, q[k]));
       this.render();
     }
 

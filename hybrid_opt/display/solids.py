@@ -82,10 +82,10 @@ def _mesh(piece: Piece) -> trimesh.Trimesh:
 
 
 def joint_placements(arm: ArmGeometry, q: Array) -> Array:
-    """(n, 6, 4, 4) of an arm's joint frames in the world at joints q (n, 6) [rad]."""
-    placed = np.empty((len(q), 6, 4, 4))
+    """(n, n_joints, 4, 4) of an arm's joint frames in the world at joints q (n, n_joints) [rad]."""
+    placed = np.empty((*q.shape, 4, 4))
     T = np.broadcast_to(arm.T_world_root, (len(q), 4, 4))
-    for j in range(6):
+    for j in range(q.shape[1]):
         turn = np.zeros((len(q), 4, 4))
         turn[:, :3, :3] = Rotation.from_rotvec(np.outer(q[:, j], arm.axes[j])).as_matrix()
         turn[:, 3, 3] = 1.0
@@ -105,14 +105,17 @@ def box_placements(pose: Array) -> Array:
 
 
 def frame_placements(geometry: CellGeometry, pose: Array, q: Array) -> dict[Frame, Array]:
-    """(n, 4, 4) of every frame in the world along n samples: pose (n, 6), q (n, 12)."""
+    """(n, 4, 4) of every frame in the world along n samples: pose (n, 6), q (n, all joints)."""
     placed = {
         Frame("world"): np.broadcast_to(np.eye(4), (len(pose), 4, 4)),
         Frame("box"): box_placements(pose),
     }
+    first = 0
     for i, arm in enumerate(geometry.arms):
-        joints = joint_placements(arm, q[:, 6 * i : 6 * i + 6])
-        placed |= {Frame("link", i, j): joints[:, j] for j in range(6)}
+        count = len(arm.axes)
+        joints = joint_placements(arm, q[:, first : first + count])
+        placed |= {Frame("link", i, j): joints[:, j] for j in range(count)}
+        first += count
     return placed
 
 
@@ -121,7 +124,7 @@ def extent_points(
 ) -> Array:
     """(k, 3) corners of every solid's own bounding box at n samples, the ground left out.
 
-    They frame what a picture has to show: pose (n, 6), q (n, 12).
+    They frame what a picture has to show: pose (n, 6), q (n, all joints).
     """
     placed = frame_placements(geometry, pose, q)
     points = []

@@ -1,0 +1,105 @@
+"""The cell in three dimensions for a browser: what `scene.js` draws, and the library it needs."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zipfile
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.display.solids import Solid, cell_solids, extent_points
+from hybrid_opt.errors import DisplayError
+from symbolic.array import Array
+from symbolic.geometry.pairs import CellGeometry
+
+_VIEWED = 12
+"""About as many samples of a carry decide where its scene is looked at from."""
+
+
+def scene_data(geometry: CellGeometry, carry: Carry) -> dict[str, Any]:
+    """Shapes, joints and a good place to look from, as JSON values."""
+    points = motion_points(geometry, carry)
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    return {
+        "arms": [
+            {
+                "root": arm.T_world_root.ravel().tolist(),
+                "origins": [origin.ravel().tolist() for origin in arm.origins],
+                "axes": arm.axes.tolist(),
+            }
+            for arm in geometry.arms
+        ],
+        "solids": [_solid(solid) for solid in cell_solids(geometry)],
+        "view": {
+            "centre": ((lower + upper) / 2.0).tolist(),
+            "radius": float(np.linalg.norm(upper - lower)) / 2.0,
+        },
+    }
+
+
+def motion_points(geometry: CellGeometry, carry: Carry) -> Array:
+    """(k, 3) what a picture of a whole carry has to show, see `extent_points`."""
+    every = slice(None, None, max(1, len(carry) // _VIEWED))
+    return extent_points(geometry, cell_solids(geometry), carry.pose[every], carry.q[every])
+
+
+def scene_js() -> str:
+    """The script that draws a scene; it needs three.js before it."""
+    return (files("hybrid_opt.display") / "scene.js").read_text("utf-8")
+
+
+def three_js() -> str:
+    """three.js as trimesh's viewer carries it, with its licence line.
+
+    Raises:
+        DisplayError: the installed trimesh has no such file.
+    """
+    path = Path(trimesh.__file__).parent / "resources" / "templates" / "viewer.zip"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            text = archive.read("viewer.html.template").decode("utf-8")
+    except (OSError, KeyError, zipfile.BadZipFile) as error:
+        raise DisplayError(
+            f"trimesh {trimesh.__version__}: no viewer template ({error})"
+        ) from error
+    library = max(text.splitlines(), key=len)
+    if "THREE={}" not in library:
+        raise DisplayError(
+            f"trimesh {trimesh.__version__}: its viewer carries three.js in another form than this "
+            "project knows; install a version that constraints.txt names"
+        )
+    return "/* three.js, Copyright 2010-2022 Three.js Authors, MIT licence */\n" + library
+
+
+def embedded_json(document: Any) -> str:
+    """JSON for a script element: no text in it can end the element or open another."""
+    text = json.dumps(document, allow_nan=False, separators=(",", ":"))
+    for letter in "<>&\u2028\u2029":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return text
+
+
+def packed(values: NDArray[Any], kind: type[np.generic]) -> str:
+    """Little-endian numbers in base64."""
+    return base64.b64encode(
+        np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).tobytes()
+    ).decode("ascii")
+
+
+def _solid(solid: Solid) -> dict[str, Any]:
+    return {
+        "group": solid.group,
+        "ground": solid.is_ground,
+        "kind": solid.frame.kind,
+        "robot": solid.frame.robot,
+        "joint": solid.frame.joint,
+        "vertices": packed(solid.vertices, np.float32),
+        "faces": packed(solid.faces, np.uint16),
+    }
