@@ -13,8 +13,8 @@ import pinocchio as pin
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.pieces import Capsule, Hull, Piece, check_piece
-from symbolic.robot.urdf import arm_model, link_frame, resolve_mesh
-from symbolic.robot.urdf_file import UrdfMesh, read_urdf
+from symbolic.robot.urdf import arm_model, link_frame, resolve_mesh, robot_urdf
+from symbolic.robot.urdf_file import UrdfMesh
 from symbolic.workcell.reader import shown
 from symbolic.workcell.records import Box, Mesh, Robot, Shape, Workcell
 
@@ -224,7 +224,7 @@ def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Fram
 def _link_pieces(robot: Robot, meshes: MeshReader) -> dict[str, tuple[Piece, ...]]:
     """The collision pieces of every link of a URDF that has any, in the link's frame."""
     links = {}
-    for link, collisions in read_urdf(robot.urdf).collisions.items():
+    for link, collisions in robot_urdf(robot).collisions.items():
         owner = f"link {link!r} of {robot.urdf.name}"
         pieces: list[Piece] = []
         for collision in collisions:

@@ -21,8 +21,9 @@ from symbolic.array import Array
 from symbolic.errors import CollisionModelError, OutsideError
 from symbolic.geometry.pieces import SMALLEST_SIZE, Hull
 
-FORMATS = ("stl", "obj", "ply", "off")
-"""Formats that are read: those that hold one mesh, and name no other file that matters."""
+FORMATS = ("stl", "dae", "obj", "ply", "off")
+"""Formats that are read: those that name no other file that matters. Lengths are metres, but for
+COLLADA (dae), which names its unit; its up axis is not turned, as in ROS."""
 
 MOST_FACES = 100_000
 """Most triangles of one mesh, and of all meshes of a cell together: cutting them takes about 0.1 ms
@@ -46,6 +47,10 @@ WORTHWHILE = 0.05
 
 class CollisionModelWarning(UserWarning):
     """A collision shape is used in a coarser form than the file describes."""
+
+
+_TOLD: dict[str | tuple[str, type[Warning], int], int] = {}
+"""What Python's warnings remember, so that each is told once."""
 
 
 def convex_pieces(path: Path, scale: Array) -> tuple[Hull, ...]:
@@ -84,11 +89,13 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
             "lines"
         ) from error
     if open_components:
-        warnings.warn(
-            f"{path}: {open_components} part(s) of the mesh are not watertight; the convex hull "
-            "of each is used as its collision shape. Close the holes to get a tighter shape",
+        warnings.warn_explicit(
+            f"{open_components} part(s) of the mesh are not watertight; the convex hull of each "
+            "is used as its collision shape. Close the holes to get a tighter shape",
             CollisionModelWarning,
-            stacklevel=2,
+            filename=path.name,  # the mesh is to be corrected, not a line of this source
+            lineno=0,
+            registry=_TOLD,
         )
     return tuple(pieces)
 
@@ -114,7 +121,8 @@ def read_mesh(path: Path, scale: Array) -> trimesh.Trimesh:
             "allowed: simplify it for collision checking"
         )
     with np.errstate(over="ignore"):
-        mesh.vertices = np.asarray(mesh.vertices, dtype=float) * np.asarray(scale, dtype=float)
+        factors = np.asarray(scale, dtype=float) * _collada_unit(mesh)
+        mesh.vertices = np.asarray(mesh.vertices, dtype=float) * factors
         largest = np.abs(mesh.vertices).max()
     if np.prod(np.sign(scale)) < 0.0:
         mesh.faces = mesh.faces[:, ::-1]
@@ -163,13 +171,19 @@ def _read(path: Path) -> trimesh.Trimesh:
     except Exception as error:  # trimesh raises whatever its many readers raise
         said = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise CollisionModelError(
-            f"{path}: cannot be read as a mesh ({said}); give an STL, OBJ or PLY file"
+            f"{path}: cannot be read as a mesh ({said}); give an STL, DAE, OBJ or PLY file"
         ) from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise CollisionModelError(f"{path}: the mesh is empty; export triangles")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise CollisionModelError(f"{path}: the mesh has triangles whose corners it does not have")
     return mesh
+
+
+def _collada_unit(mesh: trimesh.Trimesh) -> float:
+    """Metres per unit; trimesh tells a COLLADA file's as '0.01 * meters' and does not apply it."""
+    factor, _, unit = str(mesh.units or "").partition(" * ")
+    return float(factor) if unit == "meters" else 1.0
 
 
 def _hull(points: Array) -> Hull:

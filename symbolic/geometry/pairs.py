@@ -23,6 +23,7 @@ from symbolic.geometry.bodies import (
     collision_bodies,
 )
 from symbolic.geometry.coal_shapes import coal_distance
+from symbolic.geometry.ignored import ignored_pairs
 from symbolic.geometry.pieces import (
     Piece,
     ball,
@@ -30,7 +31,7 @@ from symbolic.geometry.pieces import (
     farthest_from_point,
     swept_cylinder,
 )
-from symbolic.workcell.records import IgnoredPair, Workcell
+from symbolic.workcell.records import Workcell
 
 POSTURES = 300
 """Random postures in which a pair has to touch to count as always touching."""
@@ -96,7 +97,7 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
     """
     bodies = collision_bodies(workcell)
     arms = (arm_geometry(workcell, 0), arm_geometry(workcell, 1))
-    ignored = _ignored(workcell.collision.ignored, bodies)
+    ignored = ignored_pairs(workcell, bodies)
     active, excluded = [], []
     always = _AlwaysTouching(bodies, arms)
     for i, j in combinations(range(len(bodies)), 2):
@@ -114,19 +115,6 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
         else:
             active.append(ActivePair(i, j))
     return CellGeometry(workcell, bodies, arms, tuple(active), tuple(excluded))
-
-
-def _ignored(
-    pairs: tuple[IgnoredPair, ...], bodies: tuple[CollisionBody, ...]
-) -> dict[frozenset[str], str]:
-    names = {body.name for body in bodies}
-    for pair in pairs:
-        for name in (pair.first, pair.second):
-            if name not in names:
-                raise CollisionModelError(
-                    f"collision.ignored names {name!r}; the bodies are {', '.join(sorted(names))}"
-                )
-    return {frozenset((p.first, p.second)): f"ignored in the file: {p.reason}" for p in pairs}
 
 
 def _anchor(

@@ -12,41 +12,49 @@ from pathlib import Path
 import pinocchio as pin
 
 from symbolic.errors import RobotModelError
-from symbolic.robot.urdf_file import read_urdf
+from symbolic.robot.urdf_file import Urdf, read_urdf
 from symbolic.workcell.reader import suggestion
 from symbolic.workcell.records import Robot
 
 N_JOINTS = 6
 
 
-def reduced_model(urdf: Path, locked_joints: Iterable[tuple[str, float]] = ()) -> pin.Model:
+def robot_urdf(robot: Robot) -> Urdf:
+    """The description of a robot of a workcell.
+
+    Raises:
+        UrdfError: see `symbolic.robot.urdf_file.read_urdf`.
+    """
+    return read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
+
+
+def reduced_model(urdf: Urdf, locked_joints: Iterable[tuple[str, float]] = ()) -> pin.Model:
     """The Pinocchio model of a URDF with some joints held.
 
     Args:
-        urdf: the model file.
+        urdf: the robot's description.
         locked_joints: names of single-axis joints and their positions [rad or m].
 
     Raises:
-        UrdfError: the file cannot be read, or something in it is wrong.
-        RobotModelError: a locked joint does not exist.
+        RobotModelError: Pinocchio refuses the description, or a locked joint does not exist.
     """
     try:
-        model = pin.buildModelFromXML(read_urdf(urdf).kinematics)
+        model = pin.buildModelFromXML(urdf.kinematics)
     except (ValueError, RuntimeError, IndexError) as error:
-        raise RobotModelError(f"Pinocchio cannot read {urdf.name}: {_first_line(error)}") from error
+        raise RobotModelError(f"Pinocchio cannot read {urdf.file}: {_first_line(error)}") from error
     configuration = pin.neutral(model)
     locked = []
     for name, position in locked_joints:
         if name not in list(model.names)[1:]:
             candidates = list(model.names)[1:]
             raise RobotModelError(
-                f"no moving joint {name!r} in {urdf.name}"
+                f"no moving joint {name!r} in {urdf.file}"
                 f"{suggestion(name, candidates) or f'; it has {_listed(candidates)}'}"
             )
         joint = model.getJointId(name)
         if model.joints[joint].nq != 1:
             raise RobotModelError(
-                f"joint {name!r} of {urdf.name} is continuous or has several axes; only revolute "
+                f"joint {name!r} of {urdf.file} is continuous or has several axes; only revolute "
                 "and prismatic joints can be locked"
             )
         configuration[model.joints[joint].idx_q] = position
@@ -60,7 +68,7 @@ def arm_model(robot: Robot) -> pin.Model:
     Raises:
         RobotModelError: it is not a serial arm of six revolute joints with that flange.
     """
-    model = reduced_model(robot.urdf, robot.locked_joints)
+    model = reduced_model(robot_urdf(robot), robot.locked_joints)
     for problem in (structure_problem(model), flange_problem(model, robot.flange)):
         if problem:
             raise RobotModelError(f"robot {robot.name!r}: {problem}")

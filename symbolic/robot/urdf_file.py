@@ -9,7 +9,7 @@ its element and attribute; everything else in the file is left alone. Pinocchio 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +25,7 @@ from symbolic.geometry.pieces import Capsule
 from symbolic.physics.pose import pose_matrix
 from symbolic.robot.urdf_elements import Part, parse_elements
 from symbolic.robot.urdf_tree import tree_problem
+from symbolic.robot.xacro_file import Arguments, description_content
 from symbolic.workcell import quantities as quantity
 from symbolic.workcell.reader import Problems, read_only, shown
 from symbolic.workcell.records import Box, Cylinder, Sphere
@@ -82,15 +83,20 @@ class Urdf:
         return tuple(self.collisions)
 
 
-def read_urdf(path: Path) -> Urdf:
-    """Read and check a URDF file.
+def read_urdf(path: Path, arguments: Arguments = (), package_dirs: Sequence[Path] = ()) -> Urdf:
+    """Read and check a robot's description.
+
+    Args:
+        path: a URDF, or a xacro file, which is expanded.
+        arguments: values of the xacro file's arguments, by name.
+        package_dirs: folders of packages that the xacro file may name.
 
     Raises:
         UrdfError: the file cannot be read, is no XML in UTF-8, or an element of it is wrong; every
             problem with its element and attribute.
     """
     try:
-        content = outside.read_bytes(path, outside.URDF_BYTES)
+        content = description_content(path, arguments, package_dirs)
     except OutsideError as error:
         raise UrdfError(path.name, (str(error),)) from error
     return parse_urdf(content, path.name)

@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 
 from symbolic import outside
-from symbolic.errors import BundleError, DualArmError, RobotModelError
+from symbolic.errors import BundleError, DualArmError, OutsideError, RobotModelError
 from symbolic.robot.urdf_file import read_urdf
+from symbolic.robot.xacro_file import is_xacro
 from symbolic.workcell.file import load
 from symbolic.workcell.reader import shown
 from symbolic.workcell.records import Workcell
@@ -125,7 +126,7 @@ def unpack_cell(archive: CellArchive, folder: Path, check_digest: bool = True) -
             ) from error
     _check_references(archive, root)
     try:
-        workcell = load(root / archive.workcell)
+        workcell = load(root / archive.workcell, stored=True)
     except DualArmError as error:
         raise BundleError(f"the stored workcell is not valid: {error}") from error
     if check_digest and workcell.digest != archive.digest:
@@ -227,8 +228,12 @@ def _check_references(archive: CellArchive, root: Path) -> None:
             continue
         folders = [joined(base, entry) for entry in package_dirs]
         try:
+            if is_xacro(archive.files[target]):
+                raise OutsideError(
+                    "holds xacro macros, which are never expanded from a stored cell"
+                )
             named = read_urdf(root / target)
-        except RobotModelError as error:
+        except (OutsideError, RobotModelError) as error:
             raise BundleError(f"the stored {shown(target)} is not valid: {error}") from error
         for address in (*named.collision_meshes, *named.visual_meshes):
             relative = address.removeprefix("package://").removeprefix("file://")

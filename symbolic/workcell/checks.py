@@ -13,31 +13,13 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.errors import RobotModelError
 from symbolic.physics.pose import inverse, pose_matrix
-from symbolic.robot.urdf import arm_model, link_frame
-from symbolic.robot.urdf_file import read_urdf
+from symbolic.robot.urdf import arm_model, link_frame, robot_urdf
+from symbolic.workcell.body_names import PAYLOAD_BODY, body_names, matching
 from symbolic.workcell.reader import Problems, suggestion
 from symbolic.workcell.records import Robot, Workcell
 
-PAYLOAD_BODY = "payload"
 PATCH_OVERLAP = 0.9  # [1], how far patches that carry moments together may stand beside one another
 REACH_SLACK = 1e-6  # [m], rounding of a flange exactly at full stretch
-
-
-def body_names(workcell: Workcell) -> dict[str, tuple[str, ...]]:
-    """The names by which collision pairs are addressed, per owner.
-
-    The payload is `payload`, an environment body has its own name, a link or tool body of a
-    robot is `ROBOT/NAME`. The keys are `payload`, `environment` and the robots' names.
-    """
-    names = {
-        PAYLOAD_BODY: (PAYLOAD_BODY,),
-        "environment": tuple(body.name for body in workcell.environment),
-    }
-    for robot in workcell.robots:
-        links = read_urdf(robot.urdf).collision_links
-        tools = tuple(body.name for body in robot.tool)
-        names[robot.name] = tuple(f"{robot.name}/{name}" for name in (*links, *tools))
-    return names
 
 
 def check_names(workcell: Workcell, problems: Problems) -> None:
@@ -49,7 +31,7 @@ def check_names(workcell: Workcell, problems: Problems) -> None:
         path = f"robots[{index}]"
         links: list[tuple[str, str]] = []
         if problems.clean(f"{path}.urdf"):
-            content = read_urdf(robot.urdf)
+            content = robot_urdf(robot)
             links = [(f"a link of {robot.urdf.name}", link) for link in content.collision_links]
         tools = [(f"{path}.tool[{i}].name", body.name) for i, body in enumerate(robot.tool)]
         _check_unique([*links, *tools], problems)
@@ -112,7 +94,7 @@ def check_shapes(workcell: Workcell, problems: Problems) -> None:
     counts = {"environment": len(workcell.environment)}
     for index, robot in enumerate(workcell.robots):
         counts[f"robots[{index}].tool"] = len(robot.tool)
-        collisions = read_urdf(robot.urdf).collisions.values()
+        collisions = robot_urdf(robot).collisions.values()
         counts[f"robots[{index}].urdf"] = sum(map(len, collisions))
     total = sum(counts.values()) + 1
     if total > most:
@@ -142,7 +124,7 @@ def check_references(workcell: Workcell, problems: Problems) -> None:
     for index, pair in enumerate(workcell.collision.ignored):
         for side, name in (("first", pair.first), ("second", pair.second)):
             path = f"collision.ignored[{index}].{side}"
-            if problems.clean(path) and name not in known:
+            if problems.clean(path) and not matching(name, known):
                 hint = suggestion(name, known) or f"; they are {', '.join(known)}"
                 problems.add(path, f"found {name!r}; allowed is a body of the cell{hint}")
 

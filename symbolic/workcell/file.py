@@ -8,8 +8,8 @@ from pathlib import Path
 
 from symbolic import outside
 from symbolic.errors import OutsideError, WorkcellError
-from symbolic.robot.urdf import resolve_mesh
-from symbolic.robot.urdf_file import read_urdf
+from symbolic.robot.urdf import resolve_mesh, robot_urdf
+from symbolic.robot.xacro_file import description_content
 from symbolic.workcell.checks import check_all
 from symbolic.workcell.reader import Problems, Table
 from symbolic.workcell.records import Body, Mesh, Robot, Workcell
@@ -20,13 +20,15 @@ from symbolic.workcell.task import read_task
 Check = Callable[[Workcell], Iterable[str]]
 
 
-def load(path: str | Path, checks: Sequence[Check] = ()) -> Workcell:
+def load(path: str | Path, checks: Sequence[Check] = (), stored: bool = False) -> Workcell:
     """The workcell that a TOML file describes.
 
     Args:
         path: the file; every path inside it is relative to its folder.
         checks: further checks of an otherwise valid workcell, e.g. inverse kinematics at the
             start; each yields its problems as `key.path: what was found; what is allowed`.
+        stored: whether it was unpacked from an archive: packages that `package_dirs` lacks are
+            not looked for on this machine, and xacro files were expanded before.
 
     Raises:
         WorkcellError: with all problems of the file, each with its key path.
@@ -39,7 +41,7 @@ def load(path: str | Path, checks: Sequence[Check] = ()) -> Workcell:
     except OutsideError as error:
         raise WorkcellError(str(path), (f"file: {error}",)) from error
     problems = Problems()
-    workcell = _build(Table(data, "", problems), source, content)
+    workcell = _build(Table(data, "", problems), source, content, stored)
     if workcell is None or problems.found:
         raise WorkcellError(str(path), problems.messages())
     further = tuple(problem for check in checks for problem in check(workcell))
@@ -48,11 +50,11 @@ def load(path: str | Path, checks: Sequence[Check] = ()) -> Workcell:
     return workcell
 
 
-def _build(table: Table, source: Path, content: bytes) -> Workcell | None:
+def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell | None:
     """The records, as far as they can be built; None where a section has the wrong count."""
     problems, folder = table.problems, source.parent
     name = table.text("name")
-    robots = [read_robot(entry, folder) for entry in table.tables("robots", exactly=2)]
+    robots = [read_robot(entry, folder, stored) for entry in table.tables("robots", exactly=2)]
     payload = read_payload(table.table("payload"))
     contacts = [read_contact(entry, payload.size) for entry in table.tables("contacts", exactly=2)]
     task = read_task(table.table("task"))
@@ -87,7 +89,8 @@ def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Body])
     """SHA-256 over a workcell file and the content of every file it names.
 
     Where the files stand does not matter, only what is in them: the file's own bytes, per robot
-    its URDF and the meshes the URDF names, and the meshes of tools and environment, in order.
+    its URDF (a xacro file as it expands), the meshes the URDF names and its SRDF, and the meshes
+    of tools and environment, in order.
 
     Raises:
         OutsideError: one of them cannot be read, or together they are too large.
@@ -95,8 +98,7 @@ def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Body])
     outer = hashlib.sha256(hashlib.sha256(content).digest())
     room = outside.CELL_BYTES
     # Fixed-length inner digests keep the parts apart.
-    for path, most in _named(robots, environment):
-        part = b"" if path is None else _content(path, most)
+    for part in _named(robots, environment):
         room -= len(part)
         if room < 0:
             raise OutsideError(
@@ -107,22 +109,25 @@ def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Body])
     return outer.hexdigest()
 
 
-def _content(path: Path, most: int) -> bytes:
+def _content(path: Path | None, most: int) -> bytes:
+    if path is None:
+        return b""
     try:
         return outside.read_bytes(path, most)
     except OutsideError as error:
         raise OutsideError(f"names {path.name}, which {error}") from error
 
 
-def _named(
-    robots: Sequence[Robot], environment: Sequence[Body]
-) -> Iterator[tuple[Path | None, int]]:
-    """Every file that a workcell names, None for a missing one, and its largest size."""
+def _named(robots: Sequence[Robot], environment: Sequence[Body]) -> Iterator[bytes]:
+    """The content of every file that a workcell names, nothing for a missing one."""
     for robot in robots:
-        yield robot.urdf, outside.URDF_BYTES
-        urdf = read_urdf(robot.urdf)
+        yield description_content(robot.urdf, robot.xacro_arguments, robot.package_dirs)
+        urdf = robot_urdf(robot)
         for address in (*urdf.collision_meshes, *urdf.visual_meshes):
-            yield resolve_mesh(address, robot.urdf, robot.package_dirs), outside.MESH_BYTES
+            mesh = resolve_mesh(address, robot.urdf, robot.package_dirs)
+            yield _content(mesh, outside.MESH_BYTES)
+        if robot.srdf is not None:
+            yield _content(robot.srdf, outside.URDF_BYTES)
     for body in (*(body for robot in robots for body in robot.tool), *environment):
         if isinstance(body.shape, Mesh):
-            yield body.shape.path, outside.MESH_BYTES
+            yield _content(body.shape.path, outside.MESH_BYTES)

@@ -80,8 +80,9 @@ class Robot:
 
     Attributes:
         name: unique in the workcell.
-        urdf: the model file.
-        package_dirs: folders that `package://` addresses of the URDF are looked up in.
+        urdf: the model file, a URDF or a xacro file.
+        package_dirs: folders that `package://` addresses of the URDF are looked up in: those of
+            the workcell file, then those of ROS and of the Python environment that it needs.
         flange: name of the URDF frame that the tool is mounted on.
         locked_joints: joints of the URDF held at a fixed position [rad or m].
         T_world_base: (4, 4), the URDF's root in the world.
@@ -92,6 +93,8 @@ class Robot:
         acceleration_max: (6,) [rad/s^2].
         torque_max: (6,) [N m].
         min_manipulability: least allowed |det J| of the flange-pad Jacobian [m^3].
+        xacro_arguments: names and values of the xacro file's arguments.
+        srdf: file whose disabled pairs of links are not checked for collision.
     """
 
     name: str
@@ -108,6 +111,8 @@ class Robot:
     acceleration_max: Array
     torque_max: Array
     min_manipulability: float
+    xacro_arguments: tuple[tuple[str, str], ...] = ()
+    srdf: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -232,7 +237,12 @@ class Task:
 
 @dataclass(frozen=True)
 class IgnoredPair:
-    """A pair of bodies that collision checking leaves out, with the user's reason."""
+    """Bodies that collision checking leaves out against one another, with the user's reason.
+
+    Attributes:
+        first, second: names of bodies, or patterns with `*` and `?` that stand for several.
+        reason: shown wherever pairs are listed.
+    """
 
     first: str
     second: str

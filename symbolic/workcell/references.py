@@ -10,9 +10,11 @@ from typing import Any
 
 from symbolic import outside
 from symbolic.errors import BundleError, OutsideError, RobotModelError
+from symbolic.robot.packages import PACKAGE_SCHEME
 from symbolic.robot.urdf import resolve_mesh
 from symbolic.robot.urdf_file import parse_urdf
-from symbolic.workcell.records import Workcell
+from symbolic.robot.xacro_file import description_content
+from symbolic.workcell.records import Robot, Workcell
 
 
 class CellCollector:
@@ -33,9 +35,9 @@ class CellCollector:
             urdf = self._place(str(entry["urdf"]))
             folders = [self._place(str(folder)) for folder in entry.get("package_dirs", [])]
             self._folders.extend(folders)
-            self._files[urdf] = self._with_meshes(
-                robot.urdf, urdf, list(zip(robot.package_dirs, folders, strict=True))
-            )
+            # Folders beyond those of the file belong to this machine; what they hold is embedded.
+            named = list(zip(robot.package_dirs, folders, strict=False))
+            self._files[urdf] = self._with_meshes(robot, urdf, named)
         for reference, package_dirs in references(data):
             if package_dirs is None:
                 content = _content(self._source.parent / reference, outside.MESH_BYTES)
@@ -73,39 +75,40 @@ class CellCollector:
         self._moved += 1
         return f"embedded/{self._moved}/{posixpath.basename(reference) or 'folder'}"
 
-    def _with_meshes(self, path: Path, place: str, packages: list[tuple[Path, str]]) -> bytes:
-        """Add the meshes of a URDF; its content with absolute addresses replaced."""
-        content = _content(path, outside.URDF_BYTES)
+    def _with_meshes(self, robot: Robot, place: str, packages: list[tuple[Path, str]]) -> bytes:
+        """Add the meshes of a URDF; its content with this machine's addresses replaced."""
+        path = robot.urdf
         try:
+            content = description_content(path, robot.xacro_arguments, robot.package_dirs)
             named = parse_urdf(content, path.name)
-        except RobotModelError as error:
+        except (OutsideError, RobotModelError) as error:
             raise BundleError(str(error)) from error
         for address in dict.fromkeys((*named.collision_meshes, *named.visual_meshes)):
-            if address.startswith("package://"):
-                for folder, folder_place in packages:
-                    mesh = resolve_mesh(address, path, (folder,))
-                    if mesh is not None:
-                        rest = address.removeprefix("package://")
-                        self._files[joined(folder_place, rest)] = _content(mesh, outside.MESH_BYTES)
-                        break
-                continue
-            mesh = resolve_mesh(address, path, ())
-            target = address.removeprefix("file://")
+            mesh = resolve_mesh(address, path, robot.package_dirs)
             if mesh is None:
                 continue
-            if posixpath.isabs(target):
-                moved = self._new_place(target)
-                base = posixpath.dirname(place) or "."
-                relative = posixpath.relpath(moved, base)
+            target = self._own_place(address, path, place, packages)
+            if target is None:
+                # Below the URDF's folder, whose own name the address need not know.
+                relative = self._new_place(mesh.as_posix())
+                target = joined(posixpath.dirname(place), relative)
                 content = _replaced(content.decode("utf-8"), address, relative, path.name).encode(
                     "utf-8"
                 )
-                self._files[moved] = _content(mesh, outside.MESH_BYTES)
-            else:
-                self._files[joined(posixpath.dirname(place), target)] = _content(
-                    mesh, outside.MESH_BYTES
-                )
+            self._files[target] = _content(mesh, outside.MESH_BYTES)
         return content
+
+    @staticmethod
+    def _own_place(
+        address: str, urdf: Path, place: str, packages: list[tuple[Path, str]]
+    ) -> str | None:
+        """Where a mesh address leads within the workcell's own folders; None beyond them."""
+        if address.startswith(PACKAGE_SCHEME):
+            held = (at for folder, at in packages if resolve_mesh(address, urdf, (folder,)))
+            folder = next(held, None)
+            return folder and joined(folder, address.removeprefix(PACKAGE_SCHEME))
+        target = address.removeprefix("file://")
+        return None if posixpath.isabs(target) else joined(posixpath.dirname(place), target)
 
 
 def _content(path: Path, most: int) -> bytes:
@@ -152,6 +155,8 @@ def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]
     try:
         for robot in data.get("robots", []):
             yield str(robot["urdf"]), [str(entry) for entry in robot.get("package_dirs", [])]
+            if "srdf" in robot:
+                yield str(robot["srdf"]), None
             yield from _meshes(robot.get("tool", []))
         yield from _meshes(data.get("environment", []))
     except (KeyError, TypeError, AttributeError) as error:

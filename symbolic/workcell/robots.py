@@ -11,6 +11,8 @@ import pinocchio as pin
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError, RobotModelError, UrdfError
+from symbolic.robot.packages import further_package_dirs
+from symbolic.robot.srdf_file import read_srdf
 from symbolic.robot.urdf import (
     N_JOINTS,
     flange_problem,
@@ -18,7 +20,8 @@ from symbolic.robot.urdf import (
     resolve_mesh,
     structure_problem,
 )
-from symbolic.robot.urdf_file import read_urdf
+from symbolic.robot.urdf_file import Urdf, read_urdf
+from symbolic.robot.xacro_file import Arguments, is_xacro
 from symbolic.workcell import quantities as quantity
 from symbolic.workcell.reader import Quantity, Table, read_only, shown
 from symbolic.workcell.records import Robot
@@ -32,22 +35,36 @@ MAX_START_BRANCH = 1000
 _ONES = read_only(np.ones(N_JOINTS))
 
 
-def read_robot(table: Table, folder: Path) -> tuple[Robot, int]:
-    """One arm and the index of its start branch (-1: the criterion's choice)."""
+def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot, int]:
+    """One arm and the index of its start branch (-1: the criterion's choice).
+
+    Args:
+        table: its section.
+        folder: what paths are relative to.
+        stored: whether the cell was unpacked from an archive, see `symbolic.workcell.file.load`.
+    """
     problems = table.problems
     name = table.text("name")
     if "/" in name:
         problems.add(table.at("name"), f"found {name!r}; allowed is a name without '/'")
-    urdf = read_file(table, "urdf", folder, outside.URDF_BYTES)
+    path = read_file(table, "urdf", folder, outside.URDF_BYTES)
+    arguments = _read_xacro_arguments(table)
     package_dirs = _read_folders(table, folder)
     locked = _read_locked(table)
     flange = table.text("flange")
+    urdf = _read_urdf(table, path, arguments, package_dirs)
+    if arguments and urdf is not None and not stored and not is_xacro(path.read_bytes()):
+        problems.add(table.at("xacro_arguments"), f"given for {path.name}, which is no xacro file")
+    if urdf is not None and not stored:
+        named = (*urdf.collision_meshes, *urdf.visual_meshes)
+        package_dirs += further_package_dirs(named, package_dirs, path)
     model = _read_model(table, urdf, locked, flange)
-    _check_meshes(table, urdf, package_dirs)
+    if urdf is not None:
+        _check_meshes(table, urdf, path, package_dirs)
     limits = _read_limits(table, model)
     robot = Robot(
         name=name,
-        urdf=urdf,
+        urdf=path,
         package_dirs=package_dirs,
         flange=flange,
         locked_joints=locked,
@@ -62,6 +79,8 @@ def read_robot(table: Table, folder: Path) -> tuple[Robot, int]:
         min_manipulability=table.number(
             "min_manipulability", quantity.MANIPULABILITY, DEFAULT_MIN_MANIPULABILITY
         ),
+        xacro_arguments=arguments,
+        srdf=_read_srdf(table, folder),
     )
     branch = table.integer("start_branch", -1, MAX_START_BRANCH, -1)
     table.close()
@@ -92,19 +111,52 @@ def _read_locked(table: Table) -> tuple[tuple[str, float], ...]:
     return tuple((name, inner.number(name, quantity.LOCKED_POSITION)) for name in inner)
 
 
+def _read_xacro_arguments(table: Table) -> tuple[tuple[str, str], ...]:
+    inner = table.table("xacro_arguments", {})
+    return tuple((name, inner.text(name)) for name in inner)
+
+
+def _read_srdf(table: Table, folder: Path) -> Path | None:
+    if "srdf" not in table:
+        table.raw("srdf", None)
+        return None
+    path = read_file(table, "srdf", folder, outside.URDF_BYTES)
+    if table.problems.clean(table.at("srdf")):
+        try:
+            read_srdf(path)
+        except UrdfError as error:
+            _tell(table, "srdf", error)
+    return path
+
+
+def _read_urdf(
+    table: Table, path: Path, arguments: Arguments, package_dirs: tuple[Path, ...]
+) -> Urdf | None:
+    """The robot's description, or recorded problems and None."""
+    parts = ("urdf", "xacro_arguments", "package_dirs")
+    if not table.problems.clean(*(table.at(part) for part in parts)):
+        return None
+    try:
+        return read_urdf(path, arguments, package_dirs)
+    except UrdfError as error:
+        _tell(table, "urdf", error)
+        return None
+
+
+def _tell(table: Table, key: str, error: UrdfError) -> None:
+    for problem in error.problems:
+        table.problems.add(table.at(key), f"{error.file}: {problem}")
+
+
 def _read_model(
-    table: Table, urdf: Path, locked: tuple[tuple[str, float], ...], flange: str
+    table: Table, urdf: Urdf | None, locked: tuple[tuple[str, float], ...], flange: str
 ) -> pin.Model | None:
     """The arm's model, or recorded problems and None."""
     problems = table.problems
-    if not problems.clean(table.at("urdf"), table.at("locked_joints")):
+    if urdf is None or not problems.clean(table.at("locked_joints")):
         return None
     try:
         reduced_model(urdf)
-    except UrdfError as error:
-        for problem in error.problems:
-            problems.add(table.at("urdf"), f"{error.file}: {problem}")
-        return None
     except RobotModelError as error:
         problems.add(table.at("urdf"), str(error))
         return None
@@ -124,17 +176,16 @@ def _read_model(
     return model
 
 
-def _check_meshes(table: Table, urdf: Path, package_dirs: tuple[Path, ...]) -> None:
-    if not table.problems.clean(table.at("urdf"), table.at("package_dirs")):
-        return
-    for address in read_urdf(urdf).collision_meshes:
-        path = resolve_mesh(address, urdf, package_dirs)
+def _check_meshes(table: Table, urdf: Urdf, file: Path, package_dirs: tuple[Path, ...]) -> None:
+    for address in urdf.collision_meshes:
+        path = resolve_mesh(address, file, package_dirs)
         named = f"the collision mesh {shown(address)} that it names"
         if path is None:
             table.problems.add(
                 table.at("urdf"),
-                f"{named} does not exist; package:// "
-                "addresses are looked up in the folders of package_dirs, others beside the URDF",
+                f"{named} does not exist; package:// addresses are looked up in the folders of "
+                "package_dirs, of ROS_PACKAGE_PATH and AMENT_PREFIX_PATH and of the Python "
+                "environment, others beside the URDF",
             )
             continue
         try:

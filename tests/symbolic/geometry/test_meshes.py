@@ -206,3 +206,45 @@ def test_vertices_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 nan 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
     with pytest.raises(CollisionModelError, match="not finite"):
         convex_pieces(path, ONES)
+
+
+COLLADA = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="{unit}"/><up_axis>{up}</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="12">0 0 0 1 0 0 0 2 0 0 0 3</float_array>
+<technique_common><accessor source="#a" count="4" stride="3">
+<param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
+</accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/>
+<p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node><matrix>{matrix}</matrix>
+<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.01])
+@pytest.mark.parametrize("up", ["Z_UP", "Y_UP"])
+def test_collada_units_and_transforms_count_and_its_up_axis_does_not(
+    tmp_path: Path, unit: float, up: str
+) -> None:
+    path = tmp_path / "shape.dae"
+    matrix = "0 -1 0 5  1 0 0 0  0 0 1 0  0 0 0 1"
+    path.write_text(COLLADA.format(unit=unit, up=up, matrix=matrix), encoding="utf-8")
+    (hull,) = convex_pieces(path, np.array([1.0, 1.0, 2.0]))
+    corners = np.array([[5, 0, 0], [5, 1, 0], [3, 0, 0], [5, 0, 6]]) * unit
+    found = hull.vertices[np.lexsort(hull.vertices.T)]
+    assert found == pytest.approx(corners[np.lexsort(corners.T)], abs=1e-12)
+
+
+@pytest.mark.parametrize("form", ["stl", "obj", "dae"])
+def test_every_form_of_a_mesh_gives_the_same_pieces(tmp_path: Path, form: str) -> None:
+    mesh = angle_profile()
+    path = tmp_path / f"angle.{form}"
+    mesh.export(path)
+    pieces = convex_pieces(path, ONES)
+    volume = sum(ConvexHull(piece.vertices).volume for piece in pieces)
+    mesh.export(tmp_path / "angle.ply")
+    expected = convex_pieces(tmp_path / "angle.ply", ONES)
+    assert volume == pytest.approx(sum(ConvexHull(p.vertices).volume for p in expected), rel=1e-5)

@@ -18,6 +18,7 @@ from symbolic.array import Array
 from symbolic.errors import BridgeError
 from symbolic.robot import bridge
 from symbolic.robot.urdf import reduced_model
+from symbolic.robot.urdf_file import read_urdf
 from tests.robots import GOFA_URDF, ur10_urdf
 
 # Rounding of some hundred operations on numbers of order 10 (rates) to 1000 (torques).
@@ -31,8 +32,8 @@ def _random_humanoid() -> pin.Model:
 
 
 MODELS: dict[str, Callable[[], pin.Model]] = {
-    "gofa12": lambda: reduced_model(GOFA_URDF),
-    "ur10": lambda: reduced_model(ur10_urdf()),
+    "gofa12": lambda: reduced_model(read_urdf(GOFA_URDF)),
+    "ur10": lambda: reduced_model(read_urdf(ur10_urdf())),
     "manipulator": pin.buildSampleModelManipulator,
     "humanoid": _random_humanoid,
 }

@@ -27,7 +27,7 @@ STRETCHED = np.radians([0, 90, -78.4, 0, 26.7, 0])
 
 @pytest.fixture(scope="module")
 def model() -> pin.Model:
-    return reduced_model(GOFA)
+    return reduced_model(read_urdf(GOFA))
 
 
 def flange_pose(model: pin.Model, q: np.ndarray) -> pin.SE3:

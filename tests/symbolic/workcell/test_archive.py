@@ -15,6 +15,7 @@ import pytest
 import trimesh
 
 from symbolic.errors import BundleError
+from symbolic.robot.urdf import robot_urdf
 from symbolic.workcell.archive import (
     CellArchive,
     archive_cell,
@@ -218,3 +219,44 @@ def test_damaged_and_exploding_content_is_refused(monkeypatch: pytest.MonkeyPatc
 def test_wrong_fields_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(BundleError, match="cell"):
         archive_from_json(document(**changes))
+
+
+def test_xacro_and_packages_of_this_machine_become_part_of_the_archive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tmp_path / "here"
+    path = write_cell(here, '"stone.stl"')
+    package = here / "ros" / "share" / "gofa"
+    package.mkdir(parents=True)
+    for mesh in (here / "cells" / "stone.stl", package / "base.stl"):
+        trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(here / "ros"))
+    urdf = here / "robots" / "gofa12.urdf"
+    text = urdf.read_text(encoding="utf-8")
+    box = '<box size="0.205 0.2 0.03"/>'
+    text = text.replace(box, '<mesh filename="package://$(arg package)/base.stl"/>')
+    text = text.replace("<link", '<xacro:arg name="package" default="none"/><link', 1)
+    name = 'xmlns:xacro="http://www.ros.org/wiki/xacro" name='
+    urdf.write_text(text.replace("name=", name, 1), encoding="utf-8")
+    srdf = '<robot><disable_collisions link1="link_1" link2="link_4"/></robot>'
+    (here / "cells" / "gofa.srdf").write_text(srdf, encoding="utf-8")
+    line = 'urdf = "../robots/gofa12.urdf"\n'
+    more = 'xacro_arguments = { package = "gofa" }\nsrdf = "gofa.srdf"\n'
+    path.write_text(path.read_text(encoding="utf-8").replace(line, line + more), encoding="utf-8")
+    _, archive = round_trip(load(path), tmp_path / "there")
+    shutil.rmtree(here)
+    monkeypatch.delenv("AMENT_PREFIX_PATH")
+    unpacked = unpack_cell(archive, tmp_path / "again")
+    (address,) = robot_urdf(unpacked.robots[0]).collision_meshes
+    assert "package://" not in address
+    assert str(here) not in json.dumps(archive_to_json(archive))
+    harmful = {
+        name: content.replace(b"<link", b'<link name="${1}"/><link').replace(
+            b"<robot ", b'<robot xmlns:xacro="http://www.ros.org/wiki/xacro" '
+        )
+        if name.endswith(".urdf")
+        else content
+        for name, content in archive.files.items()
+    }
+    with pytest.raises(BundleError, match="xacro macros"):
+        unpack_cell(replace(archive, files=harmful), tmp_path / "harm")

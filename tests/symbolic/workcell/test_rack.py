@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from symbolic.workcell.checks import body_names, stretched_length
+from symbolic.workcell.body_names import body_names
+from symbolic.workcell.checks import stretched_length
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Box, Cylinder, Mesh, Workcell
 from tests.symbolic.workcell.samples import RACK
