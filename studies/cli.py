@@ -10,7 +10,8 @@ from typing import NoReturn, get_args
 
 from hybrid_opt import metaheuristics
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
-from hybrid_opt.campaign.settings import ExecutorName, FirstGeneration
+from hybrid_opt.campaign.execution import ExecutorName
+from hybrid_opt.campaign.settings import FirstGeneration
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.metaheuristics.problem import ConstraintHandling
 from hybrid_opt.polishing.records import PolishSettings
@@ -149,7 +150,7 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         "--executor",
         choices=get_args(ExecutorName),
         default="processes",
-        help="where replicas run: on this machine or on a Dask cluster (default: %(default)s)",
+        help="where the work is done: on this machine or on a Dask cluster (default: %(default)s)",
     )
     work.add_argument(
         "--scheduler", metavar="ADDRESS", help="of Dask, as tcp://HOST:8786 (default: none)"

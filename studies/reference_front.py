@@ -10,6 +10,7 @@ proven one. `tests/hybrid_opt/polishing/rack_reference_front.csv` was made with
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,16 +18,20 @@ from pathlib import Path
 
 import numpy as np
 
-from codegen.function import available_cores
+from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.polish_stage import PolisherSource
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.front import FrontPolisher
-from hybrid_opt.polishing.functions import polish_functions
-from hybrid_opt.polishing.records import PolishSettings
+from hybrid_opt.polishing.records import PolishedFront, PolishSettings
 from hybrid_opt.store.files import read_bytes, write_atomically
+from hybrid_opt.work.job import Emit, Job, answer_all
+from hybrid_opt.work.processes import local_executor
 from symbolic.array import Array
 from symbolic.errors import DualArmError, SettingsError
+from symbolic.workcell.archive import archive_cell
 from symbolic.workcell.file import load
 
 CANDIDATES = 4000
@@ -69,7 +74,7 @@ def compute_reference_front(
         starts: random feasible candidates to start from, the hand-made trajectory besides.
         points: attempts of the final polish of the union.
         rng: draws the candidates.
-        jobs: child processes; has no influence on the result.
+        jobs: worker processes, 0 for one per core; has no influence on the result.
         tell: takes a line of progress.
 
     Raises:
@@ -84,16 +89,33 @@ def compute_reference_front(
             "most as many starts"
         )
     begins = [evaluator.workcell.task.initial.reshape(-1), *candidates[feasible[:starts]]]
-    functions = polish_functions(evaluator.workcell)
-    single = FrontPolisher(evaluator, PolishSettings(points=ATTEMPTS, rounds=ROUNDS), functions)
-    x = np.empty((0, evaluator.n_var))
-    for k, start in enumerate(begins, 1):
-        x = np.concatenate([x, single.polish(start[None], rng, jobs).x])
-        tell(f"start {k} of {len(begins)}: {len(x)} points")
-    union = FrontPolisher(evaluator, PolishSettings(points=points, rounds=ROUNDS), functions)
-    front = union.polish(x, rng, jobs)
+    cell = PackedCell.of(archive_cell(evaluator.workcell))
+    count = itertools.count(1)
+    executor = local_executor(jobs)
+    parts = answer_all(
+        executor,
+        _polish_job(cell, ATTEMPTS),
+        list(zip([start[None] for start in begins], rng.spawn(len(begins)), strict=True)),
+        lambda: tell(f"start {next(count)} of {len(begins)}"),
+    )
+    union = np.concatenate([part.x for part in parts])
+    (front,) = answer_all(executor, _polish_job(cell, points), [(union, rng)])
     tell(f"reference front: {len(front.x)} points")
     return ReferenceFront(evaluator.workcell.digest, front.objectives, front.x)
+
+
+def _polish_job(
+    cell: PackedCell, attempts: int
+) -> Job[FrontPolisher, tuple[Array, np.random.Generator], PolishedFront]:
+    settings = PolishSettings(points=attempts, rounds=ROUNDS)
+    source = PolisherSource(cell, PAPER_OBJECTIVES, settings)
+    return Job(source, _polished)
+
+
+def _polished(
+    polisher: FrontPolisher, request: tuple[Array, np.random.Generator], emit: Emit
+) -> PolishedFront:
+    return polisher.polish(*request)
 
 
 def encode(front: ReferenceFront, command: str) -> bytes:
@@ -151,7 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.starts,
             options.points,
             np.random.default_rng(options.seed),
-            options.jobs or available_cores(),
+            options.jobs,
             lambda text: print(text, file=sys.stderr, flush=True),
         )
         write_atomically(options.output, encode(front, command))

@@ -20,6 +20,7 @@ from hybrid_opt.campaign import (
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.polishing.records import PolishSettings
+from hybrid_opt.work.processes import warm_up
 from studies.cli import (
     campaign_parser,
     campaign_settings,
@@ -35,6 +36,13 @@ from symbolic.workcell.file import load
 
 PAGE = "report.html"
 """The report in a results folder."""
+
+WORKERS_LOAD = (
+    "hybrid_opt.campaign.polish_stage",
+    "studies.timing_stage",
+    "studies.report.generate",
+)
+"""Modules that the work of a study needs."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells use it."""
@@ -116,6 +124,8 @@ def main(
         cell: Path = options.workcell if workcell is None else workcell
         settings = campaign_settings(options)
         execution = execution_settings(options, Path("results") / cell.stem)
+        if execution.executor == "processes":
+            warm_up(*WORKERS_LOAD)
         study = StudySettings(
             polish_settings(options), options.force_limit, options.report, bool(workcell)
         )

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from hybrid_opt.campaign import CampaignFolder, Progress, Stage
+from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
+from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.layout import SELECTED
-from hybrid_opt.store.files import storing, write_json
+from hybrid_opt.store.files import write_json
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingModel, timed_trajectory
-from hybrid_opt.work.children import in_children
+from hybrid_opt.work.job import Emit, Job, answer_all
 from studies.timing_text import timing_json
 from symbolic.array import Array
+from symbolic.workcell.records import Workcell
 
 TIMING = "timing"
 """Folder of the timings in a results folder, laid out as that of the selected trajectories."""
@@ -35,21 +38,42 @@ def timing_stage(force_limit: float | None = None) -> Stage:
 
 
 def _run(folder: CampaignFolder, progress: Progress, force_limit: float | None) -> None:
-    model = TimingModel(folder.workcell)
     selected = folder.root / SELECTED
     files = sorted(path.relative_to(selected) for path in selected.rglob("*.json"))
     found = {Path(INITIAL): folder.workcell.task.initial.reshape(-1)}
     found |= {file: read_trajectory(selected / file).x for file in files}
-    calls = [partial(_store, folder, file, model, x, force_limit) for file, x in found.items()]
-    with progress.stage(TIMING, len(calls), "trajectories") as advance:
-        in_children(calls, folder.execution.jobs, lambda: advance(1))
+    job = Job(TimingModelSource(PackedCell.of(folder.archive)), _document)
+    requests = [(x, force_limit) for x in found.values()]
+    with progress.stage(TIMING, len(requests), "trajectories") as advance:
+        executor = executor_for(folder.execution)
+        documents = answer_all(executor, job, requests, lambda: advance(1))
+    for file, document in zip(found, documents, strict=True):
+        write_json(folder.root / TIMING / file, document)
 
 
-def _store(
-    folder: CampaignFolder, file: Path, model: TimingModel, x: Array, force_limit: float | None
-) -> None:
-    timed = timed_trajectory(model, x, force_limit)
-    path = folder.root / TIMING / file
-    with storing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, timing_json(timed))
+@dataclass(frozen=True)
+class TimingModelSource:
+    """Makes a workcell's timing model, in any process.
+
+    Attributes:
+        cell: the workcell.
+    """
+
+    cell: PackedCell
+
+    def __call__(self) -> TimingModel:
+        """Load the compiled functions, or build them where they are missing."""
+        return self.cell.make(_ready_model)
+
+
+def _ready_model(workcell: Workcell) -> TimingModel:
+    model = TimingModel(workcell)
+    # The cell's files are there only now: what is loaded when it is first needed is needed now.
+    model.search_carry(workcell.task.initial.reshape(-1))
+    return model
+
+
+def _document(
+    model: TimingModel, request: tuple[Array, float | None], emit: Emit
+) -> dict[str, Any]:
+    return timing_json(timed_trajectory(model, *request))

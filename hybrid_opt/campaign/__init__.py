@@ -1,9 +1,10 @@
 """Campaigns: algorithms times replicas with equal budgets, stored so that nothing is lost."""
 
+from hybrid_opt.campaign.execution import ExecutionSettings, executor_for
 from hybrid_opt.campaign.folder import CampaignFolder, open_folder
 from hybrid_opt.campaign.progress import Progress
-from hybrid_opt.campaign.search_stage import executor_for, search_stage
-from hybrid_opt.campaign.settings import CampaignSettings, ExecutionSettings
+from hybrid_opt.campaign.search_stage import search_stage
+from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Stage, run_stages
 
 __all__ = [

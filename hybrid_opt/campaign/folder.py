@@ -9,9 +9,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from hybrid_opt.campaign.execution import ExecutionSettings
 from hybrid_opt.campaign.identity import identity, require_equal
 from hybrid_opt.campaign.layout import CONFIGURATION, WORKCELL
-from hybrid_opt.campaign.settings import CampaignSettings, ExecutionSettings
+from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import locked, read_json, storing, sync_folder, write_json
 from symbolic.workcell.archive import CellArchive, archive_cell, unpack_cell

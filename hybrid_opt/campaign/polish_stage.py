@@ -11,34 +11,38 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
+from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.execution import executor_for
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.identity import identity, replica_identity
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.layout import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.progress import Advance, Progress
-from hybrid_opt.campaign.replica import CellEvaluatorSource
 from hybrid_opt.campaign.results import Replica, read_campaign
-from hybrid_opt.campaign.search_stage import executor_for
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Stage
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.polishing.attempt import Lost, use_one_thread
 from hybrid_opt.polishing.front import FrontPolisher
 from hybrid_opt.polishing.records import (
     PolishedFront,
+    PolishOutcome,
     PolishSettings,
     outcome_from_json,
     outcome_to_json,
 )
 from hybrid_opt.store.files import read_json, write_json
-from hybrid_opt.work.executor import Job
+from hybrid_opt.work.job import Job, give_up
 from symbolic.array import Array
-from symbolic.workcell.archive import archive_from_json, unpack_cell
+from symbolic.workcell.records import Workcell
+
+JUDGING_SECONDS = 30.0
+"""What judging an attempt, and the front before the first one, may take besides solving."""
 
 
 @dataclass(frozen=True)
@@ -46,31 +50,33 @@ class PolisherSource:
     """Makes a polisher, in any process.
 
     Attributes:
-        cell: the workcell with its files, as in `CellEvaluatorSource`.
+        cell: the workcell.
         objectives: names of the objectives.
         settings: of the polish.
     """
 
-    cell: str
+    cell: PackedCell
     objectives: tuple[str, ...]
     settings: PolishSettings
 
     def __call__(self) -> FrontPolisher:
         """Load the compiled functions, or build them where they are missing."""
-        with TemporaryDirectory() as folder:
-            workcell = unpack_cell(archive_from_json(json.loads(self.cell)), Path(folder))
-            return FrontPolisher(CandidateEvaluator(workcell, self.objectives), self.settings)
+        use_one_thread()
+        return self.cell.make(self._polisher)
+
+    def _polisher(self, workcell: Workcell) -> FrontPolisher:
+        return FrontPolisher(CandidateEvaluator(workcell, self.objectives), self.settings)
 
 
 @dataclass(frozen=True)
-class PolishTask:
+class PolishRequest:
     """A front to polish.
 
     Attributes:
         settings: the campaign's, for the seed.
         algorithm, replica: whose front it is.
         front_x: (k, n_var) its decision vectors.
-        recorded: the journal's blocks of an earlier, interrupted attempt.
+        recorded: the journal's blocks of an earlier, interrupted polish.
     """
 
     settings: CampaignSettings
@@ -90,17 +96,26 @@ def polish_stage(settings: PolishSettings) -> Stage:
 
 
 def polish_replica(
-    polisher: FrontPolisher, task: PolishTask, emit: Callable[[bytes], None]
+    polisher: FrontPolisher, request: PolishRequest, emit: Callable[[bytes], None]
 ) -> PolishedFront:
     """Polish one front; attempts that were recorded are not repeated."""
-    rng = task.settings.replica_rng(f"{task.algorithm}/polish", task.replica)
-    recorded = [outcome_from_json(json.loads(block)) for block in task.recorded]
+    rng = request.settings.replica_rng(f"{request.algorithm}/polish", request.replica)
     return polisher.polish(
-        task.front_x,
+        request.front_x,
         rng,
-        recorded=recorded,
+        recorded=[_from_block(block) for block in request.recorded],
         emit=lambda outcome: emit(json.dumps(outcome_to_json(outcome)).encode()),
     )
+
+
+def _block_of(lost: Lost) -> bytes:
+    """The journal's block of an attempt that its process did not survive."""
+    return json.dumps({"lost": lost.reason}).encode()
+
+
+def _from_block(block: bytes) -> PolishOutcome | Lost:
+    values = json.loads(block)
+    return Lost(values["lost"]) if "lost" in values else outcome_from_json(values)
 
 
 @dataclass(frozen=True)
@@ -151,8 +166,12 @@ class _Polish:
 
     def __init__(self, folder: CampaignFolder, settings: PolishSettings) -> None:
         self._folder, self._settings = folder, settings
-        source = CellEvaluatorSource.of(folder.archive, folder.settings.objectives)
-        self._job = Job(PolisherSource(source.cell, source.objectives, settings), polish_replica)
+        cell = PackedCell.of(folder.archive)
+        self._job = Job(
+            PolisherSource(cell, folder.settings.objectives, settings),
+            polish_replica,
+            patience=settings.max_seconds + JUDGING_SECONDS,
+        )
         self._identity = {
             "campaign": identity(folder.settings, folder.root, folder.workcell),
             "polish": asdict(settings),
@@ -170,8 +189,7 @@ class _Polish:
                 self._job.make_context()
             done = self._all - len(self._open)
             with progress.stage("polish", self._all, "fronts", done) as self._advance:
-                executor = executor_for(self._folder.execution)
-                executor.run(self._job, len(self._open), self._task, self._record, self._finish)
+                executor_for(self._folder.execution).run(self._job, self)
         finally:
             for journal in self._journals.values():
                 journal.close()
@@ -189,9 +207,13 @@ class _Polish:
             self._journals[index] = Journal(path, key)
         return self._journals[index]
 
-    def _task(self, index: int) -> PolishTask:
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def request(self, index: int) -> PolishRequest:
+        """See `hybrid_opt.work.job.Ledger`."""
         replica = self._open[index]
-        return PolishTask(
+        return PolishRequest(
             self._folder.settings,
             replica.algorithm,
             replica.replica,
@@ -199,11 +221,20 @@ class _Polish:
             tuple(self._journal(index).payloads),
         )
 
-    def _record(self, index: int, payload: bytes) -> None:
-        self._journal(index).append(payload)
+    def heard(self, index: int, message: bytes) -> None:
+        """See `hybrid_opt.work.job.Ledger`."""
+        self._journal(index).append(message)
 
-    def _finish(self, index: int, front: PolishedFront) -> None:
-        write_json(self._marker(self._open[index]), polish_document(front))
+    def lost(self, index: int, reason: str) -> None:
+        """A solver that crashes or hangs costs the attempt at hand only."""
+        journal = self._journal(index)
+        if len(journal.payloads) >= self._settings.points:
+            give_up(reason)
+        journal.append(_block_of(Lost(reason)))
+
+    def answered(self, index: int, answer: PolishedFront) -> None:
+        """See `hybrid_opt.work.job.Ledger`."""
+        write_json(self._marker(self._open[index]), polish_document(answer))
         self._journals.pop(index).discard()
         self._advance(1)
 

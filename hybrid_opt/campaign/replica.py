@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from hybrid_opt import metaheuristics
+from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.evaluations_file import EvaluationTable, encode, encode_front
 from hybrid_opt.campaign.journal import decode_generation, encode_generation
 from hybrid_opt.campaign.settings import CampaignSettings
@@ -20,7 +18,6 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.problem import CarryProblem, Evaluator, disarmed
 from symbolic.array import Array
-from symbolic.workcell.archive import CellArchive, archive_from_json, archive_to_json, unpack_cell
 
 EvaluatorSource = Callable[[], Evaluator]
 """Makes the evaluator, in any process; can be pickled and hashed."""
@@ -31,27 +28,20 @@ class CellEvaluatorSource:
     """Makes a workcell's evaluator from nothing but this value.
 
     Attributes:
-        cell: the workcell with its files, JSON of `symbolic.workcell.archive.archive_to_json`.
+        cell: the workcell.
         objectives: names of the objectives.
     """
 
-    cell: str
+    cell: PackedCell
     objectives: tuple[str, ...]
-
-    @classmethod
-    def of(cls, archive: CellArchive, objectives: tuple[str, ...]) -> CellEvaluatorSource:
-        """The source for a stored workcell."""
-        return cls(json.dumps(archive_to_json(archive)), objectives)
 
     def __call__(self) -> CandidateEvaluator:
         """Load the compiled functions, or build them where they are missing."""
-        with TemporaryDirectory() as folder:
-            workcell = unpack_cell(archive_from_json(json.loads(self.cell)), Path(folder))
-            return CandidateEvaluator(workcell, self.objectives)
+        return self.cell.make(lambda workcell: CandidateEvaluator(workcell, self.objectives))
 
 
 @dataclass(frozen=True)
-class ReplicaTask:
+class ReplicaRequest:
     """A replica to run.
 
     Attributes:
@@ -87,7 +77,7 @@ class ReplicaOutcome:
 
 
 def run_replica(
-    evaluator: Evaluator, task: ReplicaTask, emit: Callable[[bytes], None]
+    evaluator: Evaluator, request: ReplicaRequest, emit: Callable[[bytes], None]
 ) -> ReplicaOutcome:
     """Run a replica to its end.
 
@@ -96,18 +86,18 @@ def run_replica(
 
     Args:
         evaluator: of the campaign's workcell and objectives.
-        task: what to run.
+        request: what to run.
         emit: takes the journal's block of each newly evaluated generation.
 
     Raises:
         ResultsError: the journal holds other candidates than the search asks for.
     """
-    settings = task.settings
-    recording = _Recording(evaluator, task, emit)
+    settings = request.settings
+    recording = _Recording(evaluator, request, emit)
     problem = CarryProblem(recording, settings.constraint_handling)
-    start = task.initial[None] if settings.starts_from_initial(task.algorithm) else None
-    algorithm = metaheuristics.make(task.algorithm, settings.overrides(task.algorithm), start)
-    rng = settings.replica_rng(task.algorithm, task.replica)
+    start = request.initial[None] if settings.starts_from_initial(request.algorithm) else None
+    algorithm = metaheuristics.make(request.algorithm, settings.overrides(request.algorithm), start)
+    rng = settings.replica_rng(request.algorithm, request.replica)
     metaheuristics.search(problem, algorithm, settings.evaluations, rng)
     generation = np.repeat(
         np.arange(1, len(problem.batches) + 1), [len(batch) for batch in problem.batches]
@@ -129,26 +119,26 @@ class _Recording:
     """Evaluates, records what is new, and answers from the record what is not."""
 
     def __init__(
-        self, evaluator: Evaluator, task: ReplicaTask, emit: Callable[[bytes], None]
+        self, evaluator: Evaluator, request: ReplicaRequest, emit: Callable[[bytes], None]
     ) -> None:
         self.objective_names = evaluator.objective_names
         self.n_var = evaluator.n_var
         self.lower, self.upper = evaluator.lower, evaluator.upper
         self.seconds: list[float] = []
         self._evaluator = evaluator
-        self._task = task
+        self._request = request
         self._emit = emit
         self._since = time.perf_counter()
 
     def evaluate(self, x: Array) -> Evaluations:
-        recorded: Sequence[bytes] = self._task.recorded
+        recorded: Sequence[bytes] = self._request.recorded
         if len(self.seconds) < len(recorded):
             seconds, generation = decode_generation(
                 recorded[len(self.seconds)], self.n_var, len(self.objective_names)
             )
             if not np.array_equal(generation.x, x):
                 raise ResultsError(
-                    f"{self._task.algorithm} replica {self._task.replica}: the journal holds "
+                    f"{self._request.algorithm} replica {self._request.replica}: the journal holds "
                     "other candidates than the search asks for, as after a change of the machine "
                     "or of a library; delete the replica's folder to compute it anew"
                 )

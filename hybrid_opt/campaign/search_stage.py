@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.execution import executor_for
 from hybrid_opt.campaign.folder import CampaignFolder
-from hybrid_opt.campaign.identity import environment, identity, replica_identity
+from hybrid_opt.campaign.identity import identity, replica_identity
 from hybrid_opt.campaign.journal import Journal, candidates_in
 from hybrid_opt.campaign.layout import DONE, EVALUATIONS, FRONT, JOURNAL, replica_folder
 from hybrid_opt.campaign.progress import Advance, Progress
@@ -11,14 +13,12 @@ from hybrid_opt.campaign.replica import (
     CellEvaluatorSource,
     EvaluatorSource,
     ReplicaOutcome,
-    ReplicaTask,
+    ReplicaRequest,
     run_replica,
 )
-from hybrid_opt.campaign.settings import ExecutionSettings
 from hybrid_opt.campaign.stages import Stage
 from hybrid_opt.store.files import read_json, sha256, write_atomically, write_json
-from hybrid_opt.work.dask_executor import DaskExecutor
-from hybrid_opt.work.executor import Executor, Job, local_executor
+from hybrid_opt.work.job import Executor, Job, give_up
 
 
 def search_stage(source: EvaluatorSource | None = None) -> Stage:
@@ -29,18 +29,11 @@ def search_stage(source: EvaluatorSource | None = None) -> Stage:
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        maker = source or CellEvaluatorSource.of(folder.archive, folder.settings.objectives)
+        cell = PackedCell.of(folder.archive)
+        maker = source or CellEvaluatorSource(cell, folder.settings.objectives)
         _Search(folder, maker).run(executor_for(folder.execution), progress)
 
     return Stage("search", run)
-
-
-def executor_for(execution: ExecutionSettings) -> Executor:
-    """The executor that the settings ask for."""
-    if execution.executor == "dask":
-        assert execution.scheduler is not None
-        return DaskExecutor(execution.scheduler, environment(), environment)
-    return local_executor(execution.jobs)
 
 
 class _Search:
@@ -70,7 +63,7 @@ class _Search:
                 # Compiles what is missing here, once, instead of in every worker.
                 self._job.make_context()
             with progress.stage("search", total, "evaluations", recorded) as self._advance:
-                executor.run(self._job, len(self._open), self._task, self._record, self._finish)
+                executor.run(self._job, self)
         finally:
             for journal in self._journals.values():
                 journal.close()
@@ -105,22 +98,32 @@ class _Search:
             self._journals[index] = Journal(path, identity_of)
         return self._journals[index]
 
-    def _task(self, index: int) -> ReplicaTask:
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def request(self, index: int) -> ReplicaRequest:
+        """See `hybrid_opt.work.job.Ledger`."""
         journal = self._journal(index)
         initial = self._folder.workcell.task.initial.ravel()
         algorithm, replica = self._open[index]
-        return ReplicaTask(
+        return ReplicaRequest(
             self._folder.settings, algorithm, replica, initial, tuple(journal.payloads)
         )
 
-    def _record(self, index: int, payload: bytes) -> None:
-        self._journal(index).append(payload)
-        self._advance(candidates_in(payload))
+    def heard(self, index: int, message: bytes) -> None:
+        """See `hybrid_opt.work.job.Ledger`."""
+        self._journal(index).append(message)
+        self._advance(candidates_in(message))
 
-    def _finish(self, index: int, outcome: ReplicaOutcome) -> None:
+    def lost(self, index: int, reason: str) -> None:
+        """See `hybrid_opt.work.job.Ledger`."""
+        give_up(reason)
+
+    def answered(self, index: int, answer: ReplicaOutcome) -> None:
+        """See `hybrid_opt.work.job.Ledger`."""
         algorithm, replica = self._open[index]
         folder = replica_folder(self._folder.root, algorithm, replica)
-        files = {EVALUATIONS: outcome.evaluations, FRONT: outcome.front}
+        files = {EVALUATIONS: answer.evaluations, FRONT: answer.front}
         for name, content in files.items():
             write_atomically(folder / name, content)
         # Written last: with it, the replica is done.
@@ -129,8 +132,8 @@ class _Search:
             {
                 "algorithm": algorithm,
                 "replica": replica,
-                "evaluations": outcome.count,
-                "seconds": outcome.seconds,
+                "evaluations": answer.count,
+                "seconds": answer.seconds,
                 "sha256": {name: sha256(content) for name, content in files.items()},
             },
         )

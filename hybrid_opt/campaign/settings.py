@@ -1,10 +1,9 @@
-"""What a campaign computes, how it is carried out, and where its randomness comes from."""
+"""What a campaign computes, and where its randomness comes from."""
 
 from __future__ import annotations
 
 import zlib
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -16,8 +15,6 @@ from symbolic.errors import SettingsError
 
 FirstGeneration = Literal["initial", "random"]
 """'initial': uniformly random but for the workcell's hand-made trajectory; 'random': all."""
-
-ExecutorName = Literal["processes", "dask"]
 
 _SIZE_KEYS = ("population", "swarm", "batch")
 """How the algorithms' settings call the candidates of one generation."""
@@ -53,9 +50,9 @@ class CampaignSettings:
         Raises:
             SettingsError: with the value, and what is allowed.
         """
-        _require_whole("evaluations", self.evaluations, 1, 10**9)
-        _require_whole("replicas", self.replicas, 1, 10_000)
-        _require_whole("seed", self.seed, 0, 2**63 - 1)
+        require_whole("evaluations", self.evaluations, 1, 10**9)
+        require_whole("replicas", self.replicas, 1, 10_000)
+        require_whole("seed", self.seed, 0, 2**63 - 1)
         select_objectives(self.objectives)
         if self.constraint_handling not in get_args(ConstraintHandling):
             raise SettingsError(
@@ -112,42 +109,11 @@ class CampaignSettings:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
 
 
-@dataclass(frozen=True)
-class ExecutionSettings:
-    """How a campaign is carried out; nothing here changes its results.
+def require_whole(name: str, value: object, low: int, high: int) -> None:
+    """Refuse what is no whole number between two bounds.
 
-    Attributes:
-        output: the results folder.
-        jobs: worker processes, 0 for one per core that this process may use.
-        executor: 'processes' of this machine, or 'dask' for a cluster.
-        scheduler: address of the Dask scheduler, only with 'dask'.
-        resume: continue what the results folder holds.
+    Raises:
+        SettingsError: with the value, and what is allowed.
     """
-
-    output: Path
-    jobs: int = 0
-    executor: ExecutorName = "processes"
-    scheduler: str | None = None
-    resume: bool = False
-
-    def __post_init__(self) -> None:
-        """Check every value.
-
-        Raises:
-            SettingsError: with the value, and what is allowed.
-        """
-        _require_whole("jobs", self.jobs, 0, 4096)
-        if self.executor not in get_args(ExecutorName):
-            raise SettingsError(
-                f"executor {self.executor!r}; known are {', '.join(get_args(ExecutorName))}"
-            )
-        if (self.executor == "dask") != bool(self.scheduler):
-            raise SettingsError(
-                "the executor 'dask' needs a scheduler's address, and only it takes one: "
-                "--executor dask --scheduler tcp://HOST:8786"
-            )
-
-
-def _require_whole(name: str, value: object, low: int, high: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise SettingsError(f"{name} is {value!r}; allowed are whole numbers {low} to {high}")

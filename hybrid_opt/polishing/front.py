@@ -17,9 +17,9 @@ import numpy as np
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.polishing.archive import Archive
+from hybrid_opt.polishing.attempt import Lost, solve_safely
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.plan import Attempt, aimed, points, widest_gap
-from hybrid_opt.polishing.pool import Lost, SolverPool
 from hybrid_opt.polishing.records import (
     UNKNOWN,
     Aim,
@@ -71,7 +71,7 @@ class FrontPolisher:
                 f"{', '.join(evaluator.objective_names)}: switch the polish off for them"
             )
         self.evaluator, self.settings = evaluator, settings
-        self._solver = PolishSolver(
+        self.solver = PolishSolver(
             evaluator, functions or polish_functions(evaluator.workcell), settings
         )
 
@@ -79,8 +79,7 @@ class FrontPolisher:
         self,
         front_x: Array,
         rng: np.random.Generator,
-        jobs: int = 1,
-        recorded: Sequence[PolishOutcome] = (),
+        recorded: Sequence[PolishOutcome | Lost] = (),
         emit: Callable[[PolishOutcome], None] = lambda outcome: None,
     ) -> PolishedFront:
         """Polish a front.
@@ -88,8 +87,8 @@ class FrontPolisher:
         Args:
             front_x: (k, n_var) decision vectors; k may be 0.
             rng: spreads the starts of attempts at the balanced middle.
-            jobs: child processes; has no influence on the result.
-            recorded: outcomes of an earlier, interrupted polish of the same front, not repeated.
+            recorded: outcomes of an earlier, interrupted polish of the same front, not repeated;
+                `Lost` for an attempt that ended its process.
             emit: takes each new outcome.
         """
         begin = time.perf_counter()
@@ -100,8 +99,7 @@ class FrontPolisher:
         archive = Archive(x[feasible], found.objectives[feasible], feasible.tolist())
         run = _Run(self, archive, list(recorded), emit)
         if len(feasible) and self.settings.points:
-            with SolverPool(self._solver, jobs, self.settings.max_seconds) as run.pool:
-                run.all(rng)
+            run.all(rng)
         rows = archive.rows() if len(feasible) else []
         return PolishedFront(
             x=np.array([archive.x[k] for k in rows]).reshape(-1, self.evaluator.n_var),
@@ -109,7 +107,9 @@ class FrontPolisher:
             parent=np.array([archive.parent[k] for k in rows], dtype=np.int64),
             polished=np.array([archive.polished[k] for k in rows], dtype=bool),
             outcomes=tuple(run.outcomes),
-            seconds=time.perf_counter() - begin + sum(o.seconds for o in recorded),
+            seconds=time.perf_counter()
+            - begin
+            + sum(o.seconds for o in recorded if isinstance(o, PolishOutcome)),
             evaluation_seconds=unit,
         )
 
@@ -135,16 +135,15 @@ def polish_front(
 class _Run:
     """One polish in progress."""
 
-    pool: SolverPool
-
     def __init__(
         self,
         polisher: FrontPolisher,
         archive: Archive,
-        recorded: list[PolishOutcome],
+        recorded: list[PolishOutcome | Lost],
         emit: Callable[[PolishOutcome], None],
     ) -> None:
         self._evaluator, self._settings = polisher.evaluator, polisher.settings
+        self._solver = polisher.solver
         self._archive, self._recorded, self._emit = archive, recorded, emit
         self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
         self.outcomes: list[PolishOutcome] = []
@@ -185,19 +184,17 @@ class _Run:
 
     def _do(self, attempts: list[Attempt]) -> None:
         """Solve, judge and take in attempts; those on record are not solved again."""
-        attempts = attempts[: max(0, self._left())]
-        known = self._recorded[: len(attempts)]
-        del self._recorded[: len(attempts)]
-        for attempt, outcome in zip(attempts, known, strict=False):
+        for attempt in attempts[: max(0, self._left())]:
+            known = self._recorded.pop(0) if self._recorded else None
+            if isinstance(known, PolishOutcome):
+                self._take(attempt, known)
+                continue
+            begin = time.perf_counter()
+            task = SolveTask(attempt.x, attempt.target, attempt.radius)
+            outcome = self._judged(attempt, known or solve_safely(self._solver, task), begin)
             self._take(attempt, outcome)
-        fresh = attempts[len(known) :]
-        begin = time.perf_counter()
-        answers = self.pool.solve([SolveTask(a.x, a.target, a.radius) for a in fresh])
-        each = (time.perf_counter() - begin) / max(1, len(fresh))
-        for attempt, answer in zip(fresh, answers, strict=True):
-            outcome = self._judged(attempt, answer, each)
-            self._take(attempt, outcome)
-            self._emit(outcome)
+            if known is None:
+                self._emit(outcome)
 
     def _take(self, attempt: Attempt, outcome: PolishOutcome) -> None:
         self.outcomes.append(outcome)
@@ -208,8 +205,7 @@ class _Run:
         else:
             self._archive.add(outcome.x, outcome.objectives)
 
-    def _judged(self, attempt: Attempt, answer: Solution | Lost, solving: float) -> PolishOutcome:
-        begin = time.perf_counter()
+    def _judged(self, attempt: Attempt, answer: Solution | Lost, begin: float) -> PolishOutcome:
         status, reason, objectives = self._verdict(attempt, answer)
         told = answer if isinstance(answer, Solution) else NO_SOLUTION
         return PolishOutcome(
@@ -224,7 +220,7 @@ class _Run:
             iterations=told.iterations,
             rounds=told.rounds,
             rows=told.rows,
-            seconds=solving + time.perf_counter() - begin,
+            seconds=time.perf_counter() - begin,
         )
 
     def _verdict(self, attempt: Attempt, answer: Solution | Lost) -> tuple[Status, str, Array]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
@@ -16,19 +17,23 @@ from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.selection import balanced, peak_normal_forces
 from hybrid_opt.timing import TimingModel, timed_trajectory
 from hybrid_opt.timing.robustness import payload_sensitivity
-from hybrid_opt.work.children import in_children
+from hybrid_opt.work.job import Emit, Executor, Job, answer_all
+from hybrid_opt.work.serial import SerialExecutor
 from studies.report.reach import reach_map
 from studies.report.records import (
     AlgorithmRuns,
     Carry,
     Front,
+    ReachMap,
     ReportData,
     Run,
     TimedSelection,
 )
 from studies.terminal_summary import title
+from studies.timing_stage import TimingModelSource
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.workcell.archive import archive_cell
 
 INITIAL_LABEL = "hand-made"
 CURVE_POINTS = 12
@@ -38,12 +43,12 @@ REACH_SEED = 0
 """Of the postures that the reach is drawn from; no result depends on it."""
 
 
-def gather(root: Path, jobs: int = 1) -> ReportData:
+def gather(root: Path, executor: Executor | None = None) -> ReportData:
     """Read a results folder and evaluate what is drawn in detail.
 
     Args:
         root: the results folder.
-        jobs: processes, 0 for one per core.
+        executor: who does what takes long, None for this process.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -56,9 +61,10 @@ def gather(root: Path, jobs: int = 1) -> ReportData:
     geometry = build_geometry(workcell)
     algorithms = _algorithms(results, summary, maker)
     carries = _best(results, algorithms, maker)
-    slow: list[Callable[[], Any]] = [partial(maker.timing, carry) for carry in carries]
-    slow.append(partial(reach_map, geometry, np.random.default_rng(REACH_SEED)))
-    *timings, reach = in_children(slow, jobs)
+    slow: list[Callable[[TimingModel], Any]] = [partial(_reach, geometry)]
+    slow += [partial(_timing, carry.label, carry.x) for carry in carries]
+    job = Job(TimingModelSource(PackedCell.of(archive_cell(workcell))), _called)
+    reach, *timings = answer_all(executor or SerialExecutor(), job, slow)
     return ReportData(
         workcell=workcell,
         geometry=geometry,
@@ -116,10 +122,19 @@ class _CarryMaker:
         row = balanced(peak_normal_forces(self.evaluator, front.x))
         return self.carry(front.x[row], label)
 
-    def timing(self, carry: Carry) -> TimedSelection:
-        timed = timed_trajectory(self.model, carry.x, curve_points=CURVE_POINTS)
-        assert timed.curve is not None
-        return TimedSelection(carry.label, timed.report, timed.curve, timed.margins)
+
+def _called(model: TimingModel, call: Callable[[TimingModel], Any], emit: Emit) -> Any:
+    return call(model)
+
+
+def _reach(geometry: CellGeometry, model: TimingModel) -> ReachMap:
+    return reach_map(geometry, np.random.default_rng(REACH_SEED))
+
+
+def _timing(label: str, x: Array, model: TimingModel) -> TimedSelection:
+    timed = timed_trajectory(model, x, curve_points=CURVE_POINTS)
+    assert timed.curve is not None
+    return TimedSelection(label, timed.report, timed.curve, timed.margins)
 
 
 def carry_of(evaluator: CandidateEvaluator, model: TimingModel, x: Array, label: str) -> Carry:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 
-from hybrid_opt.store.files import storing, write_atomically
+from hybrid_opt.store.files import write_atomically
 from hybrid_opt.timing import TimingModel
-from hybrid_opt.work.children import in_children
+from hybrid_opt.work.job import Emit, Executor, Job, answer_all
+from hybrid_opt.work.serial import SerialExecutor
 from studies.report.figures import ReportFigure, report_figures
 from studies.report.page import render_page
 from studies.report.page_data import PageData
 from studies.report.records import ReportData
-from studies.report.style import save
+from studies.report.style import files_of
 from studies.report.tables import report_tables
 
 PAGE = "report.html"
@@ -26,7 +27,7 @@ def write_report(
     data: ReportData,
     with_paper: bool,
     done: Callable[[], None] = lambda: None,
-    jobs: int = 1,
+    executor: Executor | None = None,
 ) -> Path:
     """Write all files of the report; returns the page.
 
@@ -35,18 +36,20 @@ def write_report(
         data: from `studies.report.data.gather`.
         with_paper: whether figures that the paper states of its rack stand beside ours.
         done: called after every figure and after the page.
-        jobs: processes that draw, 0 for one per core.
+        executor: who draws, None for this process.
 
     Raises:
         ResultsError: the folder cannot be written.
         ReportError: the page cannot be made.
     """
-    folder = root / FIGURES
-    with storing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        figures = list(report_figures(data))
-        files = in_children([partial(_drawn, figure, folder) for figure in figures], jobs, done)
-    pictures = [(path, figure.caption) for path, figure in zip(files, figures, strict=True)]
+    figures = list(report_figures(data))
+    job = Job(DrawingBoard(data), _drawn)
+    drawn = answer_all(executor or SerialExecutor(), job, range(len(figures)), done)
+    pictures = []
+    for figure, files in zip(figures, drawn, strict=True):
+        for suffix, content in files.items():
+            write_atomically(root / FIGURES / f"{figure.name}.{suffix}", content)
+        pictures.append((root / FIGURES / f"{figure.name}.png", figure.caption))
     tables = report_tables(data, with_paper)
     for table in tables:
         for suffix, text in (
@@ -62,6 +65,21 @@ def write_report(
     return page
 
 
-def _drawn(figure: ReportFigure, folder: Path) -> Path:
-    """Draw a figure into its files; returns the PNG."""
-    return save(figure.draw(), folder, figure.name)[0]
+@dataclass(frozen=True)
+class DrawingBoard:
+    """Makes the figures of a report, in any process.
+
+    Attributes:
+        data: what they show.
+    """
+
+    data: ReportData
+
+    def __call__(self) -> list[ReportFigure]:
+        """All figures, not yet drawn."""
+        return list(report_figures(self.data))
+
+
+def _drawn(figures: list[ReportFigure], index: int, emit: Emit) -> dict[str, bytes]:
+    """Draw a figure; returns its files by suffix."""
+    return files_of(figures[index].draw())

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hybrid_opt.campaign import CampaignFolder, Progress, Stage
+from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
+from hybrid_opt.work.job import Executor
+from hybrid_opt.work.processes import local_executor
 
 # Drawing libraries are heavy: they are imported when something is drawn.
 
@@ -18,7 +20,7 @@ def report_stage(with_paper: bool) -> Stage:
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        _write(folder.root, with_paper, progress, folder.execution.jobs)
+        _write(folder.root, with_paper, progress, executor_for(folder.execution))
 
     return Stage("report", run, {"with_paper": with_paper})
 
@@ -58,15 +60,15 @@ def follow_report_options(root: Path, options: argparse.Namespace) -> None:
         watch(root, options.port)
 
 
-def _write(root: Path, with_paper: bool, progress: Progress, jobs: int) -> None:
+def _write(root: Path, with_paper: bool, progress: Progress, executor: Executor) -> None:
     from studies.report.data import gather
     from studies.report.figures import report_figures
     from studies.report.generate import write_report
 
-    data = gather(root, jobs)
+    data = gather(root, executor)
     count = len(list(report_figures(data))) + 1
     with progress.stage("report", count, "pictures") as advance:
-        write_report(root, data, with_paper, lambda: advance(1), jobs)
+        write_report(root, data, with_paper, lambda: advance(1), executor)
 
 
 def rewrite(root: Path, progress: Progress) -> None:
@@ -81,4 +83,4 @@ def rewrite(root: Path, progress: Progress) -> None:
     marker = root / STAGES / "report.json"
     stored = read_json(marker) if marker.exists() else {}
     settings = stored.get("settings", {}) if isinstance(stored, dict) else {}
-    _write(root, bool(settings.get("with_paper")), progress, jobs=0)
+    _write(root, bool(settings.get("with_paper")), progress, local_executor(0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,12 +13,11 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from hybrid_opt.store.files import write_atomically
+
 MM = 1.0 / 25.4
 FULL_WIDTH = 180.0 * MM
 """Text width of a journal page [inch]."""
-
-HALF_WIDTH = 88.0 * MM
-"""One column [inch]."""
 
 PNG_DPI = 200
 
@@ -124,15 +124,24 @@ def panel_label(axes: Axes, letter: str, text: str) -> None:
     axes.set_title(f"({letter}) {text}", loc="left")
 
 
-def save(figure: Figure, folder: Path, name: str) -> tuple[Path, ...]:
-    """Write a settled figure as PNG and PDF; returns the files."""
-    paths = []
+def files_of(figure: Figure) -> dict[str, bytes]:
+    """A settled figure as files, by suffix."""
+    files = {}
     with in_style():
         for suffix, metadata in (
             ("png", {"Software": None}),
             ("pdf", {"CreationDate": None}),
         ):
-            path = folder / f"{name}.{suffix}"
-            figure.savefig(path, dpi=PNG_DPI, metadata=metadata)
-            paths.append(path)
+            file = io.BytesIO()
+            figure.savefig(file, format=suffix, dpi=PNG_DPI, metadata=metadata)
+            files[suffix] = file.getvalue()
+    return files
+
+
+def save(figure: Figure, folder: Path, name: str) -> tuple[Path, ...]:
+    """Write a settled figure as PNG and PDF; returns the files."""
+    paths = []
+    for suffix, content in files_of(figure).items():
+        paths.append(folder / f"{name}.{suffix}")
+        write_atomically(paths[-1], content)
     return tuple(paths)

@@ -65,6 +65,11 @@ class FakeEvaluator:
         self._count += len(x)
         if self._count > self._source.dies_at and self._source.must_die():
             os.kill(os.getpid(), signal.SIGKILL)
+        if (
+            self._source.dies_beyond
+            and len(logged(Path(self._source.log))) > self._source.dies_beyond
+        ):
+            os.kill(os.getpid(), signal.SIGKILL)
         return verdicts(x)
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
@@ -76,7 +81,8 @@ class FakeSource:
     """Makes fake evaluators.
 
     delay: seconds per call. log: file that every evaluated x is appended to. An evaluator kills
-    its process after dies_at evaluations, if it always_dies or if the file dies_once is missing.
+    its process after dies_at evaluations, if it always_dies or if the file dies_once is missing,
+    and whenever the log holds more than dies_beyond evaluations, if that is not 0.
     """
 
     delay: float = 0.0
@@ -84,6 +90,7 @@ class FakeSource:
     dies_at: int = 0
     dies_once: str = ""
     always_dies: bool = False
+    dies_beyond: int = 0
 
     def __call__(self) -> FakeEvaluator:
         return FakeEvaluator(self)

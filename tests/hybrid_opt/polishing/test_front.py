@@ -13,6 +13,7 @@ import pytest
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing import front as front_module
+from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.front import FrontPolisher, polish_front
 from hybrid_opt.polishing.records import (
     PolishedFront,
@@ -110,11 +111,6 @@ def test_what_it_cost_is_told_in_evaluations() -> None:
     assert sum(o.status == "accepted" for o in result.outcomes) == result.counts["accepted"]
 
 
-def test_the_number_of_children_changes_nothing() -> None:
-    again = polisher().polish(start_front(), np.random.default_rng(0), jobs=2)
-    np.testing.assert_array_equal(again.x, polished().x)
-
-
 def test_recorded_attempts_are_not_repeated() -> None:
     texts = [outcome_to_json(outcome) for outcome in polished().outcomes]
     recorded = [outcome_from_json(text) for text in texts[:5]]
@@ -124,6 +120,18 @@ def test_recorded_attempts_are_not_repeated() -> None:
     )
     assert len(emitted) == len(polished().outcomes) - 5
     np.testing.assert_array_equal(again.x, polished().x)
+
+
+def test_an_attempt_that_ended_its_process_costs_itself_alone() -> None:
+    recorded: list[PolishOutcome | Lost] = [*polished().outcomes[:2], Lost("killed")]
+    emitted: list[PolishOutcome] = []
+    again = polisher().polish(
+        start_front(), np.random.default_rng(0), recorded=recorded, emit=emitted.append
+    )
+    assert (again.outcomes[2].status, again.outcomes[2].reason) == ("failed", "killed")
+    assert again.outcomes[2] not in emitted
+    assert len(again.outcomes) == len(polished().outcomes)
+    assert len(emitted) == len(again.outcomes) - 3
 
 
 def test_a_front_of_one_point() -> None:

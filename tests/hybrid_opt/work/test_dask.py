@@ -12,11 +12,14 @@ import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.errors import WorkerError
-from hybrid_opt.work.dask_executor import DaskExecutor
-from hybrid_opt.work.executor import Emit, Job
+from hybrid_opt.work.dask_cluster import DaskExecutor
+from hybrid_opt.work.job import KILLED, SILENT, Job
+from hybrid_opt.work.serial import SerialExecutor
 from symbolic.errors import DualArmError, SettingsError
 from tests.hybrid_opt.campaign.fake import FakeSource, files_of, logged, run_search
+from tests.hybrid_opt.work import jobs
 
+dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 
 SETTINGS = CampaignSettings(evaluations=160, replicas=3)
@@ -24,9 +27,12 @@ SETTINGS = CampaignSettings(evaluations=160, replicas=3)
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    with distributed.LocalCluster(
-        n_workers=3, threads_per_worker=1, processes=True, dashboard_address=None
-    ) as running:
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        distributed.LocalCluster(
+            n_workers=3, threads_per_worker=1, processes=True, dashboard_address=None
+        ) as running,
+    ):
         yield running
 
 
@@ -55,70 +61,63 @@ def test_what_a_lost_campaign_recorded_is_not_repeated(tmp_path: Path, cluster: 
         run_search(
             settings,
             on(cluster, tmp_path / "a"),
-            FakeSource(delay=0.1, dies_at=80, always_dies=True, log=str(log)),
+            FakeSource(delay=0.1, dies_beyond=80, log=str(log)),
         )
-    begun = len(logged(log))
+    log.unlink()
     run_search(settings, on(cluster, tmp_path / "a", resume=True), FakeSource(log=str(log)))
     expected = files_of(run_search(settings, ExecutionSettings(tmp_path / "here", 1)))
     assert files_of(tmp_path / "a") == expected
-    assert len(logged(log)) - begun < 160
-
-
-def echo(context: str, task: int, emit: Emit) -> tuple[str, int]:
-    for number in range(task):
-        emit(bytes([task, number]))
-    return context, task
-
-
-def fail(context: str, task: int, emit: Emit) -> None:
-    raise DualArmError(f"{context} {task} went wrong") if task else ValueError("unforeseen")
-
-
-def context() -> str:
-    return "context"
+    assert len(logged(log)) == 160 - 80
 
 
 def machine() -> dict[str, str]:
     return {"numpy": np.__version__}
 
 
-def run(cluster: Any, work: Any, environment: dict[str, str], count: int) -> Any:
-    executor = DaskExecutor(cluster.scheduler_address, environment, machine)
-    messages: list[bytes] = []
-    results: dict[int, Any] = {}
-    executor.run(
-        Job(context, work),
-        count,
-        lambda index: index,
-        lambda index, message: messages.append(message),
-        results.__setitem__,
-    )
-    return messages, results
+def executor(cluster: Any, environment: dict[str, str] | None = None) -> DaskExecutor:
+    return DaskExecutor(cluster.scheduler_address, environment or machine(), machine)
 
 
 def test_messages_come_in_order_and_once(cluster: Any) -> None:
-    messages, results = run(cluster, echo, machine(), 5)
-    assert results == {index: ("context", index) for index in range(5)}
-    # Results may overtake messages, which then no longer matter; what comes is in order.
-    for task in range(5):
-        mine = [message[1] for message in messages if message[0] == task]
-        assert mine == list(range(len(mine)))
+    found = jobs.run(executor(cluster), jobs.echo, [0, 1, 2, 3, 4])
+    assert [answer[0] for answer in found.answers] == [0, 1, 2, 3, 4]
+    # Answers may overtake messages, which then no longer matter; what comes is in order.
+    for messages in found.messages.values():
+        assert messages == [bytes([number]) for number in range(len(messages))]
+
+
+def test_the_cluster_changes_no_bit(cluster: Any) -> None:
+    here = jobs.run(SerialExecutor(), jobs.numbers, [1, 2, 3])
+    assert jobs.run(executor(cluster), jobs.numbers, [1, 2, 3]).answers == here.answers
 
 
 def test_errors_arrive_as_they_are(cluster: Any) -> None:
-    with pytest.raises(RuntimeError, match="ValueError: unforeseen"):
-        run(cluster, fail, machine(), 1)
-    with pytest.raises(DualArmError, match="context 1 went wrong"):
-        run(cluster, lambda c, t, e: fail(c, 1, e), machine(), 1)
+    with pytest.raises(RuntimeError, match="OSError: a file of the request's own"):
+        jobs.run(executor(cluster), jobs.mistake, [1])
+    with pytest.raises(DualArmError, match="this cannot be done"):
+        jobs.run(executor(cluster), jobs.misuse, [1])
+
+
+def test_a_hung_request_is_given_up_and_no_other(cluster: Any) -> None:
+    found = jobs.run(executor(cluster), jobs.moody, ["hang", "a"], patience=2.0, instead="instead")
+    assert found.answers == ["instead", "a"]
+    assert found.losses == [(0, SILENT)]
+
+
+def test_a_request_that_kills_its_workers_is_lost(cluster: Any) -> None:
+    # Alone: Dask blames all that waits on a worker for its death.
+    found = jobs.run(executor(cluster), jobs.moody, ["die"], instead="instead")
+    assert found.answers == ["instead"]
+    assert found.losses == [(0, KILLED)]
 
 
 def test_workers_with_other_software_are_refused(cluster: Any) -> None:
     with pytest.raises(DualArmError, match=r"worker tcp.* has numpy .*, this campaign 1\.0"):
-        run(cluster, echo, {"numpy": "1.0"}, 1)
+        jobs.run(executor(cluster, {"numpy": "1.0"}), jobs.echo, [1])
 
 
 def test_no_scheduler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hybrid_opt.work.dask_executor.CONNECT_SECONDS", 0.5)
-    executor = DaskExecutor("tcp://127.0.0.1:9", machine(), machine)
+    monkeypatch.setattr("hybrid_opt.work.dask_cluster.CONNECT_SECONDS", 0.5)
+    nobody = DaskExecutor("tcp://127.0.0.1:9", machine(), machine)
     with pytest.raises(SettingsError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9"):
-        executor.run(Job(context, echo), 1, lambda i: i, lambda i, m: None, lambda i, r: None)
+        nobody.run(Job(jobs.context, jobs.echo), jobs.Kept([1]))

@@ -1,0 +1,36 @@
+"""A workcell as a value that goes to any process or machine, and what is made of it there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TypeVar
+
+from symbolic.workcell.archive import CellArchive, archive_from_json, archive_to_json, unpack_cell
+from symbolic.workcell.records import Workcell
+
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True)
+class PackedCell:
+    """A workcell with its files.
+
+    Attributes:
+        text: JSON of `symbolic.workcell.archive.archive_to_json`.
+    """
+
+    text: str
+
+    @classmethod
+    def of(cls, archive: CellArchive) -> PackedCell:
+        """The value for a stored workcell."""
+        return cls(json.dumps(archive_to_json(archive)))
+
+    def make(self, of_workcell: Callable[[Workcell], Made]) -> Made:
+        """What a function makes of the workcell, whose files exist only as long as it runs."""
+        with TemporaryDirectory() as folder:
+            return of_workcell(unpack_cell(archive_from_json(json.loads(self.text)), Path(folder)))

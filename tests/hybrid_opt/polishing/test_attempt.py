@@ -1,0 +1,32 @@
+"""One attempt: what is raised costs it alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybrid_opt.polishing.attempt import Lost, solve_safely
+from hybrid_opt.polishing.records import UNKNOWN
+from hybrid_opt.polishing.solver import Solution, SolveTask
+from hybrid_opt.polishing.targets import pascoletti_serafini
+
+TASK = SolveTask(np.ones(2), pascoletti_serafini(np.zeros(2), np.ones(2)))
+
+
+class Good:
+    def solve(self, task: SolveTask) -> Solution:
+        return Solution(task.x * 2.0, "fine", True, True, UNKNOWN, 1, 1, 0)
+
+
+class Bad:
+    def solve(self, task: SolveTask) -> Solution:
+        raise ValueError("no good\nat all")
+
+
+def test_a_solution_is_handed_on() -> None:
+    found = solve_safely(Good(), TASK)
+    assert isinstance(found, Solution)
+    np.testing.assert_array_equal(found.x, [2.0, 2.0])
+
+
+def test_what_is_raised_is_a_lost_attempt() -> None:
+    assert solve_safely(Bad(), TASK) == Lost("ValueError: no good")
