@@ -76,20 +76,18 @@ def polish(
     *,
     rng: np.random.Generator,
     settings: PolishSettings | None = None,
-    jobs: int = 1,
 ) -> Front:
     """Improve a front of the paper's two objectives with IPOPT.
 
     Args:
         rng: spreads the starts of some attempts.
         settings: see `hybrid_opt.polishing.records`; None for the defaults.
-        jobs: processes; they have no influence on the result.
 
     Raises:
         SettingsError: the cell's objectives are not both peak forces.
     """
     polisher = FrontPolisher(cell.evaluator, settings or PolishSettings(), cell.polish_functions)
-    done = polisher.polish(front.x, rng, jobs)
+    done = polisher.polish(front.x, rng)
     title = f"{front.title}, polished"
     return Front(cell, title, done.x, done.objectives, front.evaluations, done)
 

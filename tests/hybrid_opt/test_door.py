@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.campaign.replica import ReplicaTask, run_replica
+from hybrid_opt.campaign.replica import ReplicaRequest, run_replica
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.indicators import metrics
 from hybrid_opt.store.trajectory_file import read_trajectory
@@ -60,11 +60,11 @@ def test_importing_it_imports_nothing_slow() -> None:
 
 def test_a_search_is_the_one_that_a_campaign_runs() -> None:
     settings = CampaignSettings(algorithms=("nsga2",), evaluations=EVALUATIONS)
-    task = ReplicaTask(settings, "nsga2", 0, cell().initial)
-    outcome = run_replica(cell().evaluator, task, lambda block: None)
+    request = ReplicaRequest(settings, "nsga2", 0, cell().initial)
+    outcome = run_replica(cell().evaluator, request, lambda block: None)
     rows = outcome.front.decode().splitlines()[1:]
     assert len(rows) == len(front()) > 1
-    again = run_replica(cell().evaluator, task, lambda block: None)
+    again = run_replica(cell().evaluator, request, lambda block: None)
     assert again.evaluations == outcome.evaluations
     assert len(front().evaluations) == EVALUATIONS
     for row, objectives in zip(rows, front().objectives, strict=True):
