@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.errors import CodegenError
+from codegen.errors import CodegenError, SlowerWarning
 from codegen.function import NumericFunction, available_cores
 from codegen.signature import Signature
 from symbolic.array import Array
@@ -232,7 +232,7 @@ def warn_one_lane(name: str, reason: str) -> None:
     warnings.warn(
         f"{name}: batches are evaluated one by one, which is slower: {reason}; another compiler "
         "(environment variable CC) may do better",
-        RuntimeWarning,
+        SlowerWarning,
         stacklevel=3,
     )
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.errors import CodegenError
+from codegen.errors import CodegenError, SlowerWarning
 from codegen.function import NumericFunction
 from codegen.signature import Signature
 from symbolic.array import Array
@@ -72,6 +72,6 @@ def warn_interpreted() -> None:
     warnings.warn(
         "no C compiler was found (environment variable CC, then cc, gcc, clang): functions are "
         "interpreted, which is much slower; install gcc or clang, or set CC",
-        RuntimeWarning,
+        SlowerWarning,
         stacklevel=3,
     )

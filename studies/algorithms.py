@@ -21,6 +21,7 @@ from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_
 from hybrid_opt.metaheuristics import Evaluated, analytic_problems
 from hybrid_opt.metaheuristics.analytic_problems import AnalyticProblem
 from studies.algorithm_bands import BAND_POPULATION, BAND_SOURCE, BANDS, Band, Verdict, judge
+from studies.program import add_verbose, run_program
 from symbolic.errors import DualArmError, SettingsError
 
 SHIFTED = "shifted-zdt1"
@@ -262,6 +263,7 @@ def _parser() -> argparse.ArgumentParser:
         "--algorithms", nargs="+", default=["mopso", "nsga2"], metavar="NAME", help="which"
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
+    add_verbose(parser)
     return parser
 
 
@@ -289,4 +291,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

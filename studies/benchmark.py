@@ -32,6 +32,7 @@ from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from studies.benchmark_collisions import with_collisions
 from studies.benchmark_turns import Evaluate, interleaved, progress, summary
+from studies.program import add_verbose, run_program
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.errors import DualArmError, SettingsError
@@ -73,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=0, help="of the candidates (default: 0)")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    add_verbose(parser)
     return parser
 
 
@@ -291,4 +293,4 @@ def _shares(figures: Mapping[str, Any]) -> list[str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

@@ -21,6 +21,7 @@ from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign,
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
+from studies.program import add_verbose, run_program
 from studies.summary import reference_front
 from studies.terminal_summary import title
 from symbolic.array import Array
@@ -212,6 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("first", type=Path, metavar="RUN_A", help="a results folder")
     parser.add_argument("second", type=Path, metavar="RUN_B", help="another results folder")
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
+    add_verbose(parser)
     options = parser.parse_args(arguments)
     try:
         found = compare(options.first, options.second)
@@ -232,4 +234,4 @@ def _json(value: Any) -> Any:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

@@ -34,6 +34,7 @@ from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_sum
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from studies.cli import Parser
+from studies.program import add_verbose, run_program
 from studies.reference_front import ReferenceFront, read_reference_front
 from studies.terminal_summary import title
 from symbolic.errors import DualArmError
@@ -267,6 +268,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="tell the distance to this reference front instead of searching (default: none)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    add_verbose(parser)
     options = parser.parse_args(arguments)
     found: Sequence[Control | Approach]
     try:
@@ -288,4 +290,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

@@ -16,6 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from studies.inspection import Branch, Inspection, Judged, inspect
+from studies.program import add_verbose, run_program
 from symbolic.errors import DualArmError, SettingsError
 from symbolic.workcell.file import load
 
@@ -94,6 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--no-pictures", action="store_true", help="draw nothing")
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
+    add_verbose(parser)
     options = parser.parse_args(arguments)
     try:
         if options.seed < 0:
@@ -113,4 +115,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

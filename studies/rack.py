@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from importlib.resources import as_file, files
 
+from studies.program import run_program
 from studies.run import main as run
 
 
@@ -16,4 +17,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

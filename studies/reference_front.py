@@ -29,6 +29,7 @@ from hybrid_opt.polishing.records import PolishedFront, PolishSettings
 from hybrid_opt.store.files import read_bytes, write_atomically
 from hybrid_opt.work.job import Emit, Job, answer_all
 from hybrid_opt.work.processes import local_executor
+from studies.program import add_verbose, run_program
 from symbolic.array import Array
 from symbolic.errors import DualArmError, SettingsError
 from symbolic.workcell.archive import archive_cell
@@ -162,6 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--points", type=int, default=60, help="attempts of the final polish")
     parser.add_argument("--seed", type=int, default=1, help="of the random starts")
     parser.add_argument("--jobs", type=int, default=0, help="processes, 0 for one per core")
+    add_verbose(parser)
     options = parser.parse_args(arguments)
     command = (
         f"python -m studies.reference_front {options.workcell} --output FILE "
@@ -188,4 +190,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

@@ -14,6 +14,7 @@ import numpy as np
 from codegen.build import Build, FunctionReport, build_set
 from codegen.cache import Cache
 from codegen.check import Comparison, compare
+from studies.program import add_verbose, run_program
 from symbolic.errors import DualArmError
 
 PROGRAM = "python -m studies.regenerate"
@@ -53,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=0, help="of the random inputs (default: 0)")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    add_verbose(parser)
     return parser
 
 
@@ -163,4 +165,4 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

@@ -14,6 +14,7 @@ from hybrid_opt.store.export import FORMATS, export
 from hybrid_opt.store.replay import Replay, replay
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing import TimingModel, timed_trajectory
+from studies.program import add_verbose, run_program
 from studies.timing_text import timing_json, timing_text
 from symbolic.errors import DualArmError, SettingsError
 
@@ -53,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--step", type=float, metavar="S", help="time step of the export [s]")
     parser.add_argument("--output", default=".", metavar="DIR", help="folder of the export")
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
+    add_verbose(parser)
     return parser
 
 
@@ -131,4 +133,4 @@ def _replay_text(stored: StoredTrajectory, replayed: Replay) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

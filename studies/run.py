@@ -27,6 +27,7 @@ from studies.cli import (
     execution_settings,
     polish_settings,
 )
+from studies.program import add_verbose, run_program
 from studies.report.stage import add_report_options, follow_report_options, report_stage
 from studies.summary_stage import summary_stage
 from studies.terminal_summary import terminal_summary
@@ -120,6 +121,7 @@ def main(
     if workcell is None:
         parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
     try:
+        add_verbose(parser)
         options = parser.parse_args(arguments)
         cell: Path = options.workcell if workcell is None else workcell
         settings = campaign_settings(options)
@@ -146,4 +148,4 @@ def main(
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

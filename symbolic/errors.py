@@ -8,6 +8,10 @@ class DualArmError(Exception):
     """Root of all errors raised on purpose by this project; the text says what to do."""
 
 
+class DualArmWarning(UserWarning):
+    """Root of all warnings of this project; the text says what is different and what to do."""
+
+
 class OutsideError(DualArmError):
     """A file from outside is not taken; the text says why, but not which file it is."""
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hybrid_opt.campaign import Progress
+from studies.program import add_verbose, run_program
 from studies.report.stage import add_report_options, follow_report_options, rewrite
 from symbolic.errors import DualArmError
 
@@ -29,6 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="put Tables 1 and 2 between the markers of this Markdown file (default: none)",
     )
     add_report_options(parser)
+    add_verbose(parser)
     options = parser.parse_args(arguments)
     try:
         if options.into:
@@ -47,4 +49,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

@@ -8,6 +8,7 @@ inside; its whole hull is used, with a warning.
 
 from __future__ import annotations
 
+import logging
 import warnings
 from io import BytesIO
 from pathlib import Path
@@ -18,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from symbolic import outside
 from symbolic.array import Array
-from symbolic.errors import CollisionModelError, OutsideError
+from symbolic.errors import CollisionModelError, DualArmWarning, OutsideError
 from symbolic.geometry.pieces import SMALLEST_SIZE, Hull
 
 FORMATS = ("stl", "dae", "obj", "ply", "off")
@@ -45,7 +46,11 @@ WORTHWHILE = 0.05
 """A cut is made if it removes at least this part of the component's hull volume."""
 
 
-class CollisionModelWarning(UserWarning):
+# What it has to say is in the errors below; its log would add tracebacks on the terminal.
+trimesh.util.log.setLevel(logging.CRITICAL)
+
+
+class CollisionModelWarning(DualArmWarning):
     """A collision shape is used in a coarser form than the file describes."""
 
 
@@ -175,6 +180,8 @@ def _read(path: Path) -> trimesh.Trimesh:
         ) from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise CollisionModelError(f"{path}: the mesh is empty; export triangles")
+    if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+        raise CollisionModelError(f"{path}: the mesh's vertices have not three coordinates each")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise CollisionModelError(f"{path}: the mesh has triangles whose corners it does not have")
     return mesh

@@ -1,0 +1,99 @@
+"""What every program has in common: how it ends, and what it says beside its results."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Callable
+from typing import TextIO
+
+from symbolic.errors import DualArmError, DualArmWarning
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+
+VERBOSE = "--verbose"
+
+
+def add_verbose(parser: argparse._ActionsContainer) -> None:
+    """Add the option `--verbose`, which `run_program` looks at."""
+    parser.add_argument(
+        VERBOSE,
+        action="store_true",
+        help="also show what the libraries warn of (default: only this project's own warnings)",
+    )
+
+
+def run_program(main: Callable[[], int]) -> int:
+    """Run a program's main function as a process of its own; returns the exit code.
+
+    Warnings of this project are told once, in one line; those of libraries (divisions by zero,
+    deprecations) only with `--verbose`, also in the processes that this one starts.
+    """
+    told = _Warnings(verbose=VERBOSE in sys.argv[1:])
+    told.install()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # names of files may hold what no terminal shows
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        code = main()
+        sys.stdout.flush()
+        return code
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read the output has enough; the interpreter is not to flush it again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except DualArmError as error:
+        print(error, file=sys.stderr)
+        return BAD_INPUT
+    except MemoryError:
+        print(
+            "out of memory; give the process more, or use smaller files or fewer --jobs",
+            file=sys.stderr,
+        )
+        return BAD_INPUT
+    except OSError as error:
+        name = f"{error.filename}: " if error.filename else ""
+        print(f"{name}{error.strerror or error}", file=sys.stderr)
+        return BAD_INPUT
+
+
+class _Warnings:
+    """Shows every warning of this project once, and all others if it is verbose."""
+
+    def __init__(self, verbose: bool) -> None:
+        self._verbose = verbose
+        self._told: set[str] = set()
+
+    def install(self) -> None:
+        """Take over from Python's way, which prints a line of source code."""
+        warnings.simplefilter("always" if self._verbose else "ignore")
+        warnings.filterwarnings("always", category=DualArmWarning)
+        warnings.showwarning = self._show
+        if self._verbose:
+            logging.basicConfig(format="%(name)s: %(message)s")
+        else:
+            os.environ["PYTHONWARNINGS"] = "ignore"
+            logging.getLogger().addHandler(logging.NullHandler())
+
+    def _show(
+        self,
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        text = " ".join(str(message).split())
+        if text in self._told:
+            return
+        self._told.add(text)
+        where = "" if issubclass(category, DualArmWarning) else f" ({category.__name__})"
+        print(f"warning: {text}{where}", file=file or sys.stderr)

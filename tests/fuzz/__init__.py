@@ -1,0 +1,1 @@
+"""Random damage to every kind of file, and the promises that no damage may break."""

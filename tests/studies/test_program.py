@@ -1,0 +1,101 @@
+"""How programs end, and what they say beside their results, in processes of their own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib import import_module
+
+import pytest
+
+from tests.symbolic.cells import ROOT
+
+PROGRAMS = (
+    *("run", "rack", "compare", "control", "algorithms", "benchmark", "regenerate"),
+    *("inspect", "replay", "reference_front", "report.__main__"),
+)
+HEAD = """
+import logging, sys, warnings
+import numpy as np
+from studies.program import run_program
+from symbolic.errors import DualArmError, DualArmWarning
+
+class Ours(DualArmWarning):
+    pass
+
+def main():
+"""
+
+
+def ended(body: str, *arguments: str) -> tuple[int, str, str]:
+    """Exit code, output and messages of a program with this main function."""
+    lines = "".join(f"    {line}\n" for line in body.splitlines())
+    text = f"{HEAD}{lines}\nsys.exit(run_program(main))\n"
+    done = subprocess.run(
+        [sys.executable, "-c", text, *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+WARNS = """
+for _ in range(3):
+    warnings.warn("the box\\nis heavy", Ours, stacklevel=2)
+np.float64(1.0) / np.float64(0.0)
+warnings.warn("old", DeprecationWarning)
+logging.getLogger("library").warning("odd")
+print("result")
+return 0
+"""
+
+
+def test_warnings_of_ours_once_and_others_on_demand() -> None:
+    assert ended(WARNS) == (0, "result\n", "warning: the box is heavy\n")
+    code, output, messages = ended(WARNS, "--verbose")
+    assert (code, output) == (0, "result\n")
+    assert messages.count("the box is heavy") == 1
+    for words in ("divide by zero", "(DeprecationWarning", "library: odd"):
+        assert words in messages
+
+
+@pytest.mark.parametrize(
+    ("body", "code", "message"),
+    [
+        ("raise DualArmError('the file is wrong')", 2, "the file is wrong"),
+        ("raise MemoryError", 2, "out of memory"),
+        ("open('/nowhere/at/all')", 2, "/nowhere/at/all: No such file or directory"),
+        ("raise KeyboardInterrupt", 130, "interrupted"),
+        ("print('\\udc80'); return 0", 0, ""),
+        ("print('x'); sys.stdout.flush(); raise BrokenPipeError", 0, ""),
+        ("return 1", 1, ""),
+    ],
+)
+def test_every_end_has_its_code_and_one_message(body: str, code: int, message: str) -> None:
+    found, _, messages = ended(body)
+    assert (found, messages.strip().startswith(message)) == (code, True)
+    assert len(messages.strip().splitlines()) == bool(message)
+
+
+def test_output_that_nobody_reads_is_no_error() -> None:
+    text = f"{HEAD}    print('x' * 1000000)\n    return 0\n\nsys.exit(run_program(main))\n"
+    command = f"'{sys.executable}' -c \"$0\" | head -c 1"
+    done = subprocess.run(
+        ["bash", "-o", "pipefail", "-c", command, text],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "x", "")
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_every_program_knows_verbose(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        import_module(f"studies.{name}").main(["--help"])
+    assert "--verbose" in capsys.readouterr().out
