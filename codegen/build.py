@@ -177,6 +177,38 @@ def load_or_build(
         return found
 
 
+def load_or_compile(
+    key: str, make: Callable[[], tuple[Signature, str]], cache: Cache | None = None
+) -> NumericFunction | None:
+    """A function written in C by hand, by the key of what it is made from.
+
+    Args:
+        key: changes with everything that `make` depends on, except the version of CasADi.
+        make: its signature and its text (`codegen.source.handwritten_source`); not called where
+            the function was compiled before.
+        cache: where libraries are kept; by default the user's.
+
+    Returns:
+        The function, or None without a C compiler.
+
+    Raises:
+        CodegenError: it cannot be compiled, cached or loaded; and whatever `make` raises.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        return None
+    cache = cache or Cache()
+    found = _load_set(key, 1, compiler, cache)
+    if found is None:
+        signature, text = make()
+        source = _Source(signature, 0, text, len(text), None)
+        function, entry, _ = _compile(source, compiler, cache, 3, rebuild=False)
+        cache.write_record(_set_key(key, 1, compiler), {"members": {signature.name: entry.key}})
+        return function
+    (function,) = found.values()
+    return function
+
+
 def build_set(
     key: str, functions: Mapping[str, ca.Function], cache: Cache | None = None, **options: Any
 ) -> Build:

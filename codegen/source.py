@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import accumulate
+from math import prod
 
 import casadi as ca
 
 from codegen.errors import CodegenError
 from codegen.lanes import lane_text
 from codegen.runtime import runtime
+from codegen.signature import Signature
 
 
 def dense(function: ca.Function) -> ca.Function:
@@ -46,13 +49,13 @@ def c_source(function: ca.Function, lanes: int = 1) -> str:
         CodegenError: CasADi cannot write this function as C (a callback, an external solver).
     """
     include = "#include <math.h>\n"
-    generated = generated_c(function)
+    generated, signature = generated_c([function]), Signature.of(function)
     in_lanes = None if lanes == 1 else lane_text(generated, "lanes")
-    before, after = [include, runtime("arithmetic.h")], [_filled(runtime("driver.c"), function)]
+    before, after = [include, runtime("arithmetic.h")], [_filled(runtime("driver.c"), signature)]
     if in_lanes is not None:
         width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
         before += [runtime("one_lane.h"), width, runtime("lanes.h")]
-        lane_driver = _filled(runtime("lane_driver.c"), function)
+        lane_driver = _filled(runtime("lane_driver.c"), signature)
         after += [
             "\n#if DUAL_ARM_LANES > 1\n" + in_lanes.text + "#endif\n\n",
             lane_driver.replace("@LANE_FUNCTION@", in_lanes.entry),
@@ -61,32 +64,48 @@ def c_source(function: ca.Function, lanes: int = 1) -> str:
     return generated.replace(include, "".join(before), 1) + "\n" + "".join(after)
 
 
-def generated_c(function: ca.Function) -> str:
-    """What CasADi generates for a dense function.
+def handwritten_source(signature: Signature, text: str, helpers: Sequence[ca.Function]) -> str:
+    """C text of a function written by hand, with the batch driver.
+
+    Args:
+        signature: its name, inputs and outputs.
+        text: C that defines `NAME` with CasADi's interface (arguments, results and work memory by
+            address) and beside it `NAME_work`, `NAME_incref`, `NAME_checkout`, `NAME_release`.
+        helpers: dense CasADi functions that the text calls; their C comes before it.
 
     Raises:
-        CodegenError: CasADi cannot write this function as C.
+        CodegenError: CasADi cannot write a helper as C.
     """
+    include = "#include <math.h>\n"
+    generated = generated_c(helpers).replace(include, include + runtime("arithmetic.h"), 1)
+    return generated + text + _filled(runtime("driver.c"), signature)
+
+
+def generated_c(functions: Sequence[ca.Function]) -> str:
+    """What CasADi generates for dense functions, at least one.
+
+    Raises:
+        CodegenError: CasADi cannot write one of them as C.
+    """
+    name = functions[0].name()
     try:
-        generator = ca.CodeGenerator(function.name(), {"main": False, "mex": False})
-        generator.add(function)
+        generator = ca.CodeGenerator(name, {"main": False, "mex": False})
+        for function in functions:
+            generator.add(function)
         return str(generator.dump())
     except RuntimeError as error:
         reason = str(error).splitlines()[-1]
-        raise CodegenError(
-            f"{function.name()}: CasADi cannot generate C for it: {reason}"
-        ) from error
+        raise CodegenError(f"{name}: CasADi cannot generate C for it: {reason}") from error
 
 
-def _filled(driver: str, function: ca.Function) -> str:
+def _filled(driver: str, signature: Signature) -> str:
     """A driver with the names and sizes of a function."""
-    n_in, n_out = function.n_in(), function.n_out()
-    inputs = [function.numel_in(i) for i in range(n_in)]
-    outputs = [function.numel_out(i) for i in range(n_out)]
+    inputs = [prod(shape) for shape in signature.input_shapes]
+    outputs = [prod(shape) for shape in signature.output_shapes]
     return (
-        driver.replace("@NAME@", function.name())
-        .replace("@N_IN@", str(n_in))
-        .replace("@N_OUT@", str(n_out))
+        driver.replace("@NAME@", signature.name)
+        .replace("@N_IN@", str(len(inputs)))
+        .replace("@N_OUT@", str(len(outputs)))
         .replace("@OFFSETS@", ", ".join(map(str, accumulate(outputs, initial=0))))
         .replace("@SIZES@", ", ".join(map(str, [*inputs, *outputs, 0])))
     )

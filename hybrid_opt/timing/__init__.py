@@ -16,6 +16,7 @@ from hybrid_opt.timing.overview import (
     report_timing,
     timed_trajectory,
 )
+from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import (
     Excess,
     Place,
@@ -23,12 +24,15 @@ from hybrid_opt.timing.records import (
     TimingLimits,
     TimingStatus,
 )
+from hybrid_opt.timing.refined import drive_path
 from hybrid_opt.timing.solve import time_path
 
 __all__ = [
     "Excess",
     "ForceCurve",
     "JudgedTiming",
+    "PathTimer",
+    "PathTiming",
     "Place",
     "TimedTrajectory",
     "Timing",
@@ -37,6 +41,7 @@ __all__ = [
     "TimingReport",
     "TimingStatus",
     "closest_to_reference_timing",
+    "drive_path",
     "duration_against_force_limit",
     "fastest_timing",
     "force_limited_timing",

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from hybrid_opt.carry import Carry
 from hybrid_opt.timing import rows as rows_of
 from hybrid_opt.timing.adapter import SolverFailure, fastest_speed
-from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
+from hybrid_opt.timing.model import PathMotion, TimingModel
 from hybrid_opt.timing.path_check import path_failure
 from hybrid_opt.timing.point_limits import POINT_TOLERANCE, PointLimits
 from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.refined import refined_carry
 from hybrid_opt.timing.rows import STAGE_POINTS, PointRows
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_ratios, limit_use, worst
 from symbolic.array import Array
@@ -198,24 +199,7 @@ class _Problem:
         )
 
     def _refined(self, squared: Array) -> Carry:
-        """The carry at `REFINEMENT` samples per stage, both ends of every stage included."""
-        stages = self._model.stages
-        share = np.linspace(0.0, 1.0, REFINEMENT + 1)
-        w = squared[:-1, None] + np.outer(np.diff(squared), share)
-        speed = np.sqrt(np.maximum(w, 0.0))
-        length = self._at.grid[1]
-        # Average speed over a piece of constant acceleration is that of its ends.
-        total = speed[:, :1] + speed
-        elapsed = 2.0 * share * length / np.where(total > 0.0, total, 1.0)
-        starts = np.concatenate([[0.0], np.cumsum(elapsed[:, -1])])[:-1]
-        a = np.repeat(np.diff(squared) / (2.0 * length), REFINEMENT + 1)
-        index = REFINEMENT * np.arange(stages)[:, None] + np.arange(REFINEMENT + 1)
-        return self._model.carry(
-            self._motion.at(index.reshape(-1)),
-            (starts[:, None] + elapsed).reshape(-1),
-            speed.reshape(-1) / self._at.scale,
-            a / self._at.scale,
-        )
+        return refined_carry(self._model, self._motion, np.sqrt(squared) / self._at.scale)
 
     def _solver_failure(self, failure: SolverFailure, iterations: int) -> Timing:
         point = len(STAGE_POINTS) * failure.stage

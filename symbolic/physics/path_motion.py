@@ -75,7 +75,7 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
         for matrix in (basis.position, basis.first, basis.second)
     )
     outputs = {"pose": pose, "pose_first": first, "pose_second": second}
-    box = _box_function(workcell).map(samples)(pose, first, second)
+    box = box_function(workcell).map(samples)(pose, first, second)
     outputs |= dict(zip(BOX_OUTPUTS, box, strict=True))
     no_wrench = ca.DM.zeros(6, samples)
     for i in (0, 1):
@@ -94,7 +94,7 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
     )
 
 
-def _box_function(workcell: Workcell) -> ca.Function:
+def box_function(workcell: Workcell) -> ca.Function:
     """`BOX_OUTPUTS` of one sample from the box pose and its derivatives by u."""
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     payload = workcell.payload

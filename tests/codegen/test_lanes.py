@@ -113,7 +113,7 @@ def test_other_c_runs_one_at_a_time(cache: Cache) -> None:
     finder = ca.rootfinder("finder", "fast_newton", {"x": x, "p": p, "g": x**2 - p})
     q = ca.MX.sym("q")
     function = ca.Function("root", [q], [finder(x0=1.0, p=q)["x"]], ["q"], ["root"])
-    assert lane_text(generated_c(function), "lanes") is None
+    assert lane_text(generated_c([function]), "lanes") is None
     made = compile_function(function, cache, lanes=0)
     assert isinstance(made, CompiledFunction)
     assert made.lanes == 1

@@ -1,0 +1,561 @@
+/* The fastest timing of one path by a backward and a forward pass over stages of constant u''.
+
+   docs/timing.md explains the method; `symbolic.physics.path_limits.LimitLayout` the numbers at a
+   sample. The text before this file defines STAGES, JOINTS, the SIZE of a sample's row, the offset
+   of every block (AT_...), RATIOS, FORCE_BRANCHES and limit_ratios, limit_slopes of CasADi.
+
+   x and y are the squared speeds u'^2 at the beginning and the end of a stage. There is rest at
+   both ends of the path, and standing still is allowed everywhere, so that (0, 0) satisfies every
+   row that is made here. */
+
+enum { REACHED, AT_REST, STUCK, SLOWED, BROKEN };
+
+enum {
+  JOINT_SPEED, BOX_SPEED, BOX_TURN, PATH_SPEED, JOINT_ACCELERATION, BOX_ACCELERATION,
+  BOX_TURN_ACCELERATION, NORMAL_FORCE, JOINT_TORQUE, PRESSURE, KINDS
+};
+
+/* Groups of limits that are tightened together. */
+enum { MOTION, FORCE, RATIO, GROUPS };
+static const int GROUP[KINDS] = {MOTION, MOTION, MOTION, MOTION, MOTION, MOTION, MOTION, FORCE,
+                                 RATIO, RATIO};
+
+#define SAMPLES (2 * STAGES + 1)  /* of the path: the ends of the stages and their middles */
+#define HALF (0.5 * STAGES)       /* u'' = HALF (y - x) */
+#define MAX_ROWS 160
+#define MAX_ROUNDS 40             /* of rows added at one stage */
+#define MAX_RENEWALS 6            /* of linearisations at one stage */
+#define MAX_SWEEPS 12
+#define MAX_REPAIRS (100 * STAGES)
+#define CONVEX_TOLERANCE 1e-7     /* excess over a limit that counts as none */
+#define RATIO_TOLERANCE 1e-4      /* the same, of limits that are linearised */
+#define CONFLICT 1e-3             /* excess at which a stage counts as impossible */
+#define TIGHTEN 2.5e-3            /* excess between the ends of a stage that tightens it */
+#define LARGEST_EXCESS 5e-3       /* a timing with more is slowed down */
+#define LEAST_SPEED 0.98          /* slowed further, it has not converged */
+#define NEARLY 0.9                /* a limit used this far is worth a row in advance */
+
+typedef struct { double x, y, bound; int key; } line; /* x X + y Y <= bound */
+
+/* The largest use of a kind of limit: over the limit, where, and of which joint or contact. */
+typedef struct { double ratio, parameter; int column; } largest_use;
+
+typedef struct {
+  const double* samples;           /* (SAMPLES, SIZE) */
+  double force;                    /* largest normal force, infinite without */
+  int torque, pressure, reference; /* whether these limits hold */
+  double* rest;                    /* (STAGES + 1, RATIOS) standing still */
+  double* rest_force;              /* (STAGES + 1,) larger normal force standing still */
+  double (*tight)[GROUPS];         /* (STAGES, GROUPS) divisor of what a limit leaves for motion */
+  double* top;                     /* (STAGES + 1,) largest u'^2 that can be brought to rest */
+  double* squared;                 /* (STAGES + 1,) u'^2 */
+} problem;
+
+static double larger(double a, double b) { return a > b ? a : b; }
+static double smaller(double a, double b) { return a < b ? a : b; }
+
+/* ---- quantities at a sample ---- */
+
+static void ratios_at(const double* f, double a, double w, double* ratios) {
+  const double* arg[3] = {f + AT_FORCE, &a, &w};
+  double* res[1] = {ratios};
+  limit_ratios(arg, res, 0, 0, 0);
+}
+
+static void slopes_at(const double* f, double a, double w, double* r, double* by_a, double* by_w) {
+  const double* arg[3] = {f + AT_FORCE, &a, &w};
+  double* res[3] = {r, by_a, by_w};
+  limit_slopes(arg, res, 0, 0, 0);
+}
+
+/* The required force along the axes of contact 1, and its part in the contact plane. */
+static double required_force(const double* f, double a, double w, double* force) {
+  const double* c = f + AT_FORCE;
+  for (int k = 0; k < 3; ++k) force[k] = c[k] * a + c[3 + k] * w + c[6 + k];
+  return sqrt(force[0] * force[0] + force[1] * force[1]);
+}
+
+/* Both normal forces; the branch that the larger one follows. */
+static int normal_forces(const double* f, double a, double w, double* n, double* force) {
+  const double tangential = required_force(f, a, w, force);
+  int best = 0;
+  double largest = -INFINITY;
+  for (int k = 0; k < FORCE_BRANCHES; ++k) {
+    const double value = BRANCH[k][0] * force[2] + BRANCH[k][1] * tangential;
+    if (value > largest) { largest = value; best = k; }
+  }
+  n[1] = largest;
+  n[0] = largest + force[2];
+  return best;
+}
+
+/* ---- rows of a stage ---- */
+
+/* alpha u'' + beta u'^2 <= bound at the beginning (end = 0) or the end of a stage. */
+static line stage_row(double alpha, double beta, double bound, int end) {
+  line row = {-HALF * alpha, HALF * alpha, bound, 0};
+  if (end) row.y += beta; else row.x += beta;
+  return row;
+}
+
+static int append(line* rows, int count, line row) {
+  if (count < MAX_ROWS) rows[count++] = row;
+  return count;
+}
+
+/* The convex limits of a stage that (x, y) uses beyond `threshold`, as supporting lines. */
+static int convex_rows(const problem* p, int stage, double x, double y, double threshold,
+                       line* rows, int count) {
+  const double a = HALF * (y - x), limit = 1.0 / p->tight[stage][MOTION];
+  for (int end = 0; end < 2; ++end) {
+    const double* f = p->samples + 2 * (stage + end) * SIZE;
+    const double w = end ? y : x;
+    const double *alpha = f + AT_ACCELERATION, *beta = alpha + JOINTS;
+    int worst = 0;
+    double largest = -1.0;
+    for (int j = 0; j < JOINTS; ++j) {
+      const double value = fabs(alpha[j] * a + beta[j] * w);
+      if (value > largest) { largest = value; worst = j; }
+    }
+    if (largest > limit * threshold) {
+      const double sign = alpha[worst] * a + beta[worst] * w > 0.0 ? 1.0 : -1.0;
+      count = append(rows, count, stage_row(sign * alpha[worst], sign * beta[worst], limit, end));
+    }
+    for (int cone = 0; cone < 2; ++cone) {
+      const double *first = f + AT_CONE + 6 * cone, *second = first + 3;
+      double v[3], length = 0.0, by_a = 0.0, by_w = 0.0;
+      for (int k = 0; k < 3; ++k) {
+        v[k] = first[k] * a + second[k] * w;
+        length += v[k] * v[k];
+      }
+      length = sqrt(length);
+      if (length <= limit * threshold || length <= 0.0) continue;
+      for (int k = 0; k < 3; ++k) {
+        by_a += v[k] / length * first[k];
+        by_w += v[k] / length * second[k];
+      }
+      count = append(rows, count, stage_row(by_a, by_w, limit, end));
+    }
+    if (isfinite(p->force)) {
+      double n[2], force[3], direction[3];
+      const double rest = p->rest_force[stage + end];
+      const double bound = rest + (p->force - rest) / p->tight[stage][FORCE];
+      const int branch = normal_forces(f, a, w, n, force);
+      const double value = larger(n[0], n[1]);
+      if (value - rest <= (bound - rest) * threshold) continue;
+      const double tangential = sqrt(force[0] * force[0] + force[1] * force[1]);
+      const double share = tangential > 0.0 ? BRANCH[branch][1] / tangential : 0.0;
+      direction[0] = share * force[0];
+      direction[1] = share * force[1];
+      direction[2] = BRANCH[branch][0] + (n[0] > n[1] ? 1.0 : 0.0);
+      const double* c = f + AT_FORCE;
+      double by_a = 0.0, by_w = 0.0, still = 0.0;
+      for (int k = 0; k < 3; ++k) {
+        by_a += direction[k] * c[k];
+        by_w += direction[k] * c[3 + k];
+        still += direction[k] * c[6 + k];
+      }
+      count = append(rows, count, stage_row(by_a / bound, by_w / bound, 1.0 - still / bound, end));
+    }
+  }
+  return count;
+}
+
+static int limited(const problem* p, int ratio) {
+  return ratio < JOINTS ? p->torque : p->pressure;
+}
+
+/* The limits that are not convex and that (x, y) exceeds, linearised there, each with its key;
+   those of the keys in `wanted` (2 RATIOS) as well, where it is given. Rest stays allowed: a
+   linearisation from far away must not forbid it. Returns their number; *worst is the largest
+   excess. */
+static int linearised_rows(const problem* p, int stage, double x, double y, const char* wanted,
+                           line* rows, double* worst) {
+  const double a = HALF * (y - x), tight = p->tight[stage][RATIO];
+  int count = 0;
+  *worst = -1.0;
+  if (!p->torque && !p->pressure) return 0;
+  for (int end = 0; end < 2; ++end) {
+    const double* f = p->samples + 2 * (stage + end) * SIZE;
+    const double w = end ? y : x;
+    double r[RATIOS], by_a[RATIOS], by_w[RATIOS];
+    int exceeded = 0;
+    ratios_at(f, a, w, r);
+    for (int k = 0; k < RATIOS; ++k) {
+      if (!limited(p, k)) continue;
+      const double still = fabs(p->rest[(stage + end) * RATIOS + k]);
+      const double bound = still + (1.0 - still) / tight;
+      const double excess = fabs(r[k]) - bound;
+      *worst = larger(*worst, excess);
+      exceeded = exceeded || excess > RATIO_TOLERANCE || (wanted && wanted[end * RATIOS + k]);
+    }
+    if (!exceeded) continue;
+    slopes_at(f, a, w, r, by_a, by_w);
+    for (int k = 0; k < RATIOS; ++k) {
+      if (!limited(p, k)) continue;
+      const double still = p->rest[(stage + end) * RATIOS + k];
+      const double bound = fabs(still) + (1.0 - fabs(still)) / tight;
+      if (fabs(r[k]) - bound <= RATIO_TOLERANCE && !(wanted && wanted[end * RATIOS + k])) continue;
+      const double sign = r[k] > 0.0 ? 1.0 : -1.0;
+      const double room = bound - sign * r[k] + sign * (by_a[k] * a + by_w[k] * w);
+      const double least = 0.5 * (1.0 - sign * still);
+      rows[count] = stage_row(sign * by_a[k], sign * by_w[k], larger(room, least), end);
+      rows[count++].key = end * RATIOS + k;
+    }
+  }
+  return count;
+}
+
+/* ---- linear programs in two variables: the largest x ---- */
+
+/* Moves an optimum that `r` cuts off onto its line, within n rows and m more. */
+static void move_onto(double* best, line r, const line* rows, int n, const line* more, int m) {
+  const double size = r.x * r.x + r.y * r.y;
+  if (size <= 0.0) return;
+  const double px = r.x * r.bound / size, py = r.y * r.bound / size;
+  const double tx = r.y, ty = -r.x;
+  double low = -INFINITY, high = INFINITY;
+  for (int k = 0; k < n + m; ++k) {
+    const line* o = k < n ? rows + k : more + (k - n);
+    const double along = o->x * tx + o->y * ty, room = o->bound - o->x * px - o->y * py;
+    if (fabs(along) <= 1e-14 * (fabs(o->x * tx) + fabs(o->y * ty))) continue;
+    const double place = room / along;
+    if (along > 0.0) { if (place < high) high = place; }
+    else if (place > low) low = place;
+  }
+  double place;
+  if (low > high) place = 0.5 * (low + high);
+  else if (tx > 0.0) place = high;
+  else if (tx < 0.0) place = low;
+  else place = smaller(larger(((best[0] - px) * tx + (best[1] - py) * ty) / size, low), high);
+  best[0] = px + place * tx;
+  best[1] = py + place * ty;
+}
+
+static int cuts(const double* best, line r) {
+  const double x = r.x * best[0], y = r.y * best[1];
+  return x + y > r.bound + 1e-13 * (fabs(x) + fabs(y));
+}
+
+/* ---- passes ---- */
+
+/* Whether a stage's exact limits allow (x, y), up to an excess. */
+static int allowed(const problem* p, int stage, double x, double y, double excess) {
+  line scratch[MAX_ROWS];
+  double worst;
+  if (convex_rows(p, stage, x, y, 1.0 + excess, scratch, 0)) return 0;
+  linearised_rows(p, stage, x, y, 0, scratch, &worst);
+  return worst <= excess;
+}
+
+/* The largest u'^2 at the beginning of a stage from which at most `top` is left at its end. */
+static double backward(const problem* p, int stage, double ceiling, double top, double guess) {
+  line rows[MAX_ROWS] = {{1, 0, ceiling, 0}, {-1, 0, 0, 0}, {0, 1, top, 0}, {0, -1, 0, 0}};
+  line near[2 * RATIOS], fresh[2 * RATIOS];
+  double best[2] = {ceiling, smaller(top, ceiling)}, worst = -1.0, x = 0.0, y = 0.0, found = -1.0;
+  int n_near = 0, from = 4, renewals = 0;
+  int count = convex_rows(p, stage, smaller(guess, ceiling), top, NEARLY, rows, 4);
+  for (int round = 0; round < MAX_ROUNDS; ++round) {
+    for (; from < count; ++from)
+      if (cuts(best, rows[from])) move_onto(best, rows[from], rows, from, 0, 0);
+    double trial[2] = {best[0], best[1]};
+    for (int k = 0; k < n_near; ++k)
+      if (cuts(trial, near[k])) move_onto(trial, near[k], rows, count, near, k);
+    x = smaller(larger(trial[0], 0.0), ceiling);
+    y = smaller(larger(trial[1], 0.0), top);
+    count = convex_rows(p, stage, x, y, 1.0 + CONVEX_TOLERANCE, rows, count);
+    if (count > from) continue;
+    int n_fresh = linearised_rows(p, stage, x, y, 0, fresh, &worst);
+    if (worst <= RATIO_TOLERANCE) {
+      /* Linearisations from elsewhere may cut off too much: renew here those that stop x. */
+      char stops[2 * RATIOS] = {0};
+      int any = 0;
+      for (int k = 0; k < n_near; ++k)
+        if (near[k].x * x + near[k].y * y > near[k].bound - RATIO_TOLERANCE)
+          any = stops[near[k].key] = 1;
+      const int better = x > found * (1.0 + RATIO_TOLERANCE);
+      found = larger(found, x);
+      if (!any || !better || ++renewals > MAX_RENEWALS) return found;
+      n_fresh = linearised_rows(p, stage, x, y, stops, fresh, &worst);
+    }
+    for (int k = 0; k < n_fresh; ++k) { /* one linearisation per limit: the last */
+      int place = 0;
+      while (place < n_near && near[place].key != fresh[k].key) ++place;
+      near[place] = fresh[k];
+      if (place == n_near) ++n_near;
+    }
+  }
+  if (found >= 0.0) return found;
+  double low = 0.0, high = 1.0;
+  for (int k = 0; k < 20; ++k) {
+    const double share = 0.5 * (low + high);
+    if (allowed(p, stage, share * x, share * y, CONFLICT)) low = share; else high = share;
+  }
+  return low * x;
+}
+
+/* Between an allowed u'^2 at the end of a stage and one beyond it: a linearisation may have left
+   the limit far behind. */
+static double halve(const problem* p, int stage, double x, double low, double high) {
+  while (high - low > 1e-4 * high) {
+    const double middle = 0.5 * (low + high);
+    if (allowed(p, stage, x, middle, RATIO_TOLERANCE)) low = middle; else high = middle;
+  }
+  return low;
+}
+
+/* The largest u'^2 at the end of a stage that begins with x, at most `top`; negative where the
+   stage's limits leave none. */
+static double forward(const problem* p, int stage, double x, double top) {
+  const double limit = 1.0 / p->tight[stage][MOTION];
+  double high = top;
+  for (int end = 0; end < 2; ++end) {
+    const double* alpha = p->samples + 2 * (stage + end) * SIZE + AT_ACCELERATION;
+    for (int j = 0; j < JOINTS; ++j) {
+      const line r = stage_row(alpha[j], alpha[JOINTS + j], 0.0, end);
+      if (fabs(r.y) <= 1e-300) continue;
+      high = smaller(high, limit / fabs(r.y) - r.x * x / r.y);
+    }
+  }
+  double y = high, beyond = high;
+  for (int round = 0; round < MAX_ROUNDS; ++round) {
+    line rows[MAX_ROWS];
+    double worst = -1.0, next = y;
+    int count = convex_rows(p, stage, x, y, 1.0 + CONVEX_TOLERANCE, rows, 0);
+    if (!count) {
+      count = linearised_rows(p, stage, x, y, 0, rows, &worst);
+      if (count) beyond = y;
+      else if (worst < -CONFLICT) y = halve(p, stage, x, y, beyond);
+    }
+    if (!count) break;
+    for (int k = 0; k < count; ++k)
+      if (rows[k].y > 0.0) next = smaller(next, (rows[k].bound - rows[k].x * x) / rows[k].y);
+    if (next >= y) break;
+    y = next;
+    if (y <= 0.0) break;
+  }
+  if (stage < STAGES - 1 && y <= 0.0) return -1.0;
+  y = larger(y, 0.0);
+  return allowed(p, stage, x, y, CONFLICT) ? y : -1.0;
+}
+
+/* Largest u'^2 that the speed limits leave at a grid point. */
+static double speed_ceiling(const problem* p, int i) {
+  const double* d = p->samples + 2 * i * SIZE + AT_SPEED;
+  const int count = JOINTS + (p->reference ? 4 : 2);
+  double demand = 1e-4, tight = 1.0;
+  for (int k = 0; k < count; ++k) demand = larger(demand, fabs(d[k]));
+  if (i > 0) tight = larger(tight, p->tight[i - 1][MOTION]);
+  if (i < STAGES) tight = larger(tight, p->tight[i][MOTION]);
+  return 1.0 / (tight * demand * demand);
+}
+
+/* Both passes; the stage that could not be driven, or -1. */
+static int sweep(problem* p) {
+  p->top[STAGES] = 0.0;
+  for (int i = STAGES - 1; i >= 0; --i) {
+    const double next = p->top[i + 1];
+    const double guess = i < STAGES - 1 ? larger(2.0 * next - p->top[i + 2], next) : next;
+    p->top[i] = backward(p, i, speed_ceiling(p, i), next, guess);
+  }
+  p->squared[0] = 0.0;
+  int repairs = 0;
+  for (int i = 0; i < STAGES;) {
+    const double y = forward(p, i, p->squared[i], p->top[i + 1]);
+    if (y >= 0.0) { p->squared[++i] = y; continue; }
+    /* Only limits that are not convex allow x and nothing after it: keep below this x. */
+    if (i == 0 || ++repairs > MAX_REPAIRS) return i;
+    p->top[i] = 0.998 * p->squared[i];
+    --i;
+  }
+  return -1;
+}
+
+/* ---- the judgement of a timing ---- */
+
+/* Cubic interpolation of the samples' rows, at a place counted in samples. */
+static void between(const problem* p, double place, double* f) {
+  int first = (int)place - 1;
+  if (first < 0) first = 0;
+  if (first > SAMPLES - 4) first = SAMPLES - 4;
+  const double t = place - first;
+  const double c[4] = {
+    (t - 1) * (t - 2) * (t - 3) / -6, t * (t - 2) * (t - 3) / 2,
+    t * (t - 1) * (t - 3) / -2, t * (t - 1) * (t - 2) / 6,
+  };
+  const double* s = p->samples + first * SIZE;
+  for (int k = 0; k < SIZE; ++k)
+    f[k] = c[0] * s[k] + c[1] * s[SIZE + k] + c[2] * s[2 * SIZE + k] + c[3] * s[3 * SIZE + k];
+}
+
+static void note(largest_use* use, int kind, double ratio, double parameter, int column) {
+  if (ratio <= use[kind].ratio) return;
+  use[kind].ratio = ratio;
+  use[kind].parameter = parameter;
+  use[kind].column = column;
+}
+
+/* Every limited quantity over its limit at one sample, u = parameter, noted in `use`; `peak` keeps
+   the largest normal forces. */
+static void judge(const problem* p, const double* f, double parameter, double a, double w,
+                  largest_use* use, double* peak) {
+  double ratios[RATIOS], n[2], force[3];
+  const double speed = sqrt(larger(w, 0.0));
+  const double *d = f + AT_SPEED, *alpha = f + AT_ACCELERATION, *cones = f + AT_CONE;
+  for (int j = 0; j < JOINTS; ++j) {
+    note(use, JOINT_SPEED, fabs(d[j]) * speed, parameter, j);
+    note(use, JOINT_ACCELERATION, fabs(alpha[j] * a + alpha[JOINTS + j] * w), parameter, j);
+  }
+  note(use, BOX_SPEED, fabs(d[JOINTS]) * speed, parameter, 0);
+  note(use, BOX_TURN, fabs(d[JOINTS + 1]) * speed, parameter, 0);
+  if (p->reference)
+    note(use, PATH_SPEED, larger(fabs(d[JOINTS + 2]), fabs(d[JOINTS + 3])) * speed, parameter, 0);
+  for (int cone = 0; cone < 2; ++cone) {
+    const double *first = cones + 6 * cone, *second = first + 3;
+    double sum = 0.0;
+    for (int k = 0; k < 3; ++k) {
+      const double v = first[k] * a + second[k] * w;
+      sum += v * v;
+    }
+    note(use, BOX_ACCELERATION + cone, sqrt(sum), parameter, 0);
+  }
+  normal_forces(f, a, w, n, force);
+  for (int k = 0; k < 2; ++k) {
+    peak[k] = larger(peak[k], n[k]);
+    note(use, NORMAL_FORCE, n[k] / p->force, parameter, k);
+  }
+  if (p->torque || p->pressure) ratios_at(f, a, w, ratios);
+  for (int k = 0; k < RATIOS; ++k) {
+    if (!limited(p, k)) continue;
+    if (k < JOINTS) note(use, JOINT_TORQUE, fabs(ratios[k]), parameter, k);
+    else note(use, PRESSURE, fabs(ratios[k]), parameter, k - JOINTS);
+  }
+}
+
+static double worst_of(const largest_use* use) {
+  double largest = use[0].ratio;
+  for (int k = 1; k < KINDS; ++k) largest = larger(largest, use[k].ratio);
+  return largest;
+}
+
+static void reset(largest_use* use, double* peak) {
+  for (int k = 0; k < KINDS; ++k) use[k].ratio = use[k].parameter = use[k].column = 0;
+  peak[0] = peak[1] = 0.0;
+}
+
+/* Judges a timing slowed by `factor` at the ends of all stages and between them; returns the
+   largest use. With `tighten`, stages that exceed a limit get the group of that limit tightened. */
+static double judge_all(problem* p, double factor, int tighten, largest_use* use, double* peak) {
+  double f[SIZE];
+  reset(use, peak);
+  for (int i = 0; i < STAGES; ++i) {
+    const double x = factor * factor * p->squared[i], y = factor * factor * p->squared[i + 1];
+    const double a = HALF * (y - x);
+    largest_use here[KINDS] = {{0}};
+    for (int quarter = 0; quarter <= 4; ++quarter) {
+      const double share = 0.25 * quarter;
+      const double* row = p->samples + (2 * i + quarter / 2) * SIZE;
+      if (quarter % 2) between(p, 2.0 * (i + share), f);
+      judge(p, quarter % 2 ? f : row, (i + share) / STAGES, a, x + share * (y - x), here, peak);
+    }
+    double excess[GROUPS] = {1.0, 1.0, 1.0};
+    for (int k = 0; k < KINDS; ++k) {
+      note(use, k, here[k].ratio, here[k].parameter, here[k].column);
+      if (here[k].ratio > 1.0 + TIGHTEN)
+        excess[GROUP[k]] = larger(excess[GROUP[k]], here[k].ratio);
+    }
+    if (!tighten) continue;
+    const double rest = larger(p->rest_force[i], p->rest_force[i + 1]);
+    if (excess[FORCE] > 1.0) excess[FORCE] = (excess[FORCE] * p->force - rest) / (p->force - rest);
+    for (int k = 0; k < GROUPS; ++k) p->tight[i][k] *= excess[k];
+  }
+  return worst_of(use);
+}
+
+/* Standing still everywhere: fills `rest` and `rest_force`; returns the largest use. */
+static double judge_rest(problem* p, largest_use* use, double* peak) {
+  reset(use, peak);
+  for (int i = 0; i <= STAGES; ++i) {
+    const double* f = p->samples + 2 * i * SIZE;
+    double n[2], force[3];
+    judge(p, f, i / (double)STAGES, 0.0, 0.0, use, peak);
+    ratios_at(f, 0.0, 0.0, p->rest + i * RATIOS);
+    normal_forces(f, 0.0, 0.0, n, force);
+    p->rest_force[i] = larger(n[0], n[1]);
+  }
+  return worst_of(use);
+}
+
+/* Both passes until the limits hold between the ends of the stages as well. */
+static int solve(problem* p, largest_use* use, double* peak, double* stage, double* sweeps,
+                 double* slowed) {
+  for (int k = 0; k < SAMPLES * SIZE; ++k)
+    if (!isfinite(p->samples[k])) {
+      *stage = k / SIZE / 2;
+      return BROKEN;
+    }
+  for (int i = 0; i < STAGES; ++i)
+    for (int k = 0; k < GROUPS; ++k) p->tight[i][k] = 1.0;
+  if (judge_rest(p, use, peak) >= 1.0 - 1e-6) return AT_REST;
+  double worst = INFINITY;
+  while (*sweeps < MAX_SWEEPS && worst > 1.0 + TIGHTEN) {
+    const int stuck = sweep(p);
+    *sweeps += 1.0;
+    if (stuck >= 0) {
+      *stage = stuck;
+      return STUCK;
+    }
+    worst = judge_all(p, 1.0, 1, use, peak);
+  }
+  if (worst <= 1.0 + LARGEST_EXCESS) return REACHED;
+  double low = 0.0, high = 1.0;
+  for (int k = 0; k < 14; ++k) {
+    const double factor = 0.5 * (low + high);
+    if (judge_all(p, factor, 0, use, peak) > 1.0) high = factor; else low = factor;
+  }
+  judge_all(p, low, 0, use, peak);
+  for (int i = 0; i <= STAGES; ++i) p->squared[i] *= low * low;
+  *slowed = low;
+  return low < LEAST_SPEED ? SLOWED : REACHED;
+}
+
+/* Inputs: samples (SAMPLES, SIZE); options (4,): largest normal force, whether torques, pressure
+   and the reference speeds are limited. Outputs: status; stage of a failure; duration; peak (2,)
+   normal forces; use (KINDS, 3): ratio, parameter, column; squared (STAGES + 1,) u'^2; sweeps;
+   slowed. */
+int path_timing(const double** arg, double** res, long long* iw, double* w, int mem) {
+  const double* options = arg[1];
+  double *status = res[0], *stage = res[1], *duration = res[2], *peak = res[3], *uses = res[4];
+  double *squared = res[5], *sweeps = res[6], *slowed = res[7];
+  largest_use use[KINDS];
+  problem p = {
+    arg[0], options[0], options[1] > 0.5, options[2] > 0.5, options[3] > 0.5, w,
+    w + (STAGES + 1) * RATIOS, (double(*)[GROUPS])(w + (STAGES + 1) * (RATIOS + 1)),
+    w + (STAGES + 1) * (RATIOS + 1 + GROUPS), squared,
+  };
+  (void)iw; (void)mem;
+  *stage = *sweeps = *duration = 0.0;
+  *slowed = 1.0;
+  for (int i = 0; i <= STAGES; ++i) squared[i] = 0.0;
+  reset(use, peak);
+  *status = solve(&p, use, peak, stage, sweeps, slowed);
+  for (int k = 0; k < KINDS; ++k) {
+    uses[3 * k] = use[k].ratio;
+    uses[3 * k + 1] = use[k].parameter;
+    uses[3 * k + 2] = use[k].column;
+  }
+  if (*status == REACHED || *status == SLOWED)
+    for (int i = 0; i < STAGES; ++i)
+      *duration += 2.0 / STAGES / (sqrt(squared[i]) + sqrt(squared[i + 1]));
+  else
+    *duration = INFINITY;
+  return 0;
+}
+
+int path_timing_work(long long* arg, long long* res, long long* iw, long long* w) {
+  *arg = 2; *res = 8; *iw = 0; *w = (STAGES + 1) * (RATIOS + 2 + GROUPS);
+  return 0;
+}
+void path_timing_incref(void) {}
+int path_timing_checkout(void) { return 0; }
+void path_timing_release(int mem) { (void)mem; }

@@ -1,0 +1,114 @@
+"""The compiled passes: `c/passes.c` for one workcell, as a numeric function."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+from codegen.build import load_or_compile
+from codegen.cache import Cache, digest, source_digest
+from codegen.compiler import find_compiler
+from codegen.function import NumericFunction
+from codegen.signature import Signature
+from hybrid_opt.evaluate.functions import workcell_key
+from hybrid_opt.timing.records import TimingStatus
+from symbolic.workcell.records import Workcell
+
+KINDS = (
+    "joint velocity",
+    "payload velocity",
+    "payload angular velocity",
+    "path speed",
+    "joint acceleration",
+    "payload acceleration",
+    "payload angular acceleration",
+    "normal force",
+    "joint torque",
+    "pressure shift",
+)
+"""Limits as `c/passes.c` numbers them."""
+
+OUTCOMES = (
+    TimingStatus.OK,
+    TimingStatus.INFEASIBLE_AT_REST,
+    TimingStatus.SOLVER_FAILED,
+    TimingStatus.NOT_CONVERGED,
+    TimingStatus.SOLVER_FAILED,
+)
+"""What its statuses mean."""
+
+
+def passes_function(
+    workcell: Workcell, stages: int, cache: Cache | None = None, *, identified: bool = True
+) -> NumericFunction | None:
+    """The timing of one path from its limits; None without a C compiler.
+
+    Inputs: samples (2 stages + 1, `LimitLayout.size`), both ends and the middle of
+    every stage; options (4,): largest normal force [N],
+    infinite for none, then whether torques, pressure shifts and the reference speeds are limited
+    (0 or 1). Outputs: status, index into `OUTCOMES`; stage of a failure; duration [s], infinite
+    without a timing; peak (2,) normal forces [N]; use (len(KINDS), 3): largest share of each limit,
+    path parameter and joint or contact there; squared (stages + 1,) u'^2 at the grid points;
+    sweeps, how often both passes ran; slowed, the factor on the speed. Without a timing peak and
+    use are those of standing still.
+
+    Args:
+        workcell: the cell.
+        stages: pieces of constant path acceleration.
+        cache: where compiled functions are kept; by default the user's.
+        identified: whether the workcell's digest stands for it; otherwise its C text does.
+    """
+    if identified and workcell.digest:
+        own = source_digest("hybrid_opt")
+        key = digest("path timing", workcell_key(workcell), str(stages), own)
+        return load_or_compile(key, lambda: _source(workcell, stages), cache)
+    if find_compiler() is None:
+        return None
+    signature, text = _source(workcell, stages)
+    return load_or_compile(digest("path timing", text), lambda: (signature, text), cache)
+
+
+def _source(workcell: Workcell, stages: int) -> tuple[Signature, str]:
+    # Not imported at the top: a warm start needs no CasADi.
+    from codegen.source import handwritten_source
+    from symbolic.physics.path_limits import limit_layout, ratio_functions
+
+    layout = limit_layout(workcell)
+    branches = _branches(workcell)
+    constants = {
+        "STAGES": stages,
+        "JOINTS": layout.joints,
+        "SIZE": layout.size,
+        "RATIOS": layout.joints + 2,
+        "FORCE_BRANCHES": len(branches),
+        **{f"AT_{name.upper()}": place for name, place in layout.offsets.items()},
+    }
+    rows = ", ".join(f"{{{n!r}, {t!r}}}" for n, t in branches)
+    text = "".join(
+        [
+            *[f"#define {name} {value}\n" for name, value in constants.items()],
+            f"static const double BRANCH[FORCE_BRANCHES][2] = {{{rows}}};\n",
+            files("hybrid_opt.timing").joinpath("c/passes.c").read_text(),
+        ]
+    )
+    signature = Signature(
+        "path_timing",
+        ("samples", "options"),
+        ("status", "stage", "duration", "peak", "use", "squared", "sweeps", "slowed"),
+        ((2 * stages + 1, layout.size), (4,)),
+        ((), (), (), (2,), (len(KINDS), 3), (stages + 1,), (), ()),
+    )
+    return signature, handwritten_source(signature, text, ratio_functions(workcell))
+
+
+def _branches(workcell: Workcell) -> list[tuple[float, float]]:
+    """N_2 by branch as shares of the required force's normal and tangential parts."""
+    import casadi as ca
+
+    from symbolic.physics.contact_forces import normal_force_branches
+
+    friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
+    normal, tangential = (
+        ca.DM(normal_force_branches(ca.DM(n), ca.DM(1 - n), friction)).full().ravel().tolist()
+        for n in (1, 0)
+    )
+    return list(zip(normal, tangential, strict=True))

@@ -1,0 +1,253 @@
+"""Timings of many paths of one workcell, in compiled code: what a search can afford.
+
+The method is that of `hybrid_opt.timing.solve` without its linear programs over all stages; see
+docs/timing.md. A carry is not built: `drive_path` recomputes one for a timing found here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from codegen.build import build, load_or_build
+from codegen.cache import Cache, digest
+from hybrid_opt.evaluate.functions import workcell_key
+from hybrid_opt.timing.model import TimingModel, joint_names
+from hybrid_opt.timing.passes import KINDS, OUTCOMES, passes_function
+from hybrid_opt.timing.path_check import LEAST_LENGTH, arm_checks
+from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.solve import time_path
+from symbolic.array import Array
+from symbolic.cell_model import CellModel, build_cell_model
+from symbolic.errors import SettingsError
+from symbolic.workcell.records import Workcell
+
+PATH_STAGES = 100
+"""Pieces of constant path acceleration."""
+
+
+@dataclass(frozen=True)
+class PathTiming:
+    """The fastest timing of one path within limits, or why there is none.
+
+    Attributes:
+        status: the outcome.
+        place: where it fails, or the most used limit.
+        duration: [s], infinite without a timing.
+        peak_force: (2,) largest normal forces [N]; standing still without a timing, NaN where
+            the path itself fails.
+        use: largest share of each limit by name of the constraint, likewise; empty where the path
+            itself fails.
+        grid_speed: (stages + 1,) path speed u' at the grid points [1/s], zero without a timing.
+        sweeps: how often both passes ran.
+        slowed: uniform factor on the path speed that made the limits hold, 1 normally.
+    """
+
+    status: TimingStatus
+    place: Place
+    duration: float
+    peak_force: Array
+    use: dict[str, float]
+    grid_speed: Array
+    sweeps: int = 0
+    slowed: float = 1.0
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is a timing that respects every limit."""
+        return self.status is TimingStatus.OK
+
+
+class PathTimer:
+    """Times paths of one workcell. Without a C compiler it asks `time_path`, which is slow.
+
+    Attributes:
+        workcell: the cell.
+        stages: pieces of constant path acceleration.
+        compiled: whether the passes are compiled.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        stages: int = PATH_STAGES,
+        cache: Cache | None = None,
+        cell_model: CellModel | None = None,
+        threads: int = 1,
+    ) -> None:
+        """Load or build the compiled functions.
+
+        Args:
+            workcell: the cell.
+            stages: pieces of constant path acceleration.
+            cache: where compiled functions are kept; by default the user's.
+            cell_model: the cell's symbolic model, where it does not follow from the workcell's
+                files alone.
+            threads: threads that share a batch.
+
+        Raises:
+            SettingsError: the number of stages is out of range.
+            DualArmError: the model or its code cannot be built.
+        """
+        if not 10 <= stages <= 2000:
+            raise SettingsError(f"{stages} stages; allowed are 10 to 2000")
+        self.workcell = workcell
+        self.stages = stages
+        self._cache = cache
+        self._cell_model = cell_model
+        self._threads = threads
+        self._joint_names = (joint_names(workcell.robots[0]), joint_names(workcell.robots[1]))
+
+        def make() -> Any:
+            # Not imported at the top: a warm start needs no CasADi.
+            from symbolic.physics.path_limits import path_limits_function
+
+            model = build_cell_model(workcell) if cell_model is None else cell_model
+            return {"path_limits": path_limits_function(model, 2 * stages + 1)}
+
+        identified = bool(workcell.digest) and cell_model is None
+        if identified:
+            key = digest("path limits", workcell_key(workcell), str(stages))
+            functions = load_or_build(key, make, cache, lanes=0)
+        else:
+            functions = build(make(), cache, lanes=0).functions
+        self._limits = functions["path_limits"]
+        self._passes = passes_function(workcell, stages, cache, identified=identified)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the passes are compiled."""
+        return self._passes is not None
+
+    def path_limits(self, x: Array) -> dict[str, Array]:
+        """`symbolic.physics.path_limits.path_limits_function` for waypoints (n, n_var), at both
+        ends and in the middle of every stage."""
+        return self._limits.batch(np.ascontiguousarray(x, dtype=float), threads=self._threads)
+
+    def time(self, x: Array, limits: TimingLimits) -> PathTiming:
+        """The fastest timing from rest to rest of one path.
+
+        Args:
+            x: (n_var,) free waypoints.
+            limits: beyond the workcell's own.
+
+        Raises:
+            SettingsError: x has the wrong shape or is not finite.
+        """
+        (timing,) = self.time_all(np.asarray(x, dtype=float)[None], [limits])
+        return timing
+
+    def time_all(self, x: Array, limits: list[TimingLimits]) -> list[PathTiming]:
+        """The fastest timing of every path (n, n_var) within its own limits.
+
+        Raises:
+            SettingsError: x has the wrong shape or is not finite.
+        """
+        x = np.ascontiguousarray(x, dtype=float)
+        (n_var,) = self._limits.input_shapes[0]
+        if x.shape != (len(limits), n_var) or not np.isfinite(x).all():
+            raise SettingsError(
+                f"waypoints of shape {x.shape}; needs {len(limits)} rows of {n_var} finite numbers"
+            )
+        return self.time_known(x, self.path_limits(x), limits)
+
+    def time_known(
+        self, x: Array, paths: dict[str, Array], limits: list[TimingLimits]
+    ) -> list[PathTiming]:
+        """As `time_all`, with the answers of `path_limits` known already."""
+        found = [self._path_failure(paths, row) for row in range(len(limits))]
+        rows = [row for row, failure in enumerate(found) if failure is None]
+        if rows and self._passes is None:
+            timings = [from_time_path(time_path(self._model, x[r], limits[r])) for r in rows]
+        elif rows and self._passes is not None:
+            options = np.array([_options(limits[row]) for row in rows])
+            samples = paths["limits"] if len(rows) == len(limits) else paths["limits"][rows]
+            out = self._passes.batch(samples, options, threads=self._threads)
+            timings = [self._timing(out, k) for k in range(len(rows))]
+        else:
+            timings = []
+        for row, timing in zip(rows, timings, strict=True):
+            found[row] = timing
+        return [timing for timing in found if timing is not None]
+
+    @cached_property
+    def _model(self) -> TimingModel:
+        return TimingModel(self.workcell, self.stages, self._cache, self._cell_model)
+
+    def _path_failure(self, paths: dict[str, Array], row: int) -> PathTiming | None:
+        """Why a path cannot be timed at all."""
+        pose = paths["pose"][row]
+        if float(np.abs(pose - pose[0]).max()) < LEAST_LENGTH:
+            return self._failed(TimingStatus.NO_MOTION, Place("path length", "", "", 0, 0.0))
+        sides = [
+            np.stack([paths[f"{name}_{arm}"][row] for arm in (1, 2)], axis=1)
+            for name in ("lost", "limit_margin", "manipulability")
+        ]
+        for check in arm_checks(self.workcell, *sides):
+            if check.failed.any():
+                sample = int(np.argmax(check.failed.any(axis=1)))
+                robot = self.workcell.robots[int(np.argmax(check.failed[sample]))].name
+                place = Place(check.constraint, robot, "", sample, sample / (2 * self.stages))
+                return self._failed(check.status, place)
+        return None
+
+    def _failed(self, status: TimingStatus, place: Place) -> PathTiming:
+        return PathTiming(
+            status, place, float("inf"), np.full(2, np.nan), {}, np.zeros(self.stages + 1)
+        )
+
+    def _timing(self, out: dict[str, Array], k: int) -> PathTiming:
+        status = OUTCOMES[int(out["status"][k])]
+        use = out["use"][k]
+        if status is TimingStatus.SOLVER_FAILED:
+            stage = int(out["stage"][k])
+            place = Place("path timing", "", "", stage, stage / self.stages)
+        else:
+            place = self._place(int(np.argmax(use[:, 0])), use)
+        return PathTiming(
+            status=status,
+            place=place,
+            duration=float(out["duration"][k]),
+            peak_force=out["peak"][k],
+            use=dict(zip(KINDS, use[:, 0].tolist(), strict=True)),
+            grid_speed=np.sqrt(out["squared"][k]),
+            sweeps=int(out["sweeps"][k]),
+            slowed=float(out["slowed"][k]),
+        )
+
+    def _place(self, kind: int, use: Array) -> Place:
+        """The joint or contact that uses a kind of limit most, and where."""
+        name, column, parameter = KINDS[kind], int(use[kind, 2]), float(use[kind, 1])
+        sample = round(parameter * self.stages)
+        robots = self.workcell.robots
+        if name.startswith("joint"):
+            arm = int(column >= len(self._joint_names[0]))
+            joint = self._joint_names[arm][column - arm * len(self._joint_names[0])]
+            return Place(name, robots[arm].name, joint, sample, parameter)
+        if name in ("normal force", "pressure shift"):
+            return Place(name, robots[column].name, "", sample, parameter)
+        return Place(name, "", "", sample, parameter)
+
+
+def from_time_path(timing: Timing) -> PathTiming:
+    """What `time_path` found, as a `PathTiming`."""
+    force = np.full(2, np.nan) if timing.carry is None else timing.carry.peak_normal_force
+    speed = np.zeros(0) if timing.grid_speed is None else timing.grid_speed
+    return PathTiming(
+        status=timing.status,
+        place=timing.place or Place("path timing", "", "", 0, 0.0),
+        duration=timing.duration,
+        peak_force=force,
+        use={name: excess.ratio for name, excess in timing.use.items()},
+        grid_speed=speed,
+        sweeps=timing.iterations,
+        slowed=timing.slowed,
+    )
+
+
+def _options(limits: TimingLimits) -> list[float]:
+    force = float("inf") if limits.force is None else limits.force
+    return [force, float(limits.torque), float(limits.pressure), float(limits.reference_speed)]

@@ -1,0 +1,231 @@
+"""Compiled timings against `time_path`, a convex program, their limits and their laws."""
+
+from __future__ import annotations
+
+from functools import cache
+from time import process_time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybrid_opt.timing import (
+    PathTimer,
+    TimingLimits,
+    TimingModel,
+    TimingStatus,
+    drive_path,
+    time_path,
+)
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
+from tests.hybrid_opt.timing import convex_oracle
+from tests.hybrid_opt.timing.cells import (
+    hand_timing,
+    initial,
+    near_initial,
+    timing_of,
+    with_robots,
+)
+from tests.symbolic.cells import (
+    RACK,
+    fixed,
+    hand_cell,
+    hand_model,
+    with_contacts,
+    with_payload,
+    with_task,
+)
+
+STAGES = 100
+STATIC = 98.1 / 2.0
+
+
+def timer_of(cell: Workcell, stages: int = STAGES) -> PathTimer:
+    return PathTimer(cell, stages, cell_model=hand_model(cell))
+
+
+@cache
+def hand_timer() -> PathTimer:
+    return timer_of(hand_cell())
+
+
+def assert_agrees(timer: PathTimer, model: TimingModel, x: Array, limits: TimingLimits) -> None:
+    """Duration within 0.2 % of `time_path`, limits within 0.5 % on the tenfold grid."""
+    found, expected = timer.time(x, limits), time_path(model, x, limits)
+    assert found.ok == expected.ok, (found.status, found.place, expected.reason)
+    if not expected.ok:
+        assert found.status is expected.status
+        return
+    assert found.duration == pytest.approx(expected.duration, rel=2e-3)
+    judged = drive_path(model, x, found.grid_speed, limits)
+    assert judged.ok, judged.reason
+    assert judged.carry is not None
+    assert judged.duration == pytest.approx(found.duration, rel=1e-9)
+    np.testing.assert_allclose(
+        judged.carry.normal_force.max(axis=0), found.peak_force, rtol=1e-3, atol=0.01
+    )
+
+
+@pytest.mark.parametrize("share", [None, 1.01, 1.05, 1.3])
+@pytest.mark.parametrize("factor", [1.0, 0.6])
+def test_durations_agree_with_time_path_and_limits_hold(share: float | None, factor: float) -> None:
+    cell = with_contacts(
+        with_robots(hand_cell(), torque_max=factor), patch_radius=(0.0315 * factor, 0.0315)
+    )
+    timer, model = timer_of(cell), timing_of(cell, STAGES)
+    limits = TimingLimits(force=None if share is None else share * STATIC)
+    for x in near_initial(np.random.default_rng(3), 4):
+        assert_agrees(timer, model, x, limits)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rack", "transfer"])
+def test_two_hundred_random_carries_agree_with_time_path(name: str) -> None:
+    cell = load(RACK.with_name(f"{name}.toml"))
+    timer, model = PathTimer(cell), TimingModel(cell, STAGES)
+    rng, task, timed = np.random.default_rng(12), cell.task, 0
+    for k in range(2000):
+        x = rng.uniform(task.lower, task.upper)
+        limits = TimingLimits(force=(None, 50.0, 52.0, 55.0, 60.0)[k % 5])
+        motion = model.path_motion(x)
+        # A path that only its tenfold samples reject is judged by other samples, not timed.
+        if motion.lost.any() or motion.manipulability.min() < 0.031:
+            continue
+        if abs(motion.limit_margin.min()) < 1e-3:
+            continue
+        assert_agrees(timer, model, x, limits)
+        timed += 1
+        if timed == 200:
+            return
+    pytest.fail(f"only {timed} carries could be timed")
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_duration_agrees_with_a_convex_program(seed: int) -> None:
+    model = hand_timing(STAGES)
+    (x,) = near_initial(np.random.default_rng(100 + seed), 1)
+    share = (None, 1.02, 1.1, 1.3)[seed % 4]
+    static = hand_timer().time(x, TimingLimits(force=1.0)).peak_force.max()
+    limits = TimingLimits(
+        force=None if share is None else share * float(static),
+        torque=False,
+        pressure=False,
+        reference_speed=seed % 3 == 0,
+    )
+    found = hand_timer().time(x, limits)
+    exact = convex_oracle.shortest_duration(model, x, limits)
+    # Stages that exceed a limit between their ends are tightened, which the program does not do.
+    assert found.duration == pytest.approx(exact, rel=1e-3)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(1.001, 1.6), st.floats(1.0, 1.5), st.integers(0, 2**32 - 1))
+def test_more_force_never_takes_longer(share: float, more: float, seed: int) -> None:
+    (x,) = near_initial(np.random.default_rng(seed), 1)
+    tight, loose = hand_timer().time_all(
+        np.array([x, x]),
+        [TimingLimits(force=share * STATIC), TimingLimits(force=more * share * STATIC)],
+    )
+    if not tight.ok:
+        assert tight.status is TimingStatus.INFEASIBLE_AT_REST
+        return
+    assert loose.ok
+    assert loose.duration <= tight.duration * (1.0 + 1e-3)
+    assert tight.peak_force.max() <= share * STATIC * 1.005
+    assert tight.grid_speed[0] == tight.grid_speed[-1] == 0.0
+
+
+def test_a_batch_gives_what_single_calls_give() -> None:
+    paths = near_initial(np.random.default_rng(8), 3)
+    paths = np.vstack([paths, initial() + np.tile([-2.0, 0, 0, 0, 0, 0], 3)])
+    limits = [TimingLimits(force=force) for force in (50.0, 52.0, None, None)]
+    together = hand_timer().time_all(paths, limits)
+    for x, limit, timing in zip(paths, limits, together, strict=True):
+        alone = hand_timer().time(x, limit)
+        assert alone.status is timing.status
+        assert alone.place == timing.place
+        np.testing.assert_array_equal(alone.grid_speed, timing.grid_speed)
+    assert together[3].status is TimingStatus.OFF_PATH
+    assert together[3].place.robot in ("first", "second")
+
+
+def test_limits_used_up_at_rest_are_named_as_time_path_names_them() -> None:
+    weak = with_robots(hand_cell(), torque_max=0.3)
+    cases = (
+        (hand_cell(), TimingLimits(force=STATIC)),
+        (weak, TimingLimits()),
+        (
+            with_payload(hand_cell(), centre_of_mass=np.array([0.04, 0.0, 0.0])),
+            TimingLimits(),
+        ),
+    )
+    for cell, limits in cases:
+        found = timer_of(cell).time(initial(), limits)
+        expected = time_path(timing_of(cell, STAGES), initial(), limits)
+        assert found.status is expected.status is TimingStatus.INFEASIBLE_AT_REST
+        assert expected.place is not None
+        assert found.place.constraint == expected.place.constraint
+        assert found.place.joint == expected.place.joint
+        assert found.duration == float("inf")
+        assert found.use[found.place.constraint] == pytest.approx(
+            expected.use[expected.place.constraint].ratio, rel=1e-3
+        )
+
+
+def test_paths_that_fail_before_any_timing() -> None:
+    task = hand_cell().task
+    still = with_task(
+        hand_cell(),
+        waypoints=(task.waypoints[0], task.waypoints[1], fixed(task.waypoints[0].lower)),
+        initial=task.waypoints[0].lower[None],
+    )
+    timing = timer_of(still).time(task.waypoints[0].lower, TimingLimits())
+    assert timing.status is TimingStatus.NO_MOTION
+    singular = with_robots(hand_cell(), min_manipulability=1e3)
+    assert timer_of(singular).time(initial(), TimingLimits()).status is TimingStatus.NEAR_SINGULAR
+    tight = with_robots(hand_cell(), position_upper=0.0)
+    assert timer_of(tight).time(initial(), TimingLimits()).status is TimingStatus.JOINT_LIMITS
+
+
+@pytest.mark.filterwarnings("ignore:no C compiler")
+def test_without_a_compiler_time_path_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = TimingLimits(force=1.05 * STATIC)
+    compiled = timer_of(hand_cell(), 30).time(initial(), limits)
+    monkeypatch.setenv("CC", "no-such-compiler")
+    timer = timer_of(hand_cell(), 30)
+    assert not timer.compiled
+    found = timer.time(initial(), limits)
+    assert found.ok
+    assert found.duration == pytest.approx(compiled.duration, rel=2e-3)
+    np.testing.assert_allclose(found.peak_force, compiled.peak_force, rtol=1e-3)
+
+
+def test_misuse_is_refused() -> None:
+    with pytest.raises(SettingsError, match="stages"):
+        PathTimer(hand_cell(), stages=5)
+    with pytest.raises(SettingsError, match="finite"):
+        hand_timer().time(np.full(18, np.nan), TimingLimits())
+    with pytest.raises(SettingsError, match="path speeds"):
+        drive_path(hand_timing(STAGES), initial(), np.zeros(STAGES + 1), TimingLimits())
+    too_fast = np.sin(np.linspace(0.0, np.pi, STAGES + 1))
+    judged = drive_path(hand_timing(STAGES), initial(), 10.0 * too_fast, TimingLimits())
+    assert judged.status is TimingStatus.EXCEEDED
+
+
+def test_it_takes_two_milliseconds_and_a_tenth_of_time_path() -> None:
+    model, timer = hand_timing(STAGES), hand_timer()
+    limits = TimingLimits(force=1.1 * STATIC)
+    ours, theirs = [], []
+    for _ in range(10):
+        begin = process_time()
+        timer.time(initial(), limits)
+        middle = process_time()
+        time_path(model, initial(), limits)
+        ours.append(middle - begin)
+        theirs.append(process_time() - middle)
+    assert min(ours) <= 2e-3
+    assert min(ours) <= min(theirs) / 10.0
