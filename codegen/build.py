@@ -199,13 +199,12 @@ def load_or_compile(
         return None
     cache = cache or Cache()
     found = _load_set(key, 1, compiler, cache)
-    if found is None:
-        signature, text = make()
-        source = _Source(signature, 0, text, len(text), None)
-        function, entry, _ = _compile(source, compiler, cache, 3, rebuild=False)
-        cache.write_record(_set_key(key, 1, compiler), {"members": {signature.name: entry.key}})
-        return function
-    (function,) = found.values()
+    if found is not None:
+        return next(iter(found.values()))
+    signature, text = make()
+    source = _Source(signature, 0, text, len(text), None)
+    function, entry, _ = _compile(source, compiler, cache, 3, rebuild=False)
+    cache.write_record(_set_key(key, 1, compiler), {"members": {signature.name: entry.key}})
     return function
 
 
