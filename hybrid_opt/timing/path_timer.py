@@ -77,6 +77,7 @@ class PathTimer:
         cache: Cache | None = None,
         cell_model: CellModel | None = None,
         threads: int = 1,
+        lanes: int = 0,
     ) -> None:
         """Load or build the compiled functions.
 
@@ -87,6 +88,8 @@ class PathTimer:
             cell_model: the cell's symbolic model, where it does not follow from the workcell's
                 files alone.
             threads: threads that share a batch.
+            lanes: paths of a batch that run side by side; 0 for what suits the machine. One lane
+                builds faster.
 
         Raises:
             SettingsError: the number of stages is out of range.
@@ -103,18 +106,21 @@ class PathTimer:
 
         def make() -> Any:
             # Not imported at the top: a warm start needs no CasADi.
-            from symbolic.physics.path_limits import path_limits_function
+            from symbolic.physics.path_limits import path_function, sample_limits_function
 
             model = build_cell_model(workcell) if cell_model is None else cell_model
-            return {"path_limits": path_limits_function(model, 2 * stages + 1)}
+            return {
+                "path": path_function(model, 2 * stages + 1),
+                "sample_limits": sample_limits_function(model),
+            }
 
         identified = bool(workcell.digest) and cell_model is None
         if identified:
             key = digest("path limits", workcell_key(workcell), str(stages))
-            functions = load_or_build(key, make, cache, lanes=0)
+            functions = load_or_build(key, make, cache, lanes=lanes)
         else:
-            functions = build(make(), cache, lanes=0).functions
-        self._limits = functions["path_limits"]
+            functions = build(make(), cache, lanes=lanes).functions
+        self._path, self._limits = functions["path"], functions["sample_limits"]
         self._passes = passes_function(workcell, stages, cache, identified=identified)
 
     @property
@@ -123,9 +129,13 @@ class PathTimer:
         return self._passes is not None
 
     def path_limits(self, x: Array) -> dict[str, Array]:
-        """`symbolic.physics.path_limits.path_limits_function` for waypoints (n, n_var), at both
-        ends and in the middle of every stage."""
-        return self._limits.batch(np.ascontiguousarray(x, dtype=float), threads=self._threads)
+        """Of waypoints (n, n_var) the outputs of `symbolic.physics.path_limits.path_function` and
+        `limits`, at both ends and in the middle of every stage."""
+        paths = self._path.batch(np.ascontiguousarray(x, dtype=float), threads=self._threads)
+        shapes = zip(self._limits.input_names, self._limits.input_shapes, strict=True)
+        samples = [paths[name].reshape(-1, *shape) for name, shape in shapes]
+        rows = self._limits.batch(*samples, threads=self._threads)["limits"]
+        return paths | {"limits": rows.reshape(len(x), 2 * self.stages + 1, -1)}
 
     def time(self, x: Array, limits: TimingLimits) -> PathTiming:
         """The fastest timing from rest to rest of one path.
@@ -147,7 +157,7 @@ class PathTimer:
             SettingsError: x has the wrong shape or is not finite.
         """
         x = np.ascontiguousarray(x, dtype=float)
-        (n_var,) = self._limits.input_shapes[0]
+        (n_var,) = self._path.input_shapes[0]
         if x.shape != (len(limits), n_var) or not np.isfinite(x).all():
             raise SettingsError(
                 f"waypoints of shape {x.shape}; needs {len(limits)} rows of {n_var} finite numbers"

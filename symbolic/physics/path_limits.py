@@ -83,43 +83,45 @@ def limit_layout(workcell: Workcell) -> LimitLayout:
     return LimitLayout(sum(len(robot.velocity_max) for robot in workcell.robots))
 
 
-def path_limits_function(model: CellModel, samples: int) -> ca.Function:
-    """Waypoints x to what bounds the timing at uniform samples of u in [0, 1].
+PATH_OUTPUTS = ("pose", "pose_first", "pose_second", "q_1", "q_2")
+"""Outputs of `path_function` that `sample_limits_function` takes."""
 
-    Outputs (NumPy shapes, n samples): pose (n, 6) of the box; per arm i = 1, 2 q_i (n, joints),
-    ik_residual_i, lost_i, limit_margin_i, manipulability_i (n,) as in
-    `symbolic.robot.arm.TRACK_OUTPUTS`; limits (n, size) as in `LimitLayout`.
+
+def path_function(model: CellModel, samples: int) -> ca.Function:
+    """Waypoints x to box and arms at uniform samples of u in [0, 1].
+
+    Outputs (NumPy shapes, n samples): those of `PATH_OUTPUTS`: the box pose and its derivatives by
+    u (n, 6), and both arms' joints (n, joints of the arm); then per arm i = 1, 2 ik_residual_i,
+    lost_i, limit_margin_i, manipulability_i (n,) as in `symbolic.robot.arm.TRACK_OUTPUTS`.
 
     Args:
         model: the cell.
-        samples: number of samples, at least 4.
+        samples: number of samples, at least 3.
     """
     workcell = model.workcell
     x = ca.MX.sym("x", 6 * sum(not w.is_fixed for w in workcell.task.waypoints))
     waypoints = waypoint_matrix(workcell.task, x)
     basis = path_basis(len(workcell.task.waypoints), np.linspace(0.0, 1.0, samples))
-    pose, first, second = (
-        ca.mtimes(waypoints, ca.DM(matrix.T))
-        for matrix in (basis.position, basis.first, basis.second)
-    )
-    outputs = {"pose": pose}
-    joints = []
+    outputs = {
+        name: ca.mtimes(waypoints, ca.DM(matrix.T))
+        for name, matrix in zip(
+            PATH_OUTPUTS, (basis.position, basis.first, basis.second), strict=False
+        )
+    }
     no_wrench = ca.DM.zeros(6, samples)
+    verdicts = {}
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         follow = follow_function(robot, model.robots[i], contact, samples, f"limits_arm_{i + 1}")
-        tracked = dict(
-            zip(TRACK_OUTPUTS, follow(ca.DM(model.start[i]), pose, no_wrench), strict=True)
-        )
-        joints.append(tracked["q"])
-        outputs |= {f"{name}_{i + 1}": tracked[name] for name in ("q", *VERDICTS)}
-    outputs["limits"] = _sample_limits(model).map(samples)(pose, first, second, *joints)
-    return ca.Function(
-        "path_limits", [x], list(outputs.values()), ["x"], list(outputs), {"cse": True}
-    )
+        results = follow(ca.DM(model.start[i]), outputs["pose"], no_wrench)
+        tracked = dict(zip(TRACK_OUTPUTS, results, strict=True))
+        outputs[f"q_{i + 1}"] = tracked["q"]
+        verdicts |= {f"{name}_{i + 1}": tracked[name] for name in VERDICTS}
+    outputs |= verdicts
+    return ca.Function("path", [x], list(outputs.values()), ["x"], list(outputs), {"cse": True})
 
 
-def _sample_limits(model: CellModel) -> ca.Function:
-    """A sample's `LimitLayout` row from box pose, its derivatives by u, and both arms' joints."""
+def sample_limits_function(model: CellModel) -> ca.Function:
+    """A sample's `LimitLayout` row, limits (size,), from the `PATH_OUTPUTS` of the sample."""
     workcell = model.workcell
     payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
@@ -164,7 +166,13 @@ def _sample_limits(model: CellModel) -> ca.Function:
     }
     assert {name: block.shape[0] for name, block in blocks.items()} == layout.sizes
     row = ca.vertcat(*[ca.densify(blocks[name]) for name in layout.sizes])
-    return ca.Function("sample_limits", [pose, first, second, *q], ca.cse([row]))
+    return ca.Function(
+        "sample_limits",
+        [pose, first, second, *q],
+        ca.cse([row]),
+        list(PATH_OUTPUTS),
+        ["limits"],
+    )
 
 
 def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:

@@ -373,21 +373,6 @@ static int sweep(problem* p) {
 
 /* ---- the judgement of a timing ---- */
 
-/* Cubic interpolation of the samples' rows, at a place counted in samples. */
-static void between(const problem* p, double place, double* f) {
-  int first = (int)place - 1;
-  if (first < 0) first = 0;
-  if (first > SAMPLES - 4) first = SAMPLES - 4;
-  const double t = place - first;
-  const double c[4] = {
-    (t - 1) * (t - 2) * (t - 3) / -6, t * (t - 2) * (t - 3) / 2,
-    t * (t - 1) * (t - 3) / -2, t * (t - 1) * (t - 2) / 6,
-  };
-  const double* s = p->samples + first * SIZE;
-  for (int k = 0; k < SIZE; ++k)
-    f[k] = c[0] * s[k] + c[1] * s[SIZE + k] + c[2] * s[2 * SIZE + k] + c[3] * s[3 * SIZE + k];
-}
-
 static void note(largest_use* use, int kind, double ratio, double parameter, int column) {
   if (ratio <= use[kind].ratio) return;
   use[kind].ratio = ratio;
@@ -443,33 +428,41 @@ static void reset(largest_use* use, double* peak) {
   peak[0] = peak[1] = 0.0;
 }
 
-/* Judges a timing slowed by `factor` at the ends of all stages and between them; returns the
-   largest use. With `tighten`, stages that exceed a limit get the group of that limit tightened. */
-static double judge_all(problem* p, double factor, int tighten, largest_use* use, double* peak) {
-  double f[SIZE];
+static void judge_stage(const problem* p, int stage, double factor, int half, largest_use* use,
+                        double* peak) {
+  const double scale = factor * factor, share = 0.5 * half;
+  const double x = scale * p->squared[stage], y = scale * p->squared[stage + 1];
+  const double* f = p->samples + (2 * stage + half) * SIZE;
+  judge(p, f, (stage + share) / STAGES, HALF * (y - x), x + share * (y - x), use, peak);
+}
+
+/* Judges a timing slowed by `factor` at the ends and in the middle of all stages; returns the
+   largest use. */
+static double judge_all(const problem* p, double factor, largest_use* use, double* peak) {
   reset(use, peak);
+  for (int i = 0; i < STAGES; ++i)
+    for (int half = 0; half <= 2; ++half) judge_stage(p, i, factor, half, use, peak);
+  return worst_of(use);
+}
+
+/* Judges the middles of all stages, where no limit was imposed, and tightens the stages that exceed
+   one by the group of that limit; returns the largest use. */
+static double tighten(problem* p) {
+  double largest = 0.0;
   for (int i = 0; i < STAGES; ++i) {
-    const double x = factor * factor * p->squared[i], y = factor * factor * p->squared[i + 1];
-    const double a = HALF * (y - x);
-    largest_use here[KINDS] = {{0}};
-    for (int quarter = 0; quarter <= 4; ++quarter) {
-      const double share = 0.25 * quarter;
-      const double* row = p->samples + (2 * i + quarter / 2) * SIZE;
-      if (quarter % 2) between(p, 2.0 * (i + share), f);
-      judge(p, quarter % 2 ? f : row, (i + share) / STAGES, a, x + share * (y - x), here, peak);
-    }
-    double excess[GROUPS] = {1.0, 1.0, 1.0};
-    for (int k = 0; k < KINDS; ++k) {
-      note(use, k, here[k].ratio, here[k].parameter, here[k].column);
-      if (here[k].ratio > 1.0 + TIGHTEN)
-        excess[GROUP[k]] = larger(excess[GROUP[k]], here[k].ratio);
-    }
-    if (!tighten) continue;
+    largest_use use[KINDS];
+    double peak[2], excess[GROUPS] = {1.0, 1.0, 1.0};
+    reset(use, peak);
+    judge_stage(p, i, 1.0, 1, use, peak);
+    largest = larger(largest, worst_of(use));
+    for (int k = 0; k < KINDS; ++k)
+      if (use[k].ratio > 1.0 + TIGHTEN)
+        excess[GROUP[k]] = larger(excess[GROUP[k]], use[k].ratio);
     const double rest = larger(p->rest_force[i], p->rest_force[i + 1]);
     if (excess[FORCE] > 1.0) excess[FORCE] = (excess[FORCE] * p->force - rest) / (p->force - rest);
     for (int k = 0; k < GROUPS; ++k) p->tight[i][k] *= excess[k];
   }
-  return worst_of(use);
+  return largest;
 }
 
 /* Standing still everywhere: fills `rest` and `rest_force`; returns the largest use. */
@@ -505,15 +498,15 @@ static int solve(problem* p, largest_use* use, double* peak, double* stage, doub
       *stage = stuck;
       return STUCK;
     }
-    worst = judge_all(p, 1.0, 1, use, peak);
+    worst = tighten(p);
   }
-  if (worst <= 1.0 + LARGEST_EXCESS) return REACHED;
+  if (judge_all(p, 1.0, use, peak) <= 1.0 + LARGEST_EXCESS) return REACHED;
   double low = 0.0, high = 1.0;
   for (int k = 0; k < 14; ++k) {
     const double factor = 0.5 * (low + high);
-    if (judge_all(p, factor, 0, use, peak) > 1.0) high = factor; else low = factor;
+    if (judge_all(p, factor, use, peak) > 1.0) high = factor; else low = factor;
   }
-  judge_all(p, low, 0, use, peak);
+  judge_all(p, low, use, peak);
   for (int i = 0; i <= STAGES; ++i) p->squared[i] *= low * low;
   *slowed = low;
   return low < LEAST_SPEED ? SLOWED : REACHED;

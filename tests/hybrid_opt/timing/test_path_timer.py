@@ -45,7 +45,7 @@ STATIC = 98.1 / 2.0
 
 
 def timer_of(cell: Workcell, stages: int = STAGES) -> PathTimer:
-    return PathTimer(cell, stages, cell_model=hand_model(cell))
+    return PathTimer(cell, stages, cell_model=hand_model(cell), lanes=1)
 
 
 @cache

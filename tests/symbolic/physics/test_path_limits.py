@@ -7,7 +7,13 @@ from functools import cache
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.physics.path_limits import limit_layout, path_limits_function, ratio_functions
+from symbolic.physics.path_limits import (
+    PATH_OUTPUTS,
+    limit_layout,
+    path_function,
+    ratio_functions,
+    sample_limits_function,
+)
 from symbolic.physics.path_motion import path_motion_function
 from symbolic.physics.payload_load import LOAD_OUTPUTS, load_function
 from symbolic.workcell.records import Workcell
@@ -28,10 +34,11 @@ def outputs() -> tuple[dict[str, Array], dict[str, Array]]:
     model = hand_model(uneven())
     rng = np.random.default_rng(2)
     x = model.workcell.task.initial.reshape(-1) + 0.05 * rng.uniform(-1.0, 1.0, 18)
-    return (
-        call(path_limits_function(model, SAMPLES), x),
-        call(path_motion_function(model, SAMPLES), x),
-    )
+    path = call(path_function(model, SAMPLES), x)
+    rows = sample_limits_function(model).map(SAMPLES)(*[path[name].T for name in PATH_OUTPUTS])
+    motion = call(path_motion_function(model, SAMPLES), x)
+    np.testing.assert_allclose(path["q_1"], motion["q_1"], atol=1e-12)
+    return {"limits": np.array(rows.T)}, motion
 
 
 def block(name: str) -> Array:
