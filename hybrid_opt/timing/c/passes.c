@@ -373,6 +373,22 @@ static int sweep(problem* p) {
 
 /* ---- the judgement of a timing ---- */
 
+/* Cubic interpolation of the first `count` numbers of the samples' rows, at a place counted in
+   samples. */
+static void between(const problem* p, double place, int count, double* f) {
+  int first = (int)place - 1;
+  if (first < 0) first = 0;
+  if (first > SAMPLES - 4) first = SAMPLES - 4;
+  const double t = place - first;
+  const double c[4] = {
+    (t - 1) * (t - 2) * (t - 3) / -6, t * (t - 2) * (t - 3) / 2,
+    t * (t - 1) * (t - 3) / -2, t * (t - 1) * (t - 2) / 6,
+  };
+  const double* s = p->samples + first * SIZE;
+  for (int k = 0; k < count; ++k)
+    f[k] = c[0] * s[k] + c[1] * s[SIZE + k] + c[2] * s[2 * SIZE + k] + c[3] * s[3 * SIZE + k];
+}
+
 static void note(largest_use* use, int kind, double ratio, double parameter, int column) {
   if (ratio <= use[kind].ratio) return;
   use[kind].ratio = ratio;
@@ -380,10 +396,10 @@ static void note(largest_use* use, int kind, double ratio, double parameter, int
   use[kind].column = column;
 }
 
-/* Every limited quantity over its limit at one sample, u = parameter, noted in `use`; `peak` keeps
-   the largest normal forces. */
+/* Every limited quantity over its limit at one sample, u = parameter, noted in `use`, the ratios
+   only where asked for; `peak` keeps the largest normal forces. */
 static void judge(const problem* p, const double* f, double parameter, double a, double w,
-                  largest_use* use, double* peak) {
+                  int with_ratios, largest_use* use, double* peak) {
   double ratios[RATIOS], n[2], force[3];
   const double speed = sqrt(larger(w, 0.0));
   const double *d = f + AT_SPEED, *alpha = f + AT_ACCELERATION, *cones = f + AT_CONE;
@@ -409,7 +425,8 @@ static void judge(const problem* p, const double* f, double parameter, double a,
     peak[k] = larger(peak[k], n[k]);
     note(use, NORMAL_FORCE, n[k] / p->force, parameter, k);
   }
-  if (p->torque || p->pressure) ratios_at(f, a, w, ratios);
+  if (!with_ratios || !(p->torque || p->pressure)) return;
+  ratios_at(f, a, w, ratios);
   for (int k = 0; k < RATIOS; ++k) {
     if (!limited(p, k)) continue;
     if (k < JOINTS) note(use, JOINT_TORQUE, fabs(ratios[k]), parameter, k);
@@ -428,32 +445,49 @@ static void reset(largest_use* use, double* peak) {
   peak[0] = peak[1] = 0.0;
 }
 
-static void judge_stage(const problem* p, int stage, double factor, int half, largest_use* use,
-                        double* peak) {
-  const double scale = factor * factor, share = 0.5 * half;
-  const double x = scale * p->squared[stage], y = scale * p->squared[stage + 1];
-  const double* f = p->samples + (2 * stage + half) * SIZE;
-  judge(p, f, (stage + share) / STAGES, HALF * (y - x), x + share * (y - x), use, peak);
+/* Judges a timing slowed by `factor` inside a stage, at its middle and its quarters. What is between
+   the samples is interpolated; ratios matter there only if the middle is near their limit. */
+static void judge_inside(const problem* p, int stage, double factor, largest_use* use,
+                         double* peak) {
+  const double x = factor * factor * p->squared[stage];
+  const double y = factor * factor * p->squared[stage + 1], a = HALF * (y - x);
+  double f[SIZE];
+  largest_use middle[KINDS] = {{0}};
+  judge(p, p->samples + (2 * stage + 1) * SIZE, (stage + 0.5) / STAGES, a, 0.5 * (x + y), 1, middle,
+        peak);
+  for (int k = 0; k < KINDS; ++k)
+    note(use, k, middle[k].ratio, middle[k].parameter, middle[k].column);
+  const int near = larger(middle[JOINT_TORQUE].ratio, middle[PRESSURE].ratio) > NEARLY;
+  for (int quarter = 1; quarter <= 3; quarter += 2) {
+    const double share = 0.25 * quarter;
+    between(p, 2.0 * (stage + share), near ? SIZE : AT_MOMENT, f);
+    judge(p, f, (stage + share) / STAGES, a, x + share * (y - x), near, use, peak);
+  }
 }
 
-/* Judges a timing slowed by `factor` at the ends and in the middle of all stages; returns the
-   largest use. */
+/* Judges a timing slowed by `factor` at the ends of all stages and inside them; returns the largest
+   use. */
 static double judge_all(const problem* p, double factor, largest_use* use, double* peak) {
   reset(use, peak);
-  for (int i = 0; i < STAGES; ++i)
-    for (int half = 0; half <= 2; ++half) judge_stage(p, i, factor, half, use, peak);
+  for (int i = 0; i < STAGES; ++i) {
+    const double x = factor * factor * p->squared[i], y = factor * factor * p->squared[i + 1];
+    const double a = HALF * (y - x);
+    judge(p, p->samples + 2 * i * SIZE, i / (double)STAGES, a, x, 1, use, peak);
+    judge(p, p->samples + 2 * (i + 1) * SIZE, (i + 1) / (double)STAGES, a, y, 1, use, peak);
+    judge_inside(p, i, factor, use, peak);
+  }
   return worst_of(use);
 }
 
-/* Judges the middles of all stages, where no limit was imposed, and tightens the stages that exceed
-   one by the group of that limit; returns the largest use. */
+/* Judges inside all stages, where no limit was imposed, and tightens the stages that exceed one by
+   the group of that limit; returns the largest use. */
 static double tighten(problem* p) {
   double largest = 0.0;
   for (int i = 0; i < STAGES; ++i) {
     largest_use use[KINDS];
     double peak[2], excess[GROUPS] = {1.0, 1.0, 1.0};
     reset(use, peak);
-    judge_stage(p, i, 1.0, 1, use, peak);
+    judge_inside(p, i, 1.0, use, peak);
     largest = larger(largest, worst_of(use));
     for (int k = 0; k < KINDS; ++k)
       if (use[k].ratio > 1.0 + TIGHTEN)
@@ -471,7 +505,7 @@ static double judge_rest(problem* p, largest_use* use, double* peak) {
   for (int i = 0; i <= STAGES; ++i) {
     const double* f = p->samples + 2 * i * SIZE;
     double n[2], force[3];
-    judge(p, f, i / (double)STAGES, 0.0, 0.0, use, peak);
+    judge(p, f, i / (double)STAGES, 0.0, 0.0, 1, use, peak);
     ratios_at(f, 0.0, 0.0, p->rest + i * RATIOS);
     normal_forces(f, 0.0, 0.0, n, force);
     p->rest_force[i] = larger(n[0], n[1]);
