@@ -40,7 +40,8 @@ OUTCOMES = (
 def passes_function(
     workcell: Workcell, stages: int, cache: Cache | None = None, *, identified: bool = True
 ) -> NumericFunction | None:
-    """The timing of one path from its limits; None without a C compiler.
+    """The timing of one path from its limits; None without a C compiler, or where the contact
+    forces are allocated jointly.
 
     Inputs: samples (2 stages + 1, `LimitLayout.size`), both ends and the middle of
     every stage; options (4,): largest normal force [N],
@@ -57,6 +58,8 @@ def passes_function(
         cache: where compiled functions are kept; by default the user's.
         identified: whether the workcell's digest stands for it; otherwise its C text does.
     """
+    if workcell.task.allocation != "paper":
+        return None  # the passes know the paper's normal forces in closed form, and no others
     if identified and workcell.digest:
         own = source_digest("hybrid_opt")
         key = digest("path timing", workcell_key(workcell), str(stages), own)
