@@ -109,7 +109,7 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
         )
     }
     no_wrench = ca.DM.zeros(6, samples)
-    verdicts = {}
+    verdicts: dict[str, ca.MX] = {}
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         follow = follow_function(robot, model.robots[i], contact, samples, f"limits_arm_{i + 1}")
         results = follow(ca.DM(model.start[i]), outputs["pose"], no_wrench)
