@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from hybrid_opt.store.export.formats import export
     from hybrid_opt.timing.records import Timing, TimingLimits
     from symbolic.errors import DualArmError
+    from symbolic.workcell.records import Workcell
 
 __all__ = [
     "Carry",
@@ -34,6 +35,7 @@ __all__ = [
     "SearchSettings",
     "Timing",
     "TimingLimits",
+    "Workcell",
     "export",
     "polish",
     "save",
@@ -52,6 +54,7 @@ _HOMES = {
     "SearchSettings": "hybrid_opt.door",
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",
+    "Workcell": "symbolic.workcell.records",
     "export": "hybrid_opt.store.export.formats",
     "polish": "hybrid_opt.door",
     "save": "hybrid_opt.door",

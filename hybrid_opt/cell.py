@@ -11,8 +11,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from hybrid_opt.carry import Carry
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations, concatenated
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective
 from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
 from symbolic.array import Array
@@ -26,6 +28,9 @@ if TYPE_CHECKING:
     from hybrid_opt.collision.certify import Certificate
     from hybrid_opt.polishing.functions import PolishFunctions
     from hybrid_opt.timing.model import TimingModel
+
+_CHUNK = 500
+"""Candidates evaluated at once; every sample of each is held in memory."""
 
 
 class Cell:
@@ -134,7 +139,13 @@ class Cell:
         Raises:
             SettingsError: x has the wrong shape.
         """
-        return self.evaluator.evaluate(x)
+        x = np.atleast_2d(x)
+        parts = [self.evaluator.evaluate(x[k : k + _CHUNK]) for k in range(0, len(x), _CHUNK)]
+        return concatenated(parts) if len(parts) > 1 else self.evaluator.evaluate(x[:_CHUNK])
+
+    def random(self, count: int, rng: np.random.Generator) -> Array:
+        """(count, n_var) decision vectors drawn uniformly from within the bounds."""
+        return rng.uniform(self.lower, self.upper, (count, self.n_var))
 
     def carry(self, x: Array) -> Carry:
         """One decision vector (n_var,) in detail, with its verdict, under the task's time law.

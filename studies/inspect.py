@@ -15,7 +15,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from studies.inspection import Branch, Inspection, Judged, inspect
+from hybrid_opt.carry import Judgement
+from studies.inspection import Branch, Inspection, inspect
 from studies.program import add_verbose, run_program
 from symbolic.errors import DualArmError, SettingsError
 from symbolic.workcell.file import load
@@ -58,19 +59,19 @@ def as_text(found: Inspection) -> str:
 
 def _branch_text(branch: Branch) -> str:
     joints = " ".join(f"{angle:7.1f}" for angle in branch.joints_deg)
-    near = "unknown" if branch.clearance_mm is None else f"{branch.clearance_mm:.0f} mm"
+    near = "unlimited" if branch.clearance_mm is None else f"{branch.clearance_mm:.1f} mm"
+    if branch.clearance_mm == 0.0:
+        near = "none (collides)"
     return (
         f"[{joints}] deg: keeps {branch.kept_samples} samples, clearance {near}, limits "
-        f"{branch.limit_margin_deg:.0f} deg, manipulability {branch.manipulability:.3f} m^3"
+        f"{branch.limit_margin_deg:.0f} deg, manipulability {branch.manipulability:.4f} m^3 "
+        f"(at least {branch.least_manipulability:g})"
     )
 
 
-def _judged_text(judged: Judged) -> str:
-    forces = ", ".join(f"{value:.4f}" for value in judged.objectives)
-    if judged.position is None:
-        return f"feasible, objectives {forces}"
-    where = f"at {100.0 * judged.position:.0f} % of the path"
-    return f"infeasible, {judged.reason.replace('_', ' ')} {where}"
+def _judged_text(judgement: Judgement) -> str:
+    forces = ", ".join(f"{value:.4f}" for value in judgement.objectives.values())
+    return f"{judgement}, objectives {forces}" if judgement.feasible else str(judgement)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -2,56 +2,37 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
-from hybrid_opt.evaluate.static_hold import static_hold
-from hybrid_opt.timing import TimingModel
-from studies.report.data import carry_of
+from hybrid_opt.carry import Carry, Judgement
+from hybrid_opt.cell import Cell
+from studies.report.data import shown
 from studies.report.figures_cell import environment, reachable_regions
 from studies.report.reach import reach_map
 from studies.report.style import in_style, save, settled
 from symbolic.array import Array
-from symbolic.cell_model import CellModel, build_cell_model
+from symbolic.cell_model import CellModel, build_cell_model, own_pairs
 from symbolic.errors import SettingsError
-from symbolic.robot.branches import StartBranch
+from symbolic.robot.branches import StartBranch, initial_poses
+from symbolic.workcell.decision import straight_line
 from symbolic.workcell.records import Workcell
-
-_CHUNK = 500
-
-
-@dataclass(frozen=True)
-class Judged:
-    """The verdict on one trajectory.
-
-    Attributes:
-        feasible: whether it satisfies every constraint.
-        reason: the constraint violated first, '' if none is.
-        position: path parameter of the first violation, None if there is none.
-        objectives: peak normal forces over the reference forces, without penalty.
-    """
-
-    feasible: bool
-    reason: str
-    position: float | None
-    objectives: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Branch:
     """A posture of one arm at the start and the least margins of the hand-made trajectory from
-    there; see `symbolic.robot.branches.StartBranch`. clearance_mm is None where nothing can
-    collide."""
+    there; see `symbolic.robot.branches.StartBranch`. The clearance is measured by FCL, 0 where
+    bodies intersect and None where nothing can collide."""
 
     joints_deg: tuple[float, ...]
     kept_samples: int
     clearance_mm: float | None
     limit_margin_deg: float
     manipulability: float
+    least_manipulability: float
     chosen: bool
 
 
@@ -82,8 +63,8 @@ class Inspection:
     static_normal_force: tuple[float, ...]
     static_objectives: tuple[float, ...]
     static_payload_limit: float
-    initial: Judged
-    straight_line: Judged
+    initial: Judgement
+    straight_line: Judgement
     candidates: int
     seed: int
     feasible_share: float
@@ -109,81 +90,64 @@ def inspect(workcell: Workcell, candidates: int, seed: int, output: Path | None)
     if candidates < 1:
         raise SettingsError(f"--candidates is {candidates}; at least 1 is needed")
     model = build_cell_model(workcell)
-    evaluator = CandidateEvaluator(workcell)
-    found = _random_candidates(evaluator, candidates, np.random.default_rng(seed))
-    reasons = Counter(REASONS[code] for code in found.tolist() if code != FEASIBLE)
-    hold = static_hold(workcell)
+    cell = Cell(workcell)
+    found = cell.evaluate(cell.random(candidates, np.random.default_rng(seed)))
+    hold = cell.static_hold
     geometry = model.geometry
     names = [body.name for body in geometry.bodies]
-    initial = workcell.task.initial.reshape(-1)
+    initial = cell.carry(cell.initial)
+    line = cell.carry(straight_line(workcell.task))
+    assert initial.judgement is not None
+    assert line.judgement is not None
     return Inspection(
         name=workcell.name,
         facts=_facts(workcell),
-        branches={robot.name: _branches(model, i) for i, robot in enumerate(workcell.robots)},
+        branches={robot.name: _branches(cell, model, i) for i, robot in enumerate(workcell.robots)},
         static_normal_force=tuple(hold.normal_force.tolist()),
         static_objectives=tuple((hold.normal_force / workcell.task.reference_force).tolist()),
         static_payload_limit=hold.payload_limit,
-        initial=_judged(evaluator.evaluate(initial[None])),
-        straight_line=_judged(evaluator.evaluate(straight_line(workcell)[None])),
+        initial=initial.judgement,
+        straight_line=line.judgement,
         candidates=candidates,
         seed=seed,
-        feasible_share=float((found == FEASIBLE).mean()),
-        infeasible_by_reason=dict(reasons.most_common()),
+        feasible_share=float(found.feasible.mean()),
+        infeasible_by_reason=found.infeasible_by_reason,
         active_pairs=geometry.pair_names,
         excluded_pairs=tuple(
             (names[p.first], names[p.second], p.reason) for p in geometry.excluded
         ),
-        files=() if output is None else _draw(model, initial, output),
+        files=() if output is None else _draw(cell, initial, output),
     )
 
 
-def straight_line(workcell: Workcell) -> Array:
-    """(n_var,) free waypoints evenly spaced on the straight lines between the fixed ones."""
-    waypoints = workcell.task.waypoints
-    fixed = [i for i, waypoint in enumerate(waypoints) if waypoint.is_fixed]
-    poses = np.array([waypoint.lower for waypoint in waypoints])
-    numbers = np.arange(len(waypoints))
-    line = np.column_stack(
-        [np.interp(numbers, fixed, poses[fixed, component]) for component in range(6)]
-    )
-    return np.asarray(line[list(workcell.task.free_indices)]).reshape(-1)
+def _branches(cell: Cell, model: CellModel, arm: int) -> tuple[Branch, ...]:
+    return tuple(_branch(cell, model, arm, branch) for branch in model.branches[arm])
 
 
-def _random_candidates(
-    evaluator: CandidateEvaluator, count: int, rng: np.random.Generator
-) -> Array:
-    """(count,) reasons of uniformly random candidates."""
-    reasons = []
-    for begin in range(0, count, _CHUNK):
-        size = (min(_CHUNK, count - begin), evaluator.n_var)
-        x = rng.uniform(evaluator.lower, evaluator.upper, size)
-        reasons.append(evaluator.evaluate(x).reason)
-    return np.concatenate(reasons)
-
-
-def _judged(evaluations: Evaluations) -> Judged:
-    feasible = bool(evaluations.feasible[0])
-    return Judged(
-        feasible,
-        "" if feasible else REASONS[int(evaluations.reason[0])],
-        None if feasible else float(evaluations.position[0]),
-        tuple(evaluations.objectives[0].tolist()),
-    )
-
-
-def _branches(model: CellModel, arm: int) -> tuple[Branch, ...]:
-    return tuple(_branch(branch, model.start[arm]) for branch in model.branches[arm])
-
-
-def _branch(branch: StartBranch, start: Array) -> Branch:
+def _branch(cell: Cell, model: CellModel, arm: int, branch: StartBranch) -> Branch:
     return Branch(
-        tuple(np.degrees(branch.q).round(2).tolist()),
-        branch.kept,
-        1e3 * branch.clearance if np.isfinite(branch.clearance) else None,
-        float(np.degrees(branch.limit_margin)),
-        branch.manipulability,
-        bool(np.allclose(branch.q, start)),
+        joints_deg=tuple(np.degrees(branch.q).round(2).tolist()),
+        kept_samples=branch.kept,
+        clearance_mm=_clearance_mm(cell, arm, branch),
+        limit_margin_deg=float(np.degrees(branch.limit_margin)),
+        manipulability=branch.manipulability,
+        least_manipulability=cell.workcell.robots[arm].min_manipulability,
+        chosen=bool(np.allclose(branch.q, model.start[arm])),
     )
+
+
+def _clearance_mm(cell: Cell, arm: int, branch: StartBranch) -> float | None:
+    """FCL's least distance of one arm from all but the other along the samples that it keeps."""
+    checker, kept = cell.evaluator.checker, max(branch.kept, 1)
+    own = own_pairs(cell.geometry, arm)
+    if not own:
+        return None
+    pose = np.ascontiguousarray(initial_poses(cell.workcell)[:kept])
+    path = np.ascontiguousarray(branch.path[:kept])
+    joints = (path, np.zeros_like(path)) if arm == 0 else (np.zeros_like(path), path)
+    bounds = np.full((kept, len(cell.geometry.active)), np.inf)
+    bounds[:, own] = checker.bounds(pose, *joints)[:, own]
+    return 1e3 * checker.min_distance(pose, *joints, bounds)[0]
 
 
 def _facts(workcell: Workcell) -> dict[str, str]:
@@ -212,14 +176,14 @@ def _vector(values: Array) -> str:
     return "(" + ", ".join(f"{value:g}" for value in values) + ")"
 
 
-def _draw(model: CellModel, initial: Array, output: Path) -> tuple[str, ...]:
+def _draw(cell: Cell, initial: Carry, output: Path) -> tuple[str, ...]:
     """The paper's Figures 4 and 5 as files."""
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SettingsError(f"--output {output}: cannot be made ({error.strerror})") from error
-    geometry = model.geometry
-    carry = carry_of(CandidateEvaluator(model.workcell), TimingModel(model.workcell), initial, "")
+    geometry = cell.geometry
+    carry = shown("", initial)
     reach = reach_map(geometry, np.random.default_rng(0))
     with in_style():
         figures = {

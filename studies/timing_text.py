@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.timing import ForceCurve, TimedTrajectory, Timing
-from hybrid_opt.timing.robustness import KILOGRAM_FORCE, Margin
+from hybrid_opt.timing.robustness import KILOGRAM_FORCE
 from hybrid_opt.timing.use import joint_use
 
 
@@ -83,7 +83,7 @@ def timing_text(timed: TimedTrajectory) -> str:
     lines += [f"  {name}: {timing.reason}" for name, timing in report.timings.items()]
     if margins:
         lines += ["", "Margins under the timing closest to the reference speed"]
-        lines += [f"  {_margin(margin)}" for margin in margins]
+        lines += [f"  {margin}" for margin in margins]
     if curve is not None:
         lines += ["", f"Duration against force limit (at rest {curve.static_force:.2f} N)"]
         lines += [
@@ -106,9 +106,3 @@ def _figures(timing: Timing) -> str:
         f"{timing.duration:8.3f}{first:9.4f}{second:9.4f}"
         f"{carry.payload_limit:7.2f} kg{100.0 * torque:6.1f} %{shift:5.1f} mm"
     )
-
-
-def _margin(margin: Margin) -> str:
-    unit = f" {margin.unit}" if margin.unit else ""
-    end = f"then {margin.fails}" if margin.fails else "nothing fails up to there"
-    return f"{margin.quantity:<28}{margin.nominal:9.4f} -> {margin.limit:9.4f}{unit}, {end}"

@@ -76,6 +76,17 @@ def build_cell_model(workcell: Workcell) -> CellModel:
     return CellModel(workcell, robots, geometry, branches, (first, second))
 
 
+def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
+    """Active pairs of one arm's bodies with anything but the other arm."""
+    own, other = (f"{geometry.workcell.robots[i].name}/" for i in (arm, 1 - arm))
+    return [
+        k
+        for k, names in enumerate(geometry.pair_names)
+        if any(name.startswith(own) for name in names)
+        and not any(name.startswith(other) for name in names)
+    ]
+
+
 def _own_clearance(
     geometry: CellGeometry, clearance: ca.Function, arm: int
 ) -> Callable[[Array, Array], float]:
@@ -83,13 +94,7 @@ def _own_clearance(
 
     The returned function takes box poses (n, 6) and the arm's joint positions (n, 6).
     """
-    own, other = (f"{geometry.workcell.robots[i].name}/" for i in (arm, 1 - arm))
-    rows = [
-        k
-        for k, names in enumerate(geometry.pair_names)
-        if any(name.startswith(own) for name in names)
-        and not any(name.startswith(other) for name in names)
-    ]
+    rows = own_pairs(geometry, arm)
 
     def least(poses: Array, path: Array) -> float:
         if not rows:

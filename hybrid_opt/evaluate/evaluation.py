@@ -103,6 +103,13 @@ class Evaluations:
         return Evaluations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 
+def concatenated(parts: list[Evaluations]) -> Evaluations:
+    """Several evaluations, at least one, in order as one."""
+    return Evaluations(
+        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evaluations)}
+    )
+
+
 class CandidateEvaluator:
     """Evaluates candidates of one workcell with a fixed selection of objectives.
 

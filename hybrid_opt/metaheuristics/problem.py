@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 from pymoo.core.problem import Problem
 
-from hybrid_opt.evaluate.evaluation import NOT_FINITE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluation import NOT_FINITE, REASONS, Evaluations, concatenated
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
@@ -60,13 +60,6 @@ def disarmed(evaluations: Evaluations) -> Evaluations:
         changed[name][broken] = 0.0
         changed[name][broken, REASONS.index(NOT_FINITE)] = 1.0
     return replace(evaluations, **changed)
-
-
-def concatenated(parts: list[Evaluations]) -> Evaluations:
-    """Several evaluations, at least one, in order as one."""
-    return Evaluations(
-        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evaluations)}
-    )
 
 
 class CarryProblem(Problem):  # type: ignore[misc]

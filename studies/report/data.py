@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt import carry as carries
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
@@ -115,7 +116,7 @@ class _CarryMaker:
         self.model = TimingModel(results.workcell)
 
     def carry(self, x: Array, label: str) -> Carry:
-        return carry_of(self.evaluator, self.model, x, label)
+        return shown(label, self.evaluator.carry(x))
 
     def balanced(self, front: Front, label: str) -> Carry:
         """The trajectory of least mean peak force of a front."""
@@ -137,12 +138,12 @@ def _timing(label: str, x: Array, model: TimingModel) -> TimedSelection:
     return TimedSelection(label, timed.report, timed.curve, timed.margins)
 
 
-def carry_of(evaluator: CandidateEvaluator, model: TimingModel, x: Array, label: str) -> Carry:
-    """One trajectory (n_var,) in detail."""
-    found = evaluator.evaluate(x[None])
-    timed = model.search_carry(x)
-    sensitivity = payload_sensitivity(timed)
-    return Carry(label, x, found.objectives[0], timed, sensitivity, bool(found.feasible[0]))
+def shown(label: str, carry: carries.Carry) -> Carry:
+    """A judged carry with what is drawn of it."""
+    judgement = carry.judgement
+    assert judgement is not None
+    objectives = np.array(list(judgement.objectives.values()))
+    return Carry(label, carry.x, objectives, carry, payload_sensitivity(carry), judgement.feasible)
 
 
 def _algorithm(

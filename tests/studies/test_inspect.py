@@ -12,7 +12,8 @@ from PIL import Image
 
 from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
 from studies.inspect import main
-from studies.inspection import Inspection, inspect, straight_line
+from studies.inspection import Inspection, inspect
+from symbolic.workcell.decision import straight_line
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
 from tests.studies.conftest import TRANSFER
@@ -79,6 +80,7 @@ def test_one_branch_of_each_arm_is_chosen(found: Inspection) -> None:
     assert set(found.branches) == {"north", "south"}
     for branches in found.branches.values():
         assert sum(branch.chosen for branch in branches) == 1
+        assert all(branch.clearance_mm >= 0.0 for branch in branches if branch.clearance_mm)
         assert branches[0].kept_samples == max(branch.kept_samples for branch in branches)
 
 
@@ -94,7 +96,7 @@ def test_the_straight_line_is_straight(transfer: Workcell) -> None:
     rack = load(RACK)
     for workcell in (transfer, rack):
         start, goal = workcell.task.waypoints[0].lower, workcell.task.waypoints[-1].lower
-        rows = straight_line(workcell).reshape(-1, 6)
+        rows = straight_line(workcell.task).reshape(-1, 6)
         fixed = [w.lower for w in workcell.task.waypoints[1:-1] if w.is_fixed]
         corners = [start, *fixed, goal]
         for row in rows:

@@ -1,0 +1,11 @@
+"""Look at a carry in three dimensions, in a page of its own."""
+
+from pathlib import Path
+
+import hybrid_opt as ho
+
+cell = ho.Cell.load("studies/workcells/rack.toml")
+carry = cell.carry(cell.initial)
+Path("out").mkdir(exist_ok=True)
+carry.view().save("out/view.html")
+print("open out/view.html in a browser; in a notebook, carry.view() is enough")

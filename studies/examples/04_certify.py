@@ -1,0 +1,11 @@
+"""Prove that a carry is free of collisions between its samples too."""
+
+import hybrid_opt as ho
+
+cell = ho.Cell.load("studies/workcells/rack.toml")
+certificate = cell.certify(cell.initial)
+print(certificate)
+print("free:", certificate.is_free, "- grid points:", certificate.points)
+lowered = cell.initial.copy()
+lowered[2::6] -= 0.1
+print(cell.carry(lowered).judgement)

@@ -1,0 +1,14 @@
+"""Select from a front: the balanced carry, or the one that spares a robot."""
+
+import numpy as np
+
+import hybrid_opt as ho
+
+cell = ho.Cell.load("studies/workcells/rack.toml")
+front = ho.search(cell, "nsga2", evaluations=1000, rng=np.random.default_rng(1))
+for name, carry in {
+    "balanced": front.balanced(),
+    "least force of the left robot": front.lowest_force(0),
+    "least force of the right robot": front.lowest_force(1),
+}.items():
+    print(f"{name}: {carry.peak_normal_force} N, {carry.excess_above_static} % above static")

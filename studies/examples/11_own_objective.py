@@ -1,0 +1,20 @@
+"""Search with an objective of one's own: the box's largest height, beside a robot's force."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+import hybrid_opt as ho
+
+
+def height(outputs: Mapping[str, np.ndarray], workcell: ho.Workcell) -> np.ndarray:
+    """Largest height of the box over the goal's, one value per candidate."""
+    goal = workcell.task.waypoints[-1].lower[2]
+    return np.asarray(outputs["pose"][:, :, 2].max(axis=1) / (2.0 * goal))
+
+
+low = ho.Objective("height", "largest height / twice the goal's", height)
+cell = ho.Cell.load("studies/workcells/rack.toml", objectives=("peak_force_1", low))
+front = ho.search(cell, "nsga2", evaluations=1000, rng=np.random.default_rng(1))
+print(front)
+print(front.lowest("height"))

@@ -1,0 +1,4 @@
+"""A way to learn the library: numbered programs of about ten lines. docs/library.md explains them.
+
+Run them from the repository's root, as `python studies/examples/01_evaluate.py`.
+"""

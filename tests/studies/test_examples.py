@@ -1,0 +1,82 @@
+"""The examples run, and docs/library.md and the README hold the same code."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = sorted((ROOT / "studies" / "examples").glob("[0-9]*.py"))
+NAMES = [path.name for path in EXAMPLES]
+
+SMALL = {
+    "evaluations=1000": "evaluations=120",
+    "evaluations=300": "evaluations=60",
+    "range(5)": "range(2)",
+    "cell.random(500": "cell.random(60",
+    "polish(cell, front, rng=rng)": (
+        "polish(cell, front, rng=rng, settings=ho.PolishSettings(points=2))"
+    ),
+    "curve_points=5": "curve_points=2",
+}
+"""What makes an example small enough for a test."""
+
+TEN_LINES = 12
+"""Lines that the way from a file to a robot's trajectory may take, imports included."""
+
+
+def code_of(path: Path) -> str:
+    """An example without its docstring."""
+    text = path.read_text("utf-8")
+    first = ast.parse(text).body[0]
+    assert first.end_lineno is not None
+    return "\n".join(text.splitlines()[first.end_lineno :]).strip()
+
+
+def blocks(page: str) -> list[str]:
+    """The Python code of a page."""
+    return [block.strip() for block in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=NAMES)
+def test_it_runs(
+    path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "studies").symlink_to(ROOT / "studies")
+    monkeypatch.chdir(tmp_path)
+    code = path.read_text("utf-8")
+    for full, small in SMALL.items():
+        code = code.replace(full, small)
+    exec(compile(code, str(path), "exec"), {"__name__": "__main__"})
+    assert capsys.readouterr().out or list((tmp_path / "out").iterdir())
+
+
+def test_the_library_page_holds_every_example_in_order() -> None:
+    page = (ROOT / "docs" / "library.md").read_text("utf-8")
+    assert blocks(page) == [code_of(path) for path in EXAMPLES]
+    assert re.findall(r"`studies/examples/(\d\d_\w+\.py)`", page) == NAMES
+
+
+def test_the_readme_shows_the_first() -> None:
+    assert code_of(EXAMPLES[0]) in blocks((ROOT / "README.md").read_text("utf-8"))
+
+
+def test_the_first_is_short_and_imports_one_thing_of_ours() -> None:
+    lines = [line for line in code_of(EXAMPLES[0]).splitlines() if line.strip()]
+    assert len(lines) <= TEN_LINES
+    assert [line for line in lines if "import" in line] == [
+        "import numpy as np",
+        "import hybrid_opt as ho",
+    ]
+
+
+def test_examples_are_numbered_and_short() -> None:
+    assert [int(name[:2]) for name in NAMES] == list(range(len(NAMES)))
+    for path in EXAMPLES:
+        assert len(code_of(path).splitlines()) <= 20
