@@ -91,6 +91,22 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
     return use / min(contact.friction for contact in workcell.contacts)
 
 
+def _robust_force(outputs: Outputs, workcell: Workcell) -> Array:
+    """Larger peak over the reference force of what the workcell's uncertainty asks of either arm.
+
+    Arm 1 leads, the force of arm 2 is commanded (`hybrid_opt.robust`).
+    """
+    # Only who asks for it pays for its compilation.
+    from hybrid_opt.robust.force import BoxMotion, robust_model
+
+    n, samples = outputs["pose"].shape[:2]
+    flat = [outputs[name].reshape(n * samples, 6) for name in ("pose", "rate", "second_rate")]
+    commanded, leading = robust_model(workcell).hold(BoxMotion(*flat), workcell.uncertainty)
+    both = np.stack([leading, commanded], axis=1).reshape(n, samples, 2)
+    uses: Array = both.max(axis=1) / workcell.task.reference_force
+    return np.asarray(uses.max(axis=1), dtype=float)
+
+
 def _time_average(values: Array, time: Array) -> Array:
     """Trapezoidal average over time; values and time (n, samples)."""
     integral = np.trapezoid(values, time, axis=1)
@@ -115,6 +131,7 @@ OBJECTIVES: dict[str, Objective] = {
         Objective("duration", "duration / twice the initial polygon's time", _duration),
         Objective("peak_torque_use", "peak joint torque / maximum", _peak_torque_use),
         Objective("force_imbalance", "peak |N1 - N2| / reference", _force_imbalance),
+        Objective("robust_force", "peak force that holds in all cases / reference", _robust_force),
         Objective("friction_use", "peak friction use at the reference squeeze", _friction_use),
     )
 }

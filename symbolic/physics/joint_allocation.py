@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import casadi as ca
 
@@ -28,14 +29,17 @@ STEPS = 26
 """Newton steps before the one that is differentiated."""
 
 FINAL_BARRIER = 1e-8
-"""Last weight of the barriers over the square of the force scale. The effort is above the least by
-at most twice both barriers' degrees times this: 1e-7 of it or so."""
+"""Last weight of the barriers over the objective, which ends above the least by at most twice the
+degree of a barrier times this: 6e-8 of it."""
 
 BARRIER_SHRINK = 0.2
 """Of the barriers' weight per step. Twice as fast, one case in some thousands leaves the central
 path so far that it does not come back in time."""
 
 STEP_SHARE = 0.9
+
+Objective = Literal["effort", "squeeze"]
+"""|f_1|^2 + |f_2|^2 or N_1 + N_2."""
 
 SCALE_FLOOR, START_FLOOR = 1e-9, 1e-3
 """Force scale [N] and squeeze over it to start from where nothing has to be carried."""
@@ -89,22 +93,37 @@ def allocate_jointly(balance: ca.MX, friction: ca.MX, radius: ca.MX) -> JointAll
         friction: (2,) Coulomb coefficients of the contacts.
         radius: (2,) radii of the patches [m].
     """
+    return _least(balance, friction, radius, "effort")
+
+
+def least_squeeze(balance: ca.MX, friction: ca.MX, radius: ca.MX) -> JointAllocation:
+    """As `allocate_jointly`, with the least N_1 + N_2 in place of the least effort.
+
+    The balance fixes N_1 - N_2, so that both are as small as they can be: with less of either no
+    pressure on the patches carries what is asked, with more of both some does.
+    """
+    return _least(balance, friction, radius, "squeeze")
+
+
+def _least(balance: ca.MX, friction: ca.MX, radius: ca.MX, objective: Objective) -> JointAllocation:
     scale = ca.sqrt(ca.sumsqr(balance[:3]) + ca.sumsqr(balance[3:5] / balance[8]) + SCALE_FLOOR**2)
     cell = (ca.vertcat(balance[:6] / scale, balance[6:]), friction, radius)
-    wrench = _central_path()(*cell)
-    wrench, _ = _newton_step()(wrench, FINAL_BARRIER, *cell)
+    wrench, _ = _newton_step(objective)(*_central_path(objective)(*cell), *cell)
     return JointAllocation(*_in_newtons()(wrench, scale, *cell))
 
 
 @cache
-def _central_path() -> ca.Function:
-    """Scaled wrench of contact 1 near the end of the central path, without derivatives."""
+def _central_path(objective: Objective) -> ca.Function:
+    """Scaled wrench of contact 1 and the barriers' weight near the end of the central path.
+
+    Its derivatives count as zero.
+    """
     cell = [ca.MX.sym(name, size) for name, size in CELL_SIZES]
-    wrench, barrier = _start()(*cell)
+    wrench, barrier = _start(objective)(*cell)
     for _ in range(STEPS):
-        wrench, barrier = _newton_step()(wrench, barrier, *cell)
-    constant = {"is_diff_in": [False] * len(cell), "is_diff_out": [False]}
-    return ca.Function("central_path", cell, [wrench], constant)
+        wrench, barrier = _newton_step(objective)(wrench, barrier, *cell)
+    constant = {"is_diff_in": [False] * len(cell), "is_diff_out": [False, False]}
+    return ca.Function("central_path", cell, [wrench, barrier], constant)
 
 
 def _both(wrench: ca.SX, cell: list[ca.SX]) -> tuple[ca.SX, ca.SX]:
@@ -124,18 +143,18 @@ def _both(wrench: ca.SX, cell: list[ca.SX]) -> tuple[ca.SX, ca.SX]:
 
 
 @cache
-def _newton_step() -> ca.Function:
+def _newton_step(objective: Objective) -> ca.Function:
     """wrench (6,), barrier's weight and the cell to the next wrench and weight."""
     wrench, barrier = ca.SX.sym("wrench", WRENCH_SIZE), ca.SX.sym("barrier")
     cell = [ca.SX.sym(name, size) for name, size in CELL_SIZES]
     friction = cell[1]
-    target = ca.fmax(BARRIER_SHRINK * barrier, FINAL_BARRIER)
     pair = _both(wrench, cell)
     forces = ca.vertcat(
         *[ca.vertcat(w[0], mu * w[1:3]) for w, mu in zip(pair, ca.vertsplit(friction), strict=True)]
     )
-    effort = ca.sumsqr(forces) / 2.0
-    gradient, hessian = ca.gradient(effort, wrench), ca.hessian(effort, wrench)[0]
+    least = ca.sumsqr(forces) / 2.0 if objective == "effort" else pair[0][0] + pair[1][0]
+    gradient, hessian = ca.gradient(least, wrench), ca.hessian(least, wrench)[0]
+    target = ca.fmax(BARRIER_SHRINK * barrier, FINAL_BARRIER * least)
     local = []
     for one in pair:
         change = ca.jacobian(one, wrench)
@@ -146,13 +165,13 @@ def _newton_step() -> ca.Function:
     direction = -ca.ldl_solve(gradient, *ca.ldl(hessian, False))
     # Along the step the cone's matrix has relative eigenvalues with this sum and sum of squares, so
     # that none is below their mean less sqrt(2) of their deviation (Samuelson's inequality).
-    least = []
+    lowest = []
     for change, slope, curvature in local:
         step = ca.mtimes(change, direction)
         mean = -ca.dot(slope, step) / 3.0
         variance = ca.dot(step, ca.mtimes(curvature, step)) / 3.0 - mean**2
-        least.append(mean - ca.sqrt(2.0 * ca.fmax(variance, 0.0)))
-    share = ca.fmin(1.0, STEP_SHARE / ca.fmax(-ca.fmin(*least), STEP_SHARE))
+        lowest.append(mean - ca.sqrt(2.0 * ca.fmax(variance, 0.0)))
+    share = ca.fmin(1.0, STEP_SHARE / ca.fmax(-ca.fmin(*lowest), STEP_SHARE))
     return ca.Function(
         "newton_step",
         [wrench, barrier, *cell],
@@ -161,7 +180,7 @@ def _newton_step() -> ca.Function:
 
 
 @cache
-def _start() -> ca.Function:
+def _start(objective: Objective) -> ca.Function:
     """A wrench well within both cones, from pressing hard, and the weight of its barriers."""
     balance, friction, radius = cell = [ca.SX.sym(name, size) for name, size in CELL_SIZES]
     by_friction, by_radius = friction[0] / ca.sum1(friction), radius[0] / ca.sum1(radius)
@@ -184,7 +203,8 @@ def _start() -> ca.Function:
     wrench = ca.vertcat(
         n_1, tangent / friction[0], moment / radius[0], by_twist * about_n / twist[0]
     )
-    return ca.Function("start", cell, [wrench, n_1**2 / BARRIER_DEGREE])
+    weight = n_1**2 if objective == "effort" else n_1
+    return ca.Function("start", cell, [wrench, weight / BARRIER_DEGREE])
 
 
 @cache

@@ -66,18 +66,38 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
         _check_overlap(workcell, problems)
 
 
+def pads_beside(workcell: Workcell) -> float:
+    """How far the contacts lie beside one another, seen along their normals [m]."""
+    apart = workcell.contacts[0].T_box_pad[:3, 3] - workcell.contacts[1].T_box_pad[:3, 3]
+    normal = workcell.contacts[0].T_box_pad[:3, 2]
+    return float(np.linalg.norm(apart - (apart @ normal) * normal))
+
+
 def _check_overlap(workcell: Workcell, problems: Problems) -> None:
     """The joint allocation carries any moment by pressing harder, which the patches' overlap,
     seen along the normal, makes possible."""
-    apart = workcell.contacts[0].T_box_pad[:3, 3] - workcell.contacts[1].T_box_pad[:3, 3]
-    normal = workcell.contacts[0].T_box_pad[:3, 2]
-    offset = float(np.linalg.norm(apart - (apart @ normal) * normal))
+    offset = pads_beside(workcell)
     room = sum(contact.patch_radius for contact in workcell.contacts)
     if offset >= PATCH_OVERLAP * room:
         problems.add(
             "contacts[1].xyz",
             f"faces a point {offset:g} m beside contacts[0]; task.allocation = 'joint' allows less "
             f"than {PATCH_OVERLAP:g} of both patch radii together, {PATCH_OVERLAP * room:g} m here",
+        )
+
+
+def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
+    """Displaced pads keep some of their patches, and these face one another."""
+    displaced = workcell.uncertainty.pad_position
+    if not displaced or not problems.clean("uncertainty", "contacts", "payload.size"):
+        return
+    radii = [contact.patch_radius for contact in workcell.contacts]
+    room = min(min(radii), (sum(radii) - pads_beside(workcell) / PATCH_OVERLAP) / 2.0)
+    if displaced >= room:
+        problems.add(
+            "uncertainty.pad_position",
+            f"found {displaced:g} m; allowed is less than {max(room, 0.0):g} m, beyond which "
+            "displaced patches need not face one another",
         )
 
 
@@ -206,6 +226,7 @@ def check_all(workcell: Workcell, problems: Problems) -> None:
         check_shapes,
         check_names,
         check_contacts,
+        check_uncertainty,
         check_references,
         check_speeds,
         check_reach,

@@ -16,6 +16,7 @@ from symbolic.workcell.records import Body, Mesh, Robot, Workcell
 from symbolic.workcell.robots import read_robot
 from symbolic.workcell.sections import read_body, read_collision, read_contact, read_payload
 from symbolic.workcell.task import read_task
+from symbolic.workcell.uncertainty import read_uncertainty
 
 Check = Callable[[Workcell], Iterable[str]]
 
@@ -60,6 +61,7 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     task = read_task(table.table("task"))
     environment = tuple(read_body(entry, folder) for entry in table.tables("environment"))
     collision = read_collision(table.table("collision", {}))
+    uncertainty = read_uncertainty(table.table("uncertainty", {}))
     table.close()
     if len(robots) != 2 or len(contacts) != 2:
         return None
@@ -80,6 +82,7 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
         start_branch=(robots[0][1], robots[1][1]),
         source=source,
         digest=identity,
+        uncertainty=uncertainty,
     )
     check_all(workcell, problems)
     return workcell

@@ -39,6 +39,10 @@ ANGULAR_ACCELERATION = Quantity("rad/s^2", 1e-3, 200.0, mistaken=(("deg/s^2", ma
 FRICTION = Quantity("", 1e-3, 5.0, mistaken=(("%", 1e-2),))
 PATCH_RADIUS = Quantity("m", 1e-4, 0.5, mistaken=_MILLIMETRES)
 
+SHARE = Quantity("", 0.0, 0.9, mistaken=(("%", 1e-2),))
+DISPLACEMENT = Quantity("m", 0.0, 0.5, mistaken=_MILLIMETRES)
+DISTURBANCE = Quantity("m/s^2", 0.0, 50.0, mistaken=(("mm/s^2", 1e-3),))
+
 JOINT_POSITION = Quantity("rad", -4 * math.pi, 4 * math.pi, mistaken=_DEGREES)
 LOCKED_POSITION = Quantity("rad or m", -4 * math.pi, 4 * math.pi)
 TORQUE = Quantity("N m", 1e-3, 1e5)

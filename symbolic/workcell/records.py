@@ -155,6 +155,36 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class Uncertainty:
+    """How far from its nominal value each quantity may be while the robots hold the box.
+
+    Attributes:
+        friction: share by which either coefficient may be lower or higher.
+        mass: share by which the mass may be lower or higher.
+        centre_of_mass: (3,) half the width of its range along the box axes [m].
+        pad_position: how far either pad may be displaced in its contact plane [m].
+        disturbance: (3,) largest acceleration of the box beside the motion's, along the world's
+            axes, either way [m/s^2].
+    """
+
+    friction: float = 0.0
+    mass: float = 0.0
+    centre_of_mass: Array = field(default_factory=lambda: np.zeros(3))
+    pad_position: float = 0.0
+    disturbance: Array = field(default_factory=lambda: np.zeros(3))
+
+    def scaled(self, factor: float) -> Uncertainty:
+        """All ranges times a factor."""
+        return Uncertainty(
+            factor * self.friction,
+            factor * self.mass,
+            factor * self.centre_of_mass,
+            factor * self.pad_position,
+            factor * self.disturbance,
+        )
+
+
+@dataclass(frozen=True)
 class Waypoint:
     """A pose of the box path: fixed where lower equals upper, otherwise free within them.
 
@@ -271,7 +301,7 @@ class Workcell:
     Attributes:
         name: title for reports.
         robots: the two arms; robot i holds contact i.
-        payload, contacts, task, environment, collision: see their records.
+        payload, contacts, task, environment, collision, uncertainty: see their records.
         start_branch: (2,) per robot the index of the start branch among the ranked branches,
             or -1 for the stated criterion's choice.
         source: the file it came from.
@@ -289,3 +319,4 @@ class Workcell:
     start_branch: tuple[int, int] = (-1, -1)
     source: Path = Path()
     digest: str = ""
+    uncertainty: Uncertainty = field(default_factory=Uncertainty)

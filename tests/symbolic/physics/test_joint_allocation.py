@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
@@ -12,7 +13,12 @@ from hypothesis import strategies as st
 
 from symbolic.array import Array
 from symbolic.physics.contact_forces import allocate
-from symbolic.physics.joint_allocation import allocate_jointly, balance_of
+from symbolic.physics.joint_allocation import (
+    JointAllocation,
+    allocate_jointly,
+    balance_of,
+    least_squeeze,
+)
 from tests.symbolic.physics.joint_oracle import Case, least_wrenches
 
 REGIMES = (
@@ -28,10 +34,10 @@ REGIMES = (
 )
 
 
-def _function() -> ca.Function:
+def _function(solve: Callable[..., JointAllocation]) -> ca.Function:
     force, moment, arms = ca.MX.sym("force", 3), ca.MX.sym("moment", 3), ca.MX.sym("arms", 3, 2)
     friction, radius = ca.MX.sym("friction", 2), ca.MX.sym("radius", 2)
-    held = allocate_jointly(balance_of(force, moment, (arms[:, 0], arms[:, 1])), friction, radius)
+    held = solve(balance_of(force, moment, (arms[:, 0], arms[:, 1])), friction, radius)
     columns = [
         ca.vertcat(held.tangent_1, held.normal[0], held.shift_1, held.torsion[0]),
         ca.vertcat(held.tangent_2, -held.normal[1], held.shift_2, held.torsion[1]),
@@ -40,7 +46,8 @@ def _function() -> ca.Function:
     return ca.Function("joint", inputs, [ca.horzcat(*columns)])
 
 
-FUNCTION = _function()
+FUNCTION = _function(allocate_jointly)
+SQUEEZE = _function(least_squeeze)
 
 
 def held(case: Case) -> tuple[Array, Array, Array]:
@@ -246,3 +253,37 @@ def test_nothing_to_carry_needs_next_to_nothing() -> None:
     forces, _, _ = held(nothing)
     assert np.isfinite(forces).all()
     assert np.abs(forces).max() < 1e-6
+
+
+def test_least_squeeze_agrees_with_clarabel() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        case = random_case(rng)
+        found: Array = np.array(
+            SQUEEZE(case.force, case.moment, case.arms.T, case.friction, case.radius)
+        )[2]
+        expected = least_wrenches(case, squeeze=True)[:, 2]
+        assert found[0] - found[1] == pytest.approx(expected[0] - expected[1], rel=1e-6)
+        assert found.sum() == pytest.approx(case.force[2], abs=1e-9)
+
+
+@given(seed=st.integers(0, 2**31), harder=st.floats(1.001, 10.0))
+@settings(max_examples=40, deadline=None)
+def test_what_holds_holds_when_pressed_harder(seed: int, harder: float) -> None:
+    """Squeezed along the line of the centres of pressure, the wrenches stay within the cones."""
+    case = random_case(np.random.default_rng(seed))
+    beside = (case.arms[0] - case.arms[1])[:2]
+    share = case.radius[:, None] / case.radius.sum() * np.outer([-1.0, 1.0], beside)
+    forces, shifts, torsion = held(case)
+    normal = forces[:, 2] * [1.0, -1.0]
+    squeeze = (harder - 1.0) * normal.max()
+    moved = (normal[:, None] * shifts + squeeze * share) / (normal + squeeze)[:, None]
+    about = _cross(shifts, forces) + torsion
+    pressed = np.column_stack([forces[:, :2], (normal + squeeze) * [1.0, -1.0]])
+    left = slack(case, pressed, moved, about - _cross(moved, forces))
+    assert min(left[0].min(), left[1].min()) > -1e-9
+
+
+def _cross(shifts: Array, forces: Array) -> Array:
+    """Moments (2,) about the normal of forces (2, 3) at shifts (2, 2)."""
+    return np.asarray(shifts[:, 0] * forces[:, 1] - shifts[:, 1] * forces[:, 0])

@@ -160,4 +160,11 @@ def cells(draw: st.DrawFn) -> dict[str, Any]:
     if draw(st.booleans()):
         ignored = {"first": "payload", "second": "one/link_6", "reason": "they touch"}
         data["collision"] = {"tolerance": draw(numbers(0, 0.05)), "ignored": [ignored]}
+    if draw(st.booleans()):
+        data["uncertainty"] = {
+            "friction": draw(numbers(0, 0.5)),
+            "mass": draw(numbers(0, 0.5)),
+            "centre_of_mass": draw(vectors(0, 0.1, 3)),
+            "disturbance": draw(vectors(0, 5.0, 3)),
+        }
     return data

@@ -78,6 +78,15 @@ def assert_same_cell(cell: Workcell, data: dict[str, Any]) -> None:
     assert [vars(pair) for pair in cell.collision.ignored] == collision.get("ignored", [])
 
 
+def assert_same_uncertainty(cell: Workcell, data: dict[str, Any]) -> None:
+    uncertainty, none = cell.uncertainty, np.zeros(3)
+    assert uncertainty.friction == data.get("friction", 0.0)
+    assert uncertainty.mass == data.get("mass", 0.0)
+    assert uncertainty.pad_position == 0.0
+    np.testing.assert_array_equal(uncertainty.centre_of_mass, data.get("centre_of_mass", none))
+    np.testing.assert_array_equal(uncertainty.disturbance, data.get("disturbance", none))
+
+
 def assert_same_task(cell: Workcell, data: dict[str, Any]) -> None:
     task = cell.task
     bounds = [(data["start"], data["start"])]
@@ -107,7 +116,9 @@ def assert_same_task(cell: Workcell, data: dict[str, Any]) -> None:
 @given(cells())
 def test_written_cells_are_read_back(data: dict[str, Any]) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        assert_same_cell(load(write(Path(folder), data)), data)
+        cell = load(write(Path(folder), data))
+    assert_same_cell(cell, data)
+    assert_same_uncertainty(cell, data.get("uncertainty", {}))
 
 
 @given(st.integers(0, 2), st.sampled_from([-1, 1]), numbers(-6, 6))

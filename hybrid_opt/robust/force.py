@@ -1,0 +1,256 @@
+"""The least commanded forces that hold for every case of a set, and what they cost.
+
+One arm leads: its pad keeps its place and presses as hard as the motion asks. The other is
+force-controlled: its normal force is commanded beforehand, the same in all cases. With N_1 - N_2
+fixed by the motion (and the case), the commanded force decides the squeeze.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from codegen.build import compile_function
+from codegen.cache import Cache
+from hybrid_opt.carry import Carry
+from hybrid_opt.robust.cases import nominal_case, random_cases, worst_cases
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.physics.case_squeeze import case_squeeze_function
+from symbolic.workcell.checks import PATCH_OVERLAP, pads_beside
+from symbolic.workcell.records import Uncertainty, Workcell
+
+BATCH = 100_000
+"""Samples that are evaluated at once."""
+
+BISECTIONS = 30
+LARGEST_FACTOR = 20.0
+"""The largest multiple of a set that is looked for."""
+
+HOLDS = 1e-6
+"""Excess over the commanded force that counts as rounding, as a share of it."""
+
+
+@dataclass(frozen=True)
+class BoxMotion:
+    """Box poses and their time derivatives at n samples, (n, 6) each."""
+
+    pose: Array
+    rate: Array
+    second_rate: Array
+
+
+Motion = BoxMotion | Carry
+"""What robust forces are asked for."""
+
+
+@dataclass(frozen=True)
+class RobustForce:
+    """Normal forces that hold for every case of a set; n samples.
+
+    Attributes:
+        leader: index of the arm that keeps its place.
+        uncertainty: the set.
+        nominal: (n, 2) least normal forces for the nominal case [N].
+        commanded: (n,) normal force of the force-controlled arm [N].
+        leading: (n,) largest normal force that the leading arm feels in any case [N].
+    """
+
+    leader: int
+    uncertainty: Uncertainty
+    nominal: Array
+    commanded: Array
+    leading: Array
+
+    @property
+    def peak(self) -> Array:
+        """(2,) largest normal force of each robot [N]."""
+        peaks = [float(self.commanded.max())] * 2
+        peaks[self.leader] = float(self.leading.max())
+        return np.array(peaks)
+
+
+@dataclass(frozen=True)
+class SampledCheck:
+    """Random cases under commanded forces.
+
+    Attributes:
+        cases: number of cases, each at all samples of the carry.
+        failing: how many of them the commanded force does not hold somewhere.
+        closest: largest share of the commanded force that any case needs.
+    """
+
+    cases: int
+    failing: int
+    closest: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether none slips and no centre of pressure leaves its patch."""
+        return self.failing == 0
+
+
+class RobustModel:
+    """The compiled function behind robust forces of one workcell's carries.
+
+    Attributes:
+        workcell: the cell.
+    """
+
+    def __init__(self, workcell: Workcell, cache: Cache | None = None) -> None:
+        """Load or build the compiled function.
+
+        Raises:
+            SettingsError: the pads do not face one another, so that some cases cannot be held.
+            DualArmError: the function cannot be built.
+        """
+        room = PATCH_OVERLAP * sum(contact.patch_radius for contact in workcell.contacts)
+        if pads_beside(workcell) >= room:
+            raise SettingsError(
+                f"the contacts lie {pads_beside(workcell):g} m beside one another; robust forces "
+                f"need less than {room:g} m, so that pressing harder holds whatever happens"
+            )
+        self.workcell = workcell
+        self._function = compile_function(case_squeeze_function(workcell), cache, lanes=0)
+
+    @property
+    def allowed_factor(self) -> float:
+        """Bound of the multiples of the workcell's set that leave friction and patches."""
+        return allowed_factor(self.workcell, self.workcell.uncertainty)
+
+    def least_squeeze(self, motion: Motion, cases: Array) -> Array:
+        """(k, n, 2) least normal forces [N] that hold each of k cases (k, 15) at n samples."""
+        n = len(motion.pose)
+        found = np.empty((len(cases), n, 2))
+        step = max(1, BATCH // n)
+        arrays = (motion.pose, motion.rate, motion.second_rate)
+        for start in range(0, len(cases), step):
+            some = cases[start : start + step]
+            repeated = [np.tile(values, (len(some), 1)) for values in arrays]
+            forces = self._function.batch(*repeated, np.repeat(some, n, axis=0))["normal_force"]
+            found[start : start + step] = forces.reshape(len(some), n, 2)
+        return found
+
+    def hold(
+        self, motion: Motion, uncertainty: Uncertainty, leader: int = 0
+    ) -> tuple[Array, Array]:
+        """Least normal force to command, and the largest that the leader then feels, (n,) [N].
+
+        Args:
+            leader: index of the arm that keeps its place.
+
+        Raises:
+            SettingsError: the set leaves no friction or patch, or there is no such arm.
+        """
+        if leader not in (0, 1):
+            raise SettingsError(f"leader {leader}: give 0 or 1, the index of an arm")
+        if not allowed_factor(self.workcell, uncertainty) > 1.0:
+            raise SettingsError(
+                "the uncertainty leaves no friction or no patch; make its shares or pad_position "
+                "smaller"
+            )
+        worst = self.least_squeeze(motion, worst_cases(self.workcell, uncertainty))
+        follower = 1 - leader
+        commanded = worst[:, :, follower].max(axis=0)
+        # The difference of both normal forces is the motion's, whatever the squeeze, and
+        # proportional to the mass.
+        difference = worst[:, :, leader] - worst[:, :, follower]
+        lighter = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass) * difference
+        return commanded, commanded + np.maximum(difference, lighter).max(axis=0)
+
+    def robust_force(
+        self, motion: Motion, uncertainty: Uncertainty | None = None, leader: int = 0
+    ) -> RobustForce:
+        """The least commanded forces that hold for every case.
+
+        Args:
+            uncertainty: the set; the workcell's by default.
+            leader: index of the arm that keeps its place.
+
+        Raises:
+            SettingsError: the set leaves no friction or patch, or there is no such arm.
+        """
+        chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
+        commanded, leading = self.hold(motion, chosen, leader)
+        nominal = self.least_squeeze(motion, nominal_case(self.workcell)[None])[0]
+        return RobustForce(leader, chosen, nominal, commanded, leading)
+
+    def check(
+        self, motion: Motion, force: RobustForce, n: int, rng: np.random.Generator
+    ) -> SampledCheck:
+        """Hold n random cases of the set against the commanded forces, at every sample."""
+        failing, closest, left = 0, 0.0, n
+        step = max(1, BATCH // len(motion.pose))
+        while left:
+            cases = random_cases(self.workcell, force.uncertainty, min(step, left), rng)
+            needed = self.least_squeeze(motion, cases)[:, :, 1 - force.leader]
+            share = (needed / force.commanded).max(axis=1)
+            failing += int((share > 1.0 + HOLDS).sum())
+            closest = max(closest, float(share.max()))
+            left -= len(cases)
+        return SampledCheck(n, failing, closest)
+
+    def price(self, motion: Motion, factors: Array, leader: int = 0) -> Array:
+        """(k, 2) peak normal forces [N] under the workcell's set times each factor (k,)."""
+        uncertainty = self.workcell.uncertainty
+        return np.array(
+            [self.robust_force(motion, uncertainty.scaled(f), leader).peak for f in factors]
+        )
+
+    def largest_factor(self, motion: Motion, limit: Array, leader: int = 0) -> float:
+        """Largest multiple of the workcell's set whose forces stay within limits (2,) [N].
+
+        Zero where the nominal forces exceed them, infinite where nothing is uncertain.
+        """
+        uncertainty = self.workcell.uncertainty
+        end = min(LARGEST_FACTOR, (1.0 - 1e-6) * self.allowed_factor)
+
+        def within(factor: float) -> bool:
+            peak = self.robust_force(motion, uncertainty.scaled(factor), leader).peak
+            return bool((peak <= limit).all())
+
+        if not within(0.0):
+            return 0.0
+        if within(end):
+            return end if end < LARGEST_FACTOR else float("inf")
+        low, high = 0.0, end
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2.0
+            low, high = (middle, high) if within(middle) else (low, middle)
+        return low
+
+
+def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
+    """Largest multiple of a set that leaves some friction and patches that face one another."""
+    radii = [contact.patch_radius for contact in workcell.contacts]
+    limits = [float("inf")]
+    limits += [1.0 / share for share in (uncertainty.friction, uncertainty.mass) if share > 0.0]
+    if uncertainty.pad_position > 0.0:
+        room = min(min(radii), (sum(radii) - pads_beside(workcell) / PATCH_OVERLAP) / 2.0)
+        limits.append(room / uncertainty.pad_position)
+    return min(limits)
+
+
+class _Identity:
+    """Lets a cache compare workcells by what they are, not by what they say."""
+
+    def __init__(self, workcell: Workcell) -> None:
+        self.workcell = workcell
+
+    def __hash__(self) -> int:
+        return id(self.workcell)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Identity) and self.workcell is other.workcell
+
+
+@lru_cache(maxsize=2)
+def _model(identity: _Identity) -> RobustModel:
+    return RobustModel(identity.workcell)
+
+
+def robust_model(workcell: Workcell) -> RobustModel:
+    """The model of a workcell, the same one for the same record."""
+    return _model(_Identity(workcell))

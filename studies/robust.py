@@ -1,0 +1,85 @@
+"""Forces that hold whatever the case: `python -m studies.robust FILE`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from hybrid_opt.cell import Cell
+from hybrid_opt.robust.force import RobustModel
+from hybrid_opt.store.trajectory_file import read_trajectory
+from symbolic.array import Array
+from symbolic.errors import DualArmError
+
+EXIT_DOES_NOT_HOLD = 1
+EXIT_BAD_INPUT = 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.robust",
+        description="The least commanded normal forces with which a stored trajectory holds for "
+        "every case of its workcell's [uncertainty], their price, the largest set that the "
+        "reference forces allow, and random cases. Exit code 1 where one of them fails.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("file", metavar="FILE", help="a trajectory file")
+    parser.add_argument(
+        "--leader", type=int, choices=(1, 2), default=1, help="the arm that keeps its place"
+    )
+    parser.add_argument("--cases", type=int, default=100_000, help="random cases to check")
+    parser.add_argument("--points", type=int, default=9, help="points of the price curve")
+    parser.add_argument("--seed", type=int, default=1, help="of the random cases")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Report one trajectory's robust forces; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        return _run(options)
+    except DualArmError as error:
+        print(error, file=sys.stderr)
+        return EXIT_BAD_INPUT
+
+
+def _run(options: argparse.Namespace) -> int:
+    stored = read_trajectory(options.file)
+    with TemporaryDirectory() as folder:
+        cell = Cell(stored.unpack(Path(folder)))
+        carry = cell.carry(stored.x)
+    model, leader = RobustModel(cell.workcell), options.leader - 1
+    limit = cell.workcell.task.reference_force
+    force = model.robust_force(carry, leader=leader)
+    factors = np.linspace(0.0, 2.0, options.points)
+    factors = factors[factors < model.allowed_factor]
+    price = model.price(carry, factors, leader)
+    largest = model.largest_factor(carry, limit, leader)
+    check = model.check(carry, force, options.cases, np.random.default_rng(options.seed))
+    print(f"{cell.workcell.name}: arm {options.leader} leads, the other's force is commanded")
+    print(f"  least peak forces, nothing uncertain {_both(force.nominal.max(axis=0))} N")
+    print(f"  peak forces that hold in all cases   {_both(force.peak)} N")
+    print(f"  reference forces                     {_both(limit)} N")
+    print(f"  they allow {largest:.3f} times the set")
+    print("\n  times the set   peak forces [N]")
+    for factor, peak in zip(factors, price, strict=True):
+        print(f"  {factor:13.2f}   {_both(peak)}")
+    verdict = "all hold" if check.holds else f"{check.failing} FAIL"
+    print(
+        f"\n  {check.cases} random cases (seed {options.seed}): {verdict}; the hardest needs "
+        f"{100.0 * check.closest:.2f} % of the commanded force"
+    )
+    return 0 if check.holds else EXIT_DOES_NOT_HOLD
+
+
+def _both(values: Array) -> str:
+    return " / ".join(f"{value:.2f}" for value in values)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

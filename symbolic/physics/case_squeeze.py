@@ -1,0 +1,85 @@
+"""The least squeeze that holds a moving box in one case of what is not exactly known.
+
+A case says what friction, mass, centre of mass, pad positions and disturbance really are. What is
+known of the payload's inertia is taken to hold about the nominal centre of mass, whatever the true
+one, and to grow with the mass: with it the required force and moment are affine in the centre of
+mass and in the disturbance, each for itself.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from symbolic.physics.joint_allocation import balance_of, least_squeeze
+from symbolic.physics.payload_load import resultant_force
+from symbolic.physics.pressure import required_moment
+from symbolic.physics.rotation import angular_acceleration, angular_velocity, rotation_matrix
+from symbolic.workcell.records import Workcell
+
+CASE_SIZES = {
+    "friction": 2,
+    "radius": 2,
+    "mass": 1,
+    "centre_of_mass": 3,
+    "disturbance": 3,
+    "displacement": 4,
+}
+"""Parts of a case, in order: coefficients; radii of the patches [m]; mass [kg]; centre of mass in
+the box frame [m]; acceleration beside the motion's, world frame [m/s^2]; displacements of both
+pads along the tangents of contact 1 [m]."""
+
+CASE_SIZE = sum(CASE_SIZES.values())
+
+
+def case_squeeze_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to normal_force (2,) [N].
+
+    With the least squeeze the patches can carry the case; with more they can, with less not.
+    """
+    motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.MX.sym("case", CASE_SIZE)
+    friction, radius, *_ = _parts(case)
+    held = least_squeeze(_balance_function(workcell)(*motion, case), friction, radius)
+    names = ["pose", "rate", "second_rate", "case"]
+    return ca.Function("case_squeeze", [*motion, case], [held.normal], names, ["normal_force"])
+
+
+def _parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
+    ends = [0]
+    for size in CASE_SIZES.values():
+        ends.append(ends[-1] + size)
+    return list(ca.vertsplit(case, ends))
+
+
+def _balance_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate and a case to what the contacts have to balance (9,)."""
+    pose, rate, second = motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.SX.sym("case", CASE_SIZE)
+    _, _, mass, centre, disturbance, displacement = _parts(case)
+    payload, contacts = workcell.payload, workcell.contacts
+    rotation = rotation_matrix(pose[3:])
+    omega = angular_velocity(pose[3:], rate[3:])
+    alpha = angular_acceleration(pose[3:], rate[3:], second[3:])
+    share = mass / payload.mass
+    nominal = ca.DM(payload.centre_of_mass)
+    pulled = second[:3] + disturbance
+
+    def resultant(offset: ca.SX | ca.DM) -> ca.SX:
+        return resultant_force(payload.mass, ca.mtimes(rotation, offset), omega, alpha, pulled)
+
+    # About the nominal centre of mass; the true one's distance turns the force on a mass there.
+    turning = required_moment(ca.SX(ca.DM(payload.inertia)), rotation, omega, alpha)
+    moment = turning + ca.cross(ca.mtimes(rotation, centre - nominal), resultant(nominal))
+    axes = ca.DM(contacts[0].T_box_pad[:3, :3])
+    to_pad = ca.mtimes(rotation, axes).T
+    arms = [
+        ca.mtimes(axes.T, ca.DM(contact.T_box_pad[:3, 3]) - nominal)
+        + ca.vertcat(displacement[2 * i : 2 * i + 2], 0.0)
+        for i, contact in enumerate(contacts)
+    ]
+    balance = balance_of(
+        share * ca.mtimes(to_pad, resultant(centre)),
+        share * ca.mtimes(to_pad, moment),
+        (arms[0], arms[1]),
+    )
+    return ca.Function("case_balance", [*motion, case], [balance])

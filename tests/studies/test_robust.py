@@ -1,0 +1,56 @@
+"""`python -m studies.robust`: forces for a stored trajectory's uncertainty."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_opt.store.trajectory_file import write_trajectory
+from studies.robust import main
+from symbolic.workcell.file import load
+from tests.symbolic.cells import RACK
+
+TABLE = """
+[uncertainty]
+friction = 0.10
+mass = 0.05
+centre_of_mass = [0.005, 0.005, 0.005]
+pad_position = 0.003
+disturbance = [0.2, 0.2, 0.2]
+"""
+
+
+def stored(folder: Path, table: str) -> Path:
+    text = RACK.read_text(encoding="utf-8").replace("../robots", str(RACK.parents[1] / "robots"))
+    cell = folder / "cell.toml"
+    cell.write_text(text + table, encoding="utf-8")
+    workcell = load(cell)
+    path = folder / "t.json"
+    write_trajectory(path, workcell, workcell.task.initial.reshape(-1), {}, {"algorithm": "hand"})
+    return path
+
+
+def test_tells_forces_price_and_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(stored(tmp_path, TABLE)), "--cases", "200", "--points", "3"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    nominal, robust = (np.array(line.split()[-4:-1:2], dtype=float) for line in lines[1:3])
+    assert (robust > 1.1 * nominal).all()
+    assert lines[7].split()[-3:] == lines[1].split()[-4:-1]
+    assert lines[8].split()[-3:] == lines[2].split()[-4:-1]
+    assert "200 random cases (seed 1): all hold" in lines[-1]
+
+
+def test_without_uncertainty_the_least_forces_hold(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(stored(tmp_path, "")), "--cases", "10", "--leader", "2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "arm 2 leads" in lines[0]
+    assert lines[1].split()[-4:] == lines[2].split()[-4:]
+
+
+def test_a_file_that_is_none_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "none.json")]) == 2
+    assert "none.json" in capsys.readouterr().err
