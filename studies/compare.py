@@ -17,10 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
+from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
+from hybrid_opt.store.json_records import to_json
 from studies.program import add_verbose, run_program
 from studies.summary import reference_front
 from studies.terminal_summary import title
@@ -83,6 +86,10 @@ def compare(first: Path, second: Path) -> Comparison:
     folders = (first, second)
     runs = tuple(read_campaign(folder) for folder in folders)
     summaries = tuple(read_summary(folder) for folder in folders)
+    for run in runs:
+        for replica in run.replicas:
+            # Told if it is damaged, as a later look at the same results would.
+            read_polished(run.root, replica, run.workcell)
     if runs[0].objectives != runs[1].objectives:
         raise ResultsError(
             f"{first} minimises {', '.join(runs[0].objectives)}, {second} "
@@ -100,7 +107,7 @@ def compare(first: Path, second: Path) -> Comparison:
     return Comparison(
         (str(first), str(second)),
         runs[0].workcell.digest == runs[1].workcell.digest,
-        tuple(_differences(runs[0].configuration, runs[1].configuration)),
+        tuple(_differences(*(to_json(run.configuration) for run in runs))),
         _with_holm(figures),
         tuple(  # type: ignore[arg-type]
             tuple(name for name in run.algorithms if name not in shared) for run in runs
@@ -111,18 +118,15 @@ def compare(first: Path, second: Path) -> Comparison:
 def _algorithm_figures(
     name: str,
     runs: tuple[CampaignResults, CampaignResults],
-    summaries: Sequence[Mapping[str, Any]],
+    summaries: Sequence[CampaignSummary],
     reference: Array,
 ) -> list[ComparedFigure]:
     columns = [[_searched(replica, reference) for replica in run.of(name)] for run in runs]
-    stored = [summary["algorithms"][name]["replicas"] for summary in summaries]
+    stored = [list(map(vars, summary.algorithms[name].replicas)) for summary in summaries]
     compared = []
     for figure in (*SEARCHED, *STORED):
         rows = columns if figure in SEARCHED else stored
-        values = [
-            np.array([np.nan if row[figure] is None else row[figure] for row in side], dtype=float)
-            for side in rows
-        ]
+        values = [np.array([row[figure] for row in side], dtype=float) for side in rows]
         known = all(np.isfinite(side).any() for side in values)
         labels = ("first", "second")
         compared.append(

@@ -13,10 +13,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,6 +30,8 @@ from hybrid_opt.campaign import (
 from hybrid_opt.campaign.layout import CONFIGURATION
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_summary
+from hybrid_opt.campaign.settings import SIZE_KEYS
+from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from studies.cli import Parser
@@ -94,30 +95,31 @@ def controls(
 
 
 def _settings(study: CampaignResults) -> CampaignSettings:
-    stored: Mapping[str, Any] = study.configuration["settings"]
+    stored = study.configuration.settings
     return CampaignSettings(
         algorithms=study.algorithms,
-        evaluations=int(stored["evaluations"]),
-        replicas=int(stored["replicas"]),
-        seed=int(stored["seed"]),
+        evaluations=stored.evaluations,
+        replicas=stored.replicas,
+        seed=stored.seed,
         objectives=study.objectives,
-        constraint_handling=stored["constraint_handling"],
-        first_generation=stored["first_generation"],
+        constraint_handling=stored.constraint_handling,
+        first_generation=stored.first_generation,
         populations=tuple(
-            (name, own.get("population", own.get("swarm")))
-            for name, own in stored["algorithms"].items()
-            if "population" in own or "swarm" in own
+            (name, own[key])
+            for name, own in stored.algorithms.items()
+            for key in SIZE_KEYS
+            if key in own
         ),
     )
 
 
-def _polish_cost(root: Path, summary: Mapping[str, Any]) -> int:
+def _polish_cost(root: Path, summary: CampaignSummary) -> int:
     """Candidate evaluations that take as long as the most expensive polish of the study."""
     costs = [
-        row["polished"]["equivalent_evaluations"]
-        for entry in summary["algorithms"].values()
-        for row in entry["replicas"]
-        if "polished" in row
+        row.polished.equivalent_evaluations
+        for entry in summary.algorithms.values()
+        for row in entry.replicas
+        if row.polished is not None
     ]
     if not costs:
         raise ResultsError(f"{root}: its fronts were not polished; run the study with --polish")
@@ -140,11 +142,11 @@ def _search(
 
 
 def _compare(
-    summary: Mapping[str, Any], longer: CampaignResults, name: str, rival: str, budget: int
+    summary: CampaignSummary, longer: CampaignResults, name: str, rival: str, budget: int
 ) -> Control:
-    rows = summary["algorithms"][name]["replicas"]
-    before = [row["hypervolume"] for row in rows]
-    after = [row["polished"]["hypervolume"] for row in rows]
+    rows = summary.algorithms[name].replicas
+    before = [row.hypervolume for row in rows]
+    after = [row.polished.hypervolume for row in rows if row.polished is not None]
     alone = [
         metrics.hypervolume(replica.front, metrics.REFERENCE_POINT) for replica in longer.of(rival)
     ]
@@ -193,7 +195,7 @@ def approaches(root: Path, reference: ReferenceFront) -> list[Approach]:
     for name in study.algorithms:
         searched, polished = [], []
         for replica in study.of(name):
-            after = read_polished(root, name, replica.replica)
+            after = read_polished(root, replica, study.workcell)
             if after is None:
                 raise ResultsError(f"{root}: replica {replica.replica} of {name} is not polished")
             searched.append(replica.front)

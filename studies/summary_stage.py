@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage
 from hybrid_opt.campaign.layout import (
@@ -16,11 +16,13 @@ from hybrid_opt.campaign.layout import (
 )
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.campaign.summary import ReplicaFigures
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.static_hold import static_hold
 from hybrid_opt.indicators.attainment import attainment_surfaces
 from hybrid_opt.indicators.selection import Selected, select
 from hybrid_opt.store.files import storing, write_atomically, write_json
+from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.summary import campaign_summary, polished_figures, reference_front, replica_figures
 from symbolic.array import Array
@@ -39,15 +41,13 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
     evaluator = CandidateEvaluator(folder.workcell, folder.settings.objectives)
     static = static_hold(folder.workcell)
     polished = {
-        (replica.algorithm, replica.replica): read_polished(
-            results.root, replica.algorithm, replica.replica
-        )
+        (replica.algorithm, replica.replica): read_polished(results.root, replica, results.workcell)
         for replica in results.replicas
     }
     fronts = [replica.front for replica in results.replicas]
     fronts += [found.objectives for found in polished.values() if found is not None]
     reference = reference_front(fronts)
-    entries: dict[str, list[dict[str, Any]]] = {name: [] for name in results.algorithms}
+    entries: dict[str, list[ReplicaFigures]] = {name: [] for name in results.algorithms}
     with progress.stage("summary", len(results.replicas), "replicas") as advance:
         for replica in results.replicas:
             key = replica.algorithm, replica.replica
@@ -59,7 +59,8 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
                 chosen = select(evaluator, front.x)
                 path = polished_selected_file(folder.root, *key)
                 file = _store_selected(folder, path, key, chosen)
-                entry["polished"] = polished_figures(front, reference, chosen, file)
+                figures = polished_figures(front, reference, chosen, file)
+                entry = replace(entry, polished=figures)
             entries[replica.algorithm].append(entry)
             advance(1)
     _write_points(folder, "reference", results.objectives, reference)
@@ -68,7 +69,8 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
         _write_points(folder, name, results.objectives, union)
         if len(results.objectives) in (2, 3):
             _write_attainment(folder, name, results)
-    write_json(folder.root / SUMMARY, campaign_summary(results, reference, static, entries))
+    summary = campaign_summary(results, reference, static, entries)
+    write_json(folder.root / SUMMARY, to_json(summary))
 
 
 def _store_selected(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+
+from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, StoredTest
 
 TITLES = {
     "nsga2": "NSGA-II",
@@ -52,37 +53,37 @@ def title(algorithm: str) -> str:
     return TITLES.get(algorithm, algorithm)
 
 
-def terminal_summary(summary: Mapping[str, Any], with_paper: bool) -> str:
+def terminal_summary(summary: CampaignSummary, with_paper: bool) -> str:
     """The figures of a summary.json as text.
 
     Args:
         summary: as from `hybrid_opt.campaign.results.read_summary`.
         with_paper: whether to print what the paper states, which is of its rack cell.
     """
-    settings = summary["settings"]
+    settings = summary.settings
     parts = [
-        f"{summary['workcell']['name']}: {settings['replicas']} replicas of "
-        f"{settings['evaluations']} evaluations, seed {settings['seed']}",
-        _table_1(summary["algorithms"]),
-        _reasons(summary["algorithms"]),
+        f"{summary.workcell.name}: {settings.replicas} replicas of "
+        f"{settings.evaluations} evaluations, seed {settings.seed}",
+        _table_1(summary.algorithms),
+        _reasons(summary.algorithms),
         _table_2(summary),
-        _over_replicas(summary["algorithms"]),
-        _polish(summary["algorithms"]),
-        _tests(summary["tests"]),
+        _over_replicas(summary.algorithms),
+        _polish(summary.algorithms),
+        _tests(summary.tests),
     ]
     if with_paper:
-        parts.append(_paper(summary["algorithms"]))
+        parts.append(_paper(summary.algorithms))
     return "\n\n".join(part for part in parts if part)
 
 
-def _table_1(algorithms: Mapping[str, Any]) -> str:
+def _table_1(algorithms: Mapping[str, AlgorithmFigures]) -> str:
     rows = [["mean ± std", *(heading for _, heading, _ in _TABLE_1)]]
     for name, entry in algorithms.items():
         cells = []
         for figure, _, digits in _TABLE_1:
             scale = 100.0 if figure == "feasible_share" else 1.0
-            statistics = entry["statistics"][figure]
-            mean, std = (_number(statistics[key], digits, scale) for key in ("mean", "std"))
+            found = entry.statistics[figure]
+            mean, std = (_number(value, digits, scale) for value in (found.mean, found.std))
             cells.append(f"{mean} ± {std}")
         rows.append([title(name), *cells])
     note = (
@@ -92,13 +93,13 @@ def _table_1(algorithms: Mapping[str, Any]) -> str:
     return f"Table 1. Quality of the search\n{_grid(rows)}\n{note}"
 
 
-def _reasons(algorithms: Mapping[str, Any]) -> str:
+def _reasons(algorithms: Mapping[str, AlgorithmFigures]) -> str:
     lines = ["What made candidates infeasible, in percent of all"]
     for name, entry in algorithms.items():
-        total = sum(row["evaluations"] for row in entry["replicas"])
+        total = sum(row.evaluations for row in entry.replicas)
         counts: dict[str, int] = {}
-        for row in entry["replicas"]:
-            for reason, count in row["infeasible_by_reason"].items():
+        for row in entry.replicas:
+            for reason, count in row.infeasible_by_reason.items():
                 counts[reason] = counts.get(reason, 0) + count
         ranked = sorted(counts.items(), key=lambda item: -item[1])
         shares = [f"{reason} {100.0 * count / total:.1f}" for reason, count in ranked]
@@ -106,81 +107,83 @@ def _reasons(algorithms: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _table_2(summary: Mapping[str, Any]) -> str:
+def _table_2(summary: CampaignSummary) -> str:
     heading = ["N", "least 1", "least 2", "peak 1", "peak 2", "above static %", "payload kg"]
     rows = [heading]
-    static = summary["static_hold"]
-    still = [_number(force, 2) for force in static["normal_force"]]
-    for name, entry in summary["algorithms"].items():
-        if entry["representative"] is None:
+    static = summary.static_hold
+    still = [_number(force, 2) for force in static.normal_force]
+    for name, entry in summary.algorithms.items():
+        row = entry.replicas[entry.representative or 0]
+        selected = row.selected
+        if entry.representative is None or selected is None:
             rows.append([f"{title(name)}: no feasible candidate", *[""] * (len(heading) - 1)])
             continue
-        row = entry["replicas"][entry["representative"]]
-        selected = row["selected"]
-        forces = [*selected["minimum_normal_force"], *selected["peak_normal_force"]]
+        forces = [*selected.minimum_normal_force, *selected.peak_normal_force]
         rows.append(
             [
-                f"{title(name)}, replica {entry['representative']}",
+                f"{title(name)}, replica {entry.representative}",
                 *(_number(force, 2) for force in forces),
-                _number(row["mean_excess_above_static"], 2),
-                _number(selected["payload_limit"], 2),
+                _number(row.mean_excess_above_static, 2),
+                _number(selected.payload_limit, 2),
             ]
         )
-    rows.append(["held still", *still, *still, "0.00", _number(static["payload_limit"], 2)])
+    rows.append(["held still", *still, *still, "0.00", _number(static.payload_limit, 2)])
     return (
         "Table 2. Normal forces of robots 1 and 2 along the selected trajectories (least mean "
         f"peak\nforce of the replica with the largest hypervolume)\n{_grid(rows)}"
     )
 
 
-def _over_replicas(algorithms: Mapping[str, Any]) -> str:
+def _over_replicas(algorithms: Mapping[str, AlgorithmFigures]) -> str:
     rows = [["median [quartiles]", *(heading for _, heading, _ in _SELECTED)]]
     for name, entry in algorithms.items():
         cells = []
         for figure, _, digits in _SELECTED:
-            keys = ("median", "quartile1", "quartile3")
-            values = [_number(entry["statistics"][figure][key], digits) for key in keys]
+            found = entry.statistics[figure]
+            three = (found.median, found.quartile1, found.quartile3)
+            values = [_number(value, digits) for value in three]
             cells.append("{} [{}, {}]".format(*values))
         rows.append([title(name), *cells])
     return f"Selected solutions of all replicas, and what a replica took\n{_grid(rows)}"
 
 
-def _polish(algorithms: Mapping[str, Any]) -> str:
+def _polish(algorithms: Mapping[str, AlgorithmFigures]) -> str:
     """What the polish made of the fronts; nothing without one."""
-    polished = {name: entry for name, entry in algorithms.items() if "polished" in entry}
-    if not polished:
-        return ""
     head = ["median", "HV before", "HV after", "better in", "above static %", "payload kg"]
     rows = [[*head, "seconds", "= evaluations"]]
-    for name, entry in polished.items():
-        after = entry["polished"]["statistics"]
+    for name, entry in algorithms.items():
+        if entry.polished is None:
+            continue
+        after = entry.polished.statistics
         rows.append(
             [
                 title(name),
-                _number(entry["statistics"]["hypervolume"]["median"], 5),
-                _number(after["hypervolume"]["median"], 5),
-                f"{entry['polished']['replicas_improved']} of {len(entry['replicas'])}",
-                _number(after["mean_excess_above_static"]["median"], 2),
-                _number(after["payload_limit"]["median"], 3),
-                _number(after["seconds"]["median"], 2),
-                _number(after["equivalent_evaluations"]["median"], 0),
+                _number(entry.statistics["hypervolume"].median, 5),
+                _number(after["hypervolume"].median, 5),
+                f"{entry.polished.replicas_improved} of {len(entry.replicas)}",
+                _number(after["mean_excess_above_static"].median, 2),
+                _number(after["payload_limit"].median, 3),
+                _number(after["seconds"].median, 2),
+                _number(after["equivalent_evaluations"].median, 0),
             ]
         )
+    if len(rows) == 1:
+        return ""
     return f"Fronts after the polish, and what it took\n{_grid(rows)}"
 
 
-def _tests(tests: Sequence[Mapping[str, Any]]) -> str:
+def _tests(tests: Sequence[StoredTest]) -> str:
     if not tests:
         return ""
     rows = [["exact Mann-Whitney", "figure", "A12", "effect", "p", "p (Holm)"]]
     rows += [
         [
-            f"{title(test['first'])} / {title(test['second'])}",
-            test["figure"],
-            _number(test["a12"], 2),
-            test["magnitude"],
-            _number(test["p"], 5),
-            _number(test["p_holm"], 5),
+            f"{title(test.first)} / {title(test.second)}",
+            test.figure,
+            _number(test.a12, 2),
+            test.magnitude,
+            _number(test.p, 5),
+            _number(test.p_holm, 5),
         ]
         for test in tests
     ]
@@ -190,13 +193,13 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def _paper(algorithms: Mapping[str, Any]) -> str:
+def _paper(algorithms: Mapping[str, AlgorithmFigures]) -> str:
     rows = [["median of ours / stated by the paper", "feasible %", "payload kg"]]
     for name, stated in PAPER.items():
         if name in algorithms:
-            statistics = algorithms[name]["statistics"]
-            share = _number(statistics["feasible_share"]["median"], 1, 100.0)
-            payload = _number(statistics["payload_limit"]["median"], 2)
+            statistics = algorithms[name].statistics
+            share = _number(statistics["feasible_share"].median, 1, 100.0)
+            payload = _number(statistics["payload_limit"].median, 2)
             rows.append(
                 [
                     title(name),

@@ -8,14 +8,15 @@ interrupted one repeats none.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.documents import FrontPoint, PolishDocument, PolishEffort
 from hybrid_opt.campaign.execution import executor_for
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.identity import identity, replica_identity
@@ -36,7 +37,8 @@ from hybrid_opt.polishing.records import (
     outcome_from_json,
     outcome_to_json,
 )
-from hybrid_opt.store.files import read_json, write_json
+from hybrid_opt.store.files import write_json
+from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.work.job import Job, give_up
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
@@ -126,36 +128,43 @@ class PolishedReplica:
         x: (k, n_var) non-dominated decision vectors, by increasing first objective.
         objectives: (k, 2).
         polished: (k,) whether the polish made the point.
-        figures: attempts by status and reason, success share, seconds, equivalent evaluations,
-            and residuals, as in `polish.json`.
+        figures: what it took.
     """
 
     x: Array
     objectives: Array
     polished: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    figures: dict[str, Any]
+    figures: PolishEffort
 
 
-def read_polished(root: Path, algorithm: str, replica: int) -> PolishedReplica | None:
+def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedReplica | None:
     """The polished front of a replica; None where it was not polished.
 
     Raises:
         ResultsError: the file is damaged.
     """
-    path = polished_folder(root, algorithm, replica) / POLISH
+    path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
     if not path.exists():
         return None
-    document = read_json(path)
-    try:
-        front = document["front"]
-        found = PolishedReplica(
-            np.array([point["x"] for point in front], dtype=float),
-            np.array([point["objectives"] for point in front], dtype=float).reshape(-1, 2),
-            np.array([point["polished"] for point in front], dtype=np.bool_),
-            document["figures"],
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise ResultsError(f"{path}: damaged ({error!r}); delete it to polish again") from error
+    remedy = "delete it to polish again"
+    document = read_record(PolishDocument, path, remedy)
+    task, front = workcell.task, document.front
+    if bool(front) != bool(len(replica.front)):
+        raise ResultsError(f"{path}: damaged at front: found {len(front)} points; {remedy}")
+    for k, point in enumerate(front):
+        if len(point.x) != task.n_var:
+            problem = f"found {len(point.x)} numbers; allowed are {task.n_var}"
+        elif np.any(point.x < task.lower) or np.any(point.x > task.upper):
+            problem = "is outside of the decision variables' bounds"
+        else:
+            continue
+        raise ResultsError(f"{path}: damaged at front[{k}].x: {problem}; {remedy}")
+    found = PolishedReplica(
+        np.array([point.x for point in front]).reshape(-1, task.n_var),
+        np.array([point.objectives for point in front]).reshape(-1, 2),
+        np.array([point.polished for point in front], dtype=np.bool_),
+        document.figures,
+    )
     for array in (found.x, found.objectives, found.polished):
         array.setflags(write=False)
     return found
@@ -234,43 +243,38 @@ class _Polish:
 
     def answered(self, index: int, answer: PolishedFront) -> None:
         """See `hybrid_opt.work.job.Ledger`."""
-        write_json(self._marker(self._open[index]), polish_document(answer))
+        write_json(self._marker(self._open[index]), to_json(polish_document(answer)))
         self._journals.pop(index).discard()
         self._advance(1)
 
 
-def polish_document(front: PolishedFront) -> dict[str, Any]:
-    """A polished front as JSON values."""
+def polish_document(front: PolishedFront) -> PolishDocument:
+    """A polished front as it is stored."""
     accepted = [outcome for outcome in front.outcomes if outcome.status == "accepted"]
-    return {
-        "front": [
-            {"objectives": values, "x": x, "parent": parent, "polished": polished}
-            for values, x, parent, polished in zip(
-                front.objectives.tolist(),
-                front.x.tolist(),
-                front.parent.tolist(),
-                front.polished.tolist(),
-                strict=True,
-            )
-        ],
-        "figures": {
-            "attempts": len(front.outcomes),
-            "counts": front.counts,
-            "success_share": front.success_share if np.isfinite(front.success_share) else None,
-            "seconds": front.seconds,
-            "median_attempt_seconds": _median([o.seconds for o in front.outcomes]),
-            "equivalent_evaluations": front.equivalent_evaluations,
-            "worst_stationarity": _worst([o.residuals.stationarity for o in accepted]),
-            "worst_feasibility": _worst([o.residuals.feasibility for o in accepted]),
-            "median_stationarity": _median([o.residuals.stationarity for o in accepted]),
-        },
-        "attempts": [outcome_to_json(outcome) for outcome in front.outcomes],
-    }
+    points = zip(front.objectives, front.x, front.parent, front.polished, strict=True)
+    return PolishDocument(
+        front=tuple(
+            FrontPoint(objectives, x, int(parent), bool(polished))
+            for objectives, x, parent, polished in points
+        ),
+        figures=PolishEffort(
+            attempts=len(front.outcomes),
+            counts=front.counts,
+            success_share=front.success_share,
+            seconds=front.seconds,
+            median_attempt_seconds=_median([o.seconds for o in front.outcomes]),
+            equivalent_evaluations=front.equivalent_evaluations,
+            worst_stationarity=_worst([o.residuals.stationarity for o in accepted]),
+            worst_feasibility=_worst([o.residuals.feasibility for o in accepted]),
+            median_stationarity=_median([o.residuals.stationarity for o in accepted]),
+        ),
+        attempts=tuple(outcome_to_json(outcome) for outcome in front.outcomes),
+    )
 
 
-def _median(values: list[float]) -> float | None:
-    return float(np.median(values)) if values else None
+def _median(values: list[float]) -> float:
+    return float(np.median(values)) if values else math.nan
 
 
-def _worst(values: list[float]) -> float | None:
-    return max(values) if values else None
+def _worst(values: list[float]) -> float:
+    return max(values, default=math.nan)

@@ -6,27 +6,29 @@ written. docs/results.md describes the folder.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_opt.campaign.documents import Configuration, FinishedReplica
 from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode
 from hybrid_opt.campaign.identity import FORMAT, VERSION
 from hybrid_opt.campaign.layout import (
     CONFIGURATION,
     DONE,
     EVALUATIONS,
+    STAGES,
     SUMMARY,
     replica_folder,
 )
 from hybrid_opt.campaign.replica import front_rows
+from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import Evaluations
 from hybrid_opt.store.files import read_bytes, read_json, sha256
+from hybrid_opt.store.json_records import from_json, read_record
 from symbolic.array import Array
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
@@ -71,16 +73,23 @@ class CampaignResults:
         root: the results folder.
         configuration: what is in its configuration.json.
         workcell: as read from the folder's copy.
-        algorithms, objectives: names, in order.
         replicas: of all algorithms, by algorithm and number.
     """
 
     root: Path
-    configuration: Mapping[str, Any]
+    configuration: Configuration
     workcell: Workcell
-    algorithms: tuple[str, ...]
-    objectives: tuple[str, ...]
     replicas: tuple[Replica, ...]
+
+    @property
+    def algorithms(self) -> tuple[str, ...]:
+        """Names, in order."""
+        return tuple(self.configuration.settings.algorithms)
+
+    @property
+    def objectives(self) -> tuple[str, ...]:
+        """Names, in order."""
+        return self.configuration.settings.objectives
 
     def of(self, algorithm: str) -> tuple[Replica, ...]:
         """The replicas of one algorithm."""
@@ -96,55 +105,51 @@ def read_campaign(root: str | Path) -> CampaignResults:
     """
     root = Path(root)
     configuration = read_configuration(root)
-    try:
-        algorithms = tuple(configuration["settings"]["algorithms"])
-        objectives = tuple(configuration["settings"]["objectives"])
-        count = int(configuration["settings"]["replicas"])
-        file, digest = (configuration["workcell"][key] for key in ("file", "digest"))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ResultsError(f"{root / CONFIGURATION}: damaged ({error!r})") from error
-    path = (root / str(file)).resolve()
+    settings = configuration.settings
+    path = (root / configuration.workcell.file).resolve()
     if not path.is_relative_to(root.resolve()):
         raise ResultsError(f"{root / CONFIGURATION}: names a workcell outside of the folder")
     workcell = load(path)
-    if workcell.digest != digest:
+    if workcell.digest != configuration.workcell.digest:
         raise ResultsError(f"{path}: was changed after the campaign began")
     replicas = tuple(
-        read_replica(root, algorithm, number, objectives)
-        for algorithm in algorithms
-        for number in range(count)
+        read_replica(root, algorithm, number, settings.objectives)
+        for algorithm in settings.algorithms
+        for number in range(settings.replicas)
     )
-    return CampaignResults(root, configuration, workcell, algorithms, objectives, replicas)
+    return CampaignResults(root, configuration, workcell, replicas)
 
 
-def read_configuration(root: str | Path) -> Mapping[str, Any]:
+def read_configuration(root: str | Path) -> Configuration:
     """The configuration of a campaign.
 
     Raises:
-        ResultsError: the folder holds none, or one of another version.
+        ResultsError: the folder holds none, a damaged one, or one of another version.
     """
     path = Path(root) / CONFIGURATION
     if not path.exists():
         raise ResultsError(f"{root}: is no results folder, {CONFIGURATION} is missing")
-    configuration = read_json(path)
-    if not isinstance(configuration, dict) or configuration.get("format") != FORMAT:
+    document = read_json(path)
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ResultsError(f"{path}: `format` is not {FORMAT!r}")
-    if configuration.get("version") != VERSION:
+    if document.get("version") != VERSION:
         raise ResultsError(
-            f"{path}: version {configuration.get('version')!r}; this program reads {VERSION}"
+            f"{path}: version {document.get('version')!a}; this program reads {VERSION}"
         )
-    return configuration
+    return from_json(Configuration, document, path, "run the study again into another --output")
 
 
-def read_summary(root: str | Path) -> Mapping[str, Any]:
+def read_summary(root: str | Path) -> CampaignSummary:
     """The figures of summary.json.
 
     Raises:
-        ResultsError: it is missing or damaged.
+        ResultsError: it is missing, damaged, or not that of the campaign.
     """
-    summary = read_json(Path(root) / SUMMARY)
-    if not isinstance(summary, dict):
-        raise ResultsError(f"{Path(root) / SUMMARY}: damaged, not an object")
+    path = Path(root) / SUMMARY
+    remedy = f"delete {STAGES}/summary.json in its folder and continue the study with --resume"
+    summary = read_record(CampaignSummary, path, remedy)
+    if summary.settings != read_configuration(root).settings:
+        raise ResultsError(f"{path}: damaged: is that of another campaign; {remedy}")
     return summary
 
 
@@ -160,21 +165,16 @@ def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str,
             f"{folder}: {algorithm} replica {number} is not finished; continue the campaign with "
             "--resume"
         )
-    marker = read_json(folder / DONE)
+    marker = read_record(FinishedReplica, folder / DONE, "delete it and continue with --resume")
     content = read_bytes(folder / EVALUATIONS)
-    try:
-        intact = sha256(content) == marker["sha256"][EVALUATIONS]
-        seconds = float(marker["seconds"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ResultsError(f"{folder / DONE}: damaged ({error!r})") from error
-    if not intact:
+    if marker.sha256.get(EVALUATIONS) != sha256(content):
         raise ResultsError(
             f"{folder / EVALUATIONS}: damaged, its checksum differs; --resume computes it anew"
         )
     table = decode(content, folder / EVALUATIONS)
     if table.objective_names != objectives:
         raise ResultsError(f"{folder / EVALUATIONS}: holds other objectives than the campaign")
-    return _replica(algorithm, number, table, seconds)
+    return _replica(algorithm, number, table, marker.seconds)
 
 
 def _replica(algorithm: str, number: int, table: EvaluationTable, seconds: float) -> Replica:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.documents import FinishedReplica
 from hybrid_opt.campaign.execution import executor_for
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.identity import identity, replica_identity
@@ -17,7 +18,8 @@ from hybrid_opt.campaign.replica import (
     run_replica,
 )
 from hybrid_opt.campaign.stages import Stage
-from hybrid_opt.store.files import read_json, sha256, write_atomically, write_json
+from hybrid_opt.store.files import sha256, write_atomically, write_json
+from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.work.job import Executor, Job, give_up
 
 
@@ -75,10 +77,11 @@ class _Search:
         folder = replica_folder(self._folder.root, algorithm, replica)
         if not (folder / DONE).exists():
             return False
-        marker = read_json(folder / DONE)
+        remedy = "delete it to compute the replica anew"
+        marker = read_record(FinishedReplica, folder / DONE, remedy)
         return all(
             (folder / name).exists() and sha256((folder / name).read_bytes()) == digest
-            for name, digest in marker["sha256"].items()
+            for name, digest in marker.sha256.items()
         )
 
     def _begin(self, index: int) -> int:
@@ -127,14 +130,7 @@ class _Search:
         for name, content in files.items():
             write_atomically(folder / name, content)
         # Written last: with it, the replica is done.
-        write_json(
-            folder / DONE,
-            {
-                "algorithm": algorithm,
-                "replica": replica,
-                "evaluations": answer.count,
-                "seconds": answer.seconds,
-                "sha256": {name: sha256(content) for name, content in files.items()},
-            },
-        )
+        checksums = {name: sha256(content) for name, content in files.items()}
+        done = FinishedReplica(algorithm, replica, answer.count, answer.seconds, checksums)
+        write_json(folder / DONE, to_json(done))
         self._journals.pop(index).discard()

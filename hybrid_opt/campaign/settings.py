@@ -16,7 +16,7 @@ from symbolic.errors import SettingsError
 FirstGeneration = Literal["initial", "random"]
 """'initial': uniformly random but for the workcell's hand-made trajectory; 'random': all."""
 
-_SIZE_KEYS = ("population", "swarm", "batch")
+SIZE_KEYS = ("population", "swarm", "batch")
 """How the algorithms' settings call the candidates of one generation."""
 
 
@@ -82,7 +82,7 @@ class CampaignSettings:
         if size is None:
             return {}
         known = {field.name for field in fields(metaheuristics.settings_of(algorithm))}
-        return {key: size for key in _SIZE_KEYS if key in known}
+        return {key: size for key in SIZE_KEYS if key in known}
 
     def starts_from_initial(self, algorithm: str) -> bool:
         """Whether an algorithm's first generation holds the hand-made trajectory."""

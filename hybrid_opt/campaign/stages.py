@@ -14,11 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hybrid_opt.campaign.documents import StageMark, StageStatus
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.layout import STAGES
 from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.files import read_json, write_json
+from hybrid_opt.store.files import write_json
+from hybrid_opt.store.json_records import read_record, to_json
 
 
 @dataclass(frozen=True)
@@ -47,13 +49,13 @@ def run_stages(folder: CampaignFolder, stages: Sequence[Stage], progress: Progre
         _check_settings(folder, stage)
     for number, stage in enumerate(stages):
         marker = _marker(folder, stage)
-        if marker.get("status") == "done":
+        if _is_done(marker):
             continue
         # First of all, so that no moment exists at which they look done and are out of date.
         for later in stages[number + 1 :]:
-            if _marker(folder, later).get("status") == "done":
+            if _is_done(_marker(folder, later)):
                 _mark(folder, later, "outdated", 0.0)
-        spent = float(marker["seconds"]) if marker.get("status") == "running" else 0.0
+        spent = marker.seconds if marker is not None and marker.status == "running" else 0.0
         _mark(folder, stage, "running", spent)
         begin = time.perf_counter()
         try:
@@ -68,26 +70,26 @@ def _path(folder: CampaignFolder, stage: Stage) -> Path:
     return folder.root / STAGES / f"{stage.name}.json"
 
 
-def _marker(folder: CampaignFolder, stage: Stage) -> dict[str, Any]:
-    """What is remembered of a stage; empty where it never began."""
+def _marker(folder: CampaignFolder, stage: Stage) -> StageMark | None:
+    """What is remembered of a stage; None where it never began."""
     path = _path(folder, stage)
-    if not path.exists():
-        return {}
-    marker = read_json(path)
-    if not isinstance(marker, dict) or not {"status", "settings", "seconds"} <= marker.keys():
-        raise ResultsError(f"{path}: damaged; delete it to run the stage again")
-    return marker
+    return (
+        read_record(StageMark, path, "delete it to run the stage again") if path.exists() else None
+    )
 
 
-def _mark(folder: CampaignFolder, stage: Stage, status: str, seconds: float) -> None:
-    document = {"status": status, "settings": dict(stage.settings), "seconds": seconds}
-    write_json(_path(folder, stage), document)
+def _is_done(marker: StageMark | None) -> bool:
+    return marker is not None and marker.status == "done"
+
+
+def _mark(folder: CampaignFolder, stage: Stage, status: StageStatus, seconds: float) -> None:
+    write_json(_path(folder, stage), to_json(StageMark(status, dict(stage.settings), seconds)))
 
 
 def _check_settings(folder: CampaignFolder, stage: Stage) -> None:
     marker = _marker(folder, stage)
-    if marker and marker["settings"] != dict(stage.settings):
+    if marker is not None and marker.settings != dict(stage.settings):
         raise ResultsError(
-            f"{folder.root}: the stage '{stage.name}' was run with {marker['settings']}, now asked "
+            f"{folder.root}: the stage '{stage.name}' was run with {marker.settings}, now asked "
             f"for is {dict(stage.settings)}; choose another --output"
         )

@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from hybrid_opt.errors import ResultsError
 from symbolic import outside
@@ -84,6 +84,10 @@ def read_json(path: Path) -> Any:
         return outside.json_value(read_bytes(path))
     except OutsideError as error:
         raise ResultsError(f"{path}: damaged ({error})") from error
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no number of JSON")
 
 
 def read_bytes(path: Path) -> bytes:

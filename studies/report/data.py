@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from hybrid_opt import carry as carries
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
+from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, ReplicaFigures
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.selection import balanced, peak_normal_forces
@@ -92,10 +93,10 @@ def gather_carries(root: Path) -> tuple[CellGeometry, tuple[Carry, ...]]:
 
 
 def _algorithms(
-    results: CampaignResults, summary: Mapping[str, Any], maker: _CarryMaker
+    results: CampaignResults, summary: CampaignSummary, maker: _CarryMaker
 ) -> tuple[AlgorithmRuns, ...]:
     return tuple(
-        _algorithm(index, name, results, summary["algorithms"][name], maker)
+        _algorithm(index, name, results, summary.algorithms[name], maker)
         for index, name in enumerate(results.algorithms)
     )
 
@@ -150,15 +151,14 @@ def _algorithm(
     index: int,
     name: str,
     results: CampaignResults,
-    entry: Mapping[str, Any],
+    entry: AlgorithmFigures,
     maker: _CarryMaker,
 ) -> AlgorithmRuns:
     runs = tuple(
-        _run(results.root, replica, figures)
-        for replica, figures in zip(results.of(name), entry["replicas"], strict=True)
+        _run(results, replica, figures)
+        for replica, figures in zip(results.of(name), entry.replicas, strict=True)
     )
-    known = entry["representative"]
-    representative = 0 if known is None else int(known)
+    representative = entry.representative or 0
     front, hybrid = runs[representative].front, runs[representative].hybrid
     return AlgorithmRuns(
         name=name,
@@ -173,16 +173,15 @@ def _algorithm(
     )
 
 
-def _run(root: Path, replica: Replica, figures: Mapping[str, Any]) -> Run:
+def _run(results: CampaignResults, replica: Replica, figures: ReplicaFigures) -> Run:
     front = Front(replica.front_x, replica.front)
-    polished = read_polished(root, replica.algorithm, replica.replica)
+    polished = read_polished(results.root, replica, results.workcell)
     hybrid = None if polished is None else Front(polished.x, polished.objectives)
-    after = figures.get("polished", {})
-    return Run(replica.replica, replica.evaluations, front, hybrid, figures, after)
+    return Run(replica.replica, replica.evaluations, front, hybrid, figures, figures.polished)
 
 
-def _static(results: CampaignResults, summary: Mapping[str, Any]) -> Array:
+def _static(results: CampaignResults, summary: CampaignSummary) -> Array:
     """Objectives of the level payload at rest."""
-    still = np.array(summary["static_hold"]["normal_force"]) / np.array(summary["reference_force"])
+    still = summary.static_hold.normal_force / summary.reference_force
     known = dict(zip(PAPER_OBJECTIVES, still, strict=True))
     return np.array([known.get(name, np.nan) for name in results.objectives])

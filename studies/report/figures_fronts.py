@@ -151,8 +151,8 @@ def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns], figure: str) -> Non
     for k, algorithm in enumerate(algorithms):
         look = series(k)
         for run in algorithm.runs:
-            if figure in run.hybrid_figures:
-                values = [run.figures[figure], run.hybrid_figures[figure]]
+            if run.hybrid_figures is not None:
+                values = [getattr(run.figures, figure), getattr(run.hybrid_figures, figure)]
                 axes.plot(
                     [3 * k, 3 * k + 1],
                     values,

@@ -124,7 +124,7 @@ def indicators(data: ReportData) -> Figure:
     ):
         for k, algorithm in enumerate(data.algorithms):
             look = series(k)
-            values = np.array([run.figures[name] for run in algorithm.runs], dtype=float)
+            values = np.array([getattr(run.figures, name) for run in algorithm.runs], dtype=float)
             values = values[np.isfinite(values)]
             if len(values):
                 axes.boxplot(

@@ -34,7 +34,7 @@ def insert_tables(root: Path, document: Path) -> None:
         ResultsError: the folder has no report.
     """
     summary = read_summary(root)
-    settings, machine = summary["settings"], summary["environment"]
+    settings, machine = summary.settings, summary.environment
     tables = [root / TABLES / f"{name}.md" for name in ("table1_quality", "table2_selected")]
     try:
         text = document.read_text("utf-8")
@@ -45,8 +45,8 @@ def insert_tables(root: Path, document: Path) -> None:
     if begin < 0 or end < begin:
         raise ReportError(f"{document}: needs the lines {BEGIN} and {END}")
     head = (
-        f"{summary['workcell']['name']}: {settings['replicas']} replicas of "
-        f"{settings['evaluations']} evaluations, seed {settings['seed']}; Python "
+        f"{summary.workcell.name}: {settings.replicas} replicas of "
+        f"{settings.evaluations} evaluations, seed {settings.seed}; Python "
         f"{machine['python']}, CasADi {machine['casadi']}, Pinocchio {machine['pin']}, pymoo "
         f"{machine['pymoo']}."
     )

@@ -16,6 +16,7 @@ from string import Template
 from typing import Any
 
 from hybrid_opt.display.scene import embedded_json, scene_js, three_js
+from hybrid_opt.store.json_records import to_json
 from studies.errors import ReportError
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
@@ -42,7 +43,8 @@ def render_page(
     texts = files("studies.report") / "page"
     own = (texts / "page.js").read_text("utf-8")
     scripts = [plotly_js(), three_js(), scene_js(), own]
-    settings = {key: data.summary[key] for key in ("workcell", "settings", "environment")}
+    shown = ("workcell", "settings", "environment")
+    settings = {key: to_json(getattr(data.summary, key)) for key in shown}
     return Template((texts / "page.html").read_text("utf-8")).substitute(
         policy=_policy(scripts),
         title=html.escape(data.workcell.name),
@@ -89,30 +91,30 @@ def _policy(scripts: list[str]) -> str:
 
 def _lead(data: ReportData) -> str:
     payload, task = data.workcell.payload, data.workcell.task
-    settings = data.summary["settings"]
+    settings = data.summary.settings
     names = ", ".join(algorithm.title for algorithm in data.algorithms)
     return (
         f"Two arms carry a box of {payload.mass:g} kg along {len(task.waypoints)} poses, "
-        f"{len(task.free_indices)} of them free. {names}: {settings['replicas']} replicas of "
-        f"{settings['evaluations']} evaluations each, seed {settings['seed']}."
+        f"{len(task.free_indices)} of them free. {names}: {settings.replicas} replicas of "
+        f"{settings.evaluations} evaluations each, seed {settings.seed}."
     )
 
 
 def _facts(data: ReportData) -> str:
     facts = []
-    still = data.summary["static_hold"]
+    still = data.summary.static_hold
     for algorithm in data.algorithms:
         if algorithm.best is None:
             facts.append(("none feasible", algorithm.title))
             continue
         peak = float(algorithm.best.timed.normal_force.max(axis=0).mean())
-        rest = sum(still["normal_force"]) / 2.0
+        rest = sum(still.normal_force) / 2.0
         facts.append(
             (f"{100.0 * (peak / rest - 1.0):.2f} %", f"above the force at rest, {algorithm.title}")
         )
         limit = algorithm.best.sensitivity.payload_limit
         facts.append((f"{limit:.2f} kg", f"payload at the limit, {algorithm.title}"))
-    facts.append((f"{number(still['payload_limit'])} kg", "payload at the limit, at rest"))
+    facts.append((f"{number(still.payload_limit)} kg", "payload at the limit, at rest"))
     return "".join(
         f"<li><b>{html.escape(value)}</b><span>{html.escape(text)}</span></li>"
         for value, text in facts

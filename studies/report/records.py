@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from numpy.typing import NDArray
 
 from hybrid_opt import carry
+from hybrid_opt.campaign.summary import CampaignSummary, PolishedFigures, ReplicaFigures
 from hybrid_opt.evaluate.evaluation import Evaluations
 from hybrid_opt.timing import ForceCurve, TimingReport
 from hybrid_opt.timing.robustness import Margin, PayloadSensitivity
@@ -58,15 +58,15 @@ class Run:
         evaluations: every candidate that the search evaluated.
         front: what the search found.
         hybrid: what the polish made of it, None without a polish.
-        figures, hybrid_figures: indicators by name, as in summary.json.
+        figures, hybrid_figures: indicators of both, as in summary.json.
     """
 
     replica: int
     evaluations: Evaluations
     front: Front
     hybrid: Front | None
-    figures: Mapping[str, Any]
-    hybrid_figures: Mapping[str, Any]
+    figures: ReplicaFigures
+    hybrid_figures: PolishedFigures | None
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class ReportData:
 
     workcell: Workcell
     geometry: CellGeometry
-    summary: Mapping[str, Any]
+    summary: CampaignSummary
     objective_titles: tuple[str, ...]
     static: Array
     algorithms: tuple[AlgorithmRuns, ...]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
+from hybrid_opt.campaign.summary import FrontFigures
 from hybrid_opt.indicators.statistics import summarise
 from studies.report.records import AlgorithmRuns, Carry, ReportData
 from studies.report.table_text import NOTHING, Table, number
@@ -20,7 +20,7 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
         with_paper: whether figures that the paper states of its own rack stand beside ours.
     """
     tables = [quality(data, with_paper), selected(data, with_paper)]
-    if len(data.summary["tests"]) > 0:
+    if data.summary.tests:
         tables.append(rank_tests(data))
     if data.timings:
         tables.append(timings(data))
@@ -44,30 +44,30 @@ def quality(data: ReportData, with_paper: bool) -> Table:
     rows = []
     for algorithm in data.algorithms:
         rows.append((algorithm.title, *_means([run.figures for run in algorithm.runs])))
-        polished = [run.hybrid_figures for run in algorithm.runs if run.hybrid is not None]
+        polished = [run.hybrid_figures for run in algorithm.runs if run.hybrid_figures is not None]
         if polished:
             rows.append((f"{algorithm.title} + polish", *_means(polished)))
         if with_paper and algorithm.name in PAPER:
             stated = PAPER[algorithm.name]
             cells = [str(stated.feasible), f"{stated.feasible / 10.0:.1f}"]
             rows.append((f"{algorithm.title}, paper", *cells, *[NOTHING] * 4))
-    settings = data.summary["settings"]
+    settings = data.summary.settings
     return Table(
         "table1_quality",
         "Table 1. Quality of the search.",
         ("algorithm", *(heading for _, heading, _, _ in _QUALITY)),
         tuple(rows),
-        f"Mean ± standard deviation of {settings['replicas']} replicas of "
-        f"{settings['evaluations']} evaluations. Hypervolume: reference 1.1 in every objective. "
+        f"Mean ± standard deviation of {settings.replicas} replicas of "
+        f"{settings.evaluations} evaluations. Hypervolume: reference 1.1 in every objective. "
         "IGD: mean distance to the non-dominated union of the campaign. Spacing: Schott's."
         + (" The paper's rows hold what its text states." if with_paper else ""),
     )
 
 
-def _means(figures: Sequence[Mapping[str, Any]]) -> list[str]:
+def _means(figures: Sequence[FrontFigures]) -> list[str]:
     cells = []
     for name, _, digits, scale in _QUALITY:
-        known = [row[name] for row in figures if row.get(name) is not None]
+        known = [getattr(row, name) for row in figures if hasattr(row, name)]
         if not known:
             cells.append(NOTHING)
             continue
@@ -84,10 +84,10 @@ def selected(data: ReportData, with_paper: bool) -> Table:
         if with_paper and algorithm.name in PAPER:
             limit = f"{PAPER[algorithm.name].payload_limit:.2f}"
             rows.append((f"{algorithm.title}, paper", *[NOTHING] * 6, limit))
-    still = data.summary["static_hold"]
-    force = [number(value, 2) for value in still["normal_force"]]
+    still = data.summary.static_hold
+    force = [number(value, 2) for value in still.normal_force]
     rows.append(
-        ("level payload at rest", *force, *force, "0.00", NOTHING, number(still["payload_limit"]))
+        ("level payload at rest", *force, *force, "0.00", NOTHING, number(still.payload_limit))
     )
     left, right = (robot.name for robot in data.workcell.robots)
     return Table(
@@ -122,7 +122,7 @@ def _selections(algorithm: AlgorithmRuns) -> list[tuple[str, Carry]]:
 def _forces(data: ReportData, carry: Carry, label: str) -> tuple[str, ...]:
     normal = carry.timed.normal_force
     least, peak = normal.min(axis=0), normal.max(axis=0)
-    still = float(np.mean(data.summary["static_hold"]["normal_force"]))
+    still = float(np.mean(data.summary.static_hold.normal_force))
     excess = 100.0 * (float(peak.mean()) / still - 1.0)
     name = label if carry.feasible else f"{label} (infeasible)"
     return (
@@ -140,14 +140,14 @@ def rank_tests(data: ReportData) -> Table:
     titles = {algorithm.name: algorithm.title for algorithm in data.algorithms}
     rows = tuple(
         (
-            f"{titles[test['first']]} / {titles[test['second']]}",
-            str(test["figure"]).replace("_", " "),
-            number(test["a12"]),
-            str(test["magnitude"]),
-            number(test["p"], 5),
-            number(test["p_holm"], 5),
+            f"{titles[test.first]} / {titles[test.second]}",
+            test.figure.replace("_", " "),
+            number(test.a12),
+            test.magnitude,
+            number(test.p, 5),
+            number(test.p_holm, 5),
         )
-        for test in data.summary["tests"]
+        for test in data.summary.tests
     )
     return Table(
         "tests",

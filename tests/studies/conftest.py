@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
-from hybrid_opt.indicators.metrics import hypervolume, non_dominated
+from hybrid_opt.campaign.documents import PolishEffort
+from hybrid_opt.campaign.summary import PolishedFigures
+from hybrid_opt.indicators.metrics import non_dominated
 from studies.report.data import gather
 from studies.report.records import Front, ReportData
 from studies.run import StudySettings, run_study
+from studies.summary import front_indicators
 from tests.symbolic.cells import ROOT
 
 TRANSFER = ROOT / "studies" / "workcells" / "transfer.toml"
@@ -43,7 +46,9 @@ def hybrid_data(data: ReportData) -> ReportData:
     objectives = np.concatenate([front.objectives for front in fronts])
     best = non_dominated(objectives)
     hybrid = Front(x[best], objectives[best])
-    figures = {"hypervolume": hypervolume(hybrid.objectives)}
+    effort = PolishEffort(1, {}, 1.0, 1.0, 1.0, 1, 0.0, 0.0, 0.0)
+    indicators = front_indicators(hybrid.objectives, hybrid.objectives, None, None)
+    figures = PolishedFigures(**indicators, **vars(effort))
     algorithms = tuple(
         replace(
             algorithm,

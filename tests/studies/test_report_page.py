@@ -132,7 +132,7 @@ def test_every_file_of_the_report_is_written(report: Path, text: str) -> None:
     assert figures == {path.stem for path in (report.parent / "figures").glob("*.pdf")}
     assert text.count("<figure>") == len(figures)
     tables = sorted(path.name for path in (report.parent / "tables").iterdir())
-    for name in ("table1_quality", "table2_selected", "tests", "timing", "margins"):
+    for name in ("table1_quality", "table2_selected", "timing", "margins"):
         assert [f"{name}.{suffix}" for suffix in ("csv", "md", "tex")] == [
             entry for entry in tables if entry.startswith(f"{name}.")
         ]

@@ -45,20 +45,22 @@ def test_study_leaves_everything_behind(study: tuple[Path, str]) -> None:
     results = read_campaign(root)
     assert [found.algorithm for found in results.replicas] == ["nsga2"] * 2 + ["mopso"] * 2
     for replica in results.replicas:
-        entry = summary["algorithms"][replica.algorithm]["replicas"][replica.replica]
+        entry = summary.algorithms[replica.algorithm].replicas[replica.replica]
         found = replica.evaluations
-        assert len(found) == entry["evaluations"] == 120
-        assert entry["feasible"] == int(found.feasible.sum()) > 0
-        assert entry["feasible"] + sum(entry["infeasible_by_reason"].values()) == 120
+        assert len(found) == entry.evaluations == 120
+        assert entry.feasible == int(found.feasible.sum()) > 0
+        assert entry.feasible + sum(entry.infeasible_by_reason.values()) == 120
         # Dominance by its definition, point by point.
         alive = found.objectives[found.feasible]
         best = [p for p in alive if not any((q <= p).all() and (q < p).any() for q in alive)]
-        assert entry["non_dominated"] == len(np.unique(best, axis=0)) == len(replica.front)
-        assert entry["hypervolume"] == metrics.hypervolume(replica.front)
-        stored = read_trajectory(root / entry["selected"]["file"])
-        np.testing.assert_array_equal(stored.x, found.x[entry["selected"]["evaluation"] - 1])
-        assert stored.figures["payload_limit"] == entry["payload_limit"]
-        assert entry["payload_limit"] < summary["static_hold"]["payload_limit"]
+        assert entry.non_dominated == len(np.unique(best, axis=0)) == len(replica.front)
+        assert entry.hypervolume == metrics.hypervolume(replica.front)
+        assert entry.selected is not None
+        assert entry.selected.file is not None
+        stored = read_trajectory(root / entry.selected.file)
+        np.testing.assert_array_equal(stored.x, found.x[entry.selected.evaluation - 1])
+        assert stored.figures["payload_limit"] == entry.payload_limit
+        assert entry.payload_limit < summary.static_hold.payload_limit
         rows = list(csv.reader((root / f"fronts/{replica.algorithm}.csv").open()))
         assert rows[0] == ["peak_force_1", "peak_force_2"]
     assert "Table 1" in printed

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from hybrid_opt.campaign.documents import Configuration, StoredCell, StoredSettings
 from hybrid_opt.campaign.replica import front_rows
 from hybrid_opt.campaign.results import CampaignResults, Replica
+from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures, SelectedEntry
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.evaluate.static_hold import StaticHold
 from hybrid_opt.indicators.statistics import rank_test
+from hybrid_opt.store.json_records import from_json, to_json
 from studies.summary import (
     FIGURES,
     TESTED,
@@ -59,26 +64,31 @@ FRONT = [[0.6, 0.4], [0.5, 0.5], [0.3, 0.3], [0.4, 0.7]]
 def test_figures_of_a_replica_by_hand() -> None:
     mine = replica(FRONT, ["", "", "collision", ""])
     figures = replica_figures(mine, np.array([[0.4, 0.4]]), None, None)
-    assert (figures["evaluations"], figures["feasible"], figures["feasible_share"]) == (4, 3, 0.75)
-    assert figures["non_dominated"] == 3
+    assert (figures.evaluations, figures.feasible, figures.feasible_share) == (4, 3, 0.75)
+    assert figures.non_dominated == 3
     # Columns from the left, up to the corner (1.1, 1.1).
     area = 0.1 * (1.1 - 0.7) + 0.1 * (1.1 - 0.5) + 0.5 * (1.1 - 0.4)
-    assert figures["hypervolume"] == pytest.approx(area)
-    assert figures["igd"] == pytest.approx(math.sqrt(0.02))
-    assert figures["igd_plus"] == pytest.approx(0.1414213562)
+    assert figures.hypervolume == pytest.approx(area)
+    assert figures.igd == pytest.approx(math.sqrt(0.02))
+    assert figures.igd_plus == pytest.approx(0.1414213562)
     # L1 distances to the nearest neighbour: 0.3, 0.2, 0.2.
-    assert figures["spacing"] == pytest.approx(np.std([0.3, 0.2, 0.2], ddof=1))
-    assert figures["infeasible_by_reason"] == {"collision": 1}
-    assert figures["best_so_far"] == [[1, 0.6, 0.4], [2, 0.5, 0.4], [4, 0.4, 0.4]]
-    assert figures["seconds"] == 1.5
-    assert figures["selected"] is None
-    assert math.isnan(figures["payload_limit"])
+    assert figures.spacing == pytest.approx(np.std([0.3, 0.2, 0.2], ddof=1))
+    assert figures.infeasible_by_reason == {"collision": 1}
+    assert [step.tolist() for step in figures.best_so_far] == [
+        [1, 0.6, 0.4],
+        [2, 0.5, 0.4],
+        [4, 0.4, 0.4],
+    ]
+    assert figures.seconds == 1.5
+    assert figures.selected is None
+    assert math.isnan(figures.payload_limit)
 
 
 def test_best_steps_begin_with_the_first_feasible_candidate() -> None:
     history = np.array([[NAN, NAN], [0.5, 0.6], [0.5, 0.6], [0.5, 0.4]])
-    assert best_steps(history) == [[2, 0.5, 0.6], [4, 0.5, 0.4]]
-    assert best_steps(history[:1]) == []
+    steps = [step.tolist() for step in best_steps(history)]
+    assert steps == [[2, 0.5, 0.6], [4, 0.5, 0.4]]
+    assert best_steps(history[:1]) == ()
 
 
 def test_reference_front_is_the_union() -> None:
@@ -88,70 +98,88 @@ def test_reference_front_is_the_union() -> None:
     assert union.tolist() == [[0.2, 0.8], [0.5, 0.5], [0.8, 0.2]]
 
 
-def entry(number: int, **figures: Any) -> dict[str, Any]:
-    base: dict[str, Any] = dict.fromkeys(FIGURES, 0.5)
-    selected = {
-        "minimum_normal_force": [40.0, 41.0],
-        "peak_normal_force": [50.0, 51.25],
-        "payload_limit": 16.5,
-    }
-    return base | {
-        "replica": number,
-        "evaluations": 10,
-        "infeasible_by_reason": {"collision": 3, "reach_1": 1},
-        "selected": selected,
-        **figures,
-    }
+PAIR = np.array([50.0, 51.25])
+SELECTED = SelectedEntry(1, None, np.array([0.4, 0.6]), PAIR, PAIR - 10.0, PAIR - 50.0, 16.5, 3.0)
+PLAIN = ReplicaFigures(
+    **dict.fromkeys(FIGURES, 0.5) | {"feasible": 5, "non_dominated": 2},  # type: ignore[arg-type]
+    selected=SELECTED,
+    replica=0,
+    evaluations=10,
+    infeasible_by_reason={"collision": 3, "reach_1": 1},
+    best_so_far=(),
+)
 
 
-def results() -> CampaignResults:
-    configuration = {
-        "workcell": {"name": "Rack", "file": "", "digest": ""},
-        "settings": {"replicas": 3, "evaluations": 10, "seed": 1},
-        "environment": {},
-    }
-    return CampaignResults(
-        Path("results"), configuration, load(RACK), ("nsga2", "mopso"), OBJECTIVES, ()
+def entry(number: int, **figures: Any) -> ReplicaFigures:
+    return replace(PLAIN, replica=number, **figures)
+
+
+def results(entries: dict[str, list[ReplicaFigures]]) -> CampaignResults:
+    settings = StoredSettings(
+        algorithms={name: {} for name in entries},
+        evaluations=10,
+        replicas=len(next(iter(entries.values()))),
+        seed=1,
+        objectives=OBJECTIVES,
+        constraint_handling="penalty",
+        first_generation="initial",
     )
+    configuration = Configuration("", 1, StoredCell("Rack", "", ""), settings, {})
+    return CampaignResults(Path("results"), configuration, load(RACK), ())
 
 
-VOLUMES = {"nsga2": [0.4, 0.6, 0.5], "mopso": [0.1, 0.2, 0.15]}
+VOLUMES = {"nsga2": [0.4, 0.6, 0.5, 0.45, 0.55], "mopso": [0.1, 0.2, 0.15, 0.12, 0.18]}
 
 
-def summary(entries: dict[str, list[dict[str, Any]]] | None = None) -> dict[str, Any]:
+def summary(entries: dict[str, list[ReplicaFigures]] | None = None) -> CampaignSummary:
     made = entries or {
         name: [entry(k, hypervolume=value) for k, value in enumerate(values)]
         for name, values in VOLUMES.items()
     }
-    return campaign_summary(results(), np.array([[0.4, 0.6]]), STATIC, made)
+    return campaign_summary(results(made), np.array([[0.4, 0.6]]), STATIC, made)
 
 
 def test_statistics_and_tests_of_a_campaign() -> None:
     made = summary()
-    statistics = made["algorithms"]["nsga2"]["statistics"]["hypervolume"]
-    assert statistics["mean"] == pytest.approx(0.5)
-    assert statistics["std"] == pytest.approx(0.1)
-    assert (statistics["quartile1"], statistics["median"], statistics["quartile3"]) == (
-        pytest.approx(0.45),
-        0.5,
-        pytest.approx(0.55),
-    )
-    assert made["algorithms"]["nsga2"]["representative"] == 1
-    tests = {test["figure"]: test for test in made["tests"]}
+    statistics = made.algorithms["nsga2"].statistics["hypervolume"]
+    assert statistics.mean == pytest.approx(0.5)
+    assert statistics.std == pytest.approx(math.sqrt(0.00625))
+    assert (statistics.quartile1, statistics.median, statistics.quartile3) == (0.45, 0.5, 0.55)
+    assert made.algorithms["nsga2"].representative == 1
+    tests = {test.figure: test for test in made.tests}
     assert set(tests) == set(TESTED)
     expected = rank_test(VOLUMES["nsga2"], VOLUMES["mopso"])
-    assert tests["hypervolume"]["p"] == expected.p == 0.1
-    assert tests["hypervolume"]["a12"] == 1.0
-    assert tests["hypervolume"]["p_holm"] == pytest.approx(min(1.0, len(TESTED) * 0.1))
-    assert made["reference_front"]["hypervolume"] == pytest.approx(0.7 * 0.5)
+    # Two orders of the ranks of ten are as far apart: 2 of 252.
+    assert tests["hypervolume"].p == expected.p == pytest.approx(2.0 / 252.0)
+    assert tests["hypervolume"].a12 == 1.0
+    assert tests["hypervolume"].p_holm == pytest.approx(len(TESTED) * 2.0 / 252.0)
+    assert made.reference_front.hypervolume == pytest.approx(0.7 * 0.5)
+
+
+def test_few_replicas_are_not_tested() -> None:
+    few = {
+        name: [entry(k, hypervolume=v) for k, v in enumerate(VOLUMES[name][:4])] for name in VOLUMES
+    }
+    made = summary(few)
+    assert made.tests == ()
+    assert "Mann-Whitney" not in terminal_summary(made, with_paper=True)
+    assert "Mann-Whitney" in terminal_summary(summary(), with_paper=True)
+
+
+def test_a_summary_comes_back_from_its_file(tmp_path: Path) -> None:
+    made = summary()
+    document = to_json(made)
+    again = from_json(CampaignSummary, json.loads(json.dumps(document)), tmp_path, "do it again")
+    assert to_json(again) == document
 
 
 def test_figures_that_do_not_exist_become_null() -> None:
     none = {name: [entry(0, igd=math.inf, spacing=NAN, selected=None)] for name in VOLUMES}
     made = summary(none)
-    assert made["algorithms"]["mopso"]["replicas"][0]["igd"] is None
-    assert made["algorithms"]["mopso"]["replicas"][0]["spacing"] is None
-    assert made["algorithms"]["mopso"]["representative"] is None
+    stored = to_json(made)["algorithms"]["mopso"]["replicas"][0]
+    assert stored["igd"] is None
+    assert stored["spacing"] is None
+    assert made.algorithms["mopso"].representative is None
     text = terminal_summary(made, with_paper=True)
     assert "MOPSO: no feasible candidate" in text
     assert "nan" not in text
@@ -162,7 +190,7 @@ def test_terminal_summary_shows_the_tables() -> None:
     text = terminal_summary(summary(), with_paper=True)
     assert all(len(line) <= 100 for line in text.splitlines())
     lines = {line.split("  ")[0]: line for line in text.splitlines()}
-    assert "0.5000 ± 0.1000" in text
+    assert "0.5000 ± 0.0791" in text
     figures = ["40.00", "41.00", "50.00", "51.25", "0.50", "16.50"]
     assert lines["NSGA-II, replica 1"].split()[3:] == figures
     assert "NSGA-II: collision 30.0, reach_1 10.0" in text

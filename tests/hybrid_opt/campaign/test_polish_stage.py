@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_polished_front_is_feasible_certified_and_better(finished: Path) -> None:
     (replica,) = read_campaign(finished).replicas
-    polished = read_polished(finished, "nsga2", 0)
+    polished = read_polished(finished, replica, load(RACK))
     assert polished is not None
     evaluator = CandidateEvaluator(load(RACK))
     again = evaluator.certified(evaluator.evaluate(polished.x))
@@ -58,8 +59,8 @@ def test_a_polished_front_is_feasible_certified_and_better(finished: Path) -> No
     before = metrics.hypervolume(replica.front, corner)
     assert metrics.hypervolume(polished.objectives, corner) > before
     assert polished.polished.any()
-    assert polished.figures["attempts"] <= POLISHED.points
-    assert polished.figures["equivalent_evaluations"] > 0
+    assert polished.figures.attempts <= POLISHED.points
+    assert polished.figures.equivalent_evaluations > 0
     assert not (polished_folder(finished, "nsga2", 0) / JOURNAL).exists()
 
 
@@ -92,7 +93,8 @@ def test_an_interrupted_polish_repeats_no_attempt(
     run(root, resume=True)
     repeated = [block for block in recorded[2:] if block in interrupted]
     assert not repeated
-    one, other = (read_polished(folder, "nsga2", 0) for folder in (finished, root))
+    (replica,) = read_campaign(root).replicas
+    one, other = (read_polished(folder, replica, load(RACK)) for folder in (finished, root))
     assert one is not None
     assert other is not None
     np.testing.assert_array_equal(one.x, other.x)
@@ -109,10 +111,40 @@ def test_other_settings_are_refused(finished: Path) -> None:
         run_stages(folder, (search_stage(), other), SILENT)
 
 
-def test_a_damaged_file_is_told(finished: Path, tmp_path: Path) -> None:
-    assert read_polished(tmp_path, "nsga2", 0) is None
+def spoilt(document: Any, fault: str) -> Any:
+    point = document["front"][0]
+    if fault == "no point":
+        document["front"] = []
+    elif fault == "too short":
+        point["x"] = point["x"][:3]
+    elif fault == "missing":
+        point["x"][1] = None
+    elif fault == "huge":
+        point["x"][1] = 1e308
+    elif fault == "objectives":
+        point["objectives"] = ["a", "b"]
+    else:
+        document = {"front": [{}], "figures": {}}
+    return document
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("no point", "at front: found 0 points"),
+        ("too short", r"at front\[0\].x: found 3 numbers; allowed are 24"),
+        ("missing", r"at front\[0\].x: holds numbers that are missing"),
+        ("huge", r"at front\[0\].x: is outside"),
+        ("objectives", r"at front\[0\].objectives: no numbers of shape 2"),
+        ("nothing", r"at front\[0\].objectives: is missing"),
+    ],
+)
+def test_a_damaged_file_is_told(finished: Path, tmp_path: Path, fault: str, told: str) -> None:
+    (replica,) = read_campaign(finished).replicas
+    assert read_polished(tmp_path, replica, load(RACK)) is None
+    whole = json.loads((polished_folder(finished, "nsga2", 0) / POLISH).read_text())
     path = polished_folder(tmp_path, "nsga2", 0) / POLISH
     path.parent.mkdir(parents=True)
-    path.write_text('{"front": [{}], "figures": {}}')
-    with pytest.raises(ResultsError, match="delete it to polish again"):
-        read_polished(tmp_path, "nsga2", 0)
+    path.write_text(json.dumps(spoilt(whole, fault)))
+    with pytest.raises(ResultsError, match=rf"damaged {told}.*; delete it to polish again"):
+        read_polished(tmp_path, replica, load(RACK))
