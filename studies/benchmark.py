@@ -3,7 +3,7 @@
 `python -m studies.benchmark [WORKCELL]` measures milliseconds per candidate on one core, in the
 thread's own processor time, so that waiting for a busy machine does not count. The three ways
 take turns on the same candidates, and a ratio is the median over the rounds of the ratio within
-a round. The plain way is the reference implementation of the tests, which needs a checkout. With
+a round. The plain way is the reference that the tests hold the evaluator to (`studies.plain`). With
 collisions the same is measured on candidates of a search (`studies.benchmark_collisions`).
 
 The cost against the number of samples and of free waypoints is measured on cells derived from the
@@ -17,7 +17,7 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -32,6 +32,8 @@ from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from studies.benchmark_collisions import with_collisions
 from studies.benchmark_turns import Evaluate, interleaved, progress, summary
+from studies.plain.candidate import PlainEvaluator
+from studies.plain.verdict import PlainJudge
 from studies.program import add_verbose, run_program
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
@@ -96,7 +98,7 @@ def benchmark(
         seed: of the decision vectors.
 
     Raises:
-        SettingsError: a number is not positive, or there is no checkout with the plain reference.
+        SettingsError: a number is not positive.
         CodegenError: there is no compiler.
         DualArmError: the cell has no model.
     """
@@ -105,7 +107,6 @@ def benchmark(
             raise SettingsError(f"--{name} is {value}; give 1 or more")
     if seed < 0:
         raise SettingsError(f"--seed is {seed}; give 0 or more")
-    make_plain, make_plain_judge = _plain_references()
     progress(f"{workcell.name}: reading the robots, choosing start branches")
     model = build_cell_model(workcell)
     x = _candidates(workcell.task, candidates, seed)
@@ -113,7 +114,7 @@ def benchmark(
     ways: dict[str, Evaluate] = {
         "compiled": _compiled(model),
         "interpreted": InterpretedFunction(dense(candidate_function(model))),
-        "plain": make_plain(workcell, model.start),
+        "plain": PlainEvaluator(workcell, model.start),
     }
     progress(f"{candidates * repeats} rounds: {', '.join(ways)}")
     return {
@@ -132,7 +133,7 @@ def benchmark(
         },
         **summary(interleaved(ways, dict.fromkeys(ways, x), repeats)),
         "with_collisions": with_collisions(
-            workcell, make_plain_judge(workcell, model.start), candidates, repeats, seed
+            workcell, PlainJudge(workcell, model.start), candidates, repeats, seed
         ),
         "scaling": _scaling(model, candidates, repeats, seed),
     }
@@ -219,22 +220,6 @@ def _compiled(model: CellModel) -> CompiledFunction:
     if not isinstance(function, CompiledFunction):
         raise CodegenError("there is no C compiler to compare with; install one, e.g. gcc")
     return function
-
-
-MakePlain = Callable[[Workcell, tuple[Array, Array]], Evaluate]
-
-
-def _plain_references() -> tuple[MakePlain, MakePlain]:
-    """The plain evaluators without and with collisions."""
-    try:
-        from tests.plain.candidate import PlainEvaluator
-        from tests.plain.verdict import PlainJudge
-    except ModuleNotFoundError as error:
-        raise SettingsError(
-            "the plain reference is part of the tests and is not installed; run the benchmark "
-            f"in the folder of a checkout of the project ({error})"
-        ) from error
-    return PlainEvaluator, PlainJudge
 
 
 def _processor() -> str:

@@ -59,18 +59,23 @@ def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> Set
 
 
 def make(
-    name: str, settings: Mapping[str, object] | None = None, initial: Array | None = None
+    name: str,
+    settings: Settings | Mapping[str, object] | None = None,
+    initial: Array | None = None,
 ) -> Algorithm:
     """A fresh algorithm for one run.
 
     Args:
         name: one of `names()`.
-        settings: values that differ from the defaults, see `hybrid_opt.metaheuristics.settings`.
+        settings: from `settings_of`, or values that differ from the defaults, see
+            `hybrid_opt.metaheuristics.settings`.
         initial: (k, n_var) decision vectors that the first generation starts with, the rest
             being uniformly random; None for all random.
 
     Raises:
         SettingsError: as `settings_of`; wrong `initial` points are told when the run starts.
     """
+    if dataclasses.is_dataclass(settings):
+        settings = dataclasses.asdict(settings)
     effective = settings_of(name, settings)
     return _REGISTRY[name].build(effective, initial)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from typing import Any
 
@@ -13,7 +12,6 @@ import pytest
 from studies import benchmark, benchmark_collisions
 from studies.benchmark_turns import Evaluate, interleaved, summary
 from symbolic.array import Array
-from symbolic.errors import SettingsError
 from tests.symbolic.cells import RACK, hand_cell
 
 PROMISED_RATIO = 200.0
@@ -114,9 +112,3 @@ def test_bad_input_gives_one_message_and_a_code(
 ) -> None:
     assert benchmark.main(arguments) == 2
     assert message in capsys.readouterr().err
-
-
-def test_without_a_checkout_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "tests.plain.candidate", None)
-    with pytest.raises(SettingsError, match="checkout"):
-        benchmark.benchmark(hand_cell())

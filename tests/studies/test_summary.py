@@ -99,7 +99,8 @@ def test_reference_front_is_the_union() -> None:
 
 
 PAIR = np.array([50.0, 51.25])
-SELECTED = SelectedEntry(1, None, np.array([0.4, 0.6]), PAIR, PAIR - 10.0, PAIR - 50.0, 16.5, 3.0)
+LEAST = np.array([40.0, 41.0])
+SELECTED = SelectedEntry(1, None, np.array([0.4, 0.6]), PAIR, LEAST, PAIR - 50.0, 16.5, 3.0)
 PLAIN = ReplicaFigures(
     **dict.fromkeys(FIGURES, 0.5) | {"feasible": 5, "non_dominated": 2},  # type: ignore[arg-type]
     selected=SELECTED,

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from studies.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.functions.candidate import candidate_function
@@ -23,7 +24,6 @@ from symbolic.physics.pose import pose_matrix
 from symbolic.robot.model import RobotModel, build_robot_model
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Contact, Payload, Robot, Task, Waypoint, Workcell
-from tests.plain.arm import PlainArm
 
 ROOT = Path(__file__).resolve().parents[2]
 GOFA = ROOT / "studies" / "robots" / "gofa12.urdf"

@@ -19,14 +19,14 @@ from hybrid_opt.evaluate.evaluation import (
     Evaluations,
     reached_samples,
 )
+from studies.plain.collisions import PlainCollisionChecker
+from studies.plain.verdict import PlainJudge, PlainVerdict
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
 from symbolic.functions.candidate import CONSTRAINTS
 from symbolic.workcell.file import load
 from symbolic.workcell.records import CollisionSettings, Workcell
 from tests.hybrid_opt.collision.test_checker import checker_of, resting_cell
-from tests.plain.collisions import PlainCollisionChecker
-from tests.plain.verdict import PlainJudge, PlainVerdict
 from tests.symbolic.cells import RACK
 from tests.symbolic.geometry.collision_cells import geometry_of, random_configurations
 

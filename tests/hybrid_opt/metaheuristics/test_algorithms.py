@@ -241,3 +241,15 @@ def test_a_budget_is_needed() -> None:
 def test_equalities_are_refused(name: str) -> None:
     with pytest.raises(SettingsError, match="1 equality constraints"):
         run(name, Counting(equalities=1), 40)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_effective_settings_make_the_same_algorithm(name: str) -> None:
+    overrides = {"population": 12} if name in ("nsga2", "sms-emoa") else {}
+    effective = settings_of(name, overrides)
+    first, second = (
+        search(Counting(), make(name, settings), 60, 3) for settings in (effective, overrides)
+    )
+    assert bits(first) == bits(second)
+    with pytest.raises(SettingsError, match="unknown setting"):
+        make("random", settings_of("nsga2"))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from studies.plain.load import GRAVITY
+from studies.plain.motion import angular_rates, rotation
 from symbolic.physics.case_squeeze import case_squeeze_function
-from tests.plain.load import GRAVITY
-from tests.plain.motion import angular_rates, rotation
 from tests.symbolic.cells import call
 from tests.symbolic.physics.joint_oracle import Case, least_wrenches
 from tests.symbolic.physics.test_payload_load import random_cell, random_motion

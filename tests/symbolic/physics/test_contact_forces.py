@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
+from studies.plain.load import allocate as plain_allocate
 from symbolic.array import Array
 from symbolic.physics.contact_forces import allocate, normal_force_branches, required_force
-from tests.plain.load import allocate as plain_allocate
 from tests.symbolic.cells import call
 
 BRANCHES = ("both cones tight", "2 unloaded", "1 unloaded", "cone 2 tight", "cone 1 tight")

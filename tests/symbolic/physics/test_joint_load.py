@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from studies.plain.load import GRAVITY
+from studies.plain.motion import angular_rates, rotation
 from symbolic.array import Array
 from symbolic.physics.payload_load import RESIDUAL_TOLERANCE, load_function
 from symbolic.workcell.records import Workcell
-from tests.plain.load import GRAVITY
-from tests.plain.motion import angular_rates, rotation
 from tests.symbolic.cells import call, with_contacts, with_payload, with_task
 from tests.symbolic.physics.joint_oracle import Case, least_wrenches
 from tests.symbolic.physics.test_payload_load import (

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from studies.plain.motion import evaluate_spline, natural_quintic, waypoints
 from symbolic.array import Array
 from symbolic.physics.path import path_basis, sample_basis, waypoint_matrix
 from symbolic.workcell.records import Task, Waypoint
-from tests.plain.motion import evaluate_spline, natural_quintic, waypoints
 from tests.symbolic.cells import fixed, free, hand_cell, with_task
 
 PARAMETER = np.linspace(0.0, 1.0, 41)

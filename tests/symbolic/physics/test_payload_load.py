@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from studies.plain.load import sample_load
+from studies.plain.motion import angular_rates, rotation
 from symbolic.array import Array
 from symbolic.physics.payload_load import load_function
 from symbolic.workcell.records import Contact, Workcell
-from tests.plain.load import sample_load
-from tests.plain.motion import angular_rates, rotation
 from tests.symbolic.cells import call, hand_cell, solid_box, with_contacts, with_payload
 
 MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from studies.plain.motion import angular_rates
 from symbolic.array import Array
 from symbolic.physics.pose import rotation_from_rpy
 from symbolic.physics.rotation import (
@@ -16,7 +17,6 @@ from symbolic.physics.rotation import (
     rate_matrix,
     rotation_matrix,
 )
-from tests.plain.motion import angular_rates
 
 angle = st.floats(-7.0, 7.0)
 angles = st.tuples(angle, angle, angle).map(np.array)

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
+from studies.plain.motion import angular_rates
 from symbolic.array import Array
 from symbolic.physics.path import path_basis, sample_basis, waypoint_matrix
 from symbolic.physics.time_law import STEP_TIME_FLOOR, timed_path
 from symbolic.workcell.records import Task, Waypoint
-from tests.plain.motion import angular_rates
 from tests.symbolic.cells import call, fixed, hand_cell, with_task
 
 

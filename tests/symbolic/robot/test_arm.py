@@ -13,6 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from studies.plain.arm import PlainArm
+from studies.plain.motion import rotation
 from symbolic.array import Array
 from symbolic.physics.rotation import rotation_matrix
 from symbolic.robot.arm import (
@@ -28,8 +30,6 @@ from symbolic.robot.arm import (
     pose_error,
     track_function,
 )
-from tests.plain.arm import PlainArm
-from tests.plain.motion import rotation
 from tests.symbolic.cells import call, gofa_model, hand_cell, start_posture
 
 CELL = hand_cell()

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from studies.plain.arm import PlainArm
+from studies.plain.load import sample_load
+from studies.plain.motion import timed_motion
 from symbolic.array import Array
 from symbolic.functions.candidate import CONSTRAINTS, FRICTION_TOLERANCE
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.workcell.records import Workcell
-from tests.plain.arm import PlainArm
-from tests.plain.load import sample_load
-from tests.plain.motion import timed_motion
 
 
 @dataclass(frozen=True)

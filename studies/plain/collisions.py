@@ -15,11 +15,11 @@ import numpy as np
 import pinocchio as pin
 
 from hybrid_opt.collision.checker import RESTING_TOLERANCE
+from studies.plain.motion import rotation
 from symbolic.array import Array
 from symbolic.geometry.meshes import convex_pieces
 from symbolic.geometry.pairs import build_geometry
 from symbolic.workcell.records import Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
-from tests.plain.motion import rotation
 
 PAYLOAD = "payload"
 

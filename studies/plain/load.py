@@ -6,9 +6,9 @@ from itertools import combinations
 
 import numpy as np
 
+from studies.plain.motion import angular_rates, rotation
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
-from tests.plain.motion import angular_rates, rotation
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from studies.plain.candidate import PlainCandidate, PlainEvaluator
+from studies.plain.collisions import PlainCollisionChecker, PlainCollisions
 from symbolic.array import Array
 from symbolic.functions.candidate import CONSTRAINTS
 from symbolic.workcell.records import Workcell
-from tests.plain.candidate import PlainCandidate, PlainEvaluator
-from tests.plain.collisions import PlainCollisionChecker, PlainCollisions
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
+from studies.plain.motion import rotation
 from symbolic.array import Array
 from symbolic.robot.arm import MAX_JOINT_STEP, NEWTON_STEPS, REACH_TOLERANCE
 from symbolic.workcell.records import Contact, Robot
-from tests.plain.motion import rotation
 
 
 class PlainArm:
