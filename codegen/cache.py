@@ -22,19 +22,23 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import platformdirs
 
 from codegen.errors import CodegenError
+from symbolic import outside
+from symbolic.errors import OutsideError
 
 FORMAT = 1
 """Part of every key; rises when what is stored changes its meaning."""
 
 _SOURCES = {".py", ".c", ".h"}
 
-_STALE_SECONDS = 24 * 3600.0
+_STALE_SECONDS = 3600.0
+_MOST_BYTES = 256 * outside.MEBIBYTE
 
 
 def digest(*parts: str | bytes) -> str:
@@ -100,9 +104,12 @@ class Cache:
         facts = self.read_record(key)
         if facts is None:
             return None
-        library = self.folder / str(facts["library"])
+        name = facts.get("library")
+        if not isinstance(name, str) or "/" in name:
+            return None
+        library = self.folder / name
         content = self._read_own(library)
-        if content is None or hashlib.sha256(content).hexdigest() != facts["sha256"]:
+        if content is None or hashlib.sha256(content).hexdigest() != facts.get("sha256"):
             return None
         return Entry(key, library, facts)
 
@@ -136,10 +143,10 @@ class Cache:
         if raw is None:
             return None
         try:
-            stored = json.loads(raw)
+            stored = outside.json_value(raw)
             facts = stored["facts"]
             intact = stored["sha256"] == digest(_canonical(facts))
-        except (ValueError, KeyError, TypeError):
+        except (OutsideError, KeyError, TypeError):
             return None
         return facts if intact and isinstance(facts, dict) else None
 
@@ -189,20 +196,24 @@ class Cache:
         self._sweep()
         with _writing(self.folder):
             scratch = Path(tempfile.mkdtemp(prefix="build-", dir=self.folder))
+            handle = os.open(scratch, os.O_RDONLY)
         try:
+            with suppress(OSError):  # where the file system has no locks
+                fcntl.flock(handle, fcntl.LOCK_EX)
             yield scratch
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
+            os.close(handle)
 
     def _sweep(self) -> None:
-        """Remove what builds left behind that were killed long ago."""
+        """Remove what builds left behind that were killed long ago.
+
+        A living build holds a lock, so that a clock that jumps does not end it.
+        """
         for left in self.folder.glob("build-*"):
-            try:
-                stale = time.time() - left.stat().st_mtime > _STALE_SECONDS
-            except OSError:
-                continue
-            if stale:
-                shutil.rmtree(left, ignore_errors=True)
+            with suppress(OSError):
+                if abs(time.time() - left.stat().st_mtime) > _STALE_SECONDS and _unlocked(left):
+                    shutil.rmtree(left, ignore_errors=True)
 
     def _make_folder(self) -> None:
         with _writing(self.folder):
@@ -234,13 +245,30 @@ class Cache:
     def _read_own(self, path: Path) -> bytes | None:
         """Content of a file that nobody else can have written; None where it is missing."""
         try:
-            with path.open("rb") as file:
-                _require_own(path, os.fstat(file.fileno()))
-                return file.read()
+            found = path.stat()
+            if not stat.S_ISREG(found.st_mode):
+                return None
+            return outside.read_bytes(path, _MOST_BYTES, partial(_require_own, path))
         except FileNotFoundError:
             return None
         except OSError as error:
             raise CodegenError(_cannot_use(path, error)) from error
+        except OutsideError as error:
+            raise CodegenError(
+                f"the cache of compiled functions cannot be used: {path} {error}; grant access "
+                f"there, or {_OTHER_FOLDER}"
+            ) from error
+
+
+def _unlocked(folder: Path) -> bool:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    finally:
+        os.close(handle)
+    return True
 
 
 _OTHER_FOLDER = "name another folder in the environment variable DUAL_ARM_CACHE"

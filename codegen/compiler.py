@@ -47,6 +47,11 @@ LARGE_SOURCE = 2_000_000
 
 NAMES = ("cc", "gcc", "clang")
 
+MOST_SECONDS = 1200.0
+"""After so long a compiler counts as hung [s]; sources here take it seconds, at most minutes."""
+
+_OTHER_COMPILER = "name another one in the environment variable CC"
+
 
 @dataclass(frozen=True)
 class Compiler:
@@ -90,12 +95,23 @@ class Compiler:
                 capture_output=True,
                 text=True,
                 errors="replace",
+                timeout=MOST_SECONDS,
                 check=False,
             )
         except OSError as error:
             raise CodegenError(f"the C compiler {self.command[0]} cannot run: {error}") from error
+        except subprocess.TimeoutExpired as error:
+            raise CodegenError(
+                f"the C compiler {self.command[0]} took longer than {MOST_SECONDS:g} s over "
+                f"{source.name} and was ended; {_OTHER_COMPILER}"
+            ) from error
         if done.returncode != 0:
             raise CodegenError(_failure(self.command[0], source, done))
+        if not library.is_file() or library.stat().st_size == 0:
+            raise CodegenError(
+                f"the C compiler {self.command[0]} reported success but made no library of "
+                f"{source.name}; {_OTHER_COMPILER}"
+            )
 
 
 def default_level(c_bytes: int) -> int:
@@ -114,9 +130,19 @@ def find_compiler() -> Compiler | None:
     return _find(os.environ.get("CC", ""), os.environ.get("PATH", ""))
 
 
+def _words(cc: str) -> list[str]:
+    try:
+        return shlex.split(cc)
+    except ValueError as error:
+        raise CodegenError(
+            f"the environment variable CC holds {cc[:60]!r}, which is no command ({error}); "
+            "correct or unset it"
+        ) from error
+
+
 @cache
 def _find(cc: str, path: str) -> Compiler | None:
-    candidates = [shlex.split(cc)] if cc.strip() else [[name] for name in NAMES]
+    candidates = [_words(cc)] if cc.strip() else [[name] for name in NAMES]
     for command in candidates:
         executable = shutil.which(command[0], path=path)
         if executable is None:
@@ -143,7 +169,7 @@ def _ask(command: tuple[str, ...], *arguments: str) -> str | None:
             capture_output=True,
             text=True,
             errors="replace",
-            timeout=30,
+            timeout=10,
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired):
@@ -161,6 +187,6 @@ def _failure(compiler: str, source: Path, done: subprocess.CompletedProcess[str]
     said = (lines or done.stderr.splitlines() or ["no message"])[0].strip()
     return (
         f"the C compiler {compiler} failed at {source.name}: {said}; make sure that it compiles a "
-        "C file with math.h (packages such as build-essential or gcc and libc-dev), or name "
-        "another one in the environment variable CC"
+        f"C file with math.h (packages such as build-essential or gcc and libc-dev), or "
+        f"{_OTHER_COMPILER}"
     )

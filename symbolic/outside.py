@@ -17,7 +17,7 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -63,17 +63,21 @@ def resolved(path: Path) -> Path:
         raise OutsideError(f"cannot be read ({_reason(error)})") from error
 
 
-def read_bytes(path: Path, most: int) -> bytes:
+def read_bytes(
+    path: Path, most: int, judge: Callable[[os.stat_result], None] = lambda found: None
+) -> bytes:
     """A regular file's content.
 
     Args:
         path: the file, or a symbolic link to it.
         most: largest size that is taken [bytes].
+        judge: looks at the file that was opened before it is read, and may raise.
 
     Raises:
         OutsideError: it cannot be read, is no regular file, or is larger.
     """
     with _opened(path) as handle:
+        judge(os.fstat(handle))
         return _content(handle, most)
 
 

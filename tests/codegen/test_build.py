@@ -203,7 +203,7 @@ def test_without_a_compiler_interpreted_with_one_warning(cache: Cache) -> None:
     )
     done = run("import warnings; warnings.simplefilter('always')\n" + program, CC="/missing/cc")
     assert done.stdout == "InterpretedFunction 5.0 False\n"
-    assert done.stderr.count("RuntimeWarning") == 1
+    assert done.stderr.count("SlowerWarning") == 1
     assert "no C compiler was found" in done.stderr
     assert "set CC" in done.stderr
     assert not cache.folder.exists()

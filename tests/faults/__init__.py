@@ -1,0 +1,1 @@
+"""Faults of the machine, with the real thing: killed processes, full disks, bad compilers."""
