@@ -40,7 +40,7 @@ def compiler(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None
         ("exit 0\n", "reported success but made no library"),
         (OUTPUT + ': > "$2"\n', "reported success but made no library"),
         (OUTPUT + 'echo nonsense > "$2"\n', "the compiled library cannot be loaded"),
-        (OUTPUT + 'cp "$(command -v true)" "$2"\n', "the compiled library cannot be loaded"),
+        (OUTPUT + 'cp /bin/ls "$2"\n', "the compiled library cannot be loaded"),
         ("kill -9 $$\n", "was ended by signal 9"),
         ("exit 3\n", "failed at square.c: no message"),
     ],
