@@ -25,8 +25,9 @@ from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
 from hybrid_opt.store.json_records import to_json
 from studies.program import add_verbose, run_program
-from studies.summary import reference_front
+from studies.summary import LEAST_TESTED, reference_front
 from studies.terminal_summary import title
+from studies.text_table import number, text_table
 from symbolic.array import Array
 from symbolic.errors import DualArmError
 
@@ -46,7 +47,7 @@ class ComparedFigure:
     Attributes:
         algorithm, figure: which one.
         first, second: its summary over each campaign's replicas.
-        test: rank test between them, None where one of them has no value.
+        test: rank test between them, None with few replicas or where one of them has no value.
     """
 
     algorithm: str
@@ -127,7 +128,7 @@ def _algorithm_figures(
     for figure in (*SEARCHED, *STORED):
         rows = columns if figure in SEARCHED else stored
         values = [np.array([row[figure] for row in side], dtype=float) for side in rows]
-        known = all(np.isfinite(side).any() for side in values)
+        known = all(np.isfinite(side).any() and len(side) >= LEAST_TESTED for side in values)
         labels = ("first", "second")
         compared.append(
             ComparedFigure(
@@ -190,19 +191,25 @@ def as_text(found: Comparison) -> str:
     if not found.same_workcell:
         lines += ["The workcells differ: the figures say more about them than about the runs.", ""]
     lines += [f"{name}: A {a}, B {b}" for name, a, b in found.differences] or ["Same configuration"]
-    lines += [
-        "",
-        f"{'median [quartiles]':<34}{'A':>33}{'B':>33}{'A12':>7}{'p (Holm)':>10}",
-    ]
+    rows = [["median [quartiles]", "A", "B", "A12", "p (Holm)"]]
     for figure in found.figures:
-        name = f"{title(figure.algorithm)}, {figure.figure.replace('_', ' ')}"
         test = figure.test
-        verdict = f"{'-':>7}{'-':>10}" if test is None else f"{test.a12:>7.2f}{test.p_holm:>10.5f}"
-        lines.append(f"{name:<34}{_spread(figure.first):>33}{_spread(figure.second):>33}{verdict}")
+        rows.append(
+            [
+                f"{title(figure.algorithm)}, {figure.figure.replace('_', ' ')}",
+                _spread(figure.first),
+                _spread(figure.second),
+                "-" if test is None else number(test.a12, 2),
+                "-" if test is None else number(test.p_holm, 5),
+            ]
+        )
+    lines += ["", text_table(rows)]
     for side, names in zip("AB", found.only, strict=True):
         if names:
             lines.append(f"only in {side}: {', '.join(title(name) for name in names)}")
-    lines.append("A12: chance that A has the larger figure. Exact Mann-Whitney tests.")
+    lines.append(
+        "A12: chance that A has the larger figure. Exact Mann-Whitney tests from five replicas on."
+    )
     return "\n".join(lines)
 
 

@@ -38,6 +38,7 @@ from studies.cli import Parser
 from studies.program import add_verbose, run_program
 from studies.reference_front import ReferenceFront, read_reference_front
 from studies.terminal_summary import title
+from studies.text_table import number, text_table
 from symbolic.errors import DualArmError
 
 PROGRAM = "python -m studies.control"
@@ -215,32 +216,39 @@ def approaches(root: Path, reference: ReferenceFront) -> list[Approach]:
 
 def approaches_text(found: Sequence[Approach]) -> str:
     """The distances as a table."""
-    lines = [
-        "Distance to the reference front, medians over the replicas",
-        f"{'':<12}{'HV gap':>12}{'polished':>12}{'closed':>10}{'IGD':>11}{'polished':>11}",
-    ]
-    lines += [
-        f"{title(a.algorithm):<12}{a.search_gap:12.6f}{a.polished_gap:12.6f}{a.closed:8.1f} %"
-        f"{a.search_igd:11.6f}{a.polished_igd:11.6f}"
+    head = ["medians over the replicas", "HV gap", "polished", "closed %", "IGD", "polished"]
+    rows = [
+        [
+            title(a.algorithm),
+            number(a.search_gap, 6),
+            number(a.polished_gap, 6),
+            number(a.closed, 1),
+            number(a.search_igd, 6),
+            number(a.polished_igd, 6),
+        ]
         for a in found
     ]
-    return "\n".join(lines)
+    return f"Distance to the reference front\n{text_table([head, *rows])}"
 
 
 def as_text(found: Sequence[Control]) -> str:
     """The comparison as a table."""
-    lines = [
-        "Median hypervolumes; wins: replicas in which the polished front is ahead",
-        f"{'polished front of':<20}{'search':>9}{'polished':>10}  {'longer search':<30}"
-        f"{'HV':>9}{'wins':>9}",
+    rows = [["polished front of", "search", "polished", "longer search", "HV", "wins"]]
+    rows += [
+        [
+            title(entry.algorithm),
+            number(entry.search, 5),
+            number(entry.polished, 5),
+            f"{title(entry.rival)}, {entry.evaluations} evaluations",
+            number(entry.longer, 5),
+            f"{entry.polished_wins}/{entry.replicas}",
+        ]
+        for entry in found
     ]
-    for entry in found:
-        rival = f"{title(entry.rival)}, {entry.evaluations} evaluations"
-        lines.append(
-            f"{title(entry.algorithm):<20}{entry.search:9.5f}{entry.polished:10.5f}  {rival:<30}"
-            f"{entry.longer:9.5f}{entry.polished_wins:5d}/{entry.replicas}"
-        )
-    return "\n".join(lines)
+    return (
+        "Median hypervolumes; wins: replicas in which the polished front is ahead\n"
+        + text_table(rows, left=(0, 3))
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,6 +15,7 @@ from codegen.build import Build, FunctionReport, build_set
 from codegen.cache import Cache
 from codegen.check import Comparison, compare
 from studies.program import add_verbose, run_program
+from studies.text_table import text_table
 from symbolic.errors import DualArmError
 
 PROGRAM = "python -m studies.regenerate"
@@ -120,7 +121,7 @@ def _print_tables(
     if removed is not None:
         print(f"{removed} libraries removed from {cache.folder}")
     if built is not None:
-        print(_table(_HEADINGS, [_row(report) for report in built.reports]))
+        print(text_table([_HEADINGS, *[_row(report) for report in built.reports]]))
     if comparisons:
         print()
         rows = [
@@ -133,7 +134,7 @@ def _print_tables(
             )
             for c in comparisons
         ]
-        print(_table(("function", "inputs", "outputs", "derivatives", "agrees"), rows))
+        print(text_table([("function", "inputs", "outputs", "derivatives", "agrees"), *rows]))
 
 
 _HEADINGS = ("function", "operations", "C size", "compile time", "from cache")
@@ -149,19 +150,6 @@ def _row(report: FunctionReport) -> tuple[str, ...]:
         f"{report.compile_seconds:.2f} s (-O{report.level})",
         "yes" if report.from_cache else "no",
     )
-
-
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Text columns: the first to the left, the others to the right."""
-    widths = [max(len(row[k]) for row in [headings, *rows]) for k in range(len(headings))]
-    lines = [
-        "  ".join(
-            cell.ljust(width) if k == 0 else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in [headings, *rows]
-    ]
-    return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
 
 
 if __name__ == "__main__":

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, StoredTest
+from studies.text_table import number, text_table
 
 TITLES = {
     "nsga2": "NSGA-II",
@@ -83,14 +83,14 @@ def _table_1(algorithms: Mapping[str, AlgorithmFigures]) -> str:
         for figure, _, digits in _TABLE_1:
             scale = 100.0 if figure == "feasible_share" else 1.0
             found = entry.statistics[figure]
-            mean, std = (_number(value, digits, scale) for value in (found.mean, found.std))
+            mean, std = (number(value, digits, scale) for value in (found.mean, found.std))
             cells.append(f"{mean} ± {std}")
         rows.append([title(name), *cells])
     note = (
         "Over replicas; fronts of all evaluated candidates. HV: hypervolume to 1.1 in every\n"
         "objective. IGD: to the non-dominated union of the campaign. Spacing: Schott's."
     )
-    return f"Table 1. Quality of the search\n{_grid(rows)}\n{note}"
+    return f"Table 1. Quality of the search\n{text_table(rows)}\n{note}"
 
 
 def _reasons(algorithms: Mapping[str, AlgorithmFigures]) -> str:
@@ -111,7 +111,7 @@ def _table_2(summary: CampaignSummary) -> str:
     heading = ["N", "least 1", "least 2", "peak 1", "peak 2", "above static %", "payload kg"]
     rows = [heading]
     static = summary.static_hold
-    still = [_number(force, 2) for force in static.normal_force]
+    still = [number(force, 2) for force in static.normal_force]
     for name, entry in summary.algorithms.items():
         row = entry.replicas[entry.representative or 0]
         selected = row.selected
@@ -122,15 +122,15 @@ def _table_2(summary: CampaignSummary) -> str:
         rows.append(
             [
                 f"{title(name)}, replica {entry.representative}",
-                *(_number(force, 2) for force in forces),
-                _number(row.mean_excess_above_static, 2),
-                _number(selected.payload_limit, 2),
+                *(number(force, 2) for force in forces),
+                number(row.mean_excess_above_static, 2),
+                number(selected.payload_limit, 2),
             ]
         )
-    rows.append(["held still", *still, *still, "0.00", _number(static.payload_limit, 2)])
+    rows.append(["held still", *still, *still, "0.00", number(static.payload_limit, 2)])
     return (
         "Table 2. Normal forces of robots 1 and 2 along the selected trajectories (least mean "
-        f"peak\nforce of the replica with the largest hypervolume)\n{_grid(rows)}"
+        f"peak\nforce of the replica with the largest hypervolume)\n{text_table(rows)}"
     )
 
 
@@ -141,10 +141,10 @@ def _over_replicas(algorithms: Mapping[str, AlgorithmFigures]) -> str:
         for figure, _, digits in _SELECTED:
             found = entry.statistics[figure]
             three = (found.median, found.quartile1, found.quartile3)
-            values = [_number(value, digits) for value in three]
+            values = [number(value, digits) for value in three]
             cells.append("{} [{}, {}]".format(*values))
         rows.append([title(name), *cells])
-    return f"Selected solutions of all replicas, and what a replica took\n{_grid(rows)}"
+    return f"Selected solutions of all replicas, and what a replica took\n{text_table(rows)}"
 
 
 def _polish(algorithms: Mapping[str, AlgorithmFigures]) -> str:
@@ -158,18 +158,18 @@ def _polish(algorithms: Mapping[str, AlgorithmFigures]) -> str:
         rows.append(
             [
                 title(name),
-                _number(entry.statistics["hypervolume"].median, 5),
-                _number(after["hypervolume"].median, 5),
+                number(entry.statistics["hypervolume"].median, 5),
+                number(after["hypervolume"].median, 5),
                 f"{entry.polished.replicas_improved} of {len(entry.replicas)}",
-                _number(after["mean_excess_above_static"].median, 2),
-                _number(after["payload_limit"].median, 3),
-                _number(after["seconds"].median, 2),
-                _number(after["equivalent_evaluations"].median, 0),
+                number(after["mean_excess_above_static"].median, 2),
+                number(after["payload_limit"].median, 3),
+                number(after["seconds"].median, 2),
+                number(after["equivalent_evaluations"].median, 0),
             ]
         )
     if len(rows) == 1:
         return ""
-    return f"Fronts after the polish, and what it took\n{_grid(rows)}"
+    return f"Fronts after the polish, and what it took\n{text_table(rows)}"
 
 
 def _tests(tests: Sequence[StoredTest]) -> str:
@@ -180,16 +180,16 @@ def _tests(tests: Sequence[StoredTest]) -> str:
         [
             f"{title(test.first)} / {title(test.second)}",
             test.figure,
-            _number(test.a12, 2),
+            number(test.a12, 2),
             test.magnitude,
-            _number(test.p, 5),
-            _number(test.p_holm, 5),
+            number(test.p, 5),
+            number(test.p_holm, 5),
         ]
         for test in tests
     ]
     return (
         "Comparison over replicas. A12: chance that the first algorithm has the larger figure\n"
-        + _grid(rows)
+        + text_table(rows)
     )
 
 
@@ -198,8 +198,8 @@ def _paper(algorithms: Mapping[str, AlgorithmFigures]) -> str:
     for name, stated in PAPER.items():
         if name in algorithms:
             statistics = algorithms[name].statistics
-            share = _number(statistics["feasible_share"].median, 1, 100.0)
-            payload = _number(statistics["payload_limit"].median, 2)
+            share = number(statistics["feasible_share"].median, 1, 100.0)
+            payload = number(statistics["payload_limit"].median, 2)
             rows.append(
                 [
                     title(name),
@@ -211,23 +211,5 @@ def _paper(algorithms: Mapping[str, AlgorithmFigures]) -> str:
         return ""
     return (
         "Beside the paper, whose rack has the same boards and robots, but unstated details\n"
-        + _grid(rows)
+        + text_table(rows)
     )
-
-
-def _number(value: float | None, digits: int, scale: float = 1.0) -> str:
-    """A figure in print; '-' where there is none."""
-    return "-" if value is None or not math.isfinite(value) else f"{value * scale:.{digits}f}"
-
-
-def _grid(rows: Sequence[Sequence[str]]) -> str:
-    """Rows in columns, the first flush left, the others flush right, a line below the head."""
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = [
-        "  ".join(
-            cell.ljust(width) if k == 0 else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
-    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])

@@ -54,7 +54,7 @@ def test_table(cache: Cache) -> None:
     headings, rule, row = first.stdout.splitlines()
     for heading in ("function", "operations", "C size", "compile time", "from cache"):
         assert heading in headings
-    assert set(rule) == {"-", " "}
+    assert set(rule) == {"-"}
     assert row.startswith("roots")
     assert row.endswith(" no")
     assert "kB" in row
