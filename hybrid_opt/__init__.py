@@ -2,7 +2,7 @@
 
 `Cell` is the only resource. `search` and `polish` make a `Front`, a front gives a `Carry`,
 `time_path` makes a `Timing` of it, and `export` writes that for robots. Rooms, in the order of the
-data: evaluate, collision, metaheuristics, indicators, polishing, timing, store; work and campaign
+data: evaluate, collision, metaheuristics, indicators, polishing, timing, robust, store; work and campaign
 carry out whole studies; display is how objects look in a notebook.
 
 Names are imported when they are first used, so that `import hybrid_opt` takes no time.
@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hybrid_opt.carry import Carry
     from hybrid_opt.cell import Cell
-    from hybrid_opt.door import SearchSettings, polish, save, search, time_every_way, time_path
+    from hybrid_opt.door import polish, save, search, time_every_way, time_path
     from hybrid_opt.evaluate.objectives import Objective
     from hybrid_opt.front import Front
+    from hybrid_opt.metaheuristics.carries import SearchSettings
     from hybrid_opt.polishing.records import PolishSettings
     from hybrid_opt.store.export.formats import export
     from hybrid_opt.timing.records import Timing, TimingLimits
@@ -51,7 +52,7 @@ _HOMES = {
     "Front": "hybrid_opt.front",
     "Objective": "hybrid_opt.evaluate.objectives",
     "PolishSettings": "hybrid_opt.polishing.records",
-    "SearchSettings": "hybrid_opt.door",
+    "SearchSettings": "hybrid_opt.metaheuristics.carries",
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",
     "Workcell": "symbolic.workcell.records",

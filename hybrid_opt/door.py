@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hybrid_opt import metaheuristics
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
-from hybrid_opt.metaheuristics.problem import CarryProblem, ConstraintHandling
+from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from hybrid_opt.polishing.front import FrontPolisher
 from hybrid_opt.polishing.records import PolishSettings
 from hybrid_opt.store.trajectory_figures import trajectory_figures
@@ -22,23 +21,6 @@ from hybrid_opt.timing.overview import TimedTrajectory, timed_trajectory
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path as solve_timing
 from symbolic.array import Array
-
-
-@dataclass(frozen=True)
-class SearchSettings:
-    """How a search is done.
-
-    Attributes:
-        algorithm: values that differ from the algorithm's defaults, see
-            `hybrid_opt.metaheuristics.settings`.
-        constraint_handling: 'penalty' (the paper's) or 'constraints'.
-        initial: (k, n_var) decision vectors that the first generation starts with, the rest being
-            uniformly random; None for the cell's hand-made trajectory. Random search takes none.
-    """
-
-    algorithm: Mapping[str, object] = field(default_factory=dict)
-    constraint_handling: ConstraintHandling = "penalty"
-    initial: Array | None = None
 
 
 def search(
@@ -55,19 +37,17 @@ def search(
         algorithm: one of `hybrid_opt.metaheuristics.names()`.
         evaluations: candidates that may be evaluated.
         rng: the search's only randomness; the same state gives the same front to the bit.
-        settings: see there; None for the defaults.
+        settings: see there; None for the defaults. Where it names no initial candidates, the
+            hand-made trajectory is in the first generation of all but the random search.
 
     Raises:
         SettingsError: an unknown algorithm or a value that is not allowed.
     """
     settings = settings or SearchSettings()
-    initial = cell.initial[None] if settings.initial is None else settings.initial
-    made = metaheuristics.make(
-        algorithm, settings.algorithm, None if algorithm == "random" else initial
-    )
-    problem = CarryProblem(cell.evaluator, settings.constraint_handling)
-    metaheuristics.search(problem, made, evaluations, rng)
-    return Front.of_search(cell, algorithm, cell.evaluator.certified(problem.evaluations))
+    if settings.initial is None and algorithm != "random":
+        settings = replace(settings, initial=cell.initial[None])
+    found = search_carries(cell.evaluator, algorithm, evaluations, rng, settings)
+    return Front.of_search(cell, algorithm, found.evaluations)
 
 
 def polish(

@@ -26,7 +26,6 @@ from hybrid_opt.campaign.summary import (
     StoredFront,
     StoredTest,
 )
-from hybrid_opt.evaluate.evaluation import REASONS
 from hybrid_opt.evaluate.static_hold import StaticHold
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.selection import Selected
@@ -103,9 +102,6 @@ def replica_figures(
     """One replica's entry in the summary; figures that do not exist are NaN or infinite."""
     found = replica.evaluations
     feasible = found.feasible
-    reasons = {
-        name: int(np.count_nonzero(found.reason == index)) for index, name in enumerate(REASONS)
-    }
     return ReplicaFigures(
         **front_indicators(replica.front, reference, selected, file),
         replica=replica.replica,
@@ -113,7 +109,7 @@ def replica_figures(
         feasible=metrics.feasible_count(feasible),
         feasible_share=metrics.feasible_share(feasible),
         seconds=replica.seconds,
-        infeasible_by_reason={name: count for name, count in reasons.items() if count},
+        infeasible_by_reason=found.infeasible_by_reason,
         best_so_far=best_steps(metrics.best_so_far(found.objectives, feasible)),
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -99,3 +100,27 @@ def test_the_index_lists_every_page() -> None:
     index = (ROOT / "docs" / "README.md").read_text("utf-8")
     pages = {path.name for path in ROOT.glob("docs/*.md")} - {"README.md"}
     assert pages <= set(LINK.findall(index))
+
+
+QUESTION = re.compile(r"^\| (.*\*\*(.+?)\*\*.*\?) \| `([^`]+)` \|$", flags=re.MULTILINE)
+
+
+def test_twenty_questions_are_answered_by_one_file_each() -> None:
+    """The file exists and speaks of what the question is about."""
+    asked = QUESTION.findall((ROOT / "CONTRIBUTING.md").read_text("utf-8"))
+    assert len(asked) == 20
+    assert len({file for _, _, file in asked}) == 20
+    for question, subject, file in asked:
+        assert subject.lower() in (ROOT / file).read_text("utf-8").lower(), question
+
+
+def test_every_room_is_listed_and_says_what_is_inside() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    rooms = [
+        path.parent
+        for package in ("symbolic", "hybrid_opt")
+        for path in (ROOT / package).glob("*/__init__.py")
+    ]
+    for room in rooms:
+        assert f"| `{room.relative_to(ROOT).as_posix()}` |" in text, room
+        assert ast.get_docstring(ast.parse((room / "__init__.py").read_text("utf-8"))), room

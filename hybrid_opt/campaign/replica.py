@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybrid_opt import metaheuristics
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.evaluations_file import EvaluationTable, encode, encode_front
 from hybrid_opt.campaign.journal import decode_generation, encode_generation
@@ -16,7 +15,8 @@ from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
-from hybrid_opt.metaheuristics.problem import CarryProblem, Evaluator, disarmed
+from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
+from hybrid_opt.metaheuristics.problem import Evaluator, disarmed
 from symbolic.array import Array
 
 EvaluatorSource = Callable[[], Evaluator]
@@ -94,20 +94,18 @@ def run_replica(
     """
     settings = request.settings
     recording = _Recording(evaluator, request, emit)
-    problem = CarryProblem(recording, settings.constraint_handling)
     start = request.initial[None] if settings.starts_from_initial(request.algorithm) else None
-    algorithm = metaheuristics.make(request.algorithm, settings.overrides(request.algorithm), start)
-    rng = settings.replica_rng(request.algorithm, request.replica)
-    metaheuristics.search(problem, algorithm, settings.evaluations, rng)
-    generation = np.repeat(
-        np.arange(1, len(problem.batches) + 1), [len(batch) for batch in problem.batches]
+    found = search_carries(
+        recording,
+        request.algorithm,
+        settings.evaluations,
+        settings.replica_rng(request.algorithm, request.replica),
+        SearchSettings(settings.overrides(request.algorithm), settings.constraint_handling, start),
     )
-    begin = time.perf_counter()
-    evaluations = recording.certified(problem.evaluations)
-    seconds = sum(recording.seconds) + time.perf_counter() - begin
-    table = EvaluationTable(evaluations, generation, evaluator.objective_names)
+    seconds = sum(recording.seconds) + recording.certification_seconds
+    table = EvaluationTable(found.evaluations, found.generation, evaluator.objective_names)
     front = front_rows(table.evaluations)
-    return ReplicaOutcome(encode(table), encode_front(table, front), len(generation), seconds)
+    return ReplicaOutcome(encode(table), encode_front(table, front), len(found.generation), seconds)
 
 
 def front_rows(evaluations: Evaluations) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
@@ -125,6 +123,7 @@ class _Recording:
         self.n_var = evaluator.n_var
         self.lower, self.upper = evaluator.lower, evaluator.upper
         self.seconds: list[float] = []
+        self.certification_seconds = 0.0
         self._evaluator = evaluator
         self._request = request
         self._emit = emit
@@ -151,4 +150,7 @@ class _Recording:
         return generation
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        return self._evaluator.certified(evaluations)
+        begin = time.perf_counter()
+        certified = self._evaluator.certified(evaluations)
+        self.certification_seconds = time.perf_counter() - begin
+        return certified

@@ -1,1 +1,5 @@
-"""Figures of fronts: indicators, statistics, attainment surfaces, selection."""
+"""Figures of fronts.
+
+metrics: hypervolume, IGD, spacing, counts. statistics: medians, rank tests, effect sizes.
+attainment: surfaces over replicas. selection: one carry of a front.
+"""

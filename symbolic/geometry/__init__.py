@@ -1,1 +1,5 @@
-"""Collision shapes: pieces, bodies, pairs, clearance bounds, bounds of the motion between."""
+"""Collision shapes.
+
+pieces, meshes, bodies, scene: what there is. pairs: what is checked, and why not the rest.
+clearance, covers, softness: bounds of distances. motion_bounds: bounds between two samples.
+"""

@@ -1,1 +1,5 @@
-"""The arms: URDF, Pinocchio's model as CasADi functions, kinematics along a path, branches."""
+"""The arms.
+
+urdf: a robot's file read and checked. model: Pinocchio's kinematics and dynamics as CasADi
+functions, through the compiled bridge. arm: Newton's method along a path. branches: start postures.
+"""

@@ -1,1 +1,5 @@
-"""What a cell is: records, reading and checking its file, the bundle of all its files."""
+"""What a cell is.
+
+records: the frozen description. file, reader, sections, task, robots: from TOML to it, with checks.
+decision: the decision vector. archive: the bundle of all files that a stored trajectory carries.
+"""
