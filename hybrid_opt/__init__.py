@@ -2,8 +2,8 @@
 
 `Cell` is the only resource. `search` and `polish` make a `Front`, a front gives a `Carry`,
 `time_path` makes a `Timing` of it, and `export` writes that for robots. Rooms, in the order of the
-data: evaluate, collision, metaheuristics, indicators, polishing, timing, robust, store; work and campaign
-carry out whole studies; display is how objects look in a notebook.
+data: evaluate, collision, metaheuristics, indicators, polishing, timing, robust, store; work and
+campaign carry out whole studies; display is how objects look in a notebook.
 
 Names are imported when they are first used, so that `import hybrid_opt` takes no time.
 """
