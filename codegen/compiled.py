@@ -136,7 +136,7 @@ class CompiledFunction(NumericFunction):
                     return
                 self._run_chunk(address, begin, end)
 
-        futures = [_executor().submit(drain) for _ in range(min(threads, pieces))]
+        futures = [thread_pool().submit(drain) for _ in range(min(threads, pieces))]
         try:
             wait(futures)
         finally:
@@ -240,7 +240,7 @@ def warn_one_lane(name: str, reason: str) -> None:
 _threads: dict[int, ThreadPoolExecutor] = {}
 
 
-def _executor() -> ThreadPoolExecutor:
+def thread_pool() -> ThreadPoolExecutor:
     """The process's threads; a forked child has none of its parent's and gets its own."""
     process = os.getpid()
     if process not in _threads:

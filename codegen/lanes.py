@@ -64,7 +64,7 @@ _WORD = re.compile(r"[A-Za-z_]\w*")
 _SCALAR_CONDITION = re.compile(
     r"if \(res\d*\[\d+\](?:!=0)?\)|if \(arg\d*\[\d+\]\)|"
     r"arg\[\d+\]\s*\? arg\[\d+\](?:\[\d+\]|\+\d+)? : (?:casadi_zeros|lanes_all_equal\(0\.0\)|0)|"
-    r"for \([^;]*; (?:i<\d+|cs!=\(?&?w\w*\)?(?:\+\d+)?); [^;)]*\)"
+    r"for \([^;]*;\s*(?:i<\d+|cs!=\(?&?w\w*\)?(?:\+\d+)?);[^;)]*\)"
 )
 
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator, reached_samples
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.sampled import reached_samples
 from hybrid_opt.metaheuristics.problem import CarryProblem
 from hybrid_opt.metaheuristics.registry import make
 from hybrid_opt.metaheuristics.run import search

@@ -7,7 +7,7 @@ than FCL's own resolution, so near the tolerance FCL alone decides, screened or 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,9 @@ class CollisionChecker:
         geometry: the cell's bodies and pairs.
         judge: FCL's objects, with counters.
         resting_tolerance: see `RESTING_TOLERANCE`.
+        free_beyond: bounds above this call a pair free [m].
+        resting_places: per allowed contact and fixed pose that touches: pair, box centre (3,),
+            departure [m].
     """
 
     def __init__(
@@ -58,10 +61,10 @@ class CollisionChecker:
         self.resting_tolerance = resting_tolerance
         self.judge = Judge(geometry, resting_tolerance)
         self._functions = functions
-        self._free_beyond = geometry.workcell.collision.tolerance + FCL_RESOLUTION
+        self.free_beyond = geometry.workcell.collision.tolerance + FCL_RESOLUTION
         self._pairs = [(pair.first, pair.second) for pair in geometry.active]
         self._names = geometry.pair_names
-        self._resting = self._find_resting()
+        self.resting_places = self._find_resting()
 
     def bounds(self, pose: Array, q_1: Array, q_2: Array) -> Array:
         """Lower bounds (n, n_pairs) of every active pair's distance [m].
@@ -97,7 +100,7 @@ class CollisionChecker:
         colliding = np.zeros(len(pose), dtype=bool)
         calls = self.judge.calls
         # `not >` keeps a NaN bound open.
-        unsure = ~(clearance > self._free_beyond) if screened else np.full(clearance.shape, True)
+        unsure = ~(clearance > self.free_beyond) if screened else np.full(clearance.shape, True)
         suspects = _by_sample(clearance, unsure)
         first: tuple[int, int] | None = None
         if suspects:
@@ -131,6 +134,27 @@ class CollisionChecker:
             ],
             dtype=bool,
         ).reshape(len(pose), len(self._pairs))
+
+    def collisions(
+        self,
+        pose: Array,
+        q_1: Array,
+        q_2: Array,
+        rows: Sequence[int],
+        pairs: Sequence[int],
+    ) -> list[bool]:
+        """FCL's answer for single pairs of n configurations.
+
+        Args:
+            rows: the configuration of each query, those of one side by side.
+            pairs: its pair.
+        """
+        self._place(pose, q_1, q_2)
+        resting = [self._resting_pairs(centre) for centre in pose[:, :3]]
+        return [
+            self._judge_pair(row, pair, pair in resting[row])
+            for row, pair in zip(rows, pairs, strict=True)
+        ]
 
     def motion(self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]) -> Motion:
         """Bounds of every pair's motion between configurations (pose, q_1, q_2), each (n, 6)."""
@@ -166,7 +190,7 @@ class CollisionChecker:
                 i, j = self._pairs[pair]
                 first = self.judge.shrunk_payload if resting else i
                 apart = self.judge.separation(local, first, j)
-                if apart <= self._free_beyond and self._judge_pair(local, pair, resting):
+                if apart <= self.free_beyond and self._judge_pair(local, pair, resting):
                     hits[k] = pair
                     break
                 clearance[k, pair] = np.fmax(clearance[k, pair], apart)
@@ -216,16 +240,16 @@ class CollisionChecker:
 
     def _resting_pairs(self, centre: Array) -> frozenset[int]:
         """Pairs whose contact is allowed with the box centre here."""
-        if not self._resting:
+        if not self.resting_places:
             return frozenset()
         return frozenset(
             pair
-            for pair, place, departure in self._resting
+            for pair, place, departure in self.resting_places
             if float(np.linalg.norm(centre - place)) <= departure
         )
 
     def _find_resting(self) -> list[tuple[int, Array, float]]:
-        """Per allowed contact and fixed pose that touches: pair, box centre, departure [m]."""
+        """See `resting_places`."""
         task = self.geometry.workcell.task
         pairs = {names: k for k, names in enumerate(self._names)}
         still = np.zeros((1, 6))

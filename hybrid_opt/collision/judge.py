@@ -27,6 +27,7 @@ class Judge:
     Attributes:
         calls: FCL queries made so far.
         updates: placements of pieces handed to FCL so far.
+        resting_shape: the payload smaller by the resting tolerance on every side.
     """
 
     def __init__(self, geometry: CellGeometry, resting_tolerance: float) -> None:
@@ -42,7 +43,8 @@ class Judge:
         ]
         payload = geometry.index(PAYLOAD)
         size = np.asarray(geometry.workcell.payload.size) - 2.0 * resting_tolerance
-        shrunk = Piece(Box(np.maximum(size, SMALLEST_SIZE)), np.eye(4))
+        self.resting_shape = Box(np.maximum(size, SMALLEST_SIZE))
+        shrunk = Piece(self.resting_shape, np.eye(4))
         self.shrunk_payload = len(self._bodies)
         """Index of the payload made smaller by the resting tolerance on every side."""
         self._bodies.append(

@@ -18,15 +18,17 @@ from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.collision.checker import CollisionChecker
-from hybrid_opt.collision.verdict import Verdict
+from hybrid_opt.collision.verdict import sample_durations
 from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificate
 from hybrid_opt.evaluate.functions import workcell_functions
+from hybrid_opt.evaluate.kernel import load_kernel
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective, select_objectives
+from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
 from hybrid_opt.evaluate.time_law import carry_under_time_law
 from hybrid_opt.indicators.metrics import non_dominated
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.functions.candidate import CONSTRAINTS
+from symbolic.functions.candidate import CONSTRAINTS, SAMPLE_SIZES
 from symbolic.geometry.pairs import build_geometry
 from symbolic.workcell.decision import waypoints_of
 from symbolic.workcell.records import Workcell
@@ -148,6 +150,10 @@ class CandidateEvaluator:
         self.n_var = workcell.task.n_var
         self.lower = workcell.task.lower
         self.upper = workcell.task.upper
+        self._needs = _needs(self.objectives)
+        self._kernel = None
+        if functions is None:
+            self._kernel = load_kernel(workcell, self.checker, self.outputs)
 
     def outputs(self, x: Array) -> dict[str, Array]:
         """Every per-sample output for decision vectors (n, n_var), see
@@ -161,8 +167,13 @@ class CandidateEvaluator:
             SettingsError: x has the wrong shape.
         """
         x = self._checked(x)
-        outputs = self.outputs(x)
-        return self._judge(x, outputs)
+        if self._kernel is None:
+            outputs = self.outputs(x)
+            return self._judge(x, one_by_one(outputs, self.checker), outputs)
+        sampled = self._kernel.evaluate(x, self._needs or (), threads=self._threads)
+        return self._judge(
+            x, sampled, sampled.outputs if self._needs is not None else self.outputs(x)
+        )
 
     def carry(self, x: Array) -> Carry:
         """One decision vector (n_var,) with its verdict, under the task's time law.
@@ -172,7 +183,8 @@ class CandidateEvaluator:
         """
         x = self._checked(x)[:1]
         outputs = self.outputs(x)
-        judgement = self._judge(x, outputs).judgement(0, self.objective_names)
+        sampled = one_by_one(outputs, self.checker)
+        judgement = self._judge(x, sampled, outputs).judgement(0, self.objective_names)
         single = {name: values[0] for name, values in outputs.items()}
         return carry_under_time_law(self.workcell, self.functions, x[0], single, judgement)
 
@@ -234,64 +246,67 @@ class CandidateEvaluator:
             )
         return x
 
-    def _judge(self, x: Array, outputs: dict[str, Array]) -> Evaluations:
-        n = len(x)
+    def _judge(
+        self, x: Array, sampled: SampledVerdicts, described: Mapping[str, Array]
+    ) -> Evaluations:
+        """Objectives, feasibility and penalties.
+
+        Args:
+            described: the per-sample outputs that the objectives need.
+        """
         values = np.column_stack(
-            [objective.evaluate(outputs, self.workcell) for objective in self.objectives]
+            [objective.evaluate(described, self.workcell) for objective in self.objectives]
         )
-        n_constraints = len(CONSTRAINTS)
+        n, n_constraints = len(x), len(CONSTRAINTS)
         violation = np.zeros((n, len(REASONS)))
         violation_time = np.zeros((n, len(REASONS)))
-        violation[:, :n_constraints] = outputs["violation"]
-        violation_time[:, :n_constraints] = outputs["violation_time"]
+        violation[:, :n_constraints] = sampled.outputs["violation"]
+        violation_time[:, :n_constraints] = sampled.outputs["violation_time"]
         judged = np.column_stack([values, violation])
         broken = np.asarray(~np.isfinite(judged).all(axis=1), dtype=np.bool_)
-        violation[broken] = 0.0
-        violation_time[broken] = 0.0
+        shares = _collision_shares(sampled.colliding & ~broken[:, None], sampled.outputs["time"])
+        violation[:, n_constraints] = violation_time[:, n_constraints] = shares
+        violation[broken] = violation_time[broken] = 0.0
         violation[broken, REASONS.index(NOT_FINITE)] = 1.0
         violation_time[broken, REASONS.index(NOT_FINITE)] = 1.0
 
-        reason = np.full(n, FEASIBLE, dtype=np.int8)
-        position = np.full(n, np.nan)
-        for row in range(n):
-            if broken[row]:
-                reason[row], position[row] = REASONS.index(NOT_FINITE), 0.0
-                continue
-            verdict = self._collisions(outputs, row)
-            share = verdict.collision_time / float(outputs["time"][row, -1])
-            violation[row, n_constraints] = violation_time[row, n_constraints] = share
-            if share > 0.0 or violation[row].any():
-                reason[row], position[row] = _first_violation(outputs["constraint"][row], verdict)
+        last = sampled.colliding.shape[1] - 1
+        collides = sampled.colliding.any(axis=1)
+        contact = np.where(collides, np.argmax(sampled.colliding, axis=1), last + 1)
+        collides_first = contact < sampled.first_sample
+        reason = np.where(collides_first, REASONS.index(COLLISION), sampled.first_reason)
+        reason[broken] = REASONS.index(NOT_FINITE)
         feasible = reason == FEASIBLE
+        position = np.minimum(contact, sampled.first_sample) / last
+        position[broken] = 0.0
+        position[feasible] = np.nan
         penalty = 1.0 + violation_time.sum(axis=1)
         penalised = np.where(feasible[:, None], values, penalty[:, None])
         return Evaluations(
-            x, values, penalised, feasible, reason, position, violation, violation_time
-        )
-
-    def _collisions(self, outputs: dict[str, Array], row: int) -> Verdict:
-        """The collision verdict on the samples that both arms reach."""
-        reached = reached_samples(outputs, row)
-        return self.checker.check(
-            outputs["pose"][row, :reached],
-            outputs["q_1"][row, :reached],
-            outputs["q_2"][row, :reached],
-            outputs["time"][row, :reached],
+            x,
+            values,
+            penalised,
+            feasible,
+            reason.astype(np.int8),
+            position,
+            violation,
+            violation_time,
         )
 
 
-def reached_samples(outputs: Mapping[str, Array], row: int) -> int:
-    """Number of samples of a candidate before an arm loses the path: those that can collide."""
-    lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
-    return int(np.argmax(lost)) if lost.any() else len(lost)
+def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
+    """What the kernel has to give per sample; None if the objectives need more than it can."""
+    wanted: set[str] = set()
+    for objective in objectives:
+        if objective.needs is None:
+            return None
+        wanted |= set(objective.needs) - {"time"}
+    return tuple(sorted(wanted)) if wanted <= set(SAMPLE_SIZES) else None
 
 
-def _first_violation(constraint: Array, verdict: Verdict) -> tuple[int, float]:
-    """Reason and path parameter of the first violated sample; constraint (samples, k)."""
-    last = len(constraint) - 1
-    violated = constraint > 0.0
-    samples = np.flatnonzero(violated.any(axis=1))
-    contact = verdict.first_contact
-    if contact is not None and (len(samples) == 0 or contact.sample < samples[0]):
-        return REASONS.index(COLLISION), contact.sample / last
-    return int(np.argmax(violated[samples[0]])), float(samples[0]) / last
+def _collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
+    """Share (n,) of the duration that the colliding samples (n, samples) stand for."""
+    shares = np.zeros(len(time))
+    for row in np.flatnonzero(colliding.any(axis=1)).tolist():
+        shares[row] = sample_durations(time[row])[colliding[row]].sum() / time[row, -1]
+    return shares

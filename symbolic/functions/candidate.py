@@ -13,7 +13,14 @@ from symbolic.physics.contact_forces import GRAVITY
 from symbolic.physics.path import sample_basis, waypoint_matrix
 from symbolic.physics.payload_load import LOAD_OUTPUTS, load_function
 from symbolic.physics.time_law import timed_path
-from symbolic.robot.arm import REACH_TOLERANCE, TRACK_OUTPUTS, follow_function
+from symbolic.robot.arm import (
+    REACH_TOLERANCE,
+    TRACK_OUTPUTS,
+    follow_function,
+    prediction_function,
+    start_state,
+    track_function,
+)
 from symbolic.workcell.records import Workcell
 
 CONSTRAINTS = (
@@ -80,6 +87,68 @@ def candidate_function(model: CellModel) -> ca.Function:
     return ca.Function(
         "candidate", [x], list(outputs.values()), ["x"], list(outputs), {"cse": True}
     )
+
+
+_LOAD_SIZES = {
+    "angular_velocity": 3,
+    "angular_acceleration": 3,
+    "normal_force": 2,
+    "tangential_force": 2,
+    "contact_force": 6,
+    "pressure_shift": 2,
+    "shift_vector": 6,
+    "required_moment": 3,
+    "point_moment_residual": 3,
+    "moment_residual": 3,
+}
+_ARM_SIZES = dict(zip(TRACK_OUTPUTS, (6, 1, 1, 1, 1, 6), strict=True))
+
+SAMPLE_SIZES = {
+    **_LOAD_SIZES,
+    **{f"{name}_{i}": size for i in (1, 2) for name, size in _ARM_SIZES.items()},
+    "constraint": len(CONSTRAINTS),
+}
+"""Outputs of `sample_functions`' `sample` after the states, and their entries; the candidate's
+function has the same ones."""
+
+
+def sample_functions(model: CellModel) -> dict[str, ca.Function]:
+    """A candidate's function in parts, to be put together sample by sample.
+
+    path: x (n_var,) -> time (1, n), pose, rate, second_rate (6, n). start: -> state_1, state_2
+    before the first sample. predict: state_1, state_2, pose (6,) of the second sample -> both
+    states before it. sample: pose, rate, second_rate (6,), state_1, state_2 -> next_state_1,
+    next_state_2, then `SAMPLE_SIZES`.
+    """
+    workcell = model.workcell
+    x = ca.MX.sym("x", workcell.task.n_var)
+    path = timed_path(workcell.task, sample_basis(workcell.task), waypoint_matrix(workcell.task, x))
+    motion = [path.time, path.pose, path.rate, path.second_rate]
+    starts = [start_state(ca.SX(ca.DM(q))) for q in model.start]
+    states = [ca.MX.sym(f"state_{i}", starts[0].shape[0]) for i in (1, 2)]
+    box = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    outputs = dict(zip(LOAD_OUTPUTS, load_function(workcell).call(box), strict=True))
+    following, predicted = [], []
+    for i, state in enumerate(states):
+        arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
+        track = track_function(*arm, f"arm_{i + 1}_sample")
+        after, *tracked = track(state, box[0], outputs[f"wrench_{i + 1}"])
+        following.append(after)
+        outputs |= {
+            f"{name}_{i + 1}": value for name, value in zip(TRACK_OUTPUTS, tracked, strict=True)
+        }
+        predicted.append(prediction_function(*arm, f"arm_{i + 1}_prediction")(state, box[0]))
+    inputs = [outputs[name] for name in _CONSTRAINT_INPUTS]
+    outputs["constraint"] = _constraint_function(workcell)(*inputs)
+    results = [*following, *(outputs[name] for name in SAMPLE_SIZES)]
+    names = ["next_state_1", "next_state_2", *SAMPLE_SIZES]
+    given = [*box, *states]
+    return {
+        "path": ca.Function("path", [x], motion, {"cse": True}),
+        "start": ca.Function("start", [], starts),
+        "predict": ca.Function("predict", [*states, box[0]], predicted),
+        "sample": ca.Function("sample", given, results, [v.name() for v in given], names),
+    }
 
 
 def _track(model: CellModel, i: int, pose: ca.MX, wrench: ca.MX) -> dict[str, ca.MX]:

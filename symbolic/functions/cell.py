@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from symbolic.cell_model import build_cell_model
-from symbolic.functions.candidate import candidate_function
+from symbolic.functions.candidate import candidate_function, sample_functions
 from symbolic.geometry.clearance import screening_functions
 from symbolic.robot.arm import posture_function
 from symbolic.workcell.records import Workcell
@@ -30,4 +30,21 @@ def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
         **{f"inverse_dynamics_{i + 1}": model.robots[i].inverse_dynamics for i in (0, 1)},
         "posture": posture_function(model.workcell.robots, model.robots, model.workcell.contacts),
         **screening_functions(model.geometry, placements),
+    }
+
+
+def kernel_functions(workcell: Workcell) -> dict[str, ca.Function]:
+    """What a whole evaluation is put together from, sample by sample.
+
+    path, start, predict, sample: see `symbolic.functions.candidate.sample_functions`.
+    clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
+
+    Raises:
+        DualArmError: the cell's model cannot be built.
+    """
+    model = build_cell_model(workcell)
+    placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
+    screening = screening_functions(model.geometry, placements)
+    return sample_functions(model) | {
+        name: screening[name] for name in ("clearance", "piece_poses")
     }

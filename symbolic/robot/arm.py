@@ -10,6 +10,7 @@ from __future__ import annotations
 import casadi as ca
 
 from symbolic.array import Array
+from symbolic.expression import Expression
 from symbolic.physics.pose import inverse
 from symbolic.physics.rotation import rotation_matrix
 from symbolic.robot.model import RobotModel
@@ -176,9 +177,9 @@ def follow_function(
     start, pose = ca.MX.sym("start", 6), ca.MX.sym("pose", 6, samples)
     wrench = ca.MX.sym("wrench", 6, samples)
     track = track_function(robot, model, contact, f"{name}_sample")
-    first = track(ca.vertcat(start, start, 0.0), pose[:, 0], wrench[:, 0])
-    predicted = _prediction_function(robot, model, contact, f"{name}_prediction")(start, pose[:, 1])
-    state = ca.vertcat(start, 2.0 * start - predicted, first[0][12])
+    first = track(start_state(start), pose[:, 0], wrench[:, 0])
+    predict = prediction_function(robot, model, contact, f"{name}_prediction")
+    state = predict(first[0], pose[:, 1])
     rest = track.mapaccum(f"{name}_samples", samples - 1)(state, pose[:, 1:], wrench[:, 1:])
     return ca.Function(
         name,
@@ -189,16 +190,25 @@ def follow_function(
     )
 
 
-def _prediction_function(
+def start_state(start: Expression) -> Expression:
+    """State of `track_function` before the first sample, from its joints (6,)."""
+    return ca.vertcat(start, start, 0.0)
+
+
+def prediction_function(
     robot: Robot, model: RobotModel, contact: Contact, name: str
 ) -> ca.Function:
-    """Joints (6,) after `NEWTON_STEPS` from given joints towards a box pose (6,)."""
-    start, pose = ca.SX.sym("start", 6), ca.SX.sym("pose", 6)
+    """State of `track_function` after the first sample -> one that predicts the second.
+
+    Inputs: state (13,); pose (6,) of the box at the second sample.
+    """
+    state, pose = ca.SX.sym("state", 13), ca.SX.sym("pose", 6)
     R_target, p_target = flange_target(robot, contact, pose[:3], rotation_matrix(pose[3:]))
-    q = start
+    q = start = state[:6]
     for _ in range(NEWTON_STEPS):
         q = newton_step(model, q, R_target, p_target)
-    return ca.Function(name, [start, pose], ca.cse([q]), ["start", "pose"], ["q"])
+    predicting = ca.vertcat(start, 2.0 * start - q, state[12])
+    return ca.Function(name, [state, pose], ca.cse([predicting]), ["state", "pose"], ["predicting"])
 
 
 def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Function:

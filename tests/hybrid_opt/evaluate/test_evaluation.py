@@ -17,8 +17,8 @@ from hybrid_opt.evaluate.evaluation import (
     REASONS,
     CandidateEvaluator,
     Evaluations,
-    reached_samples,
 )
+from hybrid_opt.evaluate.sampled import reached_samples
 from studies.plain.collisions import PlainCollisionChecker
 from studies.plain.verdict import PlainJudge, PlainVerdict
 from symbolic.array import Array

@@ -1,0 +1,260 @@
+/* Candidates in lanes, from the decision vector to the verdict on every sample.
+
+   Behind the cell's functions `path`, `start`, `predict`, `sample`, `clearance` and `piece_poses`
+   in lanes (symbolic.functions.cell) and the shapes' proofs (hybrid_opt/collision/prejudge.c). The
+   numbers in capitals are defined by hybrid_opt/evaluate/kernel.py. */
+
+/* A pair of one sample that neither bounds nor proofs decide. */
+typedef struct {
+  long long candidate, sample, pair;
+  double configuration[18]; /* box pose, joints of both arms */
+} open_pair;
+
+typedef struct { long long pair; double place[3], departure; } resting_place;
+
+/* The cell's shapes: piece k of body b for first_piece[b] <= k < first_piece[b + 1]; a further
+   body is the payload that may rest, whose one piece is placed as the payload. */
+typedef struct {
+  const long long *pairs, *first_piece;
+  const shape* shapes;
+  const double* vertices;
+  const resting_place* resting;
+  long long n_resting, payload_piece, resting_piece;
+  double free_beyond, apart, overlap, tolerance;
+} judge_data;
+
+/* Results of n candidates, an axis over them first. wanted: per output of `sample`, (n, samples,
+   size) or null. */
+typedef struct {
+  const double* x;
+  long long n, with_collisions, room;
+  double *time, *violation, *violation_time;
+  long long *first_sample, *first_reason, *reached;
+  unsigned char* colliding;
+  double** wanted;
+  open_pair* open;
+  long long n_open;
+} batch_data;
+
+#define STATE start_OUT_0
+#define MOST(a, b) ((a) > (b) ? (a) : (b))
+#define MOST_OF(what)                                                                        \
+  MOST(MOST(MOST(path_##what, start_##what), MOST(predict_##what, sample_##what)),           \
+       MOST(clearance_##what, piece_poses_##what))
+#define AFTER_STATES 2 /* outputs of `sample` before those that can be asked for */
+
+typedef struct {
+  lanes_real x[N_VAR], time[N_SAMPLES], pose[N_SAMPLES][6], rate[N_SAMPLES][6],
+      second_rate[N_SAMPLES][6], q[N_SAMPLES][2][6], state[2][2][STATE], outputs[SAMPLE_SIZE],
+      clearance[N_PAIRS + 1], quaternions[4 * N_PIECES], positions[3 * N_PIECES],
+      w[MOST_OF(W) + 1];
+  const lanes_real* arg[MOST_OF(ARG) + 8];
+  lanes_real* res[MOST_OF(RES) + 64];
+  lanes_int iw[MOST_OF(IW) + 1];
+} scratch;
+
+/* One per thread, kept as long as the thread. */
+static __thread scratch* own;
+
+static double lane_of(const lanes_real* x, int l) { return ((const double*)x)[l]; }
+
+/* Both arms and the load along the samples: violations, states, and what is asked for. */
+static int follow(const batch_data* batch, long long first, int m) {
+  scratch* s = own;
+  lanes_real violation[N_CONSTRAINTS], share[N_CONSTRAINTS], zero = lanes_all_equal(0.0);
+  lanes_mask first_sample = (lanes_mask){0} + N_SAMPLES, first_reason = (lanes_mask){0} - 1;
+  lanes_mask reached = (lanes_mask){0} + N_SAMPLES;
+  for (int c = 0; c < N_CONSTRAINTS; ++c) violation[c] = share[c] = zero;
+  s->res[0] = s->state[0][0];
+  s->res[1] = s->state[0][1];
+  if (start(s->arg, s->res, s->iw, s->w)) return 1;
+  lanes_real total = s->time[N_SAMPLES - 1];
+  for (int k = 0; k < N_SAMPLES; ++k) {
+    lanes_real(*before)[STATE] = s->state[k % 2], (*after)[STATE] = s->state[1 - k % 2];
+    if (k == 1) {
+      for (int i = 0; i < 2; ++i) s->arg[i] = before[i];
+      s->arg[2] = s->pose[1];
+      for (int i = 0; i < 2; ++i) s->res[i] = after[i];
+      if (predict(s->arg, s->res, s->iw, s->w)) return 1;
+      memcpy(before, after, sizeof s->state[0]);
+    }
+    s->arg[0] = s->pose[k];
+    s->arg[1] = s->rate[k];
+    s->arg[2] = s->second_rate[k];
+    for (int i = 0; i < 2; ++i) s->arg[3 + i] = before[i];
+    for (int i = 0; i < 2; ++i) s->res[i] = after[i];
+    for (int o = 0; o < N_OUTPUTS; ++o) s->res[AFTER_STATES + o] = s->outputs + OUTPUT_AT[o];
+    if (sample(s->arg, s->res, s->iw, s->w)) return 1;
+    for (int i = 0; i < 2; ++i) memcpy(s->q[k][i], s->outputs + Q_AT[i], sizeof s->q[k][i]);
+    lanes_mask lost = (s->outputs[LOST_AT[0]] > zero) | (s->outputs[LOST_AT[1]] > zero);
+    lanes_mask now = lost & (reached == N_SAMPLES);
+    reached = (now & k) | (~now & reached);
+    lanes_real since = k ? s->time[k] - s->time[k - 1] : zero;
+    lanes_real until = k + 1 < N_SAMPLES ? s->time[k + 1] - s->time[k] : zero;
+    lanes_real part = (since + until) / (2.0 * total);
+    const lanes_real* constraint = s->outputs + CONSTRAINT_AT;
+    for (int c = 0; c < N_CONSTRAINTS; ++c) {
+      lanes_mask violated = constraint[c] > zero;
+      violation[c] = lanes_fmax(violation[c], lanes_fmax(constraint[c], zero));
+      share[c] += lanes_where(violated, part);
+      lanes_mask new = violated & (first_sample == N_SAMPLES);
+      first_sample = (new & k) | (~new & first_sample);
+      first_reason = (new & c) | (~new & first_reason);
+    }
+    for (int o = 0; o < N_OUTPUTS; ++o) {
+      if (!batch->wanted[o]) continue;
+      for (int l = 0; l < m; ++l)
+        for (int j = 0; j < OUTPUT_SIZE[o]; ++j)
+          batch->wanted[o][((first + l) * N_SAMPLES + k) * OUTPUT_SIZE[o] + j] =
+              lane_of(s->outputs + OUTPUT_AT[o] + j, l);
+    }
+  }
+  for (int l = 0; l < m; ++l) {
+    long long row = first + l;
+    for (int c = 0; c < N_CONSTRAINTS; ++c) {
+      batch->violation[row * N_CONSTRAINTS + c] = lane_of(violation + c, l);
+      batch->violation_time[row * N_CONSTRAINTS + c] = lane_of(share + c, l);
+    }
+    for (int k = 0; k < N_SAMPLES; ++k) batch->time[row * N_SAMPLES + k] = lane_of(s->time + k, l);
+    batch->first_sample[row] = first_sample[l];
+    batch->first_reason[row] = first_reason[l];
+    batch->reached[row] = reached[l];
+  }
+  return 0;
+}
+
+static placed piece_place(long long piece, int l) {
+  const scratch* s = own;
+  const lanes_real *q = s->quaternions + 4 * piece, *p = s->positions + 3 * piece;
+  double w = lane_of(q, l), x = lane_of(q + 1, l), y = lane_of(q + 2, l), z = lane_of(q + 3, l);
+  return (placed){{1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+                   2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+                   2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)},
+                  {lane_of(p, l), lane_of(p + 1, l), lane_of(p + 2, l)}};
+}
+
+/* Whether a pair is allowed to touch here; OPEN where rounding could tell otherwise. */
+static int rests(const judge_data* judge, long long pair, int k, int l) {
+  for (long long i = 0; i < judge->n_resting; ++i) {
+    const resting_place* at = judge->resting + i;
+    if (at->pair != pair) continue;
+    double square = 0.0;
+    for (int j = 0; j < 3; ++j) {
+      double off = lane_of(own->pose[k] + j, l) - at->place[j];
+      square += off * off;
+    }
+    double beyond = sqrt(square) - at->departure;
+    if (!(fabs(beyond) > 1e-9)) return -1;
+    if (beyond < 0.0) return 1;
+  }
+  return 0;
+}
+
+static int prejudge(const judge_data* judge, long long pair, int k, int l) {
+  const long long *bodies = judge->pairs + 2 * pair, *first = judge->first_piece;
+  int resting = rests(judge, pair, k, l), found = APART;
+  if (resting < 0) return OPEN;
+  /* A resting payload may come nearer than the tolerance; it only must not intersect. */
+  double apart = judge->apart + (resting ? 0.0 : judge->tolerance);
+  long long begin = resting ? judge->resting_piece : first[bodies[0]];
+  long long end = resting ? begin + 1 : first[bodies[0] + 1];
+  for (long long i = begin; i < end; ++i) {
+    placed a = piece_place(resting ? judge->payload_piece : i, l);
+    for (long long j = first[bodies[1]]; j < first[bodies[1] + 1]; ++j) {
+      placed b = piece_place(j, l);
+      int one = prejudge_shapes(judge->shapes + i, &a, judge->shapes + j, &b, judge->vertices,
+                                apart, judge->overlap);
+      if (one == INTERSECTING) return INTERSECTING;
+      if (one == OPEN) found = OPEN;
+    }
+  }
+  return found;
+}
+
+/* Which samples of the candidates collide, and which pairs are still to be judged. */
+static int collide(batch_data* batch, const judge_data* judge, long long first, int m) {
+  scratch* s = own;
+  lanes_real free_beyond = lanes_all_equal(judge->free_beyond);
+  for (int k = 0; k < N_SAMPLES; ++k) {
+    unsigned alive = 0, placed_already = 0;
+    lanes_real sum = lanes_all_equal(0.0);
+    for (int j = 0; j < 6; ++j) sum += s->pose[k][j] + s->q[k][0][j] + s->q[k][1][j];
+    /* What is not finite is no posture; the candidate fails for that. */
+    unsigned finite = lanes_bits(lanes_fabs(sum) < lanes_all_equal(INFINITY));
+    for (int l = 0; l < m; ++l) alive |= (unsigned)(k < batch->reached[first + l]) << l;
+    alive &= finite;
+    if (!alive) continue;
+    s->arg[0] = s->pose[k];
+    for (int i = 0; i < 2; ++i) s->arg[1 + i] = s->q[k][i];
+    s->res[0] = s->clearance;
+    if (clearance(s->arg, s->res, s->iw, s->w)) return 1;
+    unsigned colliding = 0;
+    long long kept = batch->n_open;
+    for (int pair = 0; pair < N_PAIRS; ++pair) {
+      /* Not above: a bound that is not a number stays open. */
+      lanes_mask free = s->clearance[pair] > free_beyond;
+      unsigned bits = ~lanes_bits(free) & alive & ~colliding;
+      if (__builtin_expect(!bits, 1)) continue;
+      if (!placed_already) {
+        s->arg[0] = s->pose[k];
+        for (int i = 0; i < 2; ++i) s->arg[1 + i] = s->q[k][i];
+        s->res[0] = s->quaternions;
+        s->res[1] = s->positions;
+        if (piece_poses(s->arg, s->res, s->iw, s->w)) return 1;
+        placed_already = 1;
+      }
+      for (int l = 0; l < m; ++l) {
+        if (!(bits >> l & 1u)) continue;
+        int found = prejudge(judge, pair, k, l);
+        if (found == INTERSECTING) colliding |= 1u << l;
+        if (found != OPEN) continue;
+        open_pair* one = batch->open + batch->n_open++;
+        one->candidate = first + l;
+        one->sample = k;
+        one->pair = pair;
+        for (int j = 0; j < 6; ++j) {
+          one->configuration[j] = lane_of(s->pose[k] + j, l);
+          one->configuration[6 + j] = lane_of(s->q[k][0] + j, l);
+          one->configuration[12 + j] = lane_of(s->q[k][1] + j, l);
+        }
+      }
+    }
+    /* A sample that collides has no more to be judged. */
+    for (long long i = kept; i < batch->n_open; ++i) {
+      open_pair* one = batch->open + i;
+      if (!(colliding >> (one->candidate - first) & 1u)) batch->open[kept++] = *one;
+    }
+    batch->n_open = kept;
+    for (int l = 0; l < m; ++l)
+      batch->colliding[(first + l) * N_SAMPLES + k] = colliding >> l & 1u;
+  }
+  return 0;
+}
+
+/* Evaluate candidates from `begin` on. Returns the candidate to go on with once the open pairs are
+   taken, n at the end, or -1 where memory is short or a function failed. */
+DUAL_ARM_EXPORT long long dual_arm_evaluate(batch_data* batch, const judge_data* judge,
+                                            long long begin) {
+  if (!own) {
+    own = aligned_alloc(64, (sizeof(scratch) + 63) / 64 * 64);
+    if (!own) return -1;
+  }
+  scratch* s = own;
+  batch->n_open = 0;
+  for (long long first = begin; first < batch->n; first += DUAL_ARM_LANES) {
+    if (batch->room - batch->n_open < DUAL_ARM_LANES * (long long)N_SAMPLES * N_PAIRS)
+      return first;
+    int m = batch->n - first < DUAL_ARM_LANES ? (int)(batch->n - first) : DUAL_ARM_LANES;
+    for (int j = 0; j < N_VAR; ++j)
+      for (int l = 0; l < DUAL_ARM_LANES; ++l)
+        ((double*)(s->x + j))[l] = batch->x[(first + (l < m ? l : m - 1)) * N_VAR + j];
+    s->arg[0] = s->x;
+    s->res[0] = s->time;
+    s->res[1] = s->pose[0];
+    s->res[2] = s->rate[0];
+    s->res[3] = s->second_rate[0];
+    if (path(s->arg, s->res, s->iw, s->w) || follow(batch, first, m)) return -1;
+    if (batch->with_collisions && collide(batch, judge, first, m)) return -1;
+  }
+  return batch->n;
+}

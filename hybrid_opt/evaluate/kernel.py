@@ -1,0 +1,234 @@
+"""Whole evaluations in lanes: from decision vectors to what is left for FCL.
+
+`kernel.c` calls the cell's functions sample by sample, several candidates side by side, sums up the
+violations, bounds every pair's distance, and proves of most pairs that the bounds leave open that
+they are apart or intersect. Quantities per sample leave it only where they are asked for.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Mapping, Sequence
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.cache import Cache
+from codegen.compiled import thread_pool, warn_one_lane
+from codegen.errors import CodegenError
+from codegen.function import available_cores
+from codegen.program import load_or_build_program
+from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.evaluate.functions import workcell_key
+from hybrid_opt.evaluate.kernel_data import OPEN_PAIR, BatchData, judge_arrays, judge_data
+from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
+from symbolic.array import Array
+from symbolic.functions.candidate import CONSTRAINTS, SAMPLE_SIZES
+from symbolic.geometry.pairs import CellGeometry
+from symbolic.workcell.records import Workcell
+
+_LEAST_ROOM = 4096
+"""Open pairs that are collected before they are handed on, beside those of one pass."""
+
+
+class Kernel:
+    """A cell's evaluation in lanes. Not to be shared between threads, as its checker.
+
+    Attributes:
+        lanes: candidates side by side.
+    """
+
+    def __init__(self, library: ctypes.CDLL, checker: CollisionChecker) -> None:
+        """Prepare the shapes; `load_kernel` gives the library."""
+        self._evaluate = library.dual_arm_evaluate
+        self._evaluate.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong]
+        self._evaluate.restype = ctypes.c_longlong
+        self.lanes = int(library.dual_arm_lanes())
+        self._checker = checker
+        self._samples = checker.geometry.workcell.task.samples
+        self._keep = judge_arrays(checker)
+        self._judge = judge_data(checker, self._keep)
+        self._room = self.lanes * self._samples * len(checker.geometry.active) + _LEAST_ROOM
+
+    def evaluate(
+        self,
+        x: Array,
+        wanted: Sequence[str] = (),
+        with_collisions: bool = True,
+        threads: int = 1,
+    ) -> SampledVerdicts:
+        """Evaluate decision vectors (n, n_var).
+
+        Args:
+            wanted: of `SAMPLE_SIZES`, what is needed per sample.
+            with_collisions: False leaves collisions out.
+            threads: to spread the candidates over; 0 for one per core. Has no influence on the
+                results; FCL's part runs in the calling thread.
+
+        Raises:
+            CodegenError: memory is short.
+        """
+        n, samples = len(x), self._samples
+        outputs = {
+            "time": np.empty((n, samples)),
+            "violation": np.empty((n, len(CONSTRAINTS))),
+            "violation_time": np.empty((n, len(CONSTRAINTS))),
+        }
+        asked = {name: np.empty((n, samples, SAMPLE_SIZES[name])) for name in wanted}
+        whole = {name: np.empty(n, np.int64) for name in ("first_sample", "first_reason")}
+        extra: dict[str, NDArray[Any]] = {
+            "x": x,
+            "reached": np.empty(n, np.int64),
+            "colliding": np.zeros((n, samples), dtype=np.uint8),
+        }
+        arrays: dict[str, NDArray[Any]] = {**outputs, **whole, **extra}
+        n_threads = min(threads or available_cores(), max(n // self.lanes, 1))
+        bounds = [n * k // n_threads for k in range(n_threads + 1)]
+
+        def run(begin: int, end: int) -> list[NDArray[np.void]]:
+            rows = slice(begin, end)
+            addresses = [
+                asked[name][rows].ctypes.data if name in asked else None for name in SAMPLE_SIZES
+            ]
+            found = self._run({k: v[rows] for k, v in arrays.items()}, addresses, with_collisions)
+            for part in found:
+                part["candidate"] += begin
+            return found
+
+        if n_threads == 1:
+            found = [run(0, n)]
+        else:
+            found = list(thread_pool().map(run, bounds[:-1], bounds[1:]))
+        left = np.concatenate(
+            [np.empty(0, OPEN_PAIR), *(part for parts in found for part in parts)]
+        )
+        colliding = extra["colliding"].astype(np.bool_)
+        hit = self._judged(left)
+        colliding[left["candidate"][hit], left["sample"][hit]] = True
+        # A scalar per sample has no axis of its own.
+        outputs |= {
+            name: values[:, :, 0] if SAMPLE_SIZES[name] == 1 else values
+            for name, values in asked.items()
+        }
+        return SampledVerdicts(outputs, colliding=colliding, **whole)
+
+    def _run(
+        self,
+        arrays: Mapping[str, NDArray[Any]],
+        wanted: Sequence[int | None],
+        with_collisions: bool,
+    ) -> list[NDArray[np.void]]:
+        """The kernel on candidates of one thread; the pairs that it leaves open."""
+        n, room = len(arrays["x"]), np.empty(self._room if with_collisions else 0, OPEN_PAIR)
+        pointers = (ctypes.c_void_p * len(wanted))(*wanted)
+        batch = BatchData(
+            n=n,
+            with_collisions=with_collisions,
+            room=self._room,
+            wanted=ctypes.addressof(pointers),
+            open=room.ctypes.data,
+            **{name: array.ctypes.data for name, array in arrays.items()},
+        )
+        begin, found = 0, []
+        while begin < n:
+            begin = self._evaluate(ctypes.byref(batch), ctypes.byref(self._judge), begin)
+            if begin < 0:
+                raise CodegenError(
+                    "candidates cannot be evaluated: memory is short; evaluate fewer at once"
+                )
+            found.append(room[: batch.n_open].copy())
+        return found
+
+    def _judged(self, left: NDArray[np.void]) -> NDArray[np.bool_]:
+        """FCL's word on open pairs."""
+        if not len(left):
+            return np.zeros(0, dtype=bool)
+        # Pairs of one sample lie side by side: placed once.
+        place = left["candidate"] * self._samples + left["sample"]
+        new = np.concatenate([[True], place[1:] != place[:-1]])
+        configuration = left["configuration"][new]
+        pose, q_1, q_2 = (np.ascontiguousarray(configuration[:, k : k + 6]) for k in (0, 6, 12))
+        rows = (np.cumsum(new) - 1).tolist()
+        return np.array(self._checker.collisions(pose, q_1, q_2, rows, left["pair"].tolist()))
+
+
+def load_kernel(
+    workcell: Workcell,
+    checker: CollisionChecker,
+    outputs: Callable[[Array], Mapping[str, Array]],
+    cache: Cache | None = None,
+    lanes: int = 0,
+) -> Kernel | None:
+    """The kernel of a cell that was read from a file.
+
+    It is only used where it gives the bits of the functions that it is made of.
+
+    Args:
+        outputs: of decision vectors, as the candidate function has them.
+        cache: where the library is kept; by default the user's.
+        lanes: candidates side by side; 0 for what suits the machine.
+
+    Returns:
+        None where there can be no kernel; with one warning where it can be but fails.
+    """
+    if not workcell.digest:
+        return None
+
+    def make() -> Mapping[str, Any]:
+        from symbolic.functions.cell import kernel_functions
+
+        return kernel_functions(workcell)
+
+    own = _definitions(checker.geometry) + "".join(
+        files("hybrid_opt").joinpath(*path).read_text()
+        for path in (("collision", "prejudge.c"), ("evaluate", "kernel.c"))
+    )
+    library = load_or_build_program("kernel", workcell_key(workcell), make, own, cache, lanes)
+    if library is None:
+        return None
+    kernel = Kernel(library, checker)
+    task = workcell.task
+    x = np.random.default_rng(0).uniform(task.lower, task.upper, (kernel.lanes + 1, task.n_var))
+    if _same(kernel.evaluate(x, tuple(SAMPLE_SIZES)), one_by_one(outputs(x), checker)):
+        return kernel
+    warn_one_lane("kernel", "it differs from the functions that it is made of")
+    return None
+
+
+def _same(found: SampledVerdicts, expected: SampledVerdicts) -> bool:
+    """Whether two evaluations agree to the last bit, in all that the first one has."""
+    pairs = [(values, expected.outputs[name]) for name, values in found.outputs.items()]
+    pairs += [
+        (getattr(found, name), getattr(expected, name))
+        for name in ("first_sample", "first_reason", "colliding")
+    ]
+    return all(np.array_equal(one, other, equal_nan=True) for one, other in pairs)
+
+
+def _definitions(geometry: CellGeometry) -> str:
+    """The numbers that kernel.c is written for."""
+    ends = np.cumsum(list(SAMPLE_SIZES.values()))
+    starts = dict(zip(SAMPLE_SIZES, [0, *ends.tolist()], strict=False))
+    numbers = {
+        "N_VAR": geometry.workcell.task.n_var,
+        "N_SAMPLES": geometry.workcell.task.samples,
+        "N_PAIRS": len(geometry.active),
+        "N_PIECES": sum(len(body.pieces) for body in geometry.bodies),
+        "N_CONSTRAINTS": len(CONSTRAINTS),
+        "N_OUTPUTS": len(SAMPLE_SIZES),
+        "SAMPLE_SIZE": sum(SAMPLE_SIZES.values()),
+        "CONSTRAINT_AT": starts["constraint"],
+    }
+    lists = {
+        "OUTPUT_SIZE": list(SAMPLE_SIZES.values()),
+        "OUTPUT_AT": list(starts.values()),
+        "Q_AT": [starts["q_1"], starts["q_2"]],
+        "LOST_AT": [starts["lost_1"], starts["lost_2"]],
+    }
+    lines = [f"#define {name} {value}" for name, value in numbers.items()]
+    for name, values in lists.items():
+        entries = ", ".join(map(str, values))
+        lines.append(f"static const int {name}[{len(values)}] = {{{entries}}};")
+    return "\n".join(lines) + "\n"
