@@ -1,0 +1,138 @@
+"""Damaged results folders: read soundly or refused, by every program that reads them."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
+from hybrid_opt.campaign.polish_stage import read_polished
+from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.polishing.records import PolishSettings
+from studies.compare import compare
+from studies.report.data import gather_carries
+from studies.run import StudySettings, run_study
+from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
+from tests.fuzz.promises import kept
+from tests.symbolic.cells import ROOT
+
+TRANSFER = ROOT / "studies" / "workcells" / "transfer.toml"
+EVALUATIONS, MARK = "evaluations.csv.gz", "replica.json"
+
+quick = settings(max_examples=15, suppress_health_check=list(HealthCheck))
+thorough = settings(max_examples=1000, suppress_health_check=list(HealthCheck))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A polished and timed study, as small as it can be."""
+    root = tmp_path_factory.mktemp("whole") / "results"
+    campaign = CampaignSettings(
+        algorithms=("nsga2",), evaluations=60, replicas=1, seed=3, populations=(("nsga2", 20),)
+    )
+    study = StudySettings(PolishSettings(points=1), report=False)
+    run_study(TRANSFER, campaign, ExecutionSettings(root, jobs=1), Progress(shown=False), study)
+    return root
+
+
+@pytest.fixture(scope="module")
+def damaged_copy(whole: Path) -> Path:
+    """A copy whose files are damaged one at a time."""
+    return Path(shutil.copytree(whole, whole.with_name("damaged")))
+
+
+@contextlib.contextmanager
+def replaced(path: Path, content: bytes) -> Iterator[None]:
+    """A file with other content, for a while."""
+    before = path.read_bytes()
+    path.write_bytes(content)
+    try:
+        yield
+    finally:
+        path.write_bytes(before)
+
+
+def judged(root: Path, whole: Path) -> None:
+    """What programs read is told as damaged, or sound, and then drawn without a fault."""
+    compared = kept(lambda: compare(whole, root), str(root), "compare", "share", "in common")
+    if compared is None:
+        return
+    results = read_campaign(root)
+    for replica in results.replicas:
+        assert np.isfinite(replica.front).all()
+        polished = read_polished(root, replica, results.workcell)
+        if polished is not None:
+            assert np.isfinite(polished.objectives).all()
+            assert polished.x.shape[1] == results.workcell.task.n_var
+            assert np.abs(polished.x).max(initial=0.0) < 100.0
+    kept(lambda: gather_carries(root), str(root))
+
+
+def read_files(root: Path) -> list[str]:
+    """The files of a folder that programs read, by name."""
+    return sorted(
+        path.relative_to(root).as_posix()
+        for path in root.rglob("*")
+        if path.is_file()
+        and not path.name.startswith(".")
+        and path.suffix in (".json", ".gz", ".csv", ".toml", ".urdf")
+    )
+
+
+def in_bytes(root: Path, whole: Path, share: float, damaged: Bytes) -> None:
+    names = read_files(root)
+    path = root / names[int(share * len(names))]
+    with replaced(path, damaged(path.read_bytes())):
+        judged(root, whole)
+
+
+def in_values(root: Path, whole: Path, share: float, damaged: Tree) -> None:
+    names = [name for name in read_files(root) if name.endswith(".json")]
+    path = root / names[int(share * len(names))]
+    tree = damaged(json.loads(path.read_bytes()))
+    with replaced(path, json.dumps(tree).encode("utf-8", "surrogatepass")):
+        judged(root, whole)
+
+
+def in_evaluations(root: Path, whole: Path, share: float, damaged: Bytes) -> None:
+    """The table is damaged before it was packed, and its checksum is right."""
+    (path,) = root.rglob(EVALUATIONS)
+    table = gzip.compress(damaged(gzip.decompress(path.read_bytes())), mtime=0)
+    mark: dict[str, Any] = json.loads((path.parent / MARK).read_bytes())
+    mark["sha256"][EVALUATIONS] = hashlib.sha256(table).hexdigest()
+    with replaced(path, table), replaced(path.parent / MARK, json.dumps(mark).encode()):
+        judged(root, whole)
+
+
+SHARE = st.floats(0.0, 1.0, exclude_max=True)
+TESTS: dict[str, tuple[Callable[..., None], st.SearchStrategy[Any]]] = {
+    "bytes": (in_bytes, byte_damage()),
+    "values": (in_values, tree_damage()),
+    "evaluations": (in_evaluations, byte_damage()),
+}
+
+
+@pytest.mark.parametrize("kind", TESTS)
+def test_damage_is_told(kind: str, damaged_copy: Path, whole: Path) -> None:
+    check, strategy = TESTS[kind]
+    quick(given(SHARE, strategy)(lambda share, damage: check(damaged_copy, whole, share, damage)))()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", TESTS)
+def test_much_damage_is_told(kind: str, damaged_copy: Path, whole: Path) -> None:
+    check, strategy = TESTS[kind]
+    thorough(
+        given(SHARE, strategy)(lambda share, damage: check(damaged_copy, whole, share, damage))
+    )()
