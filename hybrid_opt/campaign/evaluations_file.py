@@ -8,6 +8,7 @@ from __future__ import annotations
 import gzip
 import io
 import zlib
+from array import array
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +17,12 @@ from numpy.typing import NDArray
 
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
+from symbolic.array import Array
 
 _LEVEL = 4
 _FIXED = ("evaluation", "generation", "feasible", "reason", "position")
+_REASON = _FIXED.index("reason")
+_LONGEST_LINE = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -83,23 +87,17 @@ def decode(content: bytes, path: Path) -> EvaluationTable:
         ResultsError: the content is damaged.
     """
     try:
-        text = gzip.decompress(content).decode("ascii")
-        header, _, body = text.partition("\n")
-        names = header.split(",")
-        objectives = _between(names, "objective_")
-        n_var, n_obj = len(_between(names, "x_")), len(objectives)
-        if names != columns(n_var, objectives):
-            raise ValueError("its columns are not those of this version")
-        reasons = {"": FEASIBLE, **{reason: k for k, reason in enumerate(REASONS)}}
-        rows = body.splitlines()
-        reason = np.array([reasons[row.split(",", 4)[3]] for row in rows], dtype=np.int8)
-        numeric = [k for k, name in enumerate(names) if name != "reason"]
-        values = np.loadtxt(io.StringIO(body), delimiter=",", usecols=numeric, ndmin=2)
+        with gzip.open(io.BytesIO(content)) as file:
+            names = _text(file.readline(_LONGEST_LINE)).split(",")
+            objectives = _between(names, "objective_")
+            n_var, n_obj = len(_between(names, "x_")), len(objectives)
+            if names != columns(n_var, objectives):
+                raise ValueError("its columns are not those of this version")
+            values, reason = _rows(file, len(names))
+        _, generation, feasible, position = values[:, :4].T
+        _check(values, generation, feasible, values[:, 4 : 4 + n_var])
     except (OSError, EOFError, zlib.error, ValueError, KeyError, IndexError) as error:
         raise ResultsError(f"{path}: damaged ({error})") from error
-    order, generation, feasible, position = values[:, :4].T
-    if not np.array_equal(order, np.arange(1, len(values) + 1)):
-        raise ResultsError(f"{path}: damaged (candidates are missing or out of order)")
     widths = np.cumsum([n_var, n_obj, n_obj, len(REASONS), len(REASONS)])
     x, plain, penalised, violation, violation_time, _ = np.split(values[:, 4:], widths, axis=1)
     return EvaluationTable(
@@ -109,6 +107,46 @@ def decode(content: bytes, path: Path) -> EvaluationTable:
         generation.astype(np.int64),
         objectives,
     )
+
+
+def _text(line: bytes) -> str:
+    if len(line) == _LONGEST_LINE:
+        raise ValueError(f"a line of more than {_LONGEST_LINE} characters")
+    return line.decode("ascii").rstrip("\n")
+
+
+def _rows(file: gzip.GzipFile, width: int) -> tuple[Array, NDArray[np.int8]]:
+    """Numbers (n, width - 1) and reasons (n,) of all rows.
+
+    Row by row, so that no more is held than what is kept, and a small file cannot unfold into a
+    huge one: each row bears its number.
+    """
+    reasons = {"": FEASIBLE, **{reason: k for k, reason in enumerate(REASONS)}}
+    numbers, found = array("d"), array("b")
+    while line := file.readline(_LONGEST_LINE):
+        words = _text(line).split(",")
+        if words[0] != str(len(found) + 1):
+            raise ValueError("candidates are missing or out of order")
+        if len(words) != width:
+            raise ValueError(f"candidate {words[0]} has {len(words)} columns of {width}")
+        found.append(reasons[words.pop(_REASON)])
+        numbers.extend(map(float, words))
+    return (
+        np.array(numbers, dtype=float).reshape(-1, width - 1),
+        np.array(found, dtype=np.int8),
+    )
+
+
+def _check(values: Array, generation: Array, feasible: Array, x: Array) -> None:
+    if not len(values):
+        raise ValueError("it holds no candidates")
+    if not np.isfinite(x).all():
+        raise ValueError("a decision vector is not finite")
+    if not np.isin(feasible, (0.0, 1.0)).all():
+        raise ValueError("the column feasible holds other than 0 and 1")
+    whole = np.isfinite(generation) & (generation == np.round(generation))
+    if not np.all(whole & (generation >= 1.0) & (generation <= len(values))):
+        raise ValueError("the column generation holds other than numbers of generations")
 
 
 def encode_front(table: EvaluationTable, rows: NDArray[np.intp]) -> bytes:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import re
+import tracemalloc
 from dataclasses import fields
 from pathlib import Path
 
@@ -40,7 +42,7 @@ def test_table_survives_to_the_bit() -> None:
 
 
 @settings(max_examples=50)
-@given(hnp.arrays(np.float64, (2, 4), elements=st.floats(allow_nan=False)))
+@given(hnp.arrays(np.float64, (2, 4), elements=st.floats(allow_nan=False, allow_infinity=False)))
 def test_any_number_survives(x: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> None:
     found = verdicts(np.full((2, 4), 0.5))
     arrays = {f.name: getattr(found, f.name) for f in fields(Evaluations)} | {"x": x}
@@ -77,6 +79,22 @@ def test_front_names_its_evaluations() -> None:
     assert float(rows[1]["peak_force_2"]) == before.evaluations.objectives[2, 1]
 
 
+def unpacked(content: bytes) -> bytes:
+    return gzip.decompress(content)
+
+
+def test_a_small_file_does_not_unfold_into_a_huge_one() -> None:
+    header = unpacked(encode(table())).partition(b"\n")[0] + b"\n"
+    tracemalloc.start()
+    packed = gzip.compress(header + b"0" * 2**28, 1)
+    tracemalloc.reset_peak()
+    before = tracemalloc.get_traced_memory()[0]
+    with pytest.raises(ResultsError, match=r"a line of more than"):
+        decode(packed, PATH)
+    assert tracemalloc.get_traced_memory()[1] - before < 2**24
+    tracemalloc.stop()
+
+
 @pytest.mark.parametrize(
     "spoil",
     [
@@ -89,6 +107,12 @@ def test_front_names_its_evaluations() -> None:
         ),
         lambda content: gzip.compress(gzip.decompress(content).replace(b"\n3,", b"\n4,")),
         lambda content: gzip.compress(gzip.decompress(content).replace(b"0.", b"zero", 40)),
+        lambda content: gzip.compress(gzip.decompress(content).replace(b"\n3,", b"\n\n3,")),
+        lambda content: gzip.compress(gzip.decompress(content).partition(b"\n")[0] + b"\n"),
+        lambda content: gzip.compress(gzip.decompress(content) + b"31,1,1,,0.0\n"),
+        lambda content: gzip.compress(re.sub(rb"\n1,\d+,", rb"\n1,1e308,", unpacked(content))),
+        lambda content: gzip.compress(re.sub(rb"\n1,(\d+),\d,", rb"\n1,\1,2,", unpacked(content))),
+        lambda content: gzip.compress(re.sub(rb",[^,]*\n2,", rb",x\n2,", unpacked(content))),
     ],
 )
 def test_damage_is_told(spoil: object) -> None:
