@@ -21,8 +21,10 @@ from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_
 from hybrid_opt.metaheuristics import Evaluated, analytic_problems
 from hybrid_opt.metaheuristics.analytic_problems import AnalyticProblem
 from studies.algorithm_bands import BAND_POPULATION, BAND_SOURCE, BANDS, Band, Verdict, judge
-from studies.program import add_verbose, run_program
-from symbolic.errors import DualArmError, SettingsError
+from studies.program import add_verbose, carried_out, run_program
+from symbolic.errors import SettingsError
+
+PROGRAM = "python -m studies.algorithms"
 
 SHIFTED = "shifted-zdt1"
 SHIFTED_POPULATION = 40
@@ -238,7 +240,7 @@ def table(result: Comparison) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m studies.algorithms",
+        prog=PROGRAM,
         description="Compare search algorithms on analytic problems with known fronts.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
@@ -267,21 +269,18 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the comparison; returns the exit code."""
     options = _parser().parse_args(arguments)
-    try:
-        result = compare(
-            options.problems,
-            options.evaluations,
-            options.algorithms,
-            options.seeds,
-            options.population,
-            progress=True,
-        )
-    except DualArmError as error:
-        print(error, file=sys.stderr)
-        return 2
+    result = compare(
+        options.problems,
+        options.evaluations,
+        options.algorithms,
+        options.seeds,
+        options.population,
+        progress=True,
+    )
     if options.json:
         document = asdict(result)
         print(json.dumps({"band_source": BAND_SOURCE, **document}, indent=2))

@@ -34,35 +34,34 @@ from studies.benchmark_collisions import with_collisions
 from studies.benchmark_turns import Evaluate, interleaved, progress, summary
 from studies.plain.candidate import PlainEvaluator
 from studies.plain.verdict import PlainJudge
-from studies.program import add_verbose, run_program
+from studies.program import add_verbose, carried_out, run_program
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
-from symbolic.errors import DualArmError, SettingsError
+from symbolic.errors import SettingsError
 from symbolic.functions.candidate import candidate_function
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Task, Waypoint, Workcell
+
+PROGRAM = "python -m studies.benchmark"
 
 SAMPLES = (25, 50, 100, 200, 400)
 WAYPOINTS = (1, 2, 3, 4, 5, 6, 7, 8)
 
 
+@carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit code: 0, or 2 on bad input."""
     options = _parser().parse_args(arguments)
-    try:
-        result = benchmark(
-            _workcell(options.workcell), options.candidates, options.repeats, options.seed
-        )
-    except DualArmError as error:
-        print(f"benchmark: {error}", file=sys.stderr)
-        return 2
+    result = benchmark(
+        _workcell(options.workcell), options.candidates, options.repeats, options.seed
+    )
     print(json.dumps(result, indent=2) if options.json else _report(result))
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m studies.benchmark",
+        prog=PROGRAM,
         description="Milliseconds per candidate: compiled, interpreted and written plainly.",
     )
     parser.add_argument(

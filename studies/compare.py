@@ -24,12 +24,11 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
 from hybrid_opt.store.json_records import to_json
-from studies.program import add_verbose, run_program
+from studies.program import add_verbose, carried_out, run_program
 from studies.summary import LEAST_TESTED, reference_front
 from studies.terminal_summary import title
 from studies.text_table import number, text_table
 from symbolic.array import Array
-from symbolic.errors import DualArmError
 
 PROGRAM = "python -m studies.compare"
 
@@ -218,6 +217,7 @@ def _spread(summary: Summary) -> str:
     return "{:.4g} [{:.4g}, {:.4g}]".format(*values)
 
 
+@carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
     parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
@@ -226,11 +226,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
     add_verbose(parser)
     options = parser.parse_args(arguments)
-    try:
-        found = compare(options.first, options.second)
-    except DualArmError as error:
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 2
+    found = compare(options.first, options.second)
     print(json.dumps(_json(asdict(found)), indent=2) if options.json else as_text(found))
     return 0
 

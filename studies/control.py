@@ -35,11 +35,10 @@ from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from studies.cli import Parser
-from studies.program import add_verbose, run_program
+from studies.program import add_verbose, carried_out, run_program
 from studies.reference_front import ReferenceFront, read_reference_front
 from studies.terminal_summary import title
 from studies.text_table import number, text_table
-from symbolic.errors import DualArmError
 
 PROGRAM = "python -m studies.control"
 
@@ -251,6 +250,7 @@ def as_text(found: Sequence[Control]) -> str:
     )
 
 
+@carried_out(PROGRAM, interrupted="interrupted, nothing is lost; the same command continues")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
     parser = Parser(
@@ -281,20 +281,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_verbose(parser)
     options = parser.parse_args(arguments)
     found: Sequence[Control | Approach]
-    try:
-        if options.reference is not None:
-            found = near = approaches(options.results, read_reference_front(options.reference))
-            text = approaches_text(near)
-        else:
-            progress = Progress(True)
-            found = run = controls(options.results, options.evaluations, options.jobs, progress)
-            text = as_text(run)
-    except DualArmError as error:
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\ninterrupted, nothing is lost; the same command continues", file=sys.stderr)
-        return 130
+    if options.reference is not None:
+        found = near = approaches(options.results, read_reference_front(options.reference))
+        text = approaches_text(near)
+    else:
+        progress = Progress(True)
+        found = run = controls(options.results, options.evaluations, options.jobs, progress)
+        text = as_text(run)
     print(json.dumps([asdict(entry) for entry in found], indent=1) if options.json else text)
     return 0
 

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from hybrid_opt.carry import Judgement
 from studies.inspection import Branch, Inspection, inspect
-from studies.program import add_verbose, run_program
-from symbolic.errors import DualArmError, SettingsError
+from studies.program import add_verbose, carried_out, run_program
+from symbolic.errors import SettingsError
 from symbolic.workcell.file import load
 
 PROGRAM = "python -m studies.inspect"
@@ -74,6 +74,7 @@ def _judged_text(judgement: Judgement) -> str:
     return f"{judgement}, objectives {forces}" if judgement.feasible else str(judgement)
 
 
+@carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
     parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
@@ -98,19 +99,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
     add_verbose(parser)
     options = parser.parse_args(arguments)
-    try:
-        if options.seed < 0:
-            raise SettingsError(f"--seed is {options.seed}; allowed are whole numbers from 0")
-        output = options.output or Path("inspect") / options.workcell.stem
-        found = inspect(
-            load(options.workcell),
-            options.candidates,
-            options.seed,
-            None if options.no_pictures else output,
-        )
-    except DualArmError as error:
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 2
+    if options.seed < 0:
+        raise SettingsError(f"--seed is {options.seed}; allowed are whole numbers from 0")
+    output = options.output or Path("inspect") / options.workcell.stem
+    found = inspect(
+        load(options.workcell),
+        options.candidates,
+        options.seed,
+        None if options.no_pictures else output,
+    )
     print(json.dumps(asdict(found), indent=2) if options.json else as_text(found))
     return 0
 

@@ -7,8 +7,9 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable
-from typing import TextIO
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Protocol, TextIO
 
 from symbolic.errors import DualArmError, DualArmWarning
 
@@ -16,6 +17,13 @@ BAD_INPUT = 2
 INTERRUPTED = 130
 
 VERBOSE = "--verbose"
+
+
+class Main(Protocol):
+    """A program's main function."""
+
+    def __call__(self, arguments: Sequence[str] | None = None) -> int:
+        """Run with the arguments, None for the process's own; returns the exit code."""
 
 
 def add_verbose(parser: argparse._ActionsContainer) -> None:
@@ -62,6 +70,39 @@ def run_program(main: Callable[[], int]) -> int:
         name = f"{error.filename}: " if error.filename else ""
         print(f"{name}{error.strerror or error}", file=sys.stderr)
         return BAD_INPUT
+
+
+def carry_out(program: str, work: Callable[[], int], interrupted: str = "interrupted") -> int:
+    """Do a program's work; what goes wrong ends in one message and an exit code.
+
+    Args:
+        program: how it is called, in front of the message.
+        work: returns the exit code.
+        interrupted: what to say after Ctrl-C.
+    """
+    try:
+        return work()
+    except DualArmError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"\n{interrupted}", file=sys.stderr)
+        return INTERRUPTED
+
+
+def carried_out(
+    program: str, interrupted: str = "interrupted"
+) -> Callable[[Callable[[Sequence[str] | None], int]], Main]:
+    """Make a main function of a program end as `carry_out` does."""
+
+    def wrap(main: Callable[[Sequence[str] | None], int]) -> Main:
+        @wraps(main)
+        def carrying_out(arguments: Sequence[str] | None = None) -> int:
+            return carry_out(program, lambda: main(arguments), interrupted)
+
+        return carrying_out
+
+    return wrap
 
 
 class _Warnings:

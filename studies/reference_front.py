@@ -29,11 +29,13 @@ from hybrid_opt.polishing.records import PolishedFront, PolishSettings
 from hybrid_opt.store.files import read_bytes, write_atomically
 from hybrid_opt.work.job import Emit, Job, answer_all
 from hybrid_opt.work.processes import local_executor
-from studies.program import add_verbose, run_program
+from studies.program import add_verbose, carried_out, run_program
 from symbolic.array import Array
-from symbolic.errors import DualArmError, SettingsError
+from symbolic.errors import SettingsError
 from symbolic.workcell.archive import archive_cell
 from symbolic.workcell.file import load
+
+PROGRAM = "python -m studies.reference_front"
 
 CANDIDATES = 4000
 """Random candidates among which starts are looked for."""
@@ -150,10 +152,11 @@ def read_reference_front(path: Path) -> ReferenceFront:
     return ReferenceFront(digest, objectives, x)
 
 
+@carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m studies.reference_front",
+        prog=PROGRAM,
         description="Compute the reference front of a workcell.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
@@ -169,19 +172,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"python -m studies.reference_front {options.workcell} --output FILE "
         f"--starts {options.starts} --points {options.points} --seed {options.seed}"
     )
-    try:
-        front = compute_reference_front(
-            CandidateEvaluator(load(options.workcell)),
-            options.starts,
-            options.points,
-            np.random.default_rng(options.seed),
-            options.jobs,
-            lambda text: print(text, file=sys.stderr, flush=True),
-        )
-        write_atomically(options.output, encode(front, command))
-    except DualArmError as error:
-        print(f"{parser.prog}: {error}", file=sys.stderr)
-        return 2
+    front = compute_reference_front(
+        CandidateEvaluator(load(options.workcell)),
+        options.starts,
+        options.points,
+        np.random.default_rng(options.seed),
+        options.jobs,
+        lambda text: print(text, file=sys.stderr, flush=True),
+    )
+    write_atomically(options.output, encode(front, command))
     print(
         f"{options.output}: {len(front.x)} points, hypervolume "
         f"{metrics.hypervolume(front.objectives):.6f}"

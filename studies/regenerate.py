@@ -14,24 +14,19 @@ import numpy as np
 from codegen.build import Build, FunctionReport, build_set
 from codegen.cache import Cache
 from codegen.check import Comparison, compare
-from studies.program import add_verbose, run_program
+from studies.program import add_verbose, carried_out, run_program
 from studies.text_table import text_table
-from symbolic.errors import DualArmError
 
 PROGRAM = "python -m studies.regenerate"
 
 DISAGREES = 1
-BAD_INPUT = 2
 
 
+@carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit code: 0, 1 where `--check` fails, 2 on bad input."""
     options = _parser().parse_args(arguments)
-    try:
-        return _run(options)
-    except DualArmError as error:
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return BAD_INPUT
+    return _run(options)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -14,19 +14,20 @@ from hybrid_opt.store.export import FORMATS, export
 from hybrid_opt.store.replay import Replay, replay
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing import TimingModel, timed_trajectory
-from studies.program import add_verbose, run_program
+from studies.program import add_verbose, carried_out, run_program
 from studies.timing_text import timing_json, timing_text
-from symbolic.errors import DualArmError, SettingsError
+from symbolic.errors import SettingsError
+
+PROGRAM = "python -m studies.replay"
 
 TIMINGS = {"closest": "closest to reference", "fastest": "fastest", "force": "force limited"}
 
 EXIT_DIFFERENT = 1
-EXIT_BAD_INPUT = 2
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m studies.replay",
+        prog=PROGRAM,
         description="Re-evaluate a stored trajectory from its file alone and compare its figures; "
         "time it for real robots and export it. Exit code 1 where a figure differs.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
@@ -58,14 +59,11 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Replay one file; returns the exit code."""
     options = _parser().parse_args(arguments)
-    try:
-        return _run(options)
-    except DualArmError as error:
-        print(error, file=sys.stderr)
-        return EXIT_BAD_INPUT
+    return _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:

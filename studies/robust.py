@@ -13,16 +13,17 @@ import numpy as np
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.store.trajectory_file import read_trajectory
+from studies.program import carried_out, run_program
 from symbolic.array import Array
-from symbolic.errors import DualArmError
+
+PROGRAM = "python -m studies.robust"
 
 EXIT_DOES_NOT_HOLD = 1
-EXIT_BAD_INPUT = 2
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m studies.robust",
+        prog=PROGRAM,
         description="The least commanded normal forces with which a stored trajectory holds for "
         "every case of its workcell's [uncertainty], their price, the largest set that the "
         "reference forces allow, and random cases. Exit code 1 where one of them fails.",
@@ -38,14 +39,11 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Report one trajectory's robust forces; returns the exit code."""
     options = _parser().parse_args(arguments)
-    try:
-        return _run(options)
-    except DualArmError as error:
-        print(error, file=sys.stderr)
-        return EXIT_BAD_INPUT
+    return _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -82,4 +80,4 @@ def _both(values: Array) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_program(main))

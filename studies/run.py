@@ -27,12 +27,11 @@ from studies.cli import (
     execution_settings,
     polish_settings,
 )
-from studies.program import add_verbose, run_program
+from studies.program import add_verbose, carry_out, run_program
 from studies.report.stage import add_report_options, follow_report_options, report_stage
 from studies.summary_stage import summary_stage
 from studies.terminal_summary import terminal_summary
 from studies.timing_stage import timing_stage
-from symbolic.errors import DualArmError
 from symbolic.workcell.file import load
 
 PAGE = "report.html"
@@ -44,9 +43,6 @@ WORKERS_LOAD = (
     "studies.report.generate",
 )
 """Modules that the work of a study needs."""
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells use it."""
 
 
 @dataclass(frozen=True)
@@ -120,8 +116,11 @@ def main(
     add_report_options(parser)
     if workcell is None:
         parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
-    try:
-        add_verbose(parser)
+    add_verbose(parser)
+    again = [part for part in arguments if part != "--resume"]
+    command = " ".join([program, shlex.join([*again, "--resume"])])
+
+    def work() -> int:
         options = parser.parse_args(arguments)
         cell: Path = options.workcell if workcell is None else workcell
         settings = campaign_settings(options)
@@ -136,15 +135,10 @@ def main(
         if options.report:
             print(f"Report: {execution.output / PAGE}")
         follow_report_options(execution.output, options)
-    except KeyboardInterrupt:
-        again = [part for part in arguments if part != "--resume"]
-        command = " ".join([program, shlex.join([*again, "--resume"])])
-        print(f"\ninterrupted, nothing is lost; continue with: {command}", file=sys.stderr)
-        return INTERRUPTED
-    except DualArmError as error:
-        print(f"{program}: {error}", file=sys.stderr)
-        return 2
-    return 0
+        return 0
+
+    interrupted = f"interrupted, nothing is lost; continue with: {command}"
+    return carry_out(program, work, interrupted)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hybrid_opt.campaign import Progress
-from studies.program import add_verbose, run_program
+from studies.program import add_verbose, carried_out, run_program
 from studies.report.stage import add_report_options, follow_report_options, rewrite
-from symbolic.errors import DualArmError
 
 PROGRAM = "python -m studies.report"
 
 
+@carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
     parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
@@ -32,19 +32,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_report_options(parser)
     add_verbose(parser)
     options = parser.parse_args(arguments)
-    try:
-        if options.into:
-            from studies.report.look import insert_tables
+    if options.into:
+        from studies.report.look import insert_tables
 
-            insert_tables(options.results, options.into)
-        elif options.animation or options.view:
-            follow_report_options(options.results, options)
-        else:
-            rewrite(options.results, Progress(not options.quiet))
-            print(f"Report: {options.results / 'report.html'}")
-    except DualArmError as error:
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 2
+        insert_tables(options.results, options.into)
+    elif options.animation or options.view:
+        follow_report_options(options.results, options)
+    else:
+        rewrite(options.results, Progress(not options.quiet))
+        print(f"Report: {options.results / 'report.html'}")
     return 0
 
 

@@ -8,6 +8,8 @@ from importlib import import_module
 
 import pytest
 
+from studies.program import carried_out, carry_out
+from symbolic.errors import DualArmError
 from tests.symbolic.cells import ROOT
 
 PROGRAMS = (
@@ -99,3 +101,18 @@ def test_every_program_knows_verbose(name: str, capsys: pytest.CaptureFixture[st
     with pytest.raises(SystemExit):
         import_module(f"studies.{name}").main(["--help"])
     assert "--verbose" in capsys.readouterr().out
+
+
+def test_a_programs_name_stands_before_its_message(capsys: pytest.CaptureFixture[str]) -> None:
+    def wrong() -> int:
+        raise DualArmError("the file is wrong")
+
+    def stopped() -> int:
+        raise KeyboardInterrupt
+
+    assert carry_out("python -m studies.run", wrong) == 2
+    assert carry_out("python -m studies.run", stopped, "go on with --resume") == 130
+    assert capsys.readouterr().err == (
+        "python -m studies.run: the file is wrong\n\ngo on with --resume\n"
+    )
+    assert carried_out("any")(lambda arguments: 7)() == 7
