@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,6 +14,7 @@ import pinocchio as pin
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.pieces import Capsule, Hull, Piece, check_piece
+from symbolic.robot.machine import ArmLinks, arm_links, one_machine
 from symbolic.robot.urdf import arm_model, link_frame, resolve_mesh, robot_urdf
 from symbolic.robot.urdf_file import UrdfMesh
 from symbolic.workcell.reader import shown
@@ -54,6 +56,8 @@ class CollisionBody:
         frame: what it is fixed to.
         pieces: its convex pieces, in that frame.
         is_tool: whether it is part of a robot's tool.
+        carries: robots (0, 1) that are mounted on this link of a machine; None for a body that
+            is no standing part of one.
     """
 
     name: str
@@ -61,6 +65,7 @@ class CollisionBody:
     frame: Frame
     pieces: tuple[Piece, ...]
     is_tool: bool = False
+    carries: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -87,13 +92,17 @@ class ArmGeometry:
 def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
     """All bodies: robot 1, robot 2, payload, environment, each in the order of its file.
 
+    What stands still of a robot that is a chain of a larger machine counts as environment.
+
     Raises:
         CollisionModelError: a shape or mesh is unusable, or two bodies share a name.
     """
     meshes = MeshReader()
-    bodies = [body for i in (0, 1) for body in _robot_bodies(workcell.robots[i], i, meshes)]
+    links = (arm_links(workcell.robots, 0), arm_links(workcell.robots, 1))
+    bodies = [b for i in (0, 1) for b in _robot_bodies(workcell.robots[i], i, links[i], meshes)]
     payload = Piece(Box(np.asarray(workcell.payload.size)), np.eye(4))
     bodies.append(CollisionBody(PAYLOAD, "payload", BOX, (payload,)))
+    bodies += [b for i in (0, 1) for b in _standing_bodies(workcell.robots, i, links, meshes)]
     for obstacle in workcell.environment:
         owner = f"environment body {obstacle.name!r}"
         pieces = shape_pieces(obstacle.shape, obstacle.pose, owner, meshes)
@@ -153,7 +162,7 @@ def _corners(piece: Piece) -> int:
 
 
 class MeshReader:
-    """The meshes of one cell: each is read and cut once, within `MOST_FACES` triangles together."""
+    """The meshes of one cell: each is read and cut once, within `MOST_CELL_FACES` together."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[Path, tuple[float, ...]], tuple[Hull, ...]] = {}
@@ -167,16 +176,17 @@ class MeshReader:
                 have too many triangles.
         """
         # Not imported at the top: trimesh takes long to start, and most cells have no meshes.
-        from symbolic.geometry.meshes import MOST_FACES, cut, read_mesh
+        from symbolic.geometry.meshes import MOST_CELL_FACES, cut, read_mesh
 
         key = (mesh.path, tuple(mesh.scale))
         if key not in self._known:
             found = read_mesh(mesh.path, mesh.scale)
             self._triangles += len(found.faces)
-            if self._triangles > MOST_FACES:
+            if self._triangles > MOST_CELL_FACES:
                 raise CollisionModelError(
                     f"{mesh.path}: with its {len(found.faces)} triangles the cell's meshes have "
-                    f"{self._triangles}; allowed are {MOST_FACES} together: simplify the largest"
+                    f"{self._triangles}; allowed are {MOST_CELL_FACES} together: simplify the "
+                    "largest"
                 )
             self._known[key] = cut(found, mesh.path)
         return self._known[key]
@@ -194,21 +204,42 @@ def shape_pieces(
         raise CollisionModelError(f"{owner}: {error}") from error
 
 
-def _robot_bodies(robot: Robot, i: int, meshes: MeshReader) -> list[CollisionBody]:
+def _robot_bodies(robot: Robot, i: int, links: ArmLinks, meshes: MeshReader) -> list[CollisionBody]:
+    """The bodies of one arm and its tool."""
     group: Group = "robot 1" if i == 0 else "robot 2"
     model = arm_model(robot)
+    own = links.moved if robot.chain_root else (*links.still, *links.moved)
     bodies = []
-    for link, pieces in _link_pieces(robot, meshes).items():
+    for link, pieces in _link_pieces(robot, own, meshes).items():
         frame, T = _attachment(model, link, robot, i)
         moved = tuple(piece.moved(T) for piece in pieces)
         bodies.append(CollisionBody(f"{robot.name}/{link}", group, frame, moved))
+    if robot.chain_root:  # a machine's file may list its links in any order
+        bodies.sort(key=lambda body: body.frame.joint)
     frame, T = _attachment(model, robot.flange, robot, i)
     for tool in robot.tool:
         owner = f"tool {tool.name!r} of robot {robot.name!r}"
-        pieces = tuple(
-            piece.moved(T) for piece in shape_pieces(tool.shape, tool.pose, owner, meshes)
-        )
-        bodies.append(CollisionBody(f"{robot.name}/{tool.name}", group, frame, pieces, True))
+        pieces = shape_pieces(tool.shape, tool.pose, owner, meshes)
+        moved = tuple(piece.moved(T) for piece in pieces)
+        bodies.append(CollisionBody(f"{robot.name}/{tool.name}", group, frame, moved, True))
+    return bodies
+
+
+def _standing_bodies(
+    robots: tuple[Robot, Robot], i: int, links: tuple[ArmLinks, ArmLinks], meshes: MeshReader
+) -> list[CollisionBody]:
+    """What stands still of the machine that arm i is a chain of."""
+    robot, bodies = robots[i], []
+    if not robot.chain_root:
+        return []
+    model = arm_model(robot)
+    arms = (0, 1) if one_machine(robots) else (i,)
+    for link, pieces in _link_pieces(robot, links[i].still, meshes).items():
+        _, T = _attachment(model, link, robot, i)
+        moved = tuple(piece.moved(T) for piece in pieces)
+        carries = tuple(arm for arm in arms if links[arm].mount == link)
+        name = f"{robot.name}/{link}"
+        bodies.append(CollisionBody(name, "environment", WORLD, moved, carries=carries))
     return bodies
 
 
@@ -221,18 +252,22 @@ def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Fram
     return Frame("link", i, frame.parentJoint - 1), placement
 
 
-def _link_pieces(robot: Robot, meshes: MeshReader) -> dict[str, tuple[Piece, ...]]:
-    """The collision pieces of every link of a URDF that has any, in the link's frame."""
-    links = {}
+def _link_pieces(
+    robot: Robot, links: Collection[str], meshes: MeshReader
+) -> dict[str, tuple[Piece, ...]]:
+    """The collision pieces of some links of a URDF, in the link's frame and the file's order."""
+    found_pieces = {}
     for link, collisions in robot_urdf(robot).collisions.items():
+        if link not in links:
+            continue
         owner = f"link {link!r} of {robot.urdf.name}"
         pieces: list[Piece] = []
         for collision in collisions:
             shape = collision.shape
             found = _located(shape, robot, owner) if isinstance(shape, UrdfMesh) else shape
             pieces += shape_pieces(found, collision.pose, owner, meshes)
-        links[link] = tuple(pieces)
-    return links
+        found_pieces[link] = tuple(pieces)
+    return found_pieces
 
 
 def _located(mesh: UrdfMesh, robot: Robot, owner: str) -> Mesh:

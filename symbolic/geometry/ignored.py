@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.bodies import CollisionBody
+from symbolic.robot.machine import one_machine
 from symbolic.robot.srdf_file import read_srdf
-from symbolic.workcell.body_names import matching
+from symbolic.workcell.patterns import matching
 from symbolic.workcell.records import Workcell
 
 
@@ -26,10 +28,15 @@ def ignored_pairs(
     names = [body.name for body in bodies]
     pairs: dict[frozenset[str], str] = {}
     for robot in workcell.robots:
-        for disabled in () if robot.srdf is None else read_srdf(robot.srdf):
-            pair = frozenset(f"{robot.name}/{link}" for link in (disabled.first, disabled.second))
+        if robot.srdf is None:
+            continue
+        owners = workcell.robots if one_machine(workcell.robots) else (robot,)
+        for disabled in read_srdf(robot.srdf):
             said = f": {disabled.reason}" if disabled.reason else ""
-            pairs[pair] = f"disabled in {robot.srdf.name if robot.srdf else ''}{said}"
+            for pair in product(owners, owners):
+                links = zip(pair, (disabled.first, disabled.second), strict=True)
+                named = frozenset(f"{owner.name}/{link}" for owner, link in links)
+                pairs[named] = f"disabled in {robot.srdf.name}{said}"
     for ignored in workcell.collision.ignored:
         sides = []
         for pattern in (ignored.first, ignored.second):

@@ -27,6 +27,7 @@ FORMATS = ("stl", "dae", "obj", "ply", "off")
 COLLADA (dae), which names its unit; its up axis is not turned, as in ROS."""
 
 MOST_FACES = 100_000
+MOST_CELL_FACES = 200_000
 """Most triangles of one mesh, and of all meshes of a cell together: cutting them takes about 0.1 ms
 each, and collision shapes are simplified shapes."""
 
@@ -102,7 +103,22 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
             lineno=0,
             registry=_TOLD,
         )
-    return tuple(pieces)
+    return _outermost(pieces)
+
+
+def _outermost(pieces: list[Hull]) -> tuple[Hull, ...]:
+    """The pieces without those that lie in another: screws and bearings inside a housing."""
+    volumes = [_volume(piece.vertices[piece.faces]) for piece in pieces]
+    kept: list[tuple[Hull, Array]] = []
+    for k in np.argsort(volumes, kind="stable")[::-1]:
+        piece = pieces[k]
+        inside = (
+            np.all(piece.vertices @ planes[:, :3].T + planes[:, 3] <= 1e-12) for _, planes in kept
+        )
+        if not any(inside):
+            kept.append((piece, ConvexHull(piece.vertices).equations))
+    chosen = {id(piece) for piece, _ in kept}
+    return tuple(piece for piece in pieces if id(piece) in chosen)
 
 
 def _thickened(triangles: Array) -> Array:

@@ -145,6 +145,12 @@ def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeome
 
 def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody, ...]) -> str:
     """Links of one arm with no shape on the joints between them."""
+    for standing, link in ((a, b), (b, a)):
+        if link.frame.robot in (standing.carries or ()) and not link.is_tool:
+            before = [
+                x for x in bodies if x.group == link.group and x.frame.joint < link.frame.joint
+            ]
+            return "" if before else "the arm is mounted on it, they overlap at their joint"
     if a.group != b.group or a.group == "environment" or a.is_tool or b.is_tool:
         return ""
     low, high = sorted((a.frame.joint, b.frame.joint))
@@ -190,7 +196,9 @@ def _never_meet(
     for robot, arm in enumerate(arms):
         left, right = _anchor(a, arms, robot), _anchor(b, arms, robot)
         low, high = sorted((left, right), key=lambda body: body.frame.joint)
-        own_base = low.frame.robot == robot or low.group == f"robot {robot + 1}"
+        own_base = (
+            low.frame.robot == robot or low.group == f"robot {robot + 1}" or low.carries is not None
+        )
         if high.frame.robot != robot or not own_base or high.frame.joint - low.frame.joint != 2:
             continue
         first = low.frame.joint + 1
@@ -250,7 +258,8 @@ class _AlwaysTouching:
         for robot in (0, 1):
             left, right = _anchor(a, self.arms, robot), _anchor(b, self.arms, robot)
             group = f"robot {robot + 1}"
-            if group not in (a.group, b.group) or {a.group, b.group} - {group, "payload"}:
+            own = {body.group for body in (a, b) if body.carries is None}
+            if group not in own or own - {group, "payload"}:
                 continue
             low, high = sorted((left, right), key=lambda body: body.frame.joint)
             for q in self.postures[robot]:

@@ -173,6 +173,9 @@ def start_branches(
         result = {name: np.array(value) for name, value in zip(TRACK_OUTPUTS, tracked, strict=True)}
         tracked_path = result["q"].T
         turns = _central_turns(robot, tracked_path.min(axis=0), tracked_path.max(axis=0))
+        # A path that leaves the limits may pull the start out of them, where the search found it.
+        inside = (q + turns >= robot.position_lower) & (q + turns <= robot.position_upper)
+        turns = np.where(inside, turns, 0.0)
         path = np.ascontiguousarray(tracked_path + turns)
         to_limits = np.minimum(path - robot.position_lower, robot.position_upper - path)
         margin, measure = to_limits.min(axis=1), result["manipulability"][0]

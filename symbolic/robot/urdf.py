@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pinocchio as pin
 
 from symbolic.errors import RobotModelError
+from symbolic.robot.chain import Held, chain_joints, held_joints, listed, without_links
 from symbolic.robot.urdf_file import Urdf, read_urdf
 from symbolic.workcell.reader import suggestion
 from symbolic.workcell.records import Robot
@@ -20,58 +21,83 @@ N_JOINTS = 6
 
 
 def robot_urdf(robot: Robot) -> Urdf:
-    """The description of a robot of a workcell.
+    """The description of a robot of a workcell, without the links that it drops.
 
     Raises:
-        UrdfError: see `symbolic.robot.urdf_file.read_urdf`.
+        RobotModelError: see `symbolic.robot.urdf_file.read_urdf` and
+            `symbolic.robot.chain.without_links`.
     """
-    return read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
+    urdf = read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
+    return without_links(urdf, robot.drop_links) if robot.drop_links else urdf
 
 
-def reduced_model(urdf: Urdf, locked_joints: Iterable[tuple[str, float]] = ()) -> pin.Model:
+def reduced_model(urdf: Urdf, held: Held = ()) -> pin.Model:
     """The Pinocchio model of a URDF with some joints held.
 
     Args:
         urdf: the robot's description.
-        locked_joints: names of single-axis joints and their positions [rad or m].
+        held: names of joints and the positions they are held at [rad or m]; a joint of several
+            axes is held at its neutral position, whatever is given.
 
     Raises:
-        RobotModelError: Pinocchio refuses the description, or a locked joint does not exist.
+        RobotModelError: Pinocchio refuses the description.
     """
     try:
         model = pin.buildModelFromXML(urdf.kinematics)
     except (ValueError, RuntimeError, IndexError) as error:
         raise RobotModelError(f"Pinocchio cannot read {urdf.file}: {_first_line(error)}") from error
     configuration = pin.neutral(model)
-    locked = []
-    for name, position in locked_joints:
-        if name not in list(model.names)[1:]:
-            candidates = list(model.names)[1:]
-            raise RobotModelError(
-                f"no moving joint {name!r} in {urdf.file}"
-                f"{suggestion(name, candidates) or f'; it has {_listed(candidates)}'}"
-            )
+    joints = []
+    for name, position in held:
         joint = model.getJointId(name)
-        if model.joints[joint].nq != 1:
-            raise RobotModelError(
-                f"joint {name!r} of {urdf.file} is continuous or has several axes; only revolute "
-                "and prismatic joints can be locked"
-            )
-        configuration[model.joints[joint].idx_q] = position
-        locked.append(joint)
-    return pin.buildReducedModel(model, locked, configuration) if locked else model
+        if model.joints[joint].nq == 1:
+            configuration[model.joints[joint].idx_q] = position
+        joints.append(joint)
+    return pin.buildReducedModel(model, joints, configuration) if joints else model
+
+
+def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Held) -> tuple[str, ...]:
+    """The joints that move an arm's flange.
+
+    Args:
+        urdf: the robot's description.
+        chain_root: link that the chain begins at; '' for all joints that are not locked.
+        flange: link that the chain ends at.
+        locked: joints that the user holds, with their positions.
+
+    Raises:
+        RobotModelError: see `symbolic.robot.chain.chain_joints`.
+    """
+    if chain_root:
+        found = chain_joints(urdf, chain_root, flange)
+    else:
+        mimicking = {name for name, joint in urdf.joints.items() if joint.mimics}
+        found = tuple(
+            name
+            for name, joint in urdf.joints.items()
+            if joint.kind != "fixed" and name not in mimicking
+        )
+    held = dict(locked)
+    return tuple(name for name in found if name not in held)
 
 
 def arm_model(robot: Robot) -> pin.Model:
-    """The model of a robot of a workcell, its locked joints held.
+    """The model of a robot of a workcell: its chain, all else held, its tool's mass included.
 
     Raises:
         RobotModelError: it is not a serial arm of six revolute joints with that flange.
     """
-    model = reduced_model(robot_urdf(robot), robot.locked_joints)
+    urdf = robot_urdf(robot)
+    moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
+    model = reduced_model(urdf, held_joints(urdf, moving, robot.locked_joints))
     for problem in (structure_problem(model), flange_problem(model, robot.flange)):
         if problem:
             raise RobotModelError(f"robot {robot.name!r}: {problem}")
+    if robot.tool_load is not None:
+        load = robot.tool_load
+        flange = model.frames[link_frame(model, robot.flange)]
+        inertia = pin.Inertia(load.mass, load.centre_of_mass, load.inertia)
+        model.appendBodyToJoint(flange.parentJoint, inertia, flange.placement)
     return model
 
 
@@ -80,15 +106,15 @@ def structure_problem(model: pin.Model) -> str:
     names = list(model.names)[1:]
     if model.njoints - 1 != N_JOINTS:
         return (
-            f"found {len(names)} joints that are not locked ({_listed(names)}); allowed are "
-            f"{N_JOINTS}, name others under locked_joints"
+            f"found {len(names)} joints that are not locked ({listed(names)}); allowed are "
+            f"{N_JOINTS}, name others under locked_joints or pick a chain"
         )
     for joint, name in enumerate(names, start=1):
         kind = str(model.joints[joint].shortname())
         if not kind.startswith("JointModelR") or model.joints[joint].nq != 1:
             return (
                 f"joint {name!r} is of kind {kind.removeprefix('JointModel')}; allowed are "
-                "revolute joints with limits"
+                "revolute and continuous joints; hold others by locked_joints"
             )
         if model.parents[joint] != joint - 1:
             return (
@@ -103,9 +129,9 @@ def flange_problem(model: pin.Model, flange: str) -> str:
     last = [frame.name for frame in model.frames if _carried_by_last(model, frame)]
     if flange not in bodies:
         hint = suggestion(flange, last)
-        return f"found {flange!r}, no link of the URDF; allowed are {_listed(last)}{hint}"
+        return f"found {flange!r}, no link of the URDF; allowed are {listed(last)}{hint}"
     if flange not in last:
-        return f"found {flange!r}, which the last joint does not move; allowed are {_listed(last)}"
+        return f"found {flange!r}, which the last joint does not move; allowed are {listed(last)}"
     return ""
 
 
@@ -136,8 +162,3 @@ def _carried_by_last(model: pin.Model, frame: pin.Frame) -> bool:
 
 def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or ["no reason given"])[0]
-
-
-def _listed(names: Sequence[str], most: int = 20) -> str:
-    text = ", ".join(repr(name) for name in names[:most]) or "none"
-    return f"{text} and {len(names) - most} more" if len(names) > most else text

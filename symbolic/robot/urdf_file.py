@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
@@ -22,17 +22,15 @@ from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError, UrdfError
 from symbolic.geometry.pieces import Capsule
-from symbolic.physics.pose import pose_matrix
 from symbolic.robot.urdf_elements import Part, parse_elements
-from symbolic.robot.urdf_tree import tree_problem
+from symbolic.robot.urdf_joint import UrdfJoint, origin_element, pose_of, read_joint
+from symbolic.robot.urdf_tree import mimic_problem, tree_problem
 from symbolic.robot.xacro_file import Arguments, description_content
 from symbolic.workcell import quantities as quantity
-from symbolic.workcell.reader import Problems, read_only, shown
+from symbolic.workcell.reader import Problems, shown
 from symbolic.workcell.records import Box, Cylinder, Sphere
 
 MOST_LINKS = 500
-JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-SMALLEST_AXIS = 1e-6
 LARGEST_GYRATION = 10.0
 """No inertia is larger than that of its mass at this distance [m]."""
 
@@ -66,21 +64,35 @@ class Urdf:
 
     Attributes:
         file: the file's name, without its folder.
+        links: names, in the order of the file.
+        joints: by name, in the order of the file.
         collisions: by link that has any, in the order of the file.
-        collision_meshes, visual_meshes: mesh addresses as written, each once.
+        visuals: by link the addresses of its visual meshes as written.
         kinematics: URDF text of links with their inertias and of joints, nothing else.
     """
 
     file: str
+    links: tuple[str, ...]
+    joints: Mapping[str, UrdfJoint]
     collisions: Mapping[str, tuple[UrdfCollision, ...]]
-    collision_meshes: tuple[str, ...]
-    visual_meshes: tuple[str, ...]
+    visuals: Mapping[str, tuple[str, ...]]
     kinematics: str
 
     @property
     def collision_links(self) -> tuple[str, ...]:
         """Links that have a collision shape."""
         return tuple(self.collisions)
+
+    @property
+    def collision_meshes(self) -> tuple[str, ...]:
+        """Addresses of collision meshes as written, each once."""
+        shapes = (shape.shape for found in self.collisions.values() for shape in found)
+        return tuple(dict.fromkeys(s.address for s in shapes if isinstance(s, UrdfMesh)))
+
+    @property
+    def visual_meshes(self) -> tuple[str, ...]:
+        """Addresses of visual meshes as written, each once."""
+        return tuple(dict.fromkeys(mesh for found in self.visuals.values() for mesh in found))
 
 
 def read_urdf(path: Path, arguments: Arguments = (), package_dirs: Sequence[Path] = ()) -> Urdf:
@@ -142,11 +154,15 @@ def _read(root: Part, file: str) -> Urdf:
     for name, link in links.items():
         element = ElementTree.SubElement(reduced, "link", {"name": name})
         element.extend(_inertial(link))
-    ends: dict[str, tuple[str, str]] = {}
+    read: dict[str, UrdfJoint] = {}
     for name, joint in joints.items():
-        reduced.append(_joint(joint, name, ends))
+        element, read[name] = read_joint(joint, name)
+        reduced.append(element)
     if root.problems.clean():
-        problem = tree_problem(tuple(links), ends)
+        problem = tree_problem(tuple(links), {n: (j.parent, j.child) for n, j in read.items()})
+        # Published files name joints to be mimicked that they do not have.
+        read = {n: j if j.mimics in read else replace(j, mimics="") for n, j in read.items()}
+        problem = problem or mimic_problem({n: j.mimics for n, j in read.items() if j.mimics})
         if problem:
             root.problems.add(*problem)
     collisions = {
@@ -154,16 +170,10 @@ def _read(root: Part, file: str) -> Urdf:
     }
     return Urdf(
         file=file,
+        links=tuple(links),
+        joints=MappingProxyType(read),
         collisions=MappingProxyType({name: found for name, found in collisions.items() if found}),
-        collision_meshes=tuple(
-            dict.fromkeys(
-                shape.shape.address
-                for found in collisions.values()
-                for shape in found
-                if isinstance(shape.shape, UrdfMesh)
-            )
-        ),
-        visual_meshes=_visual_meshes(links),
+        visuals=MappingProxyType({name: _visual_meshes(link) for name, link in links.items()}),
         kinematics=ElementTree.tostring(reduced, encoding="unicode"),
     )
 
@@ -174,7 +184,7 @@ def _inertial(link: Part) -> list[ElementTree.Element]:
     if inertial is None:
         return []
     kept = ElementTree.Element("inertial")
-    kept.extend(_origin(inertial))
+    kept.extend(origin_element(inertial))
     mass_part = inertial.required("mass")
     mass = mass_part.number("value", quantity.LINK_MASS)
     matrix = inertial.required("inertia")
@@ -202,61 +212,8 @@ def _inertia_problem(inertia: Array, mass: float) -> str:
     return ""
 
 
-def _joint(joint: Part, name: str, ends: dict[str, tuple[str, str]]) -> ElementTree.Element:
-    """The checked element of a joint; its parent and child are added to `ends`."""
-    kind = joint.choice("type", JOINT_TYPES)
-    kept = ElementTree.Element("joint", {"name": name, "type": kind})
-    parent, child = joint.required("parent"), joint.required("child")
-    ends[name] = (parent.text("link"), child.text("link"))
-    kept.extend(_origin(joint))
-    ElementTree.SubElement(kept, "parent", parent.written("link"))
-    ElementTree.SubElement(kept, "child", child.written("link"))
-    axis = joint.child("axis")
-    if axis is not None and kind not in ("fixed", "floating"):
-        direction = axis.numbers("xyz", (quantity.DIRECTION,) * 3)
-        if axis.problems.clean(axis.path) and np.linalg.norm(direction) < SMALLEST_AXIS:
-            axis.problems.add(
-                f"{axis.path} xyz",
-                f"found {shown(axis.raw('xyz'))}, an axis without length; allowed is a direction "
-                "such as '0 0 1'",
-            )
-        ElementTree.SubElement(kept, "axis", axis.written("xyz"))
-    limit = joint.child("limit")
-    if kind in ("revolute", "prismatic"):
-        limit = joint.required("limit")
-    if limit is not None:
-        for key, default in (("lower", "0"), ("upper", "0"), ("effort", None), ("velocity", None)):
-            limit.number(key, quantity.JOINT_LIMIT, default)
-        keys = ("lower", "upper", "effort", "velocity")
-        ElementTree.SubElement(kept, "limit", limit.written(*keys))
-    dynamics = joint.child("dynamics")
-    if dynamics is not None:
-        for key in ("damping", "friction"):
-            dynamics.number(key, quantity.JOINT_LIMIT, "0")
-        ElementTree.SubElement(kept, "dynamics", dynamics.written("damping", "friction"))
-    return kept
-
-
-def _origin(part: Part) -> list[ElementTree.Element]:
-    origin = part.child("origin")
-    if origin is None:
-        return []
-    _pose(part)
-    return [ElementTree.Element("origin", origin.written("xyz", "rpy"))]
-
-
-def _pose(part: Part) -> Array:
-    """(4, 4) of an element's origin; the identity where it has none."""
-    origin = part.child("origin")
-    if origin is None:
-        return read_only(np.eye(4))
-    xyz = origin.numbers("xyz", (quantity.POSITION,) * 3, "0 0 0")
-    rpy = origin.numbers("rpy", (quantity.URDF_ANGLE,) * 3, "0 0 0")
-    return read_only(pose_matrix(xyz, rpy))
-
-
 def _collision(part: Part) -> UrdfCollision:
-    pose = _pose(part)
+    pose = pose_of(part)
     shape: Box | Cylinder | Sphere | Capsule | UrdfMesh = Sphere(1.0)
     element = part.required("geometry").only(("box", "cylinder", "sphere", "capsule", "mesh"))
     size = quantity.SHAPE_SIZE
@@ -277,10 +234,6 @@ def _collision(part: Part) -> UrdfCollision:
     return UrdfCollision(shape, pose)
 
 
-def _visual_meshes(links: Mapping[str, Part]) -> tuple[str, ...]:
-    found = (
-        mesh.get("filename", "")
-        for link in links.values()
-        for mesh in link.element.findall("visual/geometry/mesh")
-    )
-    return tuple(dict.fromkeys(address for address in found if address))
+def _visual_meshes(link: Part) -> tuple[str, ...]:
+    found = (mesh.get("filename", "") for mesh in link.element.findall("visual/geometry/mesh"))
+    return tuple(address for address in found if address)

@@ -1,4 +1,4 @@
-"""Whether the links and joints of a URDF are a tree."""
+"""Whether the links and joints of a URDF are a tree, and no joint follows itself."""
 
 from __future__ import annotations
 
@@ -47,4 +47,20 @@ def tree_problem(
             if link in met:
                 return f"link {link!r}", "is part of a loop of joints; allowed is a tree"
             met.add(link)
+    return None
+
+
+def mimic_problem(mimics: Mapping[str, str]) -> tuple[str, str] | None:
+    """Why joints that follow others follow none, as (element, text); None where all is well.
+
+    Args:
+        mimics: the followed joint by the following one.
+    """
+    for name in mimics:
+        met, followed = {name}, mimics[name]
+        while followed in mimics:
+            if followed in met:
+                return f"joint {name!r}/mimic joint", "joints follow one another in a circle"
+            met.add(followed)
+            followed = mimics[followed]
     return None

@@ -13,8 +13,10 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.errors import RobotModelError
 from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.robot.machine import machine_problem
 from symbolic.robot.urdf import arm_model, link_frame, robot_urdf
-from symbolic.workcell.body_names import PAYLOAD_BODY, body_names, matching
+from symbolic.workcell.body_names import PAYLOAD_BODY, body_names
+from symbolic.workcell.patterns import matching
 from symbolic.workcell.reader import Problems, suggestion
 from symbolic.workcell.records import Robot, Workcell
 
@@ -137,7 +139,7 @@ def check_references(workcell: Workcell, problems: Problems) -> None:
         if problems.clean(path) and contact.body not in environment:
             hint = suggestion(contact.body, environment) or f"; they are {', '.join(environment)}"
             problems.add(path, f"found {contact.body!r}; allowed is an environment body{hint}")
-    parts = ("name", "urdf", "tool")
+    parts = ("name", "urdf", "chain", "flange", "locked_joints", "drop_links", "tool")
     if not problems.clean(*(f"robots[{index}].{part}" for index in (0, 1) for part in parts)):
         return
     known = [name for group in body_names(workcell).values() for name in group]
@@ -147,6 +149,15 @@ def check_references(workcell: Workcell, problems: Problems) -> None:
             if problems.clean(path) and not matching(name, known):
                 hint = suggestion(name, known) or f"; they are {', '.join(known)}"
                 problems.add(path, f"found {name!r}; allowed is a body of the cell{hint}")
+
+
+def check_machine(workcell: Workcell, problems: Problems) -> None:
+    """Two arms of one machine move apart from one another, and agree on what stands still."""
+    parts = ("urdf", "chain", "locked_joints", "drop_links")
+    if problems.clean(*(f"robots[{index}].{part}" for index in (0, 1) for part in parts)):
+        problem = machine_problem(workcell.robots)
+        if problem:
+            problems.add("robots[1].chain", problem)
 
 
 def check_speeds(workcell: Workcell, problems: Problems) -> None:
@@ -174,7 +185,7 @@ def check_reach(workcell: Workcell, problems: Problems) -> None:
     This is necessary, not sufficient: it costs no inverse kinematics.
     """
     poses = [(path, pose) for path, pose in _fixed_poses(workcell) if problems.clean(path)]
-    parts = ("urdf", "locked_joints", "flange", "base", "pad")
+    parts = ("urdf", "chain", "locked_joints", "drop_links", "flange", "base", "pad")
     for index, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         needed = [f"robots[{index}].{part}" for part in parts]
         if not problems.clean("payload.size", f"contacts[{index}]", *needed):
@@ -223,6 +234,7 @@ def _fixed_poses(workcell: Workcell) -> Iterator[tuple[str, Array]]:
 def check_all(workcell: Workcell, problems: Problems) -> None:
     """Every check across sections that needs no inverse kinematics."""
     for check in (
+        check_machine,
         check_shapes,
         check_names,
         check_contacts,

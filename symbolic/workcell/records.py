@@ -75,6 +75,21 @@ class Body:
 
 
 @dataclass(frozen=True)
+class ToolLoad:
+    """The tool as a rigid body on the flange.
+
+    Attributes:
+        mass: [kg].
+        centre_of_mass: (3,) in the flange frame [m].
+        inertia: (3, 3) about the centre of mass, flange axes [kg m^2].
+    """
+
+    mass: float
+    centre_of_mass: Array
+    inertia: Array
+
+
+@dataclass(frozen=True)
 class Robot:
     """One arm: its model file, where it stands, what it carries and what it may do.
 
@@ -95,6 +110,10 @@ class Robot:
         min_manipulability: least allowed |det J| of the flange-pad Jacobian [m^3].
         xacro_arguments: names and values of the xacro file's arguments.
         srdf: file whose disabled pairs of links are not checked for collision.
+        chain_root: link of the URDF that the arm begins at, the flange being its other end; ''
+            where every joint that is not locked belongs to the arm.
+        drop_links: links, by name or pattern, that are left out with all that hangs on them.
+        tool_load: mass and inertia of the tool; None where nothing is known of them.
     """
 
     name: str
@@ -113,6 +132,9 @@ class Robot:
     min_manipulability: float
     xacro_arguments: tuple[tuple[str, str], ...] = ()
     srdf: Path | None = None
+    chain_root: str = ""
+    drop_links: tuple[str, ...] = ()
+    tool_load: ToolLoad | None = None
 
 
 @dataclass(frozen=True)

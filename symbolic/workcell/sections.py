@@ -130,12 +130,26 @@ def solid_box_inertia(size: Array, mass: float) -> Array:
 
 
 def _read_inertia(table: Table, size: Array, mass: float) -> Array:
-    value = table.raw("inertia", "solid box")
-    path, problems = table.at("inertia"), table.problems
-    if value == "solid box":
+    if table.raw("inertia", "solid box") == "solid box":
         return solid_box_inertia(size, mass)
+    bound_known = table.problems.clean(table.at("size"), table.at("mass"))
+    # No mass inside the box is farther from any axis through it than the box's diagonal.
+    bound = mass * float(np.sum(size**2)) if bound_known else np.inf
+    return read_inertia(table, bound, "'solid box' or a 3 x 3 matrix")
+
+
+def read_inertia(table: Table, bound: float, allowed: str = "a 3 x 3 matrix") -> Array:
+    """The (3, 3) matrix of the key `inertia` [kg m^2], a rigid body's.
+
+    Args:
+        table: where it stands.
+        bound: no principal moment can exceed this [kg m^2].
+        allowed: what a message says is allowed.
+    """
+    value = table.raw("inertia")
+    path, problems = table.at("inertia"), table.problems
     if not isinstance(value, list) or len(value) != 3:
-        problems.add(path, f"found {shown(value)}; allowed is 'solid box' or a 3 x 3 matrix")
+        problems.add(path, f"found {shown(value)}; allowed is {allowed}")
         return read_only(np.eye(3))
     rows = [
         checked_vector(row, (quantity.INERTIA,) * 3, f"{path}[{index}]", problems)
@@ -143,9 +157,6 @@ def _read_inertia(table: Table, size: Array, mass: float) -> Array:
     ]
     inertia = read_only(np.stack(rows))
     if problems.clean(path):
-        bound_known = problems.clean(table.at("size"), table.at("mass"))
-        # No mass inside the box is farther from any axis through it than the box's diagonal.
-        bound = mass * float(np.sum(size**2)) if bound_known else np.inf
         problem = inertia_problem(inertia, bound)
         if problem:
             problems.add(path, problem)

@@ -181,7 +181,7 @@ def test_a_mesh_that_is_nowhere_is_named(tmp_path: Path) -> None:
     )
     message = r"link 'a' of x\.urdf: .*not found; package folders.*none given"
     with pytest.raises(CollisionModelError, match=message):
-        _link_pieces(replace(rack().robots[0], urdf=path), MeshReader())
+        _link_pieces(replace(rack().robots[0], urdf=path), ("a", "bare"), MeshReader())
 
 
 def test_capsules_and_origins_are_read(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_capsules_and_origins_are_read(tmp_path: Path) -> None:
         '<geometry><capsule radius="0.1" length="0.4"/></geometry></collision>'
     )
     path.write_text(URDF.format(link=shape, rest='<link name="bare"/>' + JOINT))
-    links = _link_pieces(replace(rack().robots[0], urdf=path), MeshReader())
+    links = _link_pieces(replace(rack().robots[0], urdf=path), ("a", "bare"), MeshReader())
     (piece,) = links["a"]
     assert piece.shape == Capsule(0.1, 0.4)
     assert piece.centre == pytest.approx([1, 2, 3])
@@ -211,7 +211,7 @@ def test_meshes_are_read_once_and_within_limits_together(
     monkeypatch.setattr("symbolic.geometry.bodies.MOST_CORNERS", 1000)
     with pytest.raises(CollisionModelError, match=r"1284 corners, 642 of them 'ball'.*simplify"):
         collision_bodies(twice)
-    monkeypatch.setattr("symbolic.geometry.meshes.MOST_FACES", 2000)
+    monkeypatch.setattr("symbolic.geometry.meshes.MOST_CELL_FACES", 2000)
     larger = replace(ball, name="larger", shape=Mesh(path, 2.0 * np.ones(3)))
     with pytest.raises(CollisionModelError, match=r"ball\.stl: with its 1280.*have 2560; allowed"):
         collision_bodies(replace(twice, environment=(*twice.environment, larger)))

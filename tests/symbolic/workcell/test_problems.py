@@ -184,12 +184,6 @@ URDF_CASES: list[tuple[str, UrdfChange, str, str]] = [
         "'joint_4' is of kind PX; allowed are revolute",
     ),
     (
-        "continuous",
-        lambda text: text.replace('"joint_4" type="revolute"', '"joint_4" type="continuous"'),
-        "robots[0].urdf",
-        "allowed are revolute joints with limits",
-    ),
-    (
         "branched",
         lambda text: text.replace('<parent link="link_5"/>', '<parent link="link_4"/>'),
         "robots[0].urdf",

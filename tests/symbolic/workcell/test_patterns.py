@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from symbolic.workcell.body_names import matching
+from symbolic.workcell.patterns import matching
 
 NAMES = ("payload", "left/link_1", "left/link_2", "right/link_1", "odd*name", "odd[1]")
 

@@ -1,0 +1,264 @@
+"""Cells of machines of the wheel `example-robot-data`, as it has them, for tests."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from importlib.metadata import distribution
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from symbolic.array import Array
+from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.robot.chain import held_joints
+from symbolic.robot.urdf import link_frame, moving_joints, reduced_model
+from symbolic.robot.urdf_file import read_urdf
+from symbolic.workcell.sections import pad_rotation
+
+SIZE = (0.30, 0.40, 0.25)
+
+
+def example_robot(name: str) -> Path:
+    """A file of the wheel, by its path below the folder `robots`."""
+    wheel = distribution("example-robot-data")
+    folder = "cmeel.prefix/share/example-robot-data/robots"
+    return Path(str(wheel.locate_file(f"{folder}/{name}")))
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An arm and a posture in which it can hold a box.
+
+    Attributes:
+        urdf: path below the folder `robots`.
+        chain: root and tip.
+        posture: positions of the joints of the chain that are not locked [rad].
+        locked: joints of the chain that are held [rad].
+        drop: pattern of links that are left out, '' for none.
+    """
+
+    urdf: str
+    chain: tuple[str, str]
+    posture: tuple[float, ...]
+    locked: dict[str, float] = field(default_factory=dict)
+    drop: str = ""
+
+
+_UR = (0.3, -1.2, 1.6, -1.9, -1.4, 0.2)
+SINGLE = {
+    **{
+        name: Arm(f"ur_description/urdf/{name}_robot.urdf", ("base_link", "tool0"), _UR)
+        for name in ("ur3", "ur5", "ur10")
+    },
+    "kinova": Arm(
+        "kinova_description/robots/kinova.urdf",
+        ("base", "j2s6s200_end_effector"),
+        (0.2, 3.6, 1.6, 0.4, 1.9, 0.3),
+        drop="*finger*",
+    ),
+    "z1": Arm(
+        "z1_description/urdf/z1.urdf",
+        ("link00", "link06"),
+        (0.2, 1.4, -1.3, 0.4, 0.3, 0.2),
+        drop="gripper*",
+    ),
+    "panda": Arm(
+        "panda_description/urdf/panda.urdf",
+        ("panda_link0", "panda_link8"),
+        (0.2, 0.3, -1.9, 0.3, 2.2, 0.4),
+        {"panda_joint3": 0.1},
+        "panda_hand",
+    ),
+    "xarm7": Arm(
+        "xarm_description/urdf/xarm7.urdf",
+        ("link_base", "link_eef"),
+        (0.2, 0.3, 1.4, 0.3, 1.0, 0.4),
+        {"joint3": 0.1},
+    ),
+}
+"""Six- and seven-joint arms, one of the seven held; two of each make a cell."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Two arms of one file that hold a box.
+
+    Attributes:
+        left, right: the arms; postures are not used.
+        box: x, y, z of the box's start, in the machine's root [m].
+        spin: of both pads [rad].
+        pad: pose of the pad in the flange frame.
+    """
+
+    left: Arm
+    right: Arm
+    box: tuple[float, float, float]
+    spin: float
+    pad: dict[str, list[float]]
+
+
+@dataclass(frozen=True)
+class _Both:
+    """Names for both arms of a machine, {} standing for the side."""
+
+    urdf: str
+    root: str
+    tip: str
+    locked: str
+    drop: str
+
+    def arms(self, words: tuple[str, str], angles: tuple[float, float]) -> tuple[Arm, Arm]:
+        """The left and the right arm."""
+        left, right = (
+            Arm(
+                self.urdf,
+                (self.root, self.tip.format(word)),
+                (),
+                {self.locked.format(word): angle},
+                self.drop.format(word),
+            )
+            for word, angle in zip(words, angles, strict=True)
+        )
+        return left, right
+
+
+_TIAGO = _Both(
+    "tiago_description/robots/tiago_dual.urdf",
+    "torso_lift_link",
+    "arm_{}_tool_link",
+    "arm_{}_3_joint",
+    "wrist_{}_ft_link",
+)
+_TIAGO_PRO = _Both(
+    "tiago_pro_description/robots/tiago_pro.urdf",
+    "torso_lift_link",
+    "arm_{}_tool_link",
+    "arm_{}_3_joint",
+    "gripper_{}_base_link",
+)
+_TALOS = _Both(
+    "talos_data/robots/talos_reduced.urdf",
+    "torso_2_link",
+    "wrist_{}_ft_tool_link",
+    "arm_{}_3_joint",
+    "gripper_{}_base_link",
+)
+_PR2 = _Both(
+    "pr2_description/urdf/pr2.urdf",
+    "torso_lift_link",
+    "{}_wrist_roll_link",
+    "{}_upper_arm_roll_joint",
+    "{}_gripper_palm_link",
+)
+_SIDES = ("left", "right")
+_TURN = np.pi / 2.0
+MACHINES = {
+    "tiago_dual": Machine(
+        *_TIAGO.arms(_SIDES, (1.2, 1.2)),
+        (0.65, 0.0, 0.8),
+        -_TURN,
+        {"xyz": [0.05, 0.0, 0.0], "rpy": [0.0, _TURN, 0.0]},
+    ),
+    "tiago_pro": Machine(
+        *_TIAGO_PRO.arms(_SIDES, (0.6, -0.6)), (0.65, 0.0, 1.2), -_TURN, {"xyz": [0.0, 0.0, 0.05]}
+    ),
+    "talos": Machine(
+        *_TALOS.arms(_SIDES, (0.0, 0.0)),
+        (0.55, 0.0, 0.2),
+        0.0,
+        {"xyz": [0.0, 0.0, -0.05], "rpy": [np.pi, 0.0, 0.0]},
+    ),
+    "pr2": Machine(
+        *_PR2.arms(("l", "r"), (0.6, -0.6)),
+        (0.65, 0.0, 1.0),
+        -_TURN,
+        {"xyz": [0.06, 0.0, 0.0], "rpy": [0.0, _TURN, 0.0]},
+    ),
+}
+"""Machines with both arms in one file, their lift and torso held."""
+
+
+def machine_cell(machine: Machine, folder: Path) -> Path:
+    """A workcell of the two arms of one machine that stands at the origin."""
+    robots = [
+        _robot(name, arm, {}) | {"pad": machine.pad}
+        for name, arm in (("left", machine.left), ("right", machine.right))
+    ]
+    return write_cell(folder, robots, np.array([*machine.box, 0.0, 0.0, 0.0]), machine.spin)
+
+
+def single_cell(arm: Arm, folder: Path) -> Path:
+    """A workcell of two of the same arms, each based where its posture holds the box."""
+    urdf = read_urdf(example_robot(arm.urdf))
+    locked = tuple(arm.locked.items())
+    moving = moving_joints(urdf, *arm.chain, locked)
+    model = reduced_model(urdf, held_joints(urdf, moving, locked))
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, np.array(arm.posture))
+    T_root_flange = data.oMf[link_frame(model, arm.chain[1])].homogeneous
+    robots = []
+    for name, side in (("left", 1), ("right", -1)):
+        T_box_pad = np.eye(4)
+        T_box_pad[:3, :3] = pad_rotation(1, side, 0.0)
+        T_box_pad[1, 3] = side * SIZE[1] / 2
+        pad = pose_matrix(np.array([0.0, 0.0, 0.05]), np.zeros(3))
+        T_world_base = T_box_pad @ inverse(pad) @ inverse(T_root_flange)
+        rpy = pin.rpy.matrixToRpy(T_world_base[:3, :3])
+        base = {"xyz": T_world_base[:3, 3].tolist(), "rpy": rpy.tolist()}
+        robots.append(_robot(name, arm, base))
+    return write_cell(folder, robots, np.zeros(6))
+
+
+def _robot(name: str, arm: Arm, base: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "name": name,
+        "urdf": str(example_robot(arm.urdf)),
+        "chain": list(arm.chain),
+        "locked_joints": arm.locked,
+        "base": base,
+        "pad": {"xyz": [0.0, 0.0, 0.05]},
+        "min_manipulability": 1e-4,
+        "drop_links": [arm.drop] if arm.drop else [],
+    }
+
+
+def write_cell(folder: Path, robots: list[dict[str, Any]], start: Array, spin: float = 0.0) -> Path:
+    """A workcell file in which a box is moved a little from its start."""
+    goal = start + np.array([0.02, 0.01, 0.03, 0.0, 0.0, 0.02])
+    middle = (start + goal) / 2.0
+    cell = {
+        "name": "machine",
+        "robots": robots,
+        "payload": {"size": SIZE, "mass": 1.0},
+        "contacts": [
+            {
+                "xyz": [0.0, side * SIZE[1] / 2, 0.0],
+                "spin": spin,
+                "friction": 1.0,
+                "patch_radius": 0.03,
+            }
+            for side in (1, -1)
+        ],
+        "task": {
+            "start": start.tolist(),
+            "goal": goal.tolist(),
+            "samples": 12,
+            "reference_speed": 0.2,
+            "reference_force": 100.0,
+            "waypoints": [{"lower": (middle - 0.02).tolist(), "upper": (middle + 0.02).tolist()}],
+        },
+    }
+    path = folder / "cell.toml"
+    path.write_text("\n".join(f"{key} = {_toml(value)}" for key, value in cell.items()) + "\n")
+    return path
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return json.dumps(value)
