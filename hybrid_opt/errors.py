@@ -13,3 +13,7 @@ class DisplayError(DualArmError):
 
 class WorkerError(DualArmError):
     """Processes or machines that work for this one were lost or do not fit."""
+
+
+class WitnessError(DualArmError):
+    """The simulator is missing, or cannot answer what it was asked."""

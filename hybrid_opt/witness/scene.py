@@ -1,0 +1,136 @@
+"""The witness's scene as MJCF: a free box between two pads on a carriage.
+
+Each pad is a ring of small spheres that touch the face of the box at the rim of the patch. The
+leader's pad is fixed to the carriage, the other slides along its normal. Gravity does not act on
+carriage and pads, which are driven.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.physics.contact_forces import GRAVITY
+from symbolic.workcell.records import Contact, Workcell
+
+CARRIAGE_MASS = 1e5
+"""[kg], and [kg m^2] about every axis: what the box does to the carriage within a step is lost in
+it, and its state is set anew at each step."""
+
+PAD_MASS = 0.1
+"""[kg]; its inertia is fed forward."""
+
+POINT_RADIUS = 2e-3
+"""Of the spheres [m]."""
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """How the witness simulates.
+
+    Attributes:
+        time_step: [s].
+        contact_time: time constant of a contact [s]; at least a few time steps. The stiffer, the
+            more a threshold depends on the time step.
+        points: contact points on the rim of each patch.
+        noslip_iterations: of MuJoCo's solver against the creep of frictional contacts.
+        settle: time at rest before the carry begins [s].
+        slip: displacement in the plane of a pad that counts as slip [m].
+    """
+
+    time_step: float = 2e-4
+    contact_time: float = 0.01
+    points: int = 8
+    noslip_iterations: int = 30
+    settle: float = 0.15
+    slip: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if not 0.0 < 2.0 * self.time_step <= self.contact_time:
+            raise SettingsError(
+                f"time step {self.time_step:g} s with contacts of {self.contact_time:g} s: give a "
+                "contact time of at least two time steps"
+            )
+        if self.points < 3 or self.noslip_iterations < 0:
+            raise SettingsError("give at least three contact points and no negative iterations")
+        if not (self.settle > 0.0 and self.slip > 0.0):
+            raise SettingsError("give a positive time to settle and a positive slip")
+
+
+def scene_text(
+    workcell: Workcell, settings: SimulationSettings, leader: int, disturbance: ArrayLike
+) -> str:
+    """The MJCF document.
+
+    Args:
+        leader: index of the pad that is fixed to the carriage.
+        disturbance: (3,) acceleration that the pads have to give the box beside the motion's,
+            world frame [m/s^2]; it acts like a change of gravity.
+    """
+    gravity = np.array(GRAVITY) - np.asarray(disturbance)
+    payload, inertia = workcell.payload, workcell.payload.inertia
+    about = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    pads = "\n".join(
+        _pad_text(contact, f"pad_{i + 1}", settings.points, slides=i != leader)
+        for i, contact in enumerate(workcell.contacts)
+    )
+    return f"""
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="{settings.time_step!r}" gravity="{_text(gravity)}" cone="elliptic" impratio="20"
+    integrator="implicitfast" solver="Newton" iterations="200" tolerance="1e-12"
+    noslip_iterations="{settings.noslip_iterations}" noslip_tolerance="1e-12"/>
+  <default>
+    <geom solref="{settings.contact_time!r} 1" solimp="0.99 0.9999 0.0001" condim="3"/>
+  </default>
+  <worldbody>
+    <body name="carriage" gravcomp="1">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="{CARRIAGE_MASS!r}" diaginertia="{_text([CARRIAGE_MASS] * 3)}"/>
+      {pads}
+    </body>
+    <body name="box">
+      <freejoint name="box"/>
+      <inertial pos="{_text(payload.centre_of_mass)}" mass="{payload.mass!r}"
+        fullinertia="{_text(about)}"/>
+      <geom type="box" size="{_text(payload.size / 2.0)}" contype="0" conaffinity="1"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def _pad_text(contact: Contact, name: str, points: int, slides: bool) -> str:
+    angles = 2.0 * np.pi * np.arange(points) / points
+    spheres = "\n".join(
+        f'<geom type="sphere" size="{POINT_RADIUS!r}" contype="1" conaffinity="0" priority="1" '
+        f'friction="{contact.friction!r} 0 0" pos="{_text(place)}"/>'
+        for place in np.column_stack(
+            [
+                contact.patch_radius * np.cos(angles),
+                contact.patch_radius * np.sin(angles),
+                np.full(points, -POINT_RADIUS),
+            ]
+        )
+    )
+    joint = '<joint name="press" type="slide" axis="0 0 1"/>' if slides else ""
+    at, turn = contact.T_box_pad[:3, 3], quaternion(contact.T_box_pad[:3, :3])
+    return f"""<body name="{name}" gravcomp="1" pos="{_text(at)}" quat="{_text(turn)}">
+        {joint}
+        <inertial pos="0 0 0" mass="{PAD_MASS!r}" diaginertia="0.001 0.001 0.001"/>
+        {spheres}
+      </body>"""
+
+
+def quaternion(rotation: Array) -> Array:
+    """Unit quaternions (..., 4), real part first, of rotation matrices (..., 3, 3)."""
+    last: Array = Rotation.from_matrix(rotation).as_quat()
+    return last[..., [3, 0, 1, 2]]
+
+
+def _text(values: ArrayLike) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(values))

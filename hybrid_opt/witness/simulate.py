@@ -1,0 +1,187 @@
+"""A driven box in MuJoCo: pressed with a multiple of a force, does it stay in place?
+
+The carriage is set to the planned state of the box frame at every step and accelerated as planned
+within it, so that the pads move exactly as planned; the box, free, is held by friction alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from hybrid_opt.errors import WitnessError
+from hybrid_opt.witness.drive import Drive
+from hybrid_opt.witness.scene import CARRIAGE_MASS, SimulationSettings, scene_text
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
+
+LOOKED_AT = 1e-3
+"""Time between two looks at the slip [s]."""
+
+BEGINS = 0.1
+"""Share of the slip that counts as one at which it is said to begin."""
+
+RIM_POINTS = 8
+"""Places on each patch's rim where the slip is measured."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one simulation showed.
+
+    Attributes:
+        factor: multiple of the pressing force.
+        holds: whether the box slipped by less than the settings' slip.
+        time: (n,) when it was looked at, from the settled state on [s].
+        slip: (n, 2) largest displacement in the plane of each pad since then [m].
+        turn: (n,) angle by which the box turned on the carriage since then [rad].
+    """
+
+    factor: float
+    holds: bool
+    time: Array
+    slip: Array
+    turn: Array
+
+    @property
+    def pad(self) -> int:
+        """Index of the pad with the larger slip at the end."""
+        return int(self.slip[-1].argmax())
+
+    def begins(self, slip: float) -> float:
+        """Time at which the slip first exceeds a tenth of `slip` [s]; infinite where never."""
+        beyond = np.flatnonzero(self.slip.max(axis=1) > BEGINS * slip)
+        return float(self.time[beyond[0]]) if len(beyond) else float("inf")
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """The least multiple of a force that holds.
+
+    Attributes:
+        slips, holds: simulations right below and above it.
+    """
+
+    slips: Outcome
+    holds: Outcome
+
+    @property
+    def factor(self) -> float:
+        """In the middle of both."""
+        return (self.slips.factor + self.holds.factor) / 2.0
+
+
+class Witness:
+    """The box of one workcell between its pads.
+
+    Attributes:
+        workcell, settings: what is simulated, and how.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        settings: SimulationSettings | None = None,
+        disturbance: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Describe the scene; nothing is simulated yet.
+
+        Args:
+            disturbance: (3,) acceleration beside the motion's, world frame [m/s^2].
+
+        Raises:
+            WitnessError: MuJoCo is not installed.
+        """
+        self.workcell = workcell
+        self.settings = settings or SimulationSettings()
+        self._mujoco = _mujoco()
+        self._disturbance = disturbance
+        self._models: dict[int, Any] = {}
+        around = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
+        circle = np.stack([np.cos(around), np.sin(around)])
+        pads = [contact.T_box_pad for contact in workcell.contacts]
+        radii = [contact.patch_radius for contact in workcell.contacts]
+        self._normal = pads[0][:3, 2]
+        self._rims = np.array(
+            [T[:3, 3] + (r * T[:3, :2] @ circle).T for T, r in zip(pads, radii, strict=True)]
+        )
+
+    def simulate(self, drive: Drive, factor: float = 1.0) -> Outcome:
+        """One carry with the pressing force times a factor, up to its end or to a slip."""
+        mujoco, model, settings = self._mujoco, self._model(drive.leader), self.settings
+        data = mujoco.MjData(model)
+        box = int(model.joint("box").qposadr[0])
+        press = int(model.joint("press").dofadr[0])
+        data.qpos[:3], data.qpos[3:7] = drive.position[0], drive.quaternion[0]
+        data.qpos[box : box + 3], data.qpos[box + 3 : box + 7] = data.qpos[:3], data.qpos[3:7]
+        force = factor * drive.press + drive.own
+        every = max(1, round(LOOKED_AT / settings.time_step))
+        settled: tuple[Array, Array] | None = None
+        time, slip, turn = [], [], []
+        for k in range(len(drive.time) - 1):
+            data.qpos[:3], data.qpos[3:7] = drive.position[k], drive.quaternion[k]
+            data.qvel[:3], data.qvel[3:6] = drive.velocity[k], drive.spin[k]
+            data.qfrc_applied[:3] = CARRIAGE_MASS * drive.acceleration[k]
+            data.qfrc_applied[3:6] = CARRIAGE_MASS * drive.spin_rate[k]
+            data.qfrc_applied[press] = force[k]
+            mujoco.mj_step(model, data)
+            if k % every or drive.time[k] < drive.time[0] + settings.settle / 2.0:
+                continue
+            moved, turned = self._displaced(drive, k + 1, data.qpos[box : box + 7])
+            settled = settled or (moved, turned)
+            time.append(float(drive.time[k + 1]))
+            slip.append(np.linalg.norm(moved - settled[0], axis=2).max(axis=1))
+            turn.append(float(Rotation.from_matrix(settled[1].T @ turned).magnitude()))
+            if not slip[-1].max() <= settings.slip:
+                return Outcome(factor, False, np.array(time), np.array(slip), np.array(turn))
+        return Outcome(factor, True, np.array(time), np.array(slip), np.array(turn))
+
+    def threshold(self, drive: Drive, low: float, high: float, steps: int) -> Threshold:
+        """The least factor that holds, by bisection.
+
+        Args:
+            low, high: factors between which it is looked for.
+            steps: bisections.
+
+        Raises:
+            WitnessError: the box holds at the lower or slips at the higher factor.
+        """
+        slips, holds = self.simulate(drive, low), self.simulate(drive, high)
+        if slips.holds or not holds.holds:
+            what = f"holds at {low:g}" if slips.holds else f"slips at {high:g}"
+            raise WitnessError(f"the box {what} times the force; give other factors")
+        for _ in range(steps):
+            middle = self.simulate(drive, (slips.factor + holds.factor) / 2.0)
+            slips, holds = (slips, middle) if middle.holds else (middle, holds)
+        return Threshold(slips, holds)
+
+    def _model(self, leader: int) -> Any:
+        if leader not in self._models:
+            text = scene_text(self.workcell, self.settings, leader, self._disturbance)
+            self._models[leader] = self._mujoco.MjModel.from_xml_string(text)
+        return self._models[leader]
+
+    def _displaced(self, drive: Drive, k: int, pose: Array) -> tuple[Array, Array]:
+        """Displacements (2, RIM_POINTS, 3) in the planes of the pads, and rotation (3, 3), of the
+        box on the carriage."""
+        R_world_box = Rotation.from_quat(pose[[4, 5, 6, 3]]).as_matrix()
+        turned = drive.rotation[k].T @ R_world_box
+        offset = drive.rotation[k].T @ (pose[:3] - drive.position[k])
+        moved = self._rims @ turned.T + offset - self._rims
+        return moved - (moved @ self._normal)[..., None] * self._normal, turned
+
+
+def _mujoco() -> ModuleType:
+    try:
+        import mujoco
+    except ImportError as error:
+        raise WitnessError(
+            "MuJoCo is not installed; install the extra: pip install -e '.[sim]'"
+        ) from error
+    module: ModuleType = mujoco
+    return module
