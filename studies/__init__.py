@@ -1,1 +1,18 @@
 """Programs to run: `python -m studies.rack` and its siblings, with the cells they need."""
+
+from __future__ import annotations
+
+import sys
+from types import TracebackType
+
+
+def _tell(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    if issubclass(kind, KeyboardInterrupt):
+        print("\ninterrupted", file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
+if sys.argv[:1] == ["-m"]:
+    # A program is about to be imported, which takes a second; Ctrl-C may come meanwhile.
+    sys.excepthook = _tell

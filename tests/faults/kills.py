@@ -34,7 +34,7 @@ WAYS = ("kill", "kill all", "interrupt", "terminate", "kill a worker")
 TIMES = {"seconds", "median_attempt_seconds", "equivalent_evaluations"}
 """Figures that are times, or follow from them."""
 
-ENDS = {0, 2, 130, -signal.SIGKILL, -signal.SIGTERM, 128 + signal.SIGTERM}
+ENDS = {0, 2, 130, -signal.SIGINT, -signal.SIGKILL, -signal.SIGTERM}
 PATIENCE = 300.0
 ORPHANS_END = 60.0
 """So many seconds [s] after its parent's death a worker may still be there."""
@@ -118,7 +118,7 @@ def ended(process: subprocess.Popen[bytes], said: Path) -> int:
     words = said.read_text(errors="replace")
     if code not in ENDS or "Traceback" in words:
         raise Broken(f"exit code {code}, said:\n{words[-4000:]}")
-    if code in (2, 130) and not words.strip():
+    if code in (2, 130, -signal.SIGINT) and not words.strip():
         raise Broken(f"exit code {code} without a message")
     begin = time.monotonic()
     while left := session(process.pid):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from importlib import import_module
@@ -94,6 +95,25 @@ def test_output_that_nobody_reads_is_no_error() -> None:
         check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "x", "")
+
+
+@pytest.mark.parametrize("module", ["studies", "numpy", "casadi", "hybrid_opt.campaign"])
+def test_an_interrupt_during_the_start_is_no_traceback(module: str) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-X", "importtime", "-m", "studies.run", "nowhere.toml"],
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    for line in process.stderr:  # Python tells each import when it is done
+        if line.split("|")[-1].strip() == module:
+            break
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=120)[1]
+    assert "Traceback" not in said
+    assert "interrupted" in said or "nowhere.toml" in said
+    assert process.returncode in (2, 130, -signal.SIGINT)
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
