@@ -11,7 +11,7 @@ import pinocchio as pin
 from symbolic import outside
 from symbolic.errors import OutsideError, RobotModelError, UrdfError
 from symbolic.robot.chain import Held, held_joints, without_links
-from symbolic.robot.packages import further_package_dirs
+from symbolic.robot.packages import PACKAGE_SCHEME, find_package, further_package_dirs
 from symbolic.robot.srdf_file import read_srdf
 from symbolic.robot.urdf import (
     flange_problem,
@@ -51,9 +51,9 @@ def read_description(
         folder: what paths are relative to.
         stored: whether the cell was unpacked from an archive, see `symbolic.workcell.file.load`.
     """
-    path = read_file(table, "urdf", folder, outside.URDF_BYTES)
-    arguments = _read_xacro_arguments(table)
     package_dirs = _read_folders(table, folder)
+    path = _read_described(table, "urdf", folder, package_dirs)
+    arguments = _read_xacro_arguments(table)
     locked = _read_locked(table)
     root, flange = _read_chain(table)
     drop_links = _read_texts(table, "drop_links", "names or patterns of links")
@@ -69,7 +69,7 @@ def read_description(
             package_dirs += further_package_dirs(named, package_dirs, path)
         model = _read_model(table, urdf, locked, (root, flange))
         _check_meshes(table, urdf, path, package_dirs)
-    srdf = _read_srdf(table, folder)
+    srdf = _read_srdf(table, folder, package_dirs)
     found = Description(path, arguments, package_dirs, srdf, root, flange, locked, drop_links)
     return found, model
 
@@ -103,11 +103,34 @@ def _read_xacro_arguments(table: Table) -> tuple[tuple[str, str], ...]:
     return tuple((name, inner.text(name)) for name in inner)
 
 
-def _read_srdf(table: Table, folder: Path) -> Path | None:
+def _read_described(table: Table, key: str, folder: Path, package_dirs: tuple[Path, ...]) -> Path:
+    """A file named relative to the workcell's folder, or as package://NAME/..."""
+    address = table.raw(key, None)
+    if not isinstance(address, str) or not address.startswith(PACKAGE_SCHEME):
+        return read_file(table, key, folder, outside.URDF_BYTES)
+    name, _, rest = address.removeprefix(PACKAGE_SCHEME).partition("/")
+    package = find_package(name, package_dirs, folder / "workcell")
+    if package is None or ".." in rest.split("/"):
+        table.problems.add(
+            table.at(key),
+            f"found {shown(address)}, in no package that is found; packages are looked up in "
+            "package_dirs, ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the Python environment",
+        )
+        return folder
+    try:
+        path = outside.resolved(package / rest)
+        outside.require(path, outside.URDF_BYTES)
+    except OutsideError as error:
+        table.problems.add(table.at(key), f"found {shown(address)}, which {error}")
+        return folder
+    return path
+
+
+def _read_srdf(table: Table, folder: Path, package_dirs: tuple[Path, ...]) -> Path | None:
     if "srdf" not in table:
         table.raw("srdf", None)
         return None
-    path = read_file(table, "srdf", folder, outside.URDF_BYTES)
+    path = _read_described(table, "srdf", folder, package_dirs)
     if table.problems.clean(table.at("srdf")):
         try:
             read_srdf(path)

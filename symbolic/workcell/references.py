@@ -38,8 +38,11 @@ class CellCollector:
             # Folders beyond those of the file belong to this machine; what they hold is embedded.
             named = list(zip(robot.package_dirs, folders, strict=False))
             self._files[urdf] = self._with_meshes(robot, urdf, named)
+            if robot.srdf is not None:
+                place = self._place(str(entry["srdf"]))
+                self._files[place] = _content(robot.srdf, outside.URDF_BYTES)
         for reference, package_dirs in references(data):
-            if package_dirs is None:
+            if package_dirs is None and self._place(reference) not in self._files:
                 content = _content(self._source.parent / reference, outside.MESH_BYTES)
                 self._files[self._place(reference)] = content
 
@@ -63,7 +66,7 @@ class CellCollector:
 
     def _place(self, reference: str) -> str:
         """The place of a reference of the workcell file, relative to that file."""
-        if not posixpath.isabs(reference):
+        if not posixpath.isabs(reference) and not reference.startswith(PACKAGE_SCHEME):
             return posixpath.normpath(reference)
         if reference in self._places:  # both robots may name one file
             return self._places[reference]

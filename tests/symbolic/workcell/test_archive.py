@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import trimesh
 
-from symbolic.errors import BundleError
-from symbolic.robot.urdf import robot_urdf
+from symbolic.errors import BundleError, WorkcellError
+from symbolic.robot.urdf import resolve_mesh, robot_urdf
 from symbolic.workcell.archive import (
     CellArchive,
     archive_cell,
@@ -260,3 +260,29 @@ def test_xacro_and_packages_of_this_machine_become_part_of_the_archive(
     }
     with pytest.raises(BundleError, match="xacro macros"):
         unpack_cell(replace(archive, files=harmful), tmp_path / "harm")
+
+
+def test_a_robot_of_a_package_travels_along(tmp_path: Path) -> None:
+    path = write_cell(tmp_path / "here", '"stone.stl"')
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(path.parent / "stone.stl")
+    robots = "package://example-robot-data/robots/ur_description"
+    text = path.read_text(encoding="utf-8").replace(
+        "../robots/gofa12.urdf", f"{robots}/urdf/ur5_robot.urdf"
+    )
+    line = 'flange = "tool0"\n'
+    text = text.replace(line, f'{line}srdf = "{robots}/srdf/ur5.srdf"\n')
+    path.write_text(text, encoding="utf-8")
+    cell = load(path)
+    assert cell.robots[0].urdf.name == "ur5_robot.urdf"
+    unpacked, archive = round_trip(cell, tmp_path / "there")
+    assert "package://" not in archive.files[archive.workcell].decode()
+    for robot in unpacked.robots:
+        assert robot.urdf.is_relative_to(tmp_path)
+        assert robot.srdf is not None
+        assert robot.srdf.is_relative_to(tmp_path)
+        assert all(
+            resolve_mesh(address, robot.urdf, ()) for address in robot_urdf(robot).collision_meshes
+        )
+    path.write_text(text.replace("ur5_robot", "../../ur5_robot"), encoding="utf-8")
+    with pytest.raises(WorkcellError, match="in no package that is found"):
+        load(path)
