@@ -58,7 +58,7 @@ _REWRITES = [
 _KNOWN = re.compile(
     r"^(?:const|static|int|for|if|else|return|arg\d*|res\d*|iw|w|mem|i|j|k|rr|cs|cr|"
     r"casadi_(?:real|int|zeros|copy|fill|clear|fmax|fmin|fabs|sign|sq|mtimes_dense|vfmax|vfmin|"
-    r"mmax|mmin|dot)|casadi_[fc]\d+|lanes_\w+|a\d+|w\d+|wr\d+|INFINITY|NAN|e)$"
+    r"mmax|mmin|dot|norm_2|norm_inf)|casadi_[fc]\d+|lanes_\w+|a\d+|w\d+|wr\d+|INFINITY|NAN|e)$"
 )
 _WORD = re.compile(r"[A-Za-z_]\w*")
 _SCALAR_CONDITION = re.compile(

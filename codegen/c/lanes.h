@@ -232,6 +232,14 @@ static inline lanes_real lanes_dot(lanes_int n, const lanes_real* x, const lanes
   for (lanes_int i = 0; i < n; ++i) r += x[i] * y[i];
   return r;
 }
+static inline lanes_real lanes_norm_2(lanes_int n, const lanes_real* x) {
+  return lanes_sqrt(lanes_dot(n, x, x));
+}
+static inline lanes_real lanes_norm_inf(lanes_int n, const lanes_real* x) {
+  lanes_real r = lanes_all_equal(0.0);
+  for (lanes_int i = 0; i < n; ++i) r = lanes_fmax(r, lanes_fabs(x[i]));
+  return r;
+}
 
 /* Results a in the lanes of a mask. */
 static inline void lanes_merge(unsigned bits, const lanes_real* a, lanes_int n, lanes_real* b) {

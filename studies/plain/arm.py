@@ -8,7 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from studies.plain.motion import rotation
 from symbolic.array import Array
-from symbolic.robot.arm import MAX_JOINT_STEP, NEWTON_STEPS, REACH_TOLERANCE
+from symbolic.robot.arm import (
+    CHEAP_STEPS,
+    FAR,
+    MAX_JOINT_STEP,
+    NEWTON_STEPS,
+    REACH_TOLERANCE,
+    SURE,
+)
 from symbolic.workcell.records import Contact, Robot
 
 
@@ -72,6 +79,25 @@ class PlainArm:
         distance = np.linalg.norm(target.translation - here.translation)
         return float(np.hypot(distance, 2.0 * np.sin(angle / 2.0)))
 
+    def search(self, previous: Array, change: Array, curve: Array, target: pin.SE3) -> Array:
+        """Joints (6,) for the next target by Newton's method from the joints before.
+
+        Args:
+            change, curve: (6,) the last difference of the joints, and its difference.
+        """
+        q, before = previous + change + curve, 0.0
+        for _ in range(CHEAP_STEPS):
+            before = self.residual(q, target)
+            q = self.newton_step(q, target)
+        if before > FAR:
+            q = self.newton_step(q, target)
+        if self.residual(q, target) <= SURE:
+            return q
+        other = previous + change
+        for _ in range(NEWTON_STEPS):
+            other = self.newton_step(other, target)
+        return min(q, other, key=lambda found: self.residual(found, target))
+
     def follow(self, start: Array, poses: Array, wrenches: Array) -> dict[str, Array]:
         """Every output of `symbolic.robot.arm.TRACK_OUTPUTS` along the samples.
 
@@ -80,7 +106,8 @@ class PlainArm:
             poses: (n, 6) of the box.
             wrenches: (n, 6) on the box about the nominal contact point, world axes.
         """
-        previous = before = start
+        previous = start
+        change, curve = np.zeros(6), np.zeros(6)
         predicted = start
         for _ in range(NEWTON_STEPS):
             predicted = self.newton_step(predicted, self.flange_target(poses[1]))
@@ -88,9 +115,7 @@ class PlainArm:
         samples: dict[str, list[object]] = {}
         for k, (pose, wrench) in enumerate(zip(poses, wrenches, strict=True)):
             target = self.flange_target(pose)
-            q = 2.0 * previous - before
-            for _ in range(NEWTON_STEPS):
-                q = self.newton_step(q, target)
+            q = self.search(previous, change, curve, target)
             jump = np.abs(q - previous).max()
             if not (self.residual(q, target) <= REACH_TOLERANCE and jump <= MAX_JOINT_STEP):
                 lost = 1.0
@@ -113,5 +138,6 @@ class PlainArm:
             for name, value in sample.items():
                 samples.setdefault(name, []).append(value)
             # The second sample has no motion to extrapolate: the prediction takes its place.
-            previous, before = q, previous if k > 0 else 2.0 * q - predicted
+            moved = q - previous if k > 0 else predicted - q
+            previous, change, curve = q, moved, moved - change if k > 0 else curve
         return {name: np.array(values) for name, values in samples.items()}

@@ -1,8 +1,11 @@
 """One arm that follows the box: inverse kinematics along the samples, limits and joint load.
 
 Paper Eqs. 29-33 and 61-62. The flange's target follows from the box pose alone, so both arms
-keep the relative grasp exactly. Newton's method is warm started by linear extrapolation of the
-two previous samples; what it reaches is measured, never assumed.
+keep the relative grasp exactly. Newton's method is warm started by quadratic extrapolation of the
+previous samples; what it reaches is measured, never assumed. Two cheap steps suffice nearly
+everywhere, a third is made where the second started too far away, and where that is not enough,
+`NEWTON_STEPS` steps by the QR factors have the last word: a sample counts as lost only if they do
+not reach it either.
 """
 
 from __future__ import annotations
@@ -14,6 +17,11 @@ from symbolic.expression import Expression
 from symbolic.physics.pose import inverse
 from symbolic.physics.rotation import rotation_matrix
 from symbolic.robot.model import RobotModel
+from symbolic.robot.newton import MAX_JOINT_STEP as MAX_JOINT_STEP
+from symbolic.robot.newton import block_step
+from symbolic.robot.newton import manipulability as manipulability
+from symbolic.robot.newton import newton_step as newton_step
+from symbolic.robot.newton import pose_error as pose_error
 from symbolic.workcell.records import Contact, Robot
 
 Arms = tuple[Robot, Robot]
@@ -23,11 +31,18 @@ Contacts = tuple[Contact, Contact]
 NEWTON_STEPS = 3
 """Newton steps per sample; extrapolation brings the start within their basin."""
 
+CHEAP_STEPS = 2
+"""Newton steps by blocks that every sample gets."""
+
+FAR = 1e-5
+"""Pose residual before the last cheap step above which one more is made [m, rad]; Newton's method
+squares it, within a factor of about 5."""
+
+SURE = 1e-9
+"""Pose residual above which the cheap steps are not trusted [m, rad]."""
+
 REACH_TOLERANCE = 1e-6
 """Largest pose residual of a reached sample [m, rad]: a twentieth of the arm's repeatability."""
-
-MAX_JOINT_STEP = 0.5
-"""Largest change of a joint in one Newton step, and between samples of one motion [rad]."""
 
 TRACK_OUTPUTS = ("q", "ik_residual", "lost", "limit_margin", "manipulability", "joint_torque")
 """Outputs of `track_function` after the state.
@@ -62,42 +77,6 @@ def flange_target(
     )
 
 
-def pose_error(R_target: ca.SX, p_target: ca.SX, R: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Newton's right-hand side (6,) and the pose residual (scalar) of a placement.
-
-    The right-hand side holds the position error and the axis of the rotation error times the
-    sine of its angle. The residual uses twice the sine of the half angle instead, which is zero
-    for equal rotations only.
-    """
-    dR = ca.mtimes(R_target, R.T)
-    axis = ca.vertcat(dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]) / 2.0
-    dp = p_target - p
-    turn_squared = ca.sumsqr(R_target - R) / 2.0
-    return ca.vertcat(dp, axis), ca.sqrt(ca.sumsqr(dp) + turn_squared + 1e-40)
-
-
-def newton_step(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> ca.SX:
-    """One safeguarded Newton step of the inverse kinematics; q (6,) to q (6,)."""
-    R, p = model.placement(q)
-    error, _ = pose_error(R_target, p_target, R, p)
-    Q, upper = ca.qr(model.jacobian(q))
-    step = ca.solve(upper, ca.mtimes(Q.T, error))
-    largest = ca.norm_inf(step)
-    # At a singular posture the step is not a number: stay, and let the residual tell.
-    usable = ca.norm_1(step) < 1e9
-    scale = MAX_JOINT_STEP / ca.fmax(largest, MAX_JOINT_STEP)
-    return ca.vertcat(*[q[i] + ca.if_else(usable, scale * step[i], 0.0) for i in range(6)])
-
-
-def manipulability(jacobian: ca.SX) -> ca.SX:
-    """|det J| [m^3] of a (6, 6) Jacobian (Yoshikawa's measure of a six-joint arm)."""
-    _, upper = ca.qr(jacobian)
-    product = upper[0, 0]
-    for i in range(1, 6):
-        product = product * upper[i, i]
-    return product
-
-
 def limit_margin(robot: Robot, q: ca.SX) -> ca.SX:
     """Least distance (scalar) of the joints to their limits, negative beyond one [rad]."""
     return ca.mmin(ca.vertcat(q - ca.DM(robot.position_lower), ca.DM(robot.position_upper) - q))
@@ -124,43 +103,107 @@ def joint_torque(
 def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
     """One sample of an arm's motion, to be accumulated along the path.
 
-    Inputs: state (13,) = joints at the previous sample, at the one before, and `lost`; pose (6,)
-    of the box; wrench (6,) on the box about the nominal contact point.
-    Outputs: the next state, then `TRACK_OUTPUTS`.
+    Inputs: state (19,) = joints at the previous sample, their last change, that change's own
+    change, and `lost`; pose (6,) of the box; wrench (6,) on the box about the nominal contact
+    point. Outputs: the next state, then `TRACK_OUTPUTS`.
     """
-    state, pose, wrench = ca.SX.sym("state", 13), ca.SX.sym("pose", 6), ca.SX.sym("wrench", 6)
-    previous, before, lost = state[:6], state[6:12], state[12]
-    rotation = rotation_matrix(pose[3:])
-    R_target, p_target = flange_target(robot, contact, pose[:3], rotation)
-    q = 2.0 * previous - before
-    for _ in range(NEWTON_STEPS):
-        q = newton_step(model, q, R_target, p_target)
-    _, reached = pose_error(R_target, p_target, *model.placement(q))
-    jump = ca.norm_inf(q - previous)
-    arrived = ca.logic_and(reached <= REACH_TOLERANCE, jump <= MAX_JOINT_STEP)
-    lost = ca.fmax(lost, ca.if_else(arrived, 0.0, 1.0))
+    state, pose, wrench = ca.MX.sym("state", 19), ca.MX.sym("pose", 6), ca.MX.sym("wrench", 6)
+    parts = _track_parts(robot, model, contact)
+    previous, lost = state[:6], state[18]
+    rotation, R_target, p_target = parts["target"](pose)
+    target = (R_target, p_target)
+    q, before = parts["approach"](state, *target)
+    following = lost < 0.5
+    q = parts["closer"](ca.logic_and(following, ca.logic_not(before <= FAR)), q, *target)
+    found = parts["place"](q, *target)
+    unsure = ca.logic_and(following, ca.logic_not(found[1] <= SURE))
+    found = parts["again"](unsure, state, *target, *found)
+    jump = ca.norm_inf(found[0] - previous)
+    arrived = ca.logic_and(found[1] <= REACH_TOLERANCE, jump <= MAX_JOINT_STEP)
+    lost = ca.fmax(lost, ca.logic_not(arrived))
     # A lost arm stays where it was: what Newton's method does off the path is arbitrary.
-    q = ca.vertcat(*[ca.if_else(lost > 0.5, previous[i], q[i]) for i in range(6)])
-    jacobian = model.jacobian(q)
-    _, residual = pose_error(R_target, p_target, *model.placement(q))
-    outputs = ca.cse(
-        [
-            ca.vertcat(q, previous, lost),
-            q,
-            residual,
-            lost,
-            limit_margin(robot, q),
-            manipulability(jacobian),
-            joint_torque(robot, contact, jacobian, rotation, wrench),
-        ]
-    )
+    q, residual, jacobian = parts["held"](lost > 0.5, previous, *target, *found)
+    change = q - previous
     return ca.Function(
         name,
         [state, pose, wrench],
-        [ca.densify(output) for output in outputs],
+        [
+            ca.vertcat(q, change, change - state[6:12], lost),
+            q,
+            residual,
+            lost,
+            *parts["measures"](q, jacobian, rotation, wrench),
+        ],
         ["state", "pose", "wrench"],
         ["next_state", *TRACK_OUTPUTS],
     )
+
+
+def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str, ca.Function]:
+    """The steps of `track_function`; those that begin with a condition do nothing without it.
+
+    target: pose -> R_world_box, and the flange's target. approach: state, target -> joints after
+    `CHEAP_STEPS`, the residual before the last. closer: joints, target -> joints one step on.
+    place: joints, target -> joints, residual, jacobian. again: state, target and what `place` found
+    -> the better of that and `NEWTON_STEPS` steps by QR. held: previous joints, target and what was
+    found -> what `place` finds at the previous joints. measures: joints, jacobian, R_world_box,
+    wrench -> limit margin, manipulability, joint torque.
+    """
+    state, pose, wrench = ca.SX.sym("state", 19), ca.SX.sym("pose", 6), ca.SX.sym("wrench", 6)
+    q, R, p = ca.SX.sym("q", 6), ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
+    residual, jacobian = ca.SX.sym("residual"), ca.SX.sym("jacobian", 6, 6)
+    start = ca.SX.sym("start", 6)
+    rotation = rotation_matrix(pose[3:])
+    previous, change = state[:6], state[6:12]
+
+    near = previous + (change + state[12:18])
+    before = ca.SX(0)
+    for _ in range(CHEAP_STEPS):
+        near, before = block_step(model, near, R, p)
+    place = _function("place", [q, R, p], _placed(model, q, R, p))
+    found = [q, residual, jacobian]
+
+    other = previous + change
+    for _ in range(NEWTON_STEPS):
+        other = newton_step(model, other, R, p)
+    anew = _placed(model, other, R, p)
+    keep = residual <= anew[1]
+    better = [ca.if_else(keep, a, b) for a, b in zip(found, anew, strict=True)]
+    measures = [
+        limit_margin(robot, q),
+        manipulability(jacobian),
+        joint_torque(robot, contact, jacobian, R, wrench),
+    ]
+    return {
+        "target": _function(
+            "target", [pose], [rotation, *flange_target(robot, contact, pose[:3], rotation)]
+        ),
+        "approach": _function("approach", [state, R, p], [near, before]),
+        "closer": _where("closer", [q, R, p], [block_step(model, q, R, p)[0]], [q]),
+        "place": place,
+        "again": _where("again", [state, R, p, *found], better, found),
+        "held": _where("held", [start, R, p, *found], _placed(model, start, R, p), found),
+        "measures": _function("measures", [q, jacobian, R, wrench], measures),
+    }
+
+
+def _placed(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> list[ca.SX]:
+    """Joints (6,), their pose residual and their Jacobian (6, 6)."""
+    R, p, jacobian = model.kinematics(q)
+    return [q, pose_error(R_target, p_target, R, p)[1], jacobian]
+
+
+def _function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
+    return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
+
+
+def _where(
+    name: str, inputs: list[ca.SX], results: list[ca.SX], otherwise: list[ca.SX]
+) -> ca.Function:
+    """Condition and inputs -> the results, or without the condition the others, not computed."""
+    chosen = _function(name, inputs, results)
+    left = _function(f"{name}_not", inputs, otherwise)
+    return ca.Function.if_else(f"{name}_where", chosen, left)
 
 
 def follow_function(
@@ -192,7 +235,7 @@ def follow_function(
 
 def start_state(start: Expression) -> Expression:
     """State of `track_function` before the first sample, from its joints (6,)."""
-    return ca.vertcat(start, start, 0.0)
+    return ca.vertcat(start, type(start).zeros(13))
 
 
 def prediction_function(
@@ -200,14 +243,14 @@ def prediction_function(
 ) -> ca.Function:
     """State of `track_function` after the first sample -> one that predicts the second.
 
-    Inputs: state (13,); pose (6,) of the box at the second sample.
+    Inputs: state (19,); pose (6,) of the box at the second sample.
     """
-    state, pose = ca.SX.sym("state", 13), ca.SX.sym("pose", 6)
+    state, pose = ca.SX.sym("state", 19), ca.SX.sym("pose", 6)
     R_target, p_target = flange_target(robot, contact, pose[:3], rotation_matrix(pose[3:]))
     q = start = state[:6]
     for _ in range(NEWTON_STEPS):
         q = newton_step(model, q, R_target, p_target)
-    predicting = ca.vertcat(start, 2.0 * start - q, state[12])
+    predicting = ca.vertcat(start, q - start, ca.SX.zeros(6), state[18])
     return ca.Function(name, [state, pose], ca.cse([predicting]), ["state", "pose"], ["predicting"])
 
 

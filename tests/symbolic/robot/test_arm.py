@@ -18,6 +18,7 @@ from studies.plain.motion import rotation
 from symbolic.array import Array
 from symbolic.physics.rotation import rotation_matrix
 from symbolic.robot.arm import (
+    CHEAP_STEPS,
     MAX_JOINT_STEP,
     NEWTON_STEPS,
     REACH_TOLERANCE,
@@ -30,6 +31,7 @@ from symbolic.robot.arm import (
     pose_error,
     track_function,
 )
+from symbolic.robot.newton import block_step
 from tests.symbolic.cells import call, gofa_model, hand_cell, start_posture
 
 CELL = hand_cell()
@@ -238,10 +240,10 @@ def test_a_jump_to_another_branch_counts_as_lost() -> None:
     track = track_function(CELL.robots[0], gofa_model(), CELL.contacts[0], "track")
     start, pose = start_posture(CELL)[0], CELL.task.waypoints[0].lower
     previous = start + 2.0 * MAX_JOINT_STEP * np.eye(6)[0]
-    # Extrapolation from these two lands exactly on the posture that holds the box.
-    before = 2.0 * previous - start
+    # Extrapolation with this change lands exactly on the posture that holds the box.
+    change = start - previous
     assert ARMS[0].residual(start, ARMS[0].flange_target(pose)) < REACH_TOLERANCE
-    result = call(track, np.concatenate([previous, before, [0.0]]), pose, np.zeros(6))
+    result = call(track, np.concatenate([previous, change, np.zeros(7)]), pose, np.zeros(6))
     assert result["lost"][0] == 1.0
     np.testing.assert_array_equal(result["q"], previous)
 
@@ -253,6 +255,39 @@ def test_agrees_with_the_plain_arm() -> None:
     expected = ARMS[1].follow(start, poses, wrenches)
     for name, value in call(follow, start, poses, wrenches).items():
         np.testing.assert_allclose(value, expected[name], atol=1e-8, rtol=1e-8, err_msg=name)
+
+
+def test_a_step_by_blocks_is_newtons() -> None:
+    model = gofa_model()
+    step, residual = block_step(model, _q, _R, _p)
+    both = ca.Function("both", [_q, _R, _p], [step, residual, newton_step(model, _q, _R, _p)])
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        q = random_posture(rng)
+        target = ARMS[0].place(q + 0.05 * rng.normal(size=6)).copy()
+        found, before, expected = both(q, target.rotation, target.translation)
+        conditioned = np.linalg.cond(ARMS[0].jacobian(q)) < 1e4
+        if conditioned:
+            np.testing.assert_allclose(found.full(), expected.full(), atol=1e-9)
+        assert float(before) == pytest.approx(ARMS[0].residual(q, target), abs=1e-12)
+
+
+def test_a_sample_that_the_cheap_steps_miss_is_reached_all_the_same() -> None:
+    """A wild change of the last change sends the extrapolation astray; the QR steps find back."""
+    track = track_function(CELL.robots[0], gofa_model(), CELL.contacts[0], "track")
+    start, pose = start_posture(CELL)[0], CELL.task.waypoints[0].lower
+    rng = np.random.default_rng(6)
+    astray = 0
+    for _ in range(20):
+        state = np.concatenate([start, np.zeros(6), rng.normal(0.0, 2.0, 6), [0.0]])
+        result = call(track, state, pose, np.zeros(6))
+        assert result["lost"] == 0.0
+        assert ARMS[0].residual(result["q"], ARMS[0].flange_target(pose)) < REACH_TOLERANCE
+        guess = start + state[12:18]
+        for _ in range(CHEAP_STEPS + 1):
+            guess = ARMS[0].newton_step(guess, ARMS[0].flange_target(pose))
+        astray += ARMS[0].residual(guess, ARMS[0].flange_target(pose)) > REACH_TOLERANCE
+    assert astray > 5
 
 
 def test_turning_base_and_box_together_changes_nothing_for_the_arm() -> None:
