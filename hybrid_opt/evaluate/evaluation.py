@@ -18,12 +18,11 @@ from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.collision.checker import CollisionChecker
-from hybrid_opt.collision.verdict import sample_durations
 from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificate
 from hybrid_opt.evaluate.functions import workcell_functions
 from hybrid_opt.evaluate.kernel import load_kernel
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective, select_objectives
-from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
+from hybrid_opt.evaluate.sampled import SampledVerdicts, collision_shares, one_by_one
 from hybrid_opt.evaluate.time_law import carry_under_time_law
 from hybrid_opt.indicators.metrics import non_dominated
 from symbolic.array import Array
@@ -194,12 +193,27 @@ class CandidateEvaluator:
         Raises:
             LostPathError: an arm loses the path, on its samples or between them.
         """
-        outputs = self.outputs(x)
-        if outputs["lost_1"].any() or outputs["lost_2"].any():
+        (path,) = self._paths(self._checked(x)[:1])
+        if path is None:
             raise LostPathError("an arm loses the path; no more can be said of its collisions")
-        waypoints = waypoints_of(self.workcell.task, self._checked(x)[0])
-        path = SampledPath(waypoints, outputs["q_1"][0], outputs["q_2"][0])
         return certificate(self.checker, self.functions["posture"], path)
+
+    def _paths(self, x: Array) -> list[SampledPath | None]:
+        """The carries of decision vectors (n, n_var) on their samples; None where one is lost."""
+        if self._kernel is None:
+            outputs: Mapping[str, Array] = self.outputs(x)
+        else:
+            wanted = ("q_1", "q_2", "lost_1", "lost_2")
+            outputs = self._kernel.evaluate(x, wanted, with_collisions=False).outputs
+        lost = np.any((outputs["lost_1"] > 0.0) | (outputs["lost_2"] > 0.0), axis=1)
+        return [
+            None
+            if lost[k]
+            else SampledPath(
+                waypoints_of(self.workcell.task, x[k]), outputs["q_1"][k], outputs["q_2"][k]
+            )
+            for k in range(len(x))
+        ]
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
         """The evaluations with their feasible front proven free between the samples.
@@ -215,8 +229,9 @@ class CandidateEvaluator:
             unproven = np.flatnonzero(front & ~proven)
             if len(unproven) == 0:
                 break
-            for row in unproven.tolist():
-                failure = self._failure_between_samples(evaluations.x[row])
+            paths = self._paths(np.ascontiguousarray(evaluations.x[unproven]))
+            for row, path in zip(unproven.tolist(), paths, strict=True):
+                failure = self._failure_between_samples(path)
                 proven[row] = failure is None
                 if failure is not None:
                     feasible[row], position[row] = False, failure
@@ -230,10 +245,12 @@ class CandidateEvaluator:
             violation=violation,
         )
 
-    def _failure_between_samples(self, x: Array) -> float | None:
+    def _failure_between_samples(self, path: SampledPath | None) -> float | None:
         """Path parameter where a carry is not proven free, None where it is throughout."""
+        if path is None:
+            return 0.0
         try:
-            verdict = self.certificate(x)
+            verdict = certificate(self.checker, self.functions["posture"], path)
         except LostPathError:
             return 0.0
         return None if verdict.is_free else verdict.at_parameter
@@ -264,7 +281,7 @@ class CandidateEvaluator:
         violation_time[:, :n_constraints] = sampled.outputs["violation_time"]
         judged = np.column_stack([values, violation])
         broken = np.asarray(~np.isfinite(judged).all(axis=1), dtype=np.bool_)
-        shares = _collision_shares(sampled.colliding & ~broken[:, None], sampled.outputs["time"])
+        shares = collision_shares(sampled.colliding & ~broken[:, None], sampled.outputs["time"])
         violation[:, n_constraints] = violation_time[:, n_constraints] = shares
         violation[broken] = violation_time[broken] = 0.0
         violation[broken, REASONS.index(NOT_FINITE)] = 1.0
@@ -302,11 +319,3 @@ def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
             return None
         wanted |= set(objective.needs) - {"time"}
     return tuple(sorted(wanted)) if wanted <= set(SAMPLE_SIZES) else None
-
-
-def _collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
-    """Share (n,) of the duration that the colliding samples (n, samples) stand for."""
-    shares = np.zeros(len(time))
-    for row in np.flatnonzero(colliding.any(axis=1)).tolist():
-        shares[row] = sample_durations(time[row])[colliding[row]].sum() / time[row, -1]
-    return shares

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.collision.verdict import sample_durations
 from symbolic.array import Array
 
 
@@ -58,3 +59,11 @@ def reached_samples(outputs: Mapping[str, Array], row: int) -> int:
     """Number of samples of a candidate before an arm loses the path: those that can collide."""
     lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
     return int(np.argmax(lost)) if lost.any() else len(lost)
+
+
+def collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
+    """Share (n,) of the duration that the colliding samples (n, samples) stand for."""
+    shares = np.zeros(len(time))
+    for row in np.flatnonzero(colliding.any(axis=1)).tolist():
+        shares[row] = sample_durations(time[row])[colliding[row]].sum() / time[row, -1]
+    return shares

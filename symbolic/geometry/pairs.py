@@ -8,6 +8,7 @@ they touch in every sampled posture, or a bound of their motion proves that they
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -72,7 +73,7 @@ class CellGeometry:
     active: tuple[ActivePair, ...]
     excluded: tuple[ExcludedPair, ...]
 
-    @property
+    @cached_property
     def pair_names(self) -> tuple[tuple[str, str], ...]:
         """Names of the two bodies of every active pair, in order."""
         return tuple((self.bodies[p.first].name, self.bodies[p.second].name) for p in self.active)

@@ -8,7 +8,9 @@ the path parameter u in [0, 1].
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -40,24 +42,24 @@ def path_basis(n_waypoints: int, parameter: Array) -> PathBasis:
         n_waypoints: number of waypoints, at least 2; two make a straight line.
         parameter: (n,) values of u in [0, 1].
     """
-    identity = np.eye(n_waypoints)
     if n_waypoints == 2:
         # Two points do not determine a natural quintic spline: the straight line has least jerk.
         position = np.column_stack([1.0 - parameter, parameter])
         slope = np.tile([-1.0, 1.0], (len(parameter), 1))
         return _read_only(parameter, position, slope, np.zeros_like(slope))
+    return _read_only(parameter, *(spline(parameter) for spline in _natural_splines(n_waypoints)))
+
+
+@cache
+def _natural_splines(n_waypoints: int) -> tuple[Callable[[Array], Array], ...]:
+    """The natural quintic splines of unit waypoints, and their first and second derivatives."""
     # Not imported at the top: SciPy takes long to start, and compiled functions need no basis.
     from scipy.interpolate import make_interp_spline
 
     knots = np.linspace(0.0, 1.0, n_waypoints)
     natural = [(3, np.zeros(n_waypoints)), (4, np.zeros(n_waypoints))]
-    spline = make_interp_spline(knots, identity, k=5, bc_type=(natural, natural))
-    return _read_only(
-        parameter,
-        spline(parameter),
-        spline.derivative(1)(parameter),
-        spline.derivative(2)(parameter),
-    )
+    spline = make_interp_spline(knots, np.eye(n_waypoints), k=5, bc_type=(natural, natural))
+    return spline, spline.derivative(1), spline.derivative(2)
 
 
 def sample_basis(task: Task) -> PathBasis:
