@@ -33,6 +33,7 @@ from studies.program import add_verbose, carried_out, run_program
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.archive import archive_cell
+from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.file import load
 
 PROGRAM = "python -m studies.reference_front"
@@ -91,7 +92,7 @@ def compute_reference_front(
             f"only {len(feasible)} of {CANDIDATES} random candidates are feasible; ask for at "
             "most as many starts"
         )
-    begins = [evaluator.workcell.task.initial.reshape(-1), *candidates[feasible[:starts]]]
+    begins = [initial_decision(evaluator.workcell.task), *candidates[feasible[:starts]]]
     cell = PackedCell.of(archive_cell(evaluator.workcell))
     count = itertools.count(1)
     executor = local_executor(jobs)

@@ -15,6 +15,7 @@ from hybrid_opt.timing import TimingModel, timed_trajectory
 from hybrid_opt.work.job import Emit, Job, answer_all
 from studies.timing_text import timing_json
 from symbolic.array import Array
+from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.records import Workcell
 
 TIMING = "timing"
@@ -40,7 +41,7 @@ def timing_stage(force_limit: float | None = None) -> Stage:
 def _run(folder: CampaignFolder, progress: Progress, force_limit: float | None) -> None:
     selected = folder.root / SELECTED
     files = sorted(path.relative_to(selected) for path in selected.rglob("*.json"))
-    found = {Path(INITIAL): folder.workcell.task.initial.reshape(-1)}
+    found = {Path(INITIAL): initial_decision(folder.workcell.task)}
     found |= {file: read_trajectory(selected / file).x for file in files}
     job = Job(TimingModelSource(PackedCell.of(folder.archive)), _document)
     requests = [(x, force_limit) for x in found.values()]
@@ -69,7 +70,7 @@ class TimingModelSource:
 def _ready_model(workcell: Workcell) -> TimingModel:
     model = TimingModel(workcell)
     # The cell's files are there only now: what is loaded when it is first needed is needed now.
-    model.search_carry(workcell.task.initial.reshape(-1))
+    model.search_carry(initial_decision(workcell.task))
     return model
 
 

@@ -21,6 +21,7 @@ from hybrid_opt.campaign.stages import Stage
 from hybrid_opt.store.files import sha256, write_atomically, write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.work.job import Executor, Job, give_up
+from symbolic.workcell.decision import initial_decision
 
 
 def search_stage(source: EvaluatorSource | None = None) -> Stage:
@@ -107,7 +108,7 @@ class _Search:
     def request(self, index: int) -> ReplicaRequest:
         """See `hybrid_opt.work.job.Ledger`."""
         journal = self._journal(index)
-        initial = self._folder.workcell.task.initial.ravel()
+        initial = initial_decision(self._folder.workcell.task)
         algorithm, replica = self._open[index]
         return ReplicaRequest(
             self._folder.settings, algorithm, replica, initial, tuple(journal.payloads)

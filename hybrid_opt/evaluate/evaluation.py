@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificate
+from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
 from hybrid_opt.evaluate.functions import workcell_functions
 from hybrid_opt.evaluate.kernel import load_kernel
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective, select_objectives
@@ -32,14 +34,18 @@ from symbolic.geometry.pairs import build_geometry
 from symbolic.workcell.decision import waypoints_of
 from symbolic.workcell.records import Workcell
 
+if TYPE_CHECKING:
+    from hybrid_opt.evaluate.drive import Driver
+
 COLLISION = "collision"
 BETWEEN_SAMPLES = "between_samples"
 NOT_FINITE = "not_finite"
-REASONS = (*CONSTRAINTS, COLLISION, BETWEEN_SAMPLES, NOT_FINITE)
+REASONS = (*CONSTRAINTS, COLLISION, BETWEEN_SAMPLES, NOT_FINITE, *DRIVE_CONSTRAINTS)
 """What can make a candidate infeasible; `Evaluations.reason` indexes it.
 
 between_samples: not proven free of collisions between the samples; only fronts are certified.
 not_finite: an objective is NaN or infinite (a solver or model failure, never a front member).
+The rest only under the time law 'optimal', see `hybrid_opt.evaluate.drive_constraints`.
 """
 
 FEASIBLE = -1
@@ -120,6 +126,7 @@ class CandidateEvaluator:
         functions: the cell's compiled functions by name.
         checker: FCL's verdict on samples.
         n_var, lower, upper: size and bounds of the decision vector.
+        driver: what drives candidates of the time law 'optimal', None under the others.
     """
 
     def __init__(
@@ -128,12 +135,14 @@ class CandidateEvaluator:
         objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
         threads: int = 1,
         functions: Mapping[str, NumericFunction] | None = None,
+        driver: Driver | None = None,
     ) -> None:
         """Load or build the compiled functions.
 
         Args:
             objectives: what to minimise, by name or as one's own record.
             functions: those of `symbolic.functions.cell`, if not to be loaded or built here.
+            driver: under the time law 'optimal', likewise.
 
         Raises:
             SettingsError: an objective is unknown or there twice.
@@ -146,18 +155,23 @@ class CandidateEvaluator:
         self.functions = workcell_functions(workcell) if functions is None else functions
         self._candidate = self.functions["candidate"]
         self.checker = CollisionChecker(build_geometry(workcell), self.functions)
+        self.driver = _driver(workcell, threads) if driver is None else driver
         self.n_var = workcell.task.n_var
         self.lower = workcell.task.lower
         self.upper = workcell.task.upper
         self._needs = _needs(self.objectives)
         self._kernel = None
-        if functions is None:
+        if functions is None and self.driver is None:
             self._kernel = load_kernel(workcell, self.checker, self.outputs)
 
     def outputs(self, x: Array) -> dict[str, Array]:
         """Every per-sample output for decision vectors (n, n_var), see
-        `symbolic.functions.candidate`."""
-        return self._candidate.batch(self._checked(x), threads=self._threads)
+        `symbolic.functions.candidate`; under the time law 'optimal' also `peak_force` (n, 2),
+        `drive_violation` and `drive_position` as in `hybrid_opt.evaluate.drive.Drive`."""
+        x = self._checked(x)
+        if self.driver is not None:
+            return self.driver.outputs(self._candidate, x)
+        return self._candidate.batch(x, threads=self._threads)
 
     def evaluate(self, x: Array) -> Evaluations:
         """Verdicts on decision vectors (n, n_var).
@@ -279,6 +293,12 @@ class CandidateEvaluator:
         violation_time = np.zeros((n, len(REASONS)))
         violation[:, :n_constraints] = sampled.outputs["violation"]
         violation_time[:, :n_constraints] = sampled.outputs["violation_time"]
+        driven = np.zeros((n, len(DRIVE_CONSTRAINTS)))
+        if self.driver is not None:
+            driven = described["drive_violation"]
+            violation[:, -len(DRIVE_CONSTRAINTS) :] = driven
+            # What no timing drives violates it throughout, the more the farther it is from one.
+            violation_time[:, -len(DRIVE_CONSTRAINTS) :] = driven / (1.0 + driven)
         judged = np.column_stack([values, violation])
         broken = np.asarray(~np.isfinite(judged).all(axis=1), dtype=np.bool_)
         shares = collision_shares(sampled.colliding & ~broken[:, None], sampled.outputs["time"])
@@ -292,9 +312,14 @@ class CandidateEvaluator:
         contact = np.where(collides, np.argmax(sampled.colliding, axis=1), last + 1)
         collides_first = contact < sampled.first_sample
         reason = np.where(collides_first, REASONS.index(COLLISION), sampled.first_reason)
+        position = np.minimum(contact, sampled.first_sample) / last
+        undriven = (reason == FEASIBLE) & driven.any(axis=1)
+        if undriven.any():
+            first = REASONS.index(DRIVE_CONSTRAINTS[0])
+            reason[undriven] = first + np.argmax(driven[undriven], axis=1)
+            position[undriven] = described["drive_position"][undriven]
         reason[broken] = REASONS.index(NOT_FINITE)
         feasible = reason == FEASIBLE
-        position = np.minimum(contact, sampled.first_sample) / last
         position[broken] = 0.0
         position[feasible] = np.nan
         penalty = 1.0 + violation_time.sum(axis=1)
@@ -309,6 +334,16 @@ class CandidateEvaluator:
             violation,
             violation_time,
         )
+
+
+def _driver(workcell: Workcell, threads: int) -> Driver | None:
+    """What drives candidates under the time law 'optimal'."""
+    if workcell.task.time_law != "optimal":
+        return None
+    # Not imported at the top: other time laws need no timing, and hence no CasADi.
+    from hybrid_opt.evaluate.drive import Driver
+
+    return Driver(workcell, threads)
 
 
 def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:

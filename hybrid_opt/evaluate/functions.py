@@ -42,4 +42,5 @@ def workcell_key(workcell: Workcell) -> str:
     """What a workcell's functions are made from: its files, the symbolic package's sources and
     the libraries that write the expressions (CasADi's version is part of every set's key)."""
     libraries = [f"{library} {version(library)}" for library in ("pin", "scipy")]
-    return digest(workcell.digest, source_digest("symbolic"), *libraries)
+    law = workcell.task.time_law
+    return digest(workcell.digest, law, source_digest("symbolic"), *libraries)

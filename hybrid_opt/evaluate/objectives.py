@@ -41,13 +41,27 @@ class Objective:
 PAPER_OBJECTIVES = ("peak_force_1", "peak_force_2")
 """The paper's pair: peak normal force of each robot."""
 
+DRIVABLE_OBJECTIVES = ("duration", "peak_force")
+"""How long a carry takes and how hard it presses: the pair of the time law 'optimal'."""
+
 
 def _peak_force(robot: int) -> Callable[[Outputs, Workcell], Array]:
     def evaluate(outputs: Outputs, workcell: Workcell) -> Array:
-        peak: Array = outputs["normal_force"][:, :, robot].max(axis=1)
-        return peak / float(workcell.task.reference_force[robot])
+        return _peaks(outputs)[:, robot] / float(workcell.task.reference_force[robot])
 
     return evaluate
+
+
+def _larger_peak_force(outputs: Outputs, workcell: Workcell) -> Array:
+    """The larger of both peak normal forces, each over its reference force."""
+    return np.asarray((_peaks(outputs) / workcell.task.reference_force).max(axis=1))
+
+
+def _peaks(outputs: Outputs) -> Array:
+    """(n, 2) peak normal forces [N]: those of the whole path where a timing tells them."""
+    if "peak_force" in outputs:
+        return outputs["peak_force"]
+    return np.asarray(outputs["normal_force"].max(axis=1))
 
 
 def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
@@ -136,6 +150,7 @@ OBJECTIVES: dict[str, Objective] = {
         Objective(
             "peak_force_2", "peak normal force of robot 2 / reference", _peak_force(1), _FORCE
         ),
+        Objective("peak_force", "larger peak normal force / reference", _larger_peak_force, _FORCE),
         Objective("mean_force", "mean normal force / reference", _mean_force, ("time", *_FORCE)),
         Objective("duration", "duration / twice the initial polygon's time", _duration, ("time",)),
         Objective("peak_torque_use", "peak joint torque / maximum", _peak_torque_use, _TORQUES),

@@ -31,6 +31,7 @@ from hybrid_opt.polishing.records import (
 from hybrid_opt.polishing.solver import PolishSolver, Solution, SolveTask
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.workcell.decision import initial_decision
 
 TIMED_EVALUATIONS = 32
 """Candidates whose evaluation is timed, to express the polish in their unit."""
@@ -115,7 +116,7 @@ class FrontPolisher:
 
     def _evaluation_seconds(self, x: Array) -> float:
         """Time of one candidate evaluation; the initial trajectory's for an empty front."""
-        sample = x if len(x) else self.evaluator.workcell.task.initial.reshape(1, -1)
+        sample = x if len(x) else initial_decision(self.evaluator.workcell.task)[None]
         batch = np.resize(sample, (TIMED_EVALUATIONS, self.evaluator.n_var))
         begin = time.perf_counter()
         self.evaluator.evaluate(batch)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,9 @@ class PathMotion:
         sampled = {f.name: getattr(self, f.name)[samples] for f in fields(self) if f.name != "x"}
         return PathMotion(self.x, **sampled)
 
+
+if TYPE_CHECKING:
+    from hybrid_opt.evaluate.drive import Driver
 
 _BOX = (
     "pose",
@@ -208,7 +211,20 @@ class TimingModel:
         """The carry under the task's own time law, see `hybrid_opt.evaluate.time_law`."""
         x = self._checked(x)
         functions = self._search_functions
-        return carry_under_time_law(self.workcell, functions, x, functions["candidate"](x))
+        if self.workcell.task.time_law != "optimal":
+            return carry_under_time_law(self.workcell, functions, x, functions["candidate"](x))
+        outputs = self._driver.outputs(functions["candidate"], x[None])
+        single = {name: values[0] for name, values in outputs.items()}
+        return carry_under_time_law(self.workcell, functions, x, single)
+
+    @cached_property
+    def _driver(self) -> Driver:
+        # Not imported at the top: it is built on this module.
+        from hybrid_opt.evaluate.drive import Driver
+        from hybrid_opt.timing.path_timer import PathTimer
+
+        timer = PathTimer(self.workcell, cache=self._cache, cell_model=self._cell_model)
+        return Driver(self.workcell, timer=timer)
 
     @cached_property
     def _search_functions(self) -> Mapping[str, NumericFunction]:

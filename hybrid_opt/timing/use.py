@@ -7,6 +7,7 @@ import numpy as np
 from hybrid_opt.carry import Carry
 from hybrid_opt.timing.records import Excess, Place, TimingLimits
 from symbolic.array import Array
+from symbolic.functions.candidate import TIMING_TOLERANCE
 from symbolic.workcell.records import Workcell
 
 JOINT_CONSTRAINTS = ("joint velocity", "joint acceleration", "joint torque")
@@ -15,7 +16,7 @@ CONTACT_CONSTRAINTS = ("normal force", "friction", "pressure shift")
 FRICTION_ROUNDING = 1e-6
 """The least-effort forces lie on the friction cones; this much beyond them is rounding."""
 
-RECOMPUTED_TOLERANCE = 5e-3
+RECOMPUTED_TOLERANCE = TIMING_TOLERANCE
 """Largest excess of a recomputed limit, as a share of it."""
 
 FORCE_FLOOR = 1e-9

@@ -36,6 +36,7 @@ from studies.timing_stage import TimingModelSource
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.workcell.archive import archive_cell
+from symbolic.workcell.decision import initial_decision
 
 INITIAL_LABEL = "hand-made"
 CURVE_POINTS = 12
@@ -104,7 +105,7 @@ def _algorithms(
 def _best(
     results: CampaignResults, algorithms: tuple[AlgorithmRuns, ...], maker: _CarryMaker
 ) -> tuple[Carry, ...]:
-    initial = maker.carry(results.workcell.task.initial.reshape(-1), INITIAL_LABEL)
+    initial = maker.carry(initial_decision(results.workcell.task), INITIAL_LABEL)
     best = [algorithm.best for algorithm in algorithms]
     return (initial, *(carry for carry in best if carry is not None))
 

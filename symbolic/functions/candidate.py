@@ -12,7 +12,7 @@ from symbolic.cell_model import CellModel
 from symbolic.physics.contact_forces import GRAVITY
 from symbolic.physics.path import sample_basis, waypoint_matrix
 from symbolic.physics.payload_load import LOAD_OUTPUTS, load_function
-from symbolic.physics.time_law import timed_path
+from symbolic.physics.time_law import driven_path, timed_path
 from symbolic.robot.arm import (
     REACH_TOLERANCE,
     TRACK_OUTPUTS,
@@ -43,6 +43,12 @@ pressure: shift of the centre of pressure over the patch radius, minus 1.
 Limits and singularity of a lost arm are unknown and count as satisfied; its loss does not.
 """
 
+DRIVE_INPUTS = ("drive_time", "drive_speed", "drive_acceleration")
+"""(n,) times [s], u' [1/s] and u'' [1/s^2] at the samples, found by a solver."""
+
+TIMING_TOLERANCE = 5e-3
+"""Excess over a limit that a timing may have, as a share of it (`hybrid_opt.timing.use`)."""
+
 FRICTION_TOLERANCE = 1e-9
 """Rounding allowed in a tight friction cone, as a share of the payload's weight."""
 
@@ -55,11 +61,18 @@ def candidate_function(model: CellModel) -> ca.Function:
     `TRACK_OUTPUTS` as q_i (n, 6) and so on; constraint (n, 9), see `CONSTRAINTS`; violation
     (9,): largest positive value of each constraint over the samples; violation_time (9,): time
     for which each is violated, over the duration.
+
+    Under the time law 'optimal' the inputs of `DRIVE_INPUTS` follow x.
     """
     workcell = model.workcell
     n = workcell.task.samples
-    x = ca.MX.sym("x", workcell.task.n_var)
-    path = timed_path(workcell.task, sample_basis(workcell.task), waypoint_matrix(workcell.task, x))
+    inputs = {"x": ca.MX.sym("x", workcell.task.n_var)}
+    basis, waypoints = sample_basis(workcell.task), waypoint_matrix(workcell.task, inputs["x"])
+    if workcell.task.time_law == "optimal":
+        inputs |= {name: ca.MX.sym(name, n) for name in DRIVE_INPUTS}
+        path = driven_path(basis, waypoints, *[inputs[name].T for name in DRIVE_INPUTS])
+    else:
+        path = timed_path(workcell.task, basis, waypoints)
     load = dict(
         zip(
             LOAD_OUTPUTS,
@@ -85,7 +98,12 @@ def candidate_function(model: CellModel) -> ca.Function:
     outputs["violation"] = _row_max(violated)
     outputs["violation_time"] = ca.mtimes(violated > 0.0, _time_share(path.time).T)
     return ca.Function(
-        "candidate", [x], list(outputs.values()), ["x"], list(outputs), {"cse": True}
+        "candidate",
+        list(inputs.values()),
+        list(outputs.values()),
+        list(inputs),
+        list(outputs),
+        {"cse": True},
     )
 
 
@@ -113,7 +131,7 @@ function has the same ones."""
 
 
 def sample_functions(model: CellModel) -> dict[str, ca.Function]:
-    """A candidate's function in parts, to be put together sample by sample.
+    """A candidate's function in parts, to be put together sample by sample; not for 'optimal'.
 
     path: x (n_var,) -> time (1, n), pose, rate, second_rate (6, n). start: -> state_1, state_2
     before the first sample. predict: state_1, state_2, pose (6,) of the second sample -> both
@@ -190,7 +208,8 @@ def _constraint_function(workcell: Workcell) -> ca.Function:
         values[f"singularity_{arm}"] = ca.if_else(
             lost > 0.5, 0.0, 1.0 - inputs[f"manipulability_{arm}"] / robot.min_manipulability
         )
-        values[f"pressure_{arm}"] = inputs["pressure_shift"][i] / contact.patch_radius - 1.0
+        allowed = 1.0 + (TIMING_TOLERANCE if workcell.task.time_law == "optimal" else 0.0)
+        values[f"pressure_{arm}"] = inputs["pressure_shift"][i] / contact.patch_radius - allowed
         limit = contact.friction * inputs["normal_force"][i]
         cones.append((inputs["tangential_force"][i] - limit) / weight - FRICTION_TOLERANCE)
     values["friction"] = ca.fmax(cones[0], cones[1])

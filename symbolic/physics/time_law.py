@@ -8,6 +8,9 @@ angular speed.
 
 `ramped` drives the same geometry from rest to rest: the speed rises by a smooth cubic step to
 the reference speed, cruises, and falls again; derivatives are exact.
+
+`optimal` is no expression: a solver finds how the path is driven (`hybrid_opt.timing`), and
+`driven_path` takes what it found.
 """
 
 from __future__ import annotations
@@ -59,6 +62,28 @@ def timed_path(task: Task, basis: PathBasis, waypoints: ca.MX) -> TimedPath:
     first = ca.mtimes(waypoints, ca.DM(basis.first.T))
     second = ca.mtimes(waypoints, ca.DM(basis.second.T))
     return _ramped(task, basis, pose, first, second)
+
+
+def driven_path(
+    basis: PathBasis, waypoints: ca.MX, time: ca.MX, speed: ca.MX, acceleration: ca.MX
+) -> TimedPath:
+    """Poses at the samples of `basis`, driven as found elsewhere.
+
+    Args:
+        waypoints: (6, n_waypoints) from `symbolic.physics.path.waypoint_matrix`.
+        time, speed, acceleration: (1, n) times [s], u' [1/s] and u'' [1/s^2] of the samples.
+    """
+    pose, first, second = (
+        ca.mtimes(waypoints, ca.DM(matrix.T))
+        for matrix in (basis.position, basis.first, basis.second)
+    )
+    rows = ca.repmat(1.0, 6, 1)
+    return TimedPath(
+        time=time,
+        pose=pose,
+        rate=first * ca.mtimes(rows, speed),
+        second_rate=second * ca.mtimes(rows, speed**2) + first * ca.mtimes(rows, acceleration),
+    )
 
 
 def _constant(task: Task, pose: ca.MX) -> TimedPath:

@@ -19,6 +19,7 @@ from symbolic.physics.pose import inverse, pose_matrix
 from symbolic.physics.time_law import timed_path
 from symbolic.robot.arm import TRACK_OUTPUTS, box_flange, follow_function
 from symbolic.robot.model import RobotModel
+from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.records import Contact, Robot, Workcell
 
 N_STARTS = 1024
@@ -208,4 +209,4 @@ def initial_poses(workcell: Workcell) -> Array:
     x = ca.MX.sym("x", task.n_var)
     path = timed_path(task, sample_basis(task), waypoint_matrix(task, x))
     poses = ca.Function("poses", [x], [path.pose])
-    return np.array(poses(task.initial.reshape(-1))).T
+    return np.array(poses(initial_decision(task))).T

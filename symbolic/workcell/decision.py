@@ -1,5 +1,7 @@
 """The decision vector: the free waypoints of a task's path, one after the other.
 
+Under the time law 'optimal' the force limit [N] follows them.
+
 The only place that puts them into the path, and takes them out, as numbers; as expressions it is
 `symbolic.physics.path.waypoint_matrix`.
 """
@@ -18,19 +20,26 @@ POSE_SIZE = 6
 def waypoints_of(task: Task, x: Array) -> Array:
     """All waypoints (n_waypoints, 6) of a decision vector (n_var,), angles unwrapped."""
     points = np.array([waypoint.lower for waypoint in task.waypoints])
-    points[list(task.free_indices)] = np.reshape(x, (-1, POSE_SIZE))
+    points[list(task.free_indices)] = np.reshape(x[: task.n_path], (-1, POSE_SIZE))
     points[:, 3:] = np.unwrap(points[:, 3:], axis=0)
     return points
 
 
 def decision_of(task: Task, waypoints: Array) -> Array:
-    """The decision vector (n_var,) of all waypoints (n_waypoints, 6)."""
-    return np.asarray(waypoints[list(task.free_indices)], dtype=float).reshape(-1)
+    """The decision vector (n_var,) of all waypoints (n_waypoints, 6); a force limit at its upper
+    bound."""
+    return _with_force(task, waypoints[list(task.free_indices)])
 
 
 def initial_decision(task: Task) -> Array:
-    """The decision vector (n_var,) of the hand-made trajectory."""
-    return np.array(task.initial, dtype=float).reshape(-1)
+    """The decision vector (n_var,) of the hand-made trajectory, a force limit at its upper
+    bound."""
+    return _with_force(task, task.initial)
+
+
+def _with_force(task: Task, free: Array) -> Array:
+    path = np.array(free, dtype=float).reshape(-1)
+    return np.append(path, task.force_limit[1]) if task.time_law == "optimal" else path
 
 
 def straight_line(task: Task) -> Array:

@@ -15,7 +15,7 @@ from symbolic.workcell.reader import Problems, Table
 from symbolic.workcell.records import Body, Mesh, Robot, Workcell
 from symbolic.workcell.robots import read_robot
 from symbolic.workcell.sections import read_body, read_collision, read_contact, read_payload
-from symbolic.workcell.task import read_task
+from symbolic.workcell.task import read_task, with_force_limit
 from symbolic.workcell.uncertainty import read_uncertainty
 
 Check = Callable[[Workcell], Iterable[str]]
@@ -76,7 +76,7 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
         robots=(robots[0][0], robots[1][0]),
         payload=payload,
         contacts=(contacts[0], contacts[1]),
-        task=task,
+        task=with_force_limit(task, payload, contacts),
         environment=environment,
         collision=collision,
         start_branch=(robots[0][1], robots[1][1]),

@@ -21,7 +21,7 @@ import numpy as np
 
 from symbolic.array import Array
 
-TimeLaw = Literal["constant", "ramped"]
+TimeLaw = Literal["constant", "ramped", "optimal"]
 Allocation = Literal["paper", "joint"]
 
 
@@ -244,7 +244,8 @@ class Task:
     Attributes:
         waypoints: the ordered poses of the path; the first and last are fixed.
         samples: number of samples along the path, ends included.
-        time_law: 'constant' (the paper's) or 'ramped' (from rest to rest).
+        time_law: 'constant' (the paper's), 'ramped' (from rest to rest) or 'optimal' (the fastest
+            from rest to rest within all limits and a force limit that is a decision variable).
         reference_speed: [m/s], speed of the box centre (cruise speed of 'ramped').
         reference_angular_speed: [rad/s], for steps that mostly rotate.
         ramp_time: [s], duration of each ramp of 'ramped'.
@@ -253,6 +254,7 @@ class Task:
         allowed_contacts: contacts that are no collisions, see AllowedContact.
         allocation: 'paper' (least forces first, then the moments) or 'joint' (the least forces
             that carry the moments as well).
+        force_limit: (2,) bounds of the force limit, the last decision variable of 'optimal' [N].
     """
 
     waypoints: tuple[Waypoint, ...]
@@ -265,6 +267,7 @@ class Task:
     initial: Array
     allowed_contacts: tuple[AllowedContact, ...]
     allocation: Allocation = "paper"
+    force_limit: tuple[float, float] = (0.0, np.inf)
 
     @property
     def free_indices(self) -> tuple[int, ...]:
@@ -272,19 +275,28 @@ class Task:
         return tuple(i for i, w in enumerate(self.waypoints) if not w.is_fixed)
 
     @property
-    def n_var(self) -> int:
-        """Number of decision variables, six per free waypoint (paper Eq. 14)."""
+    def n_path(self) -> int:
+        """Number of variables of the path, six per free waypoint (paper Eq. 14)."""
         return 6 * len(self.free_indices)
+
+    @property
+    def n_var(self) -> int:
+        """Number of decision variables: those of the path, then under 'optimal' the force limit."""
+        return self.n_path + (self.time_law == "optimal")
 
     @property
     def lower(self) -> Array:
         """(n_var,) lower bounds of the decision vector."""
-        return np.concatenate([self.waypoints[i].lower for i in self.free_indices])
+        return self._bounds("lower", self.force_limit[0])
 
     @property
     def upper(self) -> Array:
         """(n_var,) upper bounds of the decision vector."""
-        return np.concatenate([self.waypoints[i].upper for i in self.free_indices])
+        return self._bounds("upper", self.force_limit[1])
+
+    def _bounds(self, name: str, force: float) -> Array:
+        parts = [getattr(self.waypoints[i], name) for i in self.free_indices]
+        return np.concatenate(parts + ([np.array([force])] if self.time_law == "optimal" else []))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -9,14 +11,27 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.workcell import quantities as quantity
 from symbolic.workcell.reader import Table, checked_vector, read_only, shown
-from symbolic.workcell.records import Allocation, AllowedContact, Task, TimeLaw, Waypoint
+from symbolic.workcell.records import (
+    Allocation,
+    AllowedContact,
+    Contact,
+    Payload,
+    Task,
+    TimeLaw,
+    Waypoint,
+)
 
 MIN_SAMPLES = 5
 MAX_SAMPLES = 2_000
 MAX_WAYPOINTS = 100
 COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
-TIME_LAWS = ("constant", "ramped")
+TIME_LAWS = ("constant", "ramped", "optimal")
 ALLOCATIONS = ("paper", "joint")
+
+GRAVITY = 9.81
+"""[m/s^2], as in `symbolic.physics.contact_forces`, which needs CasADi."""
+
+ABOVE_STILL = 1.001
 
 
 def read_task(table: Table) -> Task:
@@ -49,9 +64,36 @@ def read_task(table: Table) -> Task:
         initial=_read_initial(table, [w for w in waypoints if not w.is_fixed]),
         allowed_contacts=tuple(_allowed_contact(e) for e in table.tables("allowed_contacts")),
         allocation=cast("Allocation", table.choice("allocation", ALLOCATIONS, "paper")),
+        force_limit=_force_limit(table),
     )
     table.close()
     return task
+
+
+def with_force_limit(task: Task, payload: Payload, contacts: Sequence[Contact]) -> Task:
+    """The task with the default bounds of the force limit where its file has none.
+
+    From a thousandth above the force that holds the payload level and still between upright
+    contacts to the smaller reference force.
+    """
+    if np.isfinite(task.force_limit[1]):
+        return task
+    still = payload.mass * GRAVITY / sum(contact.friction for contact in contacts)
+    highest = max(float(task.reference_force.min()), ABOVE_STILL * still)
+    return replace(task, force_limit=(ABOVE_STILL * still, highest))
+
+
+def _force_limit(table: Table) -> tuple[float, float]:
+    """Bounds of the force limit; infinite above where the file has none."""
+    if "force_limit" not in table:
+        return (0.0, np.inf)
+    low, high = table.vector("force_limit", (quantity.FORCE,) * 2)
+    if low > high:
+        table.problems.add(
+            table.at("force_limit"),
+            f"found {low:g} above {high:g}; allowed is the least limit, then the largest",
+        )
+    return (float(low), float(high))
 
 
 def _fixed(table: Table, key: str) -> Waypoint:

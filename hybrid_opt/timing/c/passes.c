@@ -30,7 +30,7 @@ static const int GROUP[KINDS] = {MOTION, MOTION, MOTION, MOTION, MOTION, MOTION,
 #define CONVEX_TOLERANCE 1e-7     /* excess over a limit that counts as none */
 #define RATIO_TOLERANCE 1e-4      /* the same, of limits that are linearised */
 #define CONFLICT 1e-3             /* excess at which a stage counts as impossible */
-#define TIGHTEN 2.5e-3            /* excess between the ends of a stage that tightens it */
+#define TIGHTEN 1e-3              /* excess between the ends of a stage that tightens it */
 #define LARGEST_EXCESS 5e-3       /* a timing with more is slowed down */
 #define LEAST_SPEED 0.98          /* slowed further, it has not converged */
 #define NEARLY 0.9                /* a limit used this far is worth a row in advance */

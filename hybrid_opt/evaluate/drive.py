@@ -1,0 +1,127 @@
+"""Candidates of the time law 'optimal': how their paths are driven, and what no timing can drive.
+
+A candidate is a path and a force limit. Its timing is the fastest from rest to rest within that
+force and all limits of robots, payload and contacts (`hybrid_opt.timing.path_timer`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from codegen.function import NumericFunction
+from hybrid_opt.evaluate.drive_constraints import (
+    DRIVE_CONSTRAINTS,
+    FORCE_LIMIT,
+    JOINT_TORQUE,
+    NO_TIMING,
+)
+from hybrid_opt.timing.path_timer import PathTimer, PathTiming
+from hybrid_opt.timing.records import TimingLimits, TimingStatus
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
+
+_AT_REST = {"normal force": FORCE_LIMIT, "joint torque": JOINT_TORQUE}
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How n candidates are driven, at m samples uniform in u.
+
+    Attributes:
+        time, speed, acceleration: (n, m) [s], u' [1/s], u'' [1/s^2]. A path without a timing
+            stands still, its samples one second apart in all.
+        peak_force: (n, 2) largest normal forces [N].
+        violation: (n, len(DRIVE_CONSTRAINTS)).
+        position: (n,) path parameter of the violation, NaN without one.
+    """
+
+    time: Array
+    speed: Array
+    acceleration: Array
+    peak_force: Array
+    violation: Array
+    position: Array
+
+
+class Driver:
+    """Drives candidates of one workcell."""
+
+    def __init__(
+        self, workcell: Workcell, threads: int = 1, timer: PathTimer | None = None
+    ) -> None:
+        """Load or build the compiled timing.
+
+        Args:
+            workcell: its time law is 'optimal'.
+            threads: threads that share a batch.
+            timer: of the same workcell, where there is one.
+
+        Raises:
+            DualArmError: the model cannot be built.
+        """
+        self._task = workcell.task
+        self._threads = threads
+        self.timer = PathTimer(workcell, threads=threads) if timer is None else timer
+
+    def outputs(self, candidate: NumericFunction, x: Array) -> dict[str, Array]:
+        """Every per-sample output of decision vectors (n, n_var), driven.
+
+        Args:
+            candidate: compiled `symbolic.functions.candidate.candidate_function`.
+            x: decision vectors.
+
+        Returns:
+            Its outputs, and `peak_force`, `drive_violation`, `drive_position` as in `Drive`.
+        """
+        found = self.drive(x)
+        motion = (found.time, found.speed, found.acceleration)
+        return candidate.batch(x, *motion, threads=self._threads) | {
+            "peak_force": found.peak_force,
+            "drive_violation": found.violation,
+            "drive_position": found.position,
+        }
+
+    def timings(self, x: Array) -> list[PathTiming]:
+        """The timing of every decision vector (n, n_var)."""
+        limits = [TimingLimits(force=max(float(force), 1e-9)) for force in x[:, -1]]
+        return self.timer.time_all(x[:, : self._task.n_path], limits)
+
+    def drive(self, x: Array) -> Drive:
+        """How decision vectors (n, n_var) are driven."""
+        timings = self.timings(x)
+        u = np.linspace(0.0, 1.0, self._task.samples)
+        driven = [_at(timing, u) for timing in timings]
+        violation = np.zeros((len(x), len(DRIVE_CONSTRAINTS)))
+        position = np.full(len(x), np.nan)
+        for row, timing in enumerate(timings):
+            if np.isfinite(timing.duration):
+                continue
+            name, excess = NO_TIMING, 1.0
+            if timing.status is TimingStatus.INFEASIBLE_AT_REST:
+                name = _AT_REST.get(timing.place.constraint, NO_TIMING)
+                excess = max(timing.use[timing.place.constraint] - 1.0, 1e-9)
+            violation[row, DRIVE_CONSTRAINTS.index(name)] = excess
+            position[row] = timing.place.parameter
+        force = np.array([timing.peak_force for timing in timings]).reshape(-1, 2)
+        time, speed, acceleration = (np.array(part) for part in zip(*driven, strict=True))
+        return Drive(time, speed, acceleration, force, violation, position)
+
+
+def _at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:
+    """Time, u' and u'' at path parameters u; u'' is that of the stage that begins there."""
+    if not np.isfinite(timing.duration):
+        return u, np.zeros_like(u), np.zeros_like(u)
+    squared = timing.grid_speed**2
+    stages = len(squared) - 1
+    stage = np.minimum((u * stages).astype(int), stages - 1)
+    acceleration = np.diff(squared) * stages / 2.0
+    # Average speed over a piece of constant acceleration is that of its ends.
+    steps = 2.0 / stages / (timing.grid_speed[:-1] + timing.grid_speed[1:])
+    begins = np.concatenate([[0.0], np.cumsum(steps)])[:-1]
+    into = u - stage / stages
+    speed = np.sqrt(np.maximum(squared[stage] + 2.0 * acceleration[stage] * into, 0.0))
+    total = timing.grid_speed[stage] + speed
+    time = begins[stage] + 2.0 * into / np.where(total > 0.0, total, 1.0)
+    return time, speed, acceleration[stage]
