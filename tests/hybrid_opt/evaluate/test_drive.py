@@ -1,0 +1,123 @@
+"""Candidates of the time law 'optimal' against `time_path`, and what no timing can drive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from codegen.build import build
+from hybrid_opt.evaluate.drive import Driver
+from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
+from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.timing import PathTimer, TimingLimits, time_path
+from symbolic.array import Array
+from symbolic.functions.candidate import candidate_function
+from symbolic.geometry.clearance import screening_functions
+from symbolic.robot.arm import posture_function
+from symbolic.workcell.decision import initial_decision, waypoints_of
+from symbolic.workcell.records import Workcell
+from tests.hybrid_opt.timing.cells import hand_timing, near_initial
+from tests.symbolic.cells import hand_cell, hand_model, with_task
+
+STATIC = 98.1 / 2.0
+
+
+def drivable_cell() -> Workcell:
+    return with_task(hand_cell(), time_law="optimal", force_limit=(1.01 * STATIC, 60.0))
+
+
+@cache
+def evaluator() -> CandidateEvaluator:
+    """The drivable hand cell, its functions compiled as a file's would be."""
+    cell = drivable_cell()
+    model = hand_model(cell)
+    placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
+    made = {
+        "candidate": candidate_function(model),
+        "posture": posture_function(cell.robots, model.robots, cell.contacts),
+        **screening_functions(model.geometry, placements),
+    } | {
+        f"inverse_dynamics_{i + 1}": robot.inverse_dynamics for i, robot in enumerate(model.robots)
+    }
+    functions = build(made).functions
+    driver = Driver(cell, timer=PathTimer(cell, cell_model=model, lanes=1))
+    return CandidateEvaluator(cell, DRIVABLE_OBJECTIVES, functions=functions, driver=driver)
+
+
+def candidates(count: int) -> Array:
+    rng = np.random.default_rng(4)
+    force = rng.uniform(1.05 * STATIC, 60.0, count)
+    return np.column_stack([near_initial(rng, count, size=0.5), force])
+
+
+def test_the_decision_vector_ends_with_the_force_limit() -> None:
+    task = drivable_cell().task
+    assert task.n_var == task.n_path + 1 == 19
+    assert task.lower[-1] == 1.01 * STATIC
+    assert task.upper[-1] == 60.0
+    x = initial_decision(task)
+    assert x[-1] == 60.0
+    np.testing.assert_array_equal(waypoints_of(task, x)[1:-1], task.initial)
+
+
+def test_objectives_are_those_of_time_path_at_the_candidates_force() -> None:
+    x = candidates(4)
+    found = evaluator().evaluate(x)
+    outputs = evaluator().outputs(x)
+    for k, row in enumerate(x):
+        timing = time_path(hand_timing(100), row[:-1], TimingLimits(force=float(row[-1])))
+        assert timing.ok, timing.reason
+        assert timing.carry is not None
+        assert outputs["time"][k, -1] == pytest.approx(timing.duration, rel=2e-3)
+        peak = timing.carry.peak_normal_force.max() / 117.68
+        assert found.objectives[k, 1] == pytest.approx(peak, rel=2e-3)
+        # The samples lie on the timing: their time and forces are those of the recomputed carry.
+        u = np.linspace(0.0, 1.0, 60)
+        time = np.interp(u, timing.carry.parameter, timing.carry.time)
+        np.testing.assert_allclose(outputs["time"][k], time, atol=0.01 * timing.duration)
+        assert outputs["normal_force"][k].max() <= row[-1] * 1.005
+
+
+def test_the_motion_is_the_derivative_of_the_path() -> None:
+    (x,) = candidates(1)
+    outputs = evaluator().outputs(x)
+    time, pose, rate = (outputs[name][0] for name in ("time", "pose", "rate"))
+    step = np.diff(time)[:, None]
+    np.testing.assert_allclose(rate[[0, -1]], 0.0, atol=1e-9)
+    travelled = np.cumsum(step * (rate[1:] + rate[:-1]) / 2.0, axis=0)
+    np.testing.assert_allclose(travelled, pose[1:] - pose[0], atol=6e-3)
+
+
+def test_paths_that_cannot_be_driven_say_why_and_where() -> None:
+    x = candidates(3)
+    x[0, -1] = 0.9 * STATIC
+    x[1, 0] -= 2.0
+    found = evaluator().evaluate(x)
+    names = ["" if code < 0 else REASONS[code] for code in found.reason]
+    assert names[0] == "force_limit"
+    assert names[1].startswith("reach")
+    assert not found.feasible[:2].any()
+    assert (found.penalised[:2] > 1.0).all()
+    assert 0.0 <= found.position[0] <= 1.0
+    column = REASONS.index("force_limit")
+    assert found.violation[0, column] == pytest.approx(1.0 / 0.9 - 1.0, rel=0.02)
+    assert found.violation[2, -len(DRIVE_CONSTRAINTS) :].max() == 0.0
+
+
+def test_less_force_violates_more_and_costs_more() -> None:
+    x = np.repeat(candidates(1), 5, axis=0)
+    x[:, -1] = np.linspace(20.0, 45.0, 5)
+    found = evaluator().evaluate(x)
+    assert (np.diff(found.penalised[:, 0]) < 0.0).all()
+
+
+def test_the_time_law_is_part_of_what_functions_are_kept_by() -> None:
+    from hybrid_opt.evaluate.functions import workcell_key
+
+    cell = replace(hand_cell(), digest="d")
+    drivable = replace(cell, task=replace(cell.task, time_law="optimal"))
+    assert workcell_key(cell) != workcell_key(drivable)
