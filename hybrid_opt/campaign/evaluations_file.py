@@ -40,15 +40,17 @@ class EvaluationTable:
     objective_names: tuple[str, ...]
 
 
-def columns(n_var: int, objective_names: tuple[str, ...]) -> list[str]:
+def columns(
+    n_var: int, objective_names: tuple[str, ...], reasons: tuple[str, ...] = REASONS
+) -> list[str]:
     """The names of all columns."""
     return [
         *_FIXED,
         *(f"x_{k + 1}" for k in range(n_var)),
         *(f"objective_{name}" for name in objective_names),
         *(f"penalised_{name}" for name in objective_names),
-        *(f"violation_{reason}" for reason in REASONS),
-        *(f"violation_time_{reason}" for reason in REASONS),
+        *(f"violation_{reason}" for reason in reasons),
+        *(f"violation_time_{reason}" for reason in reasons),
     ]
 
 
@@ -91,15 +93,19 @@ def decode(content: bytes, path: Path) -> EvaluationTable:
             names = _text(file.readline(_LONGEST_LINE)).split(",")
             objectives = _between(names, "objective_")
             n_var, n_obj = len(_between(names, "x_")), len(objectives)
-            if names != columns(n_var, objectives):
+            # Reasons are only ever added, at the end: older files have the first of them.
+            stored = REASONS[: len(_between(names, "violation_time_"))]
+            if names != columns(n_var, objectives, stored):
                 raise ValueError("its columns are not those of this version")
             values, reason = _rows(file, len(names))
         _, generation, feasible, position = values[:, :4].T
         _check(values, generation, feasible, values[:, 4 : 4 + n_var])
     except (OSError, EOFError, zlib.error, ValueError, KeyError, IndexError) as error:
         raise ResultsError(f"{path}: damaged ({error})") from error
-    widths = np.cumsum([n_var, n_obj, n_obj, len(REASONS), len(REASONS)])
-    x, plain, penalised, violation, violation_time, _ = np.split(values[:, 4:], widths, axis=1)
+    widths = np.cumsum([n_var, n_obj, n_obj, len(stored), len(stored)])
+    x, plain, penalised, *violations, _ = np.split(values[:, 4:], widths, axis=1)
+    missing = ((0, 0), (0, len(REASONS) - len(stored)))
+    violation, violation_time = (np.pad(part, missing) for part in violations)
     return EvaluationTable(
         Evaluations(
             x, plain, penalised, feasible == 1.0, reason, position, violation, violation_time

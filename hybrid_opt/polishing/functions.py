@@ -16,6 +16,7 @@ from hybrid_opt.evaluate.functions import workcell_key
 from symbolic.cell_model import build_cell_model
 from symbolic.smooth.forces import force_functions, pressure_functions
 from symbolic.smooth.rows import RowFunctions, solve_function
+from symbolic.errors import SettingsError
 from symbolic.workcell.records import Workcell
 
 _LEVELS = {
@@ -57,8 +58,14 @@ def polish_functions(workcell: Workcell) -> PolishFunctions:
     Of the rows at places of the path the frequent ones are compiled; the others are interpreted.
 
     Raises:
+        SettingsError: the time law is 'optimal', which is no smooth function of the path.
         DualArmError: the cell's model cannot be built, or its functions not be compiled.
     """
+    if workcell.task.time_law == "optimal":
+        raise SettingsError(
+            "the polish does not know the time law 'optimal'; search without it (--no-polish), or "
+            "polish under 'constant' or 'ramped'"
+        )
     model = build_cell_model(workcell)
 
     def make() -> Mapping[str, ca.Function]:

@@ -41,6 +41,18 @@ def test_table_survives_to_the_bit() -> None:
         assert (old.dtype, old.shape, old.tobytes()) == (new.dtype, new.shape, new.tobytes())
 
 
+def test_files_from_before_a_reason_was_added_are_read() -> None:
+    before = table()
+    header, *lines = gzip.decompress(encode(before)).decode().splitlines()
+    names = header.split(",")
+    kept = [k for k, name in enumerate(names) if not name.endswith("no_timing")]
+    old = [",".join(line.split(",")[k] for k in kept) for line in (header, *lines)]
+    after = decode(gzip.compress(("\n".join(old) + "\n").encode()), PATH).evaluations
+    np.testing.assert_array_equal(after.violation, before.evaluations.violation)
+    np.testing.assert_array_equal(after.violation_time, before.evaluations.violation_time)
+    np.testing.assert_array_equal(after.reason, before.evaluations.reason)
+
+
 @settings(max_examples=50)
 @given(hnp.arrays(np.float64, (2, 4), elements=st.floats(allow_nan=False, allow_infinity=False)))
 def test_any_number_survives(x: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> None:

@@ -65,6 +65,8 @@ CASES: list[tuple[str, Any, str, str]] = [
     ("uncertainty", {"disturbance": 0.3}, "uncertainty.disturbance", "array of 3 numbers"),
     ("uncertainty", {"pad_position": 0.04}, "uncertainty.pad_position", "less than 0.0315 m"),
     ("task.allocation", "conic", "task.allocation", "allowed is one of 'paper', 'joint'"),
+    ("task.force_limit", [60.0, 50.0], "task.force_limit", "found 60 above 50"),
+    ("task.force_limit", 50.0, "task.force_limit", "allowed is an array of 2 numbers"),
     ("task.time_law", "toppra", "task.time_law", "allowed is one of 'constant', 'ramped'"),
     ("task.samples", 4, "task.samples", "found 4; allowed is a whole number 5 to"),
     ("task.samples", 50.0, "task.samples", "allowed is a whole number"),

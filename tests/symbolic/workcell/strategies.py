@@ -130,7 +130,8 @@ def tasks(draw: st.DrawFn, bodies: list[str]) -> dict[str, Any]:
     optional = {
         "initial": st.just(initial),
         "samples": st.integers(5, 500),
-        "time_law": st.sampled_from(["constant", "ramped"]),
+        "time_law": st.sampled_from(["constant", "ramped", "optimal"]),
+        "force_limit": st.tuples(numbers(20, 60), numbers(60, 1e4)).map(list),
         "reference_angular_speed": numbers(0.01, 1.0),
         "ramp_time": numbers(0.01, 5.0),
     }

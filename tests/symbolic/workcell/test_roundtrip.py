@@ -99,7 +99,14 @@ def assert_same_task(cell: Workcell, data: dict[str, Any]) -> None:
     bounds.append((data["goal"], data["goal"]))
     assert [(w.lower.tolist(), w.upper.tolist()) for w in task.waypoints] == bounds
     free = [pair for pair in bounds if pair[0] != pair[1]]
-    assert task.n_var == 6 * len(free)
+    assert task.n_path == 6 * len(free)
+    assert task.n_var == task.n_path + (task.time_law == "optimal") == len(task.lower)
+    if "force_limit" in data:
+        assert list(task.force_limit) == data["force_limit"]
+    else:
+        still = cell.payload.mass * 9.81 / sum(c.friction for c in cell.contacts)
+        assert task.force_limit[0] == 1.001 * still
+        assert task.force_limit[1] == max(1.001 * still, task.reference_force.min())
     centres = np.mean(free, axis=1)
     np.testing.assert_allclose(task.initial, np.array(data.get("initial", centres)), atol=1e-15)
     assert task.samples == data.get("samples", 100)
