@@ -77,8 +77,11 @@ class Driver:
         """
         found = self.drive(x)
         motion = (found.time, found.speed, found.acceleration)
-        return candidate.batch(x, *motion, threads=self._threads) | {
-            "peak_force": found.peak_force,
+        outputs = candidate.batch(x, *motion, threads=self._threads)
+        # Where the path itself fails no timing tells the forces: those of its samples at rest.
+        sampled = outputs["normal_force"].max(axis=1)
+        return outputs | {
+            "peak_force": np.where(np.isfinite(found.peak_force), found.peak_force, sampled),
             "drive_violation": found.violation,
             "drive_position": found.position,
         }

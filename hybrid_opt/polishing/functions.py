@@ -14,9 +14,9 @@ from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.evaluate.functions import workcell_key
 from symbolic.cell_model import build_cell_model
+from symbolic.errors import SettingsError
 from symbolic.smooth.forces import force_functions, pressure_functions
 from symbolic.smooth.rows import RowFunctions, solve_function
-from symbolic.errors import SettingsError
 from symbolic.workcell.records import Workcell
 
 _LEVELS = {

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from codegen.build import build
+from hybrid_opt import metaheuristics
 from hybrid_opt.evaluate.drive import Driver
 from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
 from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.indicators.metrics import non_dominated
+from hybrid_opt.metaheuristics.problem import CarryProblem
 from hybrid_opt.timing import PathTimer, TimingLimits, time_path
 from symbolic.array import Array
 from symbolic.functions.candidate import candidate_function
@@ -106,6 +109,21 @@ def test_paths_that_cannot_be_driven_say_why_and_where() -> None:
     column = REASONS.index("force_limit")
     assert found.violation[0, column] == pytest.approx(1.0 / 0.9 - 1.0, rel=0.02)
     assert found.violation[2, -len(DRIVE_CONSTRAINTS) :].max() == 0.0
+
+
+@pytest.mark.parametrize("name", ["nsga2", "mopso"])
+def test_searches_find_fronts_that_time_path_confirms(name: str) -> None:
+    problem = CarryProblem(evaluator(), "penalty")
+    algorithm = metaheuristics.make(name, {"population": 20}, candidates(4))
+    metaheuristics.search(problem, algorithm, 60, np.random.default_rng(2))
+    found = problem.evaluations
+    rows = np.flatnonzero(non_dominated(found.objectives, found.feasible))
+    assert len(rows) > 0
+    best = found[rows[[int(np.argmin(found.objectives[rows, 0]))]]]
+    timing = time_path(hand_timing(100), best.x[0, :-1], TimingLimits(force=float(best.x[0, -1])))
+    assert timing.ok, timing.reason
+    slowest = evaluator().outputs(best.x)["time"][0, -1]
+    assert slowest == pytest.approx(timing.duration, rel=2e-3)
 
 
 def test_less_force_violates_more_and_costs_more() -> None:
