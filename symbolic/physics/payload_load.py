@@ -7,12 +7,14 @@ and `symbolic.physics.joint_allocation` takes over where not.
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import casadi as ca
 import numpy as np
 
 from symbolic.expression import Expression
 from symbolic.physics.contact_forces import allocate, required_force
-from symbolic.physics.joint_allocation import allocate_jointly, balance_of
+from symbolic.physics.joint_allocation import JointAllocation, allocate_jointly, balance_of
 from symbolic.physics.pressure import pressure_shift, required_moment
 from symbolic.physics.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.workcell.records import Workcell
@@ -151,13 +153,10 @@ def _joint_load_function(workcell: Workcell) -> ca.Function:
     inputs = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
     found = paper_load_function(workcell)(*inputs.values())
     paper = dict(zip(LOAD_OUTPUTS, found, strict=True))
-    points = [contact.T_box_pad[:3, 3] for contact in workcell.contacts]
-    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
     force = paper["contact_force"][:3] + paper["contact_force"][3:]
-    distance = float(np.linalg.norm(points[0] - points[1]))
-    allowed = RESIDUAL_TOLERANCE * distance * ca.norm_2(force)
-    shifted = ca.mmax(paper["pressure_shift"] / radius) <= 1.0
-    suffices = ca.logic_and(shifted, ca.norm_2(paper["moment_residual"]) <= allowed)
+    suffices = _suffices_function(workcell)(
+        paper["pressure_shift"], paper["moment_residual"], force
+    )
     kept = [paper[name] for name in _ALLOCATED]
     passed = [ca.MX.sym(name, value.shape[0]) for name, value in zip(_ALLOCATED, kept, strict=True)]
     asked = [inputs["pose"], force, paper["required_moment"], inputs["friction"]]
@@ -180,25 +179,42 @@ def _joint_load_function(workcell: Workcell) -> ca.Function:
     )
 
 
+def _suffices_function(workcell: Workcell) -> ca.Function:
+    """pressure_shift (2,), moment_residual (3,), force (3,) to whether the paper's result holds."""
+    shift, residual, force = (ca.SX.sym(*entry) for entry in (("shift", 2), ("rest", 3), ("f", 3)))
+    points = [contact.T_box_pad[:3, 3] for contact in workcell.contacts]
+    distance = float(np.linalg.norm(points[0] - points[1]))
+    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
+    carried = ca.sumsqr(residual) <= (RESIDUAL_TOLERANCE * distance) ** 2 * ca.sumsqr(force)
+    within = ca.logic_and(shift[0] <= radius[0], shift[1] <= radius[1])
+    return ca.Function("suffices", [shift, residual, force], [ca.logic_and(within, carried)])
+
+
 def _joint_sample_function(workcell: Workcell) -> ca.Function:
     """pose, force, moment (world), friction and centre of mass to the outputs `_ALLOCATED`."""
     sizes = (("pose", 6), ("force", 3), ("moment", 3), ("friction", 2), ("centre_of_mass", 3))
-    pose, force, moment, friction, centre_of_mass = (ca.MX.sym(*entry) for entry in sizes)
-    T_box_pads = [contact.T_box_pad for contact in workcell.contacts]
-    axes = ca.mtimes(_rotation_function()(pose[3:]), ca.DM(T_box_pads[0][:3, :3]))
-    arms = [
-        ca.mtimes(ca.DM(T_box_pads[0][:3, :3].T), ca.DM(T[:3, 3]) - centre_of_mass)
-        for T in T_box_pads
-    ]
-    needed = (ca.mtimes(axes.T, force), ca.mtimes(axes.T, moment))
-    held = allocate_jointly(
-        balance_of(*needed, (arms[0], arms[1])),
-        friction,
-        ca.DM([contact.patch_radius for contact in workcell.contacts]),
-    )
+    pose, force, moment, friction, centre_of_mass = inputs = [ca.MX.sym(*entry) for entry in sizes]
+    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
+    asked = (pose, force, moment, centre_of_mass)
+    held = allocate_jointly(_balance_function(workcell)(*asked), friction, radius)
+    wrenches = [getattr(held, each.name) for each in fields(held)]
+    return ca.Function("joint_sample", inputs, _world_function(workcell)(*asked, *wrenches))
+
+
+def _balance_function(workcell: Workcell) -> ca.Function:
+    """pose, force, moment (world) and centre of mass to what the contacts have to balance (9,)."""
+    inputs, _, needed, arms = _in_pad_axes(workcell)
+    return ca.Function("joint_balance", inputs, [balance_of(*needed, arms)])
+
+
+def _world_function(workcell: Workcell) -> ca.Function:
+    """As `_balance_function`, then the fields of a `JointAllocation`, to the outputs
+    `_ALLOCATED`."""
+    inputs, axes, needed, arms = _in_pad_axes(workcell)
+    held = JointAllocation(*[ca.SX.sym(each.name, 2) for each in fields(JointAllocation)])
     forces = [
-        ca.vertcat(tangent, sign * held.normal[i])
-        for i, (tangent, sign) in enumerate(((held.tangent_1, 1.0), (held.tangent_2, -1.0)))
+        ca.vertcat(held.tangent_1, held.normal[0]),
+        ca.vertcat(held.tangent_2, -held.normal[1]),
     ]
     shifts = [ca.vertcat(shift, 0.0) for shift in (held.shift_1, held.shift_2)]
     moments = [
@@ -206,8 +222,10 @@ def _joint_sample_function(workcell: Workcell) -> ca.Function:
         for i, (shift, at) in enumerate(zip(shifts, forces, strict=True))
     ]
     point = needed[1] - ca.cross(arms[0], forces[0]) - ca.cross(arms[1], forces[1])
-    world = ca.mtimes(axes, ca.horzcat(*forces, *shifts, *moments, point, point - sum(moments)))
-    first, second, shift_1, shift_2, moment_1, moment_2, before, left = ca.horzsplit(world)
+    local = (*forces, *shifts, *moments, point, point - moments[0] - moments[1])
+    first, second, shift_1, shift_2, moment_1, moment_2, before, left = (
+        ca.mtimes(axes, vector) for vector in local
+    )
     outputs = {
         "normal_force": held.normal,
         "tangential_force": ca.vertcat(_length(held.tangent_1), _length(held.tangent_2)),
@@ -219,17 +237,22 @@ def _joint_sample_function(workcell: Workcell) -> ca.Function:
         "wrench_1": ca.vertcat(first, moment_1),
         "wrench_2": ca.vertcat(second, moment_2),
     }
-    return ca.Function(
-        "joint_sample",
-        [pose, force, moment, friction, centre_of_mass],
-        [outputs[name] for name in _ALLOCATED],
-    )
+    wrenches = [getattr(held, each.name) for each in fields(held)]
+    return ca.Function("joint_world", [*inputs, *wrenches], [outputs[name] for name in _ALLOCATED])
 
 
-def _rotation_function() -> ca.Function:
-    """rpy (3,) to R_world_box, as expressions of one kind need it within those of the other."""
-    rpy = ca.SX.sym("rpy", 3)
-    return ca.Function("rotation", [rpy], [rotation_matrix(rpy)])
+def _in_pad_axes(
+    workcell: Workcell,
+) -> tuple[list[ca.SX], ca.SX, tuple[ca.SX, ca.SX], tuple[ca.SX, ca.SX]]:
+    """Inputs pose, force, moment and centre of mass; the axes of pad 1 in the world (3, 3); force
+    and moment, and the contacts' arms from the centre of mass, along these axes."""
+    sizes = (("pose", 6), ("force", 3), ("moment", 3), ("centre_of_mass", 3))
+    pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in sizes]
+    first, second = (contact.T_box_pad for contact in workcell.contacts)
+    in_box = ca.DM(first[:3, :3])
+    axes = ca.mtimes(rotation_matrix(pose[3:]), in_box)
+    arms = tuple(ca.mtimes(in_box.T, ca.DM(T[:3, 3]) - centre_of_mass) for T in (first, second))
+    return inputs, axes, (ca.mtimes(axes.T, force), ca.mtimes(axes.T, moment)), (arms[0], arms[1])
 
 
 def _length(vector: Expression) -> Expression:

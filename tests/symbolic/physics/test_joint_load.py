@@ -7,6 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from codegen.lanes import lane_text
+from codegen.source import generated_c
 from studies.plain.load import GRAVITY
 from studies.plain.motion import angular_rates, rotation
 from symbolic.array import Array
@@ -143,3 +145,9 @@ def test_derivatives_pass_through_the_choice() -> None:
             for sign in (1.0, -1.0)
         ]
         np.testing.assert_allclose(found[:, k], (ends[0] - ends[1]) / 2e-4, atol=1e-4)
+
+
+def test_runs_in_lanes() -> None:
+    """A batch is evaluated side by side only if every construct of the function is known there."""
+    function = load_function(joint(ten_kilogram_cell()))
+    assert lane_text(generated_c([function]), "joint") is not None
