@@ -16,7 +16,23 @@ from symbolic.robot.arm import (
     REACH_TOLERANCE,
     SURE,
 )
+from symbolic.robot.chain import held_joints
+from symbolic.robot.urdf import moving_joints
+from symbolic.robot.urdf_file import read_urdf
 from symbolic.workcell.records import Contact, Robot
+
+
+def held_model(robot: Robot) -> tuple[pin.Model, list[int], Array]:
+    """The model of the whole description, the joints that do not move, and where they stand."""
+    urdf = read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
+    moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
+    model = pin.buildModelFromXML(urdf.kinematics)
+    q, joints = pin.neutral(model), []
+    for name, position in held_joints(urdf, moving, robot.locked_joints):
+        joint = model.getJointId(name)
+        q[model.joints[joint].idx_q] = position
+        joints.append(joint)
+    return model, joints, q
 
 
 class PlainArm:
@@ -25,13 +41,8 @@ class PlainArm:
     def __init__(self, robot: Robot, contact: Contact) -> None:
         self.robot = robot
         self.contact = contact
-        model = pin.buildModelFromUrdf(str(robot.urdf))
-        locked = [model.getJointId(name) for name, _ in robot.locked_joints]
-        q = pin.neutral(model)
-        for joint, (_, position) in zip(locked, robot.locked_joints, strict=True):
-            q[model.joints[joint].idx_q] = position
-        self.model = pin.buildReducedModel(model, locked, q)
-        self.flange = self.model.getFrameId(robot.flange)
+        self.model = pin.buildReducedModel(*held_model(robot))
+        self.flange = self.model.getFrameId(robot.flange, pin.FrameType.BODY)
         self.data = self.model.createData()
         self.T_root_world = pin.SE3(robot.T_world_base).inverse()
         self.T_flange_pad = pin.SE3(robot.T_flange_pad)

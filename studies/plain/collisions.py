@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from hybrid_opt.collision.checker import RESTING_TOLERANCE
+from studies.plain.arm import held_model
 from studies.plain.motion import rotation
 from symbolic.array import Array
 from symbolic.geometry.meshes import convex_pieces
@@ -129,23 +130,19 @@ class _Arm:
 
     def __init__(self, robot: Robot) -> None:
         self.base = pin.SE3(robot.T_world_base)
-        full = pin.buildModelFromUrdf(str(robot.urdf))
+        full, held, q = held_model(robot)
         folders = [str(folder) for folder in robot.package_dirs]
         geometry = pin.buildGeomFromUrdf(
             full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=folders
         )
         links = [full.frames[item.parentFrame].name for item in geometry.geometryObjects]
-        locked = [full.getJointId(name) for name, _ in robot.locked_joints]
-        q = pin.neutral(full)
-        for joint, (_, position) in zip(locked, robot.locked_joints, strict=True):
-            q[full.joints[joint].idx_q] = position
-        self.model, geometry = pin.buildReducedModel(full, geometry, locked, q)
+        self.model, geometry = pin.buildReducedModel(full, geometry, held, q)
         self.data = self.model.createData()
         self.bodies: dict[str, list[_Solid]] = {}
         self.carried: list[tuple[_Solid, int]] = []
         for link, item in zip(links, geometry.geometryObjects, strict=True):
             self._add(f"{robot.name}/{link}", _urdf_shape(item), item.placement, item.parentJoint)
-        flange = self.model.frames[self.model.getFrameId(robot.flange)]
+        flange = self.model.frames[self.model.getFrameId(robot.flange, pin.FrameType.BODY)]
         for tool in robot.tool:
             placement = flange.placement * pin.SE3(tool.pose)
             self._add(f"{robot.name}/{tool.name}", tool.shape, placement, flange.parentJoint)

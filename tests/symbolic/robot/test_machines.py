@@ -8,9 +8,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from studies.plain.collisions import PlainCollisionChecker
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
 from symbolic.functions.candidate import candidate_function
+from symbolic.geometry.pairs import build_geometry
 from symbolic.robot.branches import start_branches
 from symbolic.robot.chain import held_joints
 from symbolic.robot.machine import arm_links, one_machine
@@ -20,6 +22,7 @@ from symbolic.workcell.body_names import body_names
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Robot, Workcell
 from tests.machines import MACHINES, SINGLE, machine_cell, single_cell
+from tests.symbolic.geometry.collision_cells import placed_pieces
 
 pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
 
@@ -142,3 +145,24 @@ def test_start_postures_are_within_their_limits(tmp_path: Path) -> None:
         for branch in start_branches(workcell, i, build_robot_model(robot)):
             assert np.all(branch.q >= robot.position_lower)
             assert np.all(branch.q <= robot.position_upper)
+
+
+def test_links_stand_where_the_plain_reference_puts_them(tmp_path: Path) -> None:
+    """Every solid that is checked, in random postures of both arms of a machine."""
+    workcell = cell_of("pr2", tmp_path)
+    geometry = build_geometry(workcell)
+    checker = PlainCollisionChecker(workcell)
+    rng = np.random.default_rng(4)
+    q = [rng.uniform(robot.position_lower, robot.position_upper) for robot in workcell.robots]
+    for arm, posture in zip(checker.arms, q, strict=True):
+        arm.move(posture)
+    seen = 0
+    for body, pieces in zip(geometry.bodies, placed_pieces(geometry, np.zeros(6), *q), strict=True):
+        if body.name == "payload":
+            continue
+        for piece, solid in zip(pieces, checker.bodies[body.name], strict=True):
+            pose = solid.object.getTransform()
+            assert pose.getTranslation() == pytest.approx(piece.pose[:3, 3], abs=1e-9)
+            assert pose.getRotation() == pytest.approx(piece.pose[:3, :3], abs=1e-9)
+            seen += 1
+    assert seen > 30
