@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hybrid_opt.evaluate.objectives import Objective
     from hybrid_opt.front import Front
     from hybrid_opt.metaheuristics.carries import SearchSettings
-    from hybrid_opt.polishing.records import PolishSettings
+    from hybrid_opt.polishing.settings import PolishSettings
     from hybrid_opt.store.export.formats import export
     from hybrid_opt.timing.records import Timing, TimingLimits
     from symbolic.errors import DualArmError

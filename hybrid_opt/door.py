@@ -14,7 +14,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from hybrid_opt.polishing.front import FrontPolisher
-from hybrid_opt.polishing.records import PolishSettings
+from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.overview import TimedTrajectory, timed_trajectory

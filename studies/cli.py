@@ -14,7 +14,7 @@ from hybrid_opt.campaign.execution import ExecutorName
 from hybrid_opt.campaign.settings import FirstGeneration
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.metaheuristics.problem import ConstraintHandling
-from hybrid_opt.polishing.records import PolishSettings
+from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.errors import SettingsError
 
 _DEFAULT = CampaignSettings()

@@ -25,7 +25,8 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.front import FrontPolisher
-from hybrid_opt.polishing.records import PolishedFront, PolishSettings
+from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.files import read_bytes, write_atomically
 from hybrid_opt.work.job import Emit, Job, answer_all
 from hybrid_opt.work.processes import local_executor

@@ -19,7 +19,7 @@ from hybrid_opt.campaign import (
 )
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
-from hybrid_opt.polishing.records import PolishSettings
+from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.work.processes import warm_up
 from studies.cli import (
     campaign_parser,

@@ -33,10 +33,10 @@ from hybrid_opt.polishing.front import FrontPolisher
 from hybrid_opt.polishing.records import (
     PolishedFront,
     PolishOutcome,
-    PolishSettings,
     outcome_from_json,
     outcome_to_json,
 )
+from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.work.job import Job, give_up

@@ -14,14 +14,14 @@ from typing import Protocol
 
 import casadi
 
-from hybrid_opt.polishing.solver import Solution, SolveTask
+from hybrid_opt.polishing.point import Solution, SolveTask
 
 
 class Solver(Protocol):
     """What solves."""
 
     def solve(self, task: SolveTask) -> Solution:
-        """See `hybrid_opt.polishing.solver.PolishSolver`."""
+        """See `hybrid_opt.polishing.point.PolishSolver`."""
 
 
 @dataclass(frozen=True)

@@ -20,15 +20,13 @@ from hybrid_opt.polishing.archive import Archive
 from hybrid_opt.polishing.attempt import Lost, solve_safely
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.plan import Attempt, aimed, points, widest_gap
+from hybrid_opt.polishing.point import PolishSolver, Solution, SolveTask
 from hybrid_opt.polishing.records import (
-    UNKNOWN,
-    Aim,
     PolishedFront,
     PolishOutcome,
-    PolishSettings,
     Status,
 )
-from hybrid_opt.polishing.solver import PolishSolver, Solution, SolveTask
+from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.decision import initial_decision
@@ -36,19 +34,7 @@ from symbolic.workcell.decision import initial_decision
 TIMED_EVALUATIONS = 32
 """Candidates whose evaluation is timed, to express the polish in their unit."""
 
-OPTIMAL_STATIONARITY = 1e-3
-"""Residual below which a point that could not be improved counts as optimal."""
-
-TURNS_PER_GAP = 3
-"""Turns at the ends and the middle before one at a gap: they decide hypervolume and payload."""
-
-PROGRESS = 2e-5
-"""Least gain of an attempt, in units of the reference force, that counts as coming further."""
-
-BALANCE_STALLS = 2
-"""Attempts in a row that came no further, after which the balanced middle is left."""
-
-NO_SOLUTION = Solution(np.empty(0), "", False, False, UNKNOWN, 0, 0, 0)
+NO_SOLUTION = Solution(np.empty(0))
 
 
 class FrontPolisher:
@@ -153,26 +139,26 @@ class _Run:
         """The front's points first; then ends, middle and gaps in turns, while attempts last."""
         self._do(points(self._archive, self._settings))
         while self._left() > 0:
-            for _ in range(TURNS_PER_GAP):
-                self._turn("extreme", (0, 1), rng)
-                if self._stalls[None] < BALANCE_STALLS:
-                    self._turn("balance", (None,), rng)
+            for _ in range(self._settings.front.turns_per_gap):
+                self._turn((0, 1), rng)
+                if self._stalls[None] < self._settings.front.middle_stalls:
+                    self._turn((None,), rng)
             self._do(self._gap())
 
-    def _turn(self, aim: Aim, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
+    def _turn(self, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
         """An attempt at each of some aims, and whether it came further."""
         before = [self._archive.best(objective)[1] for objective in objectives]
         stalls = [self._stalls[objective] for objective in objectives]
         pairs = zip(objectives, stalls, strict=True)
-        self._do([aimed(self._archive, aim, *pair, rng) for pair in pairs])
+        self._do([aimed(self._archive, *pair, self._settings, rng) for pair in pairs])
         for objective, value in zip(objectives, before, strict=True):
-            further = self._archive.best(objective)[1] < value - PROGRESS
+            further = self._archive.best(objective)[1] < value - self._settings.front.progress
             self._stalls[objective] = 0 if further else self._stalls[objective] + 1
 
     def _gap(self) -> list[Attempt]:
         """An attempt in the widest gap that was not tried, none where all are narrow."""
         tried = {outcome.start.tobytes() for outcome in self.outcomes if outcome.aim == "gap"}
-        found = widest_gap(self._archive, tried)
+        found = widest_gap(self._archive, tried, self._settings)
         if found is None:
             return []
         attempt, beyond = found
@@ -247,6 +233,6 @@ class _Run:
         return "accepted", "", objectives
 
     def _not_improved(self, answer: Solution, attempt: Attempt) -> tuple[Status, str, Array]:
-        if answer.converged or answer.residuals.stationarity <= OPTIMAL_STATIONARITY:
+        if answer.converged or answer.residuals.stationarity <= self._settings.front.optimal:
             return "optimal", "not improved", attempt.start
         return "failed", f"not improved: {answer.message}", attempt.start

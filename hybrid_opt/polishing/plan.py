@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 
 from hybrid_opt.polishing.archive import LEAST_SPAN, Archive
-from hybrid_opt.polishing.records import Aim, PolishSettings
-from hybrid_opt.polishing.solver import FIRST_RADIUS
+from hybrid_opt.polishing.records import Aim
+from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.targets import (
     Target,
     balance,
@@ -19,12 +20,6 @@ from hybrid_opt.polishing.targets import (
 )
 from symbolic.array import Array
 
-LEAST_GAP = 0.02
-"""Gaps narrower than this are left, in units of the front's extent."""
-
-SMALL_RADIUS = 0.1
-"""First box of trust of an attempt that goes on where the last one came no further."""
-
 
 @dataclass(frozen=True)
 class Attempt:
@@ -33,7 +28,7 @@ class Attempt:
     Attributes:
         aim, parent, start: as in `hybrid_opt.polishing.records.PolishOutcome`.
         x: (n_var,) decision vector to start from.
-        target, radius: see `hybrid_opt.polishing.solver.SolveTask`.
+        target, radius: see `hybrid_opt.polishing.point.SolveTask`.
     """
 
     aim: Aim
@@ -41,13 +36,13 @@ class Attempt:
     x: Array
     start: Array
     target: Target
-    radius: float = FIRST_RADIUS
+    radius: float
 
 
 def points(archive: Archive, settings: PolishSettings) -> list[Attempt]:
     """Evenly spread points of the front, the balanced one among them."""
     rows = archive.rows()
-    count = min(len(rows), (settings.points + 5) // 6)
+    count = min(len(rows), ceil(settings.points * settings.front.own_share))
     chosen = {rows[int(k)] for k in np.round(np.linspace(0, len(rows) - 1, count))}
     middle, _ = archive.best(None)
     if middle not in chosen and count > 2:
@@ -63,12 +58,18 @@ def points(archive: Archive, settings: PolishSettings) -> list[Attempt]:
             target = epsilon_constraint(start, span, objective)
         else:
             target = pascoletti_serafini(start, span)
-        attempts.append(Attempt("point", archive.parent[k], archive.x[k], start, target))
+        attempts.append(
+            Attempt("point", archive.parent[k], archive.x[k], start, target, settings.trust.first)
+        )
     return attempts
 
 
 def aimed(
-    archive: Archive, aim: Aim, objective: int | None, stalls: int, rng: np.random.Generator
+    archive: Archive,
+    objective: int | None,
+    stalls: int,
+    settings: PolishSettings,
+    rng: np.random.Generator,
 ) -> Attempt:
     """An attempt at an end of the front or at its balanced middle.
 
@@ -80,18 +81,22 @@ def aimed(
         objective: whose end; None for the middle.
         stalls: attempts in a row that came no further.
     """
-    k, radius = archive.best(objective)[0], FIRST_RADIUS
+    k, radius = archive.best(objective)[0], settings.trust.first
     if stalls % 2 == 1:
-        radius = SMALL_RADIUS
+        radius = settings.front.small_radius
     elif stalls:
         rows = archive.rows()
         k = rows[int(rng.integers(len(rows)))]
     start, span = archive.objectives[k], np.full(2, LEAST_SPAN)
-    target = balance(start, span) if objective is None else extreme(start, span, objective)
-    return Attempt(aim, -1, archive.x[k], start, target, radius)
+    if objective is None:
+        return Attempt("balance", -1, archive.x[k], start, balance(start, span), radius)
+    target = extreme(start, span, objective)
+    return Attempt("extreme", -1, archive.x[k], start, target, radius)
 
 
-def widest_gap(archive: Archive, tried: Collection[bytes]) -> tuple[Attempt, Array] | None:
+def widest_gap(
+    archive: Archive, tried: Collection[bytes], settings: PolishSettings
+) -> tuple[Attempt, Array] | None:
     """An attempt in the widest gap between neighbours, along the normal of their chord.
 
     Args:
@@ -107,10 +112,11 @@ def widest_gap(archive: Archive, tried: Collection[bytes]) -> tuple[Attempt, Arr
     for gap in np.argsort(-widths, kind="stable").tolist():
         first, second = rows[gap], rows[gap + 1]
         start = (archive.objectives[first] + archive.objectives[second]) / 2.0
-        if start.tobytes() in tried or widths[gap] <= LEAST_GAP:
+        if start.tobytes() in tried or widths[gap] <= settings.front.least_gap:
             continue
         chord = np.abs(values[gap + 1] - values[gap])
         normal = chord[::-1] / np.linalg.norm(chord)
         target = pascoletti_serafini(start, span, normal)
-        return Attempt("gap", -1, archive.x[first], start, target), archive.x[second]
+        radius = settings.trust.first
+        return Attempt("gap", -1, archive.x[first], start, target, radius), archive.x[second]
     return None

@@ -1,197 +1,233 @@
-"""IPOPT on one assembled program, and the residuals of what it returns."""
+"""The polish as a nonlinear program with exact first and second derivatives.
+
+Variables z = (xi, phi, a): the decision vector scaled to [-1, 1] by its bounds, both robots' peak
+forces f (the epigraph of the paper's Eq. 60) as phi = (f - anchor) / span, and a level. With the
+target's anchor, span, direction, offset and cost,
+
+    minimise    cost . (a, phi_1, phi_2)
+    subject to  (N_i,k(x) / N_ref,i - anchor_i) / span_i <= phi_i    chosen samples k, robot i
+                phi_j <= direction_j a + offset_j                    both objectives
+                1 - (shift_i,k(x) / patch radius_i)^2 >= margin      chosen robots and samples
+                c_r(x) / scale_r >= required_r / scale_r             chosen rows at chosen places.
+
+That covers the scalarisation of Pascoletti and Serafini (direction of ones), the epsilon
+constraint (a zero in the direction) and normal boundary intersection (the normal as direction).
+Values and derivatives are put together here, in NumPy, from batches over samples and places:
+another set of rows costs no more than choosing them.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from typing import Protocol
 
-import casadi as ca
 import numpy as np
 
-from hybrid_opt.polishing.records import UNKNOWN, PolishSettings, Residuals
+from hybrid_opt.polishing.decision import UnitBox
+from hybrid_opt.polishing.functions import PolishFunctions
+from hybrid_opt.polishing.grid import Grid
+from hybrid_opt.polishing.layout import Layout, PlaceRow, Row
+from hybrid_opt.polishing.place_values import Places, PlaceValues
+from hybrid_opt.polishing.placed_carry import PlacedCarry
+from hybrid_opt.polishing.sample_values import SampleValues
+from hybrid_opt.polishing.targets import Target, needed_level
 from symbolic.array import Array
-from symbolic.smooth.problem import SmoothProblem
+from symbolic.smooth.samples import branch_coefficients, sample_blocks
+from symbolic.workcell.decision import waypoints_of
+from symbolic.workcell.records import Workcell
 
-IPOPT: dict[str, Any] = {
-    "ipopt.print_level": 0,
-    "ipopt.sb": "yes",
-    "print_time": False,
-    # A metaheuristic's point is near the solution but has no multipliers: a small barrier, little
-    # push off the bounds (docs/polish.md has the comparison).
-    "ipopt.mu_init": 1e-3,
-    "ipopt.bound_push": 1e-4,
-    "ipopt.bound_frac": 1e-4,
-    "ipopt.slack_bound_push": 1e-4,
-    "ipopt.mu_linear_decrease_factor": 0.5,
-    "ipopt.mu_superlinear_decrease_power": 1.2,
-    "ipopt.tol": 1e-6,
-    "ipopt.honor_original_bounds": "yes",
-    "no_nlp_grad": True,
-    "calc_lam_p": False,
-    "calc_lam_x": False,
-    "calc_f": False,
-    "calc_g": False,
-    "error_on_fail": False,
-}
+SLACK = 0.1
+"""What the epigraph variables start above the peak forces, in units of the span."""
+
+LEVEL_BOUND = 2e3
+"""Bound of |phi| and |a|; beyond anything the targets ask for."""
 
 
-FEASIBLE = 1e-3
-"""Violation, in the program's scaled constraints, at which an iterate counts as feasible."""
+class Program(Protocol):
+    """A nonlinear program: minimise cost . z within bounds, constraints within theirs.
 
-PATIENCE = 3
-"""Times the wanted number of iterations that IPOPT may take to become feasible."""
-
-
-class _Stop(ca.Callback):  # type: ignore[misc]  # CasADi has no types
-    """Ends a solve after the wanted number of iterations, as soon as an iterate is feasible.
-
-    A solve that is cut off wherever it stands ends in an obstacle more often than not.
+    Attributes:
+        cost: (n_variables,) gradient of the objective, which is linear.
+        start, low, high: (n_variables,).
+        below, above: (n_rows,) bounds of the constraints, infinite where there is none.
     """
 
-    def __init__(self, problem: SmoothProblem, iterations: int) -> None:
-        ca.Callback.__init__(self)
-        self._problem, self._iterations, self._count = problem, iterations, 0
-        self._below = self._above = np.empty(0)
-        self.construct("stop", {})
-
-    def begin(self, below: Array, above: Array) -> None:
-        """Before every solve: bounds of the constraints."""
-        self._below, self._above, self._count = below, above, 0
-
-    def get_n_in(self) -> int:
-        """CasADi's question."""
-        return int(ca.nlpsol_n_out())
-
-    def get_n_out(self) -> int:
-        """CasADi's question."""
-        return 1
-
-    def get_sparsity_in(self, index: int) -> ca.Sparsity:
-        """CasADi's question."""
-        name, nlp = ca.nlpsol_out(index), self._problem.nlp
-        shapes = {"f": (1, 1), "x": nlp.size_in(0), "lam_x": nlp.size_in(0)}
-        shapes |= {"g": nlp.size_out(1), "lam_g": nlp.size_out(1), "lam_p": (0, 0)}
-        return ca.Sparsity.dense(*shapes[name])
-
-    def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
-        """1 to stop, 0 to go on."""
-        self._count += 1
-        if self._count <= self._iterations:
-            return [ca.DM(0)]
-        g = arguments[2].full().ravel()
-        violation = max(np.max(self._below - g), np.max(g - self._above))
-        return [ca.DM(float(violation <= FEASIBLE))]
-
-
-@dataclass(frozen=True)
-class Program:
-    """The numbers of a program: start z, parameters p, bounds of z and of the constraints."""
-
+    cost: Array
     start: Array
-    parameters: Array
     low: Array
     high: Array
     below: Array
     above: Array
 
+    def constraints(self, z: Array) -> tuple[Array, Array]:
+        """Values (n_rows,) and Jacobian (n_rows, n_variables) at z."""
 
-@dataclass(frozen=True)
-class Answer:
-    """What IPOPT returned.
+    def curvature(self, z: Array, multipliers: Array) -> Array:
+        """(n_variables, n_variables) second derivatives of multipliers . constraints at z."""
+
+
+class SmoothCell:
+    """What all smooth programs of a cell share.
 
     Attributes:
-        x: (n_var,) decision vector within its bounds.
-        message: IPOPT's status.
-        converged: whether it claims an optimum.
-        usable: whether x is finite.
-        residuals: recomputed here.
-        iterations: IPOPT's.
+        task, functions, grid: the cell's.
+        unit: the scaled decision vector.
+        blocks: how samples are divided among functions.
+        coefficients: see `branch_coefficients`.
     """
 
-    x: Array
-    message: str
-    converged: bool
-    usable: bool
-    residuals: Residuals
-    iterations: int
+    def __init__(self, workcell: Workcell, functions: PolishFunctions, grid: Grid) -> None:
+        self.task, self.functions, self.grid = workcell.task, functions, grid
+        self.unit = UnitBox.of(workcell.task)
+        self.blocks = sample_blocks(workcell.task)
+        self.coefficients = branch_coefficients(workcell)
 
 
-@dataclass(frozen=True)
-class Ipopt:
-    """IPOPT for one program, and what ends it."""
+class SmoothProgram:
+    """The program of a set of rows near one candidate; attributes as of `Program`, and:
 
-    solver: ca.Function
-    stop: _Stop
-
-
-def ipopt(problem: SmoothProblem, settings: PolishSettings) -> Ipopt:
-    """IPOPT for a program."""
-    stop = _Stop(problem, settings.max_iterations)
-    options = IPOPT | {
-        "grad_f": problem.grad_f,
-        "jac_g": problem.jac_g,
-        "hess_lag": problem.hess_lag,
-        "ipopt.max_iter": PATIENCE * settings.max_iterations,
-        "iteration_callback": stop,
-        "ipopt.max_wall_time": settings.max_seconds,
-    }
-    return Ipopt(ca.nlpsol("polish", "ipopt", problem.nlp, options), stop)
-
-
-def run(problem: SmoothProblem, solver: Ipopt, program: Program) -> Answer:
-    """Solve a program."""
-    n = len(problem.scale)
-    solver.stop.begin(program.below, program.above)
-    try:
-        found = solver.solver(
-            x0=program.start,
-            p=program.parameters,
-            lbx=program.low,
-            ubx=program.high,
-            lbg=program.below,
-            ubg=program.above,
-        )
-    except RuntimeError as error:
-        # CasADi's way to report that a function failed outright.
-        message = str(error).strip().splitlines()[-1]
-        return Answer(np.full(n, np.nan), message, False, False, UNKNOWN, 0)
-    statistics = solver.solver.stats()
-    z = np.asarray(found["x"].full()).ravel()
-    usable = bool(np.isfinite(z).all())
-    x = problem.centre + problem.scale * np.clip(z[:n], program.low[:n], program.high[:n])
-    multipliers = (found["lam_x"].full().ravel(), found["lam_g"].full().ravel())
-    return Answer(
-        x=x,
-        message=str(statistics["return_status"]),
-        converged=statistics["return_status"] == "Solve_Succeeded",
-        usable=usable,
-        residuals=residuals(problem, program, z, *multipliers) if usable else UNKNOWN,
-        iterations=int(statistics["iter_count"]),
-    )
-
-
-def residuals(
-    problem: SmoothProblem, program: Program, z: Array, lam_x: Array, lam_g: Array
-) -> Residuals:
-    """Residuals of the optimality conditions at z with the given multipliers.
-
-    In CasADi's convention: positive multipliers belong to upper bounds, negative to lower ones.
+    Attributes:
+        layout: where everything stands.
     """
-    gradient = problem.grad_f(z, program.parameters)[1].full().ravel()
-    g, jacobian = problem.jac_g(z, program.parameters)
-    values = g.full().ravel()
-    lagrangian = gradient + ca.mtimes(jacobian.T, lam_g).full().ravel() + lam_x
-    sides = (
-        (z, program.low, program.high, lam_x),
-        (values, program.below, program.above, lam_g),
-    )
-    violation, product = 0.0, 0.0
-    for value, low, high, multiplier in sides:
-        violation = max(
-            violation, np.max(low - value, initial=0.0), np.max(value - high, initial=0.0)
+
+    def __init__(
+        self,
+        cell: SmoothCell,
+        required: Mapping[Row, float],
+        target: Target,
+        carry: PlacedCarry,
+        x: Array,
+        radius: float,
+    ) -> None:
+        """Around a candidate.
+
+        Args:
+            required: the rows, and what each has to keep; forces stay below their peaks.
+            target: what to aim at.
+            carry: the candidate x (n_var,) on places.
+            radius: half the width of the box of trust, in halves of the variables' ranges.
+        """
+        self._cell, self._target = cell, target
+        self.layout = layout = Layout.of(cell.task.n_var, required)
+        ruled = {row.sample for row in layout.force_rows}
+        self._forces = SampleValues("force", cell.blocks, cell.functions.samples, ruled)
+        pressed = {row.sample for row in layout.pressure_rows}
+        self._patches = SampleValues("pressure", cell.blocks, cell.functions.samples, pressed)
+        self._places = self._place_values(carry)
+        self._index_rows()
+
+        phi = (carry.peak - target.anchor) / target.span + SLACK
+        xi, low, high = (cell.unit.scaled(v) for v in (x, cell.task.lower, cell.task.upper))
+        self.cost = np.zeros(layout.n_variables)
+        self.cost[layout.level], self.cost[layout.peaks] = target.cost[0], target.cost[1:]
+        self.start = np.concatenate([xi, phi, [needed_level(target, phi) + SLACK]])
+        self.low, self.high = np.full((2, layout.n_variables), LEVEL_BOUND)
+        self.low *= -1.0
+        self.low[layout.decision] = np.maximum(low, xi - radius)
+        self.high[layout.decision] = np.minimum(high, xi + radius)
+        self.below = np.full(layout.n_rows, -np.inf)
+        self.above = np.full(layout.n_rows, np.inf)
+        self.above[: layout.sides.stop] = 0.0
+        self.below[layout.patches] = [required[row] for row in layout.pressure_rows]
+        self.below[layout.places] = [
+            required[row] / row.constraint.scale for row in layout.place_rows
+        ]
+        self._fixed = self._fixed_part()
+        self._known = b""
+
+    def _place_values(self, carry: PlacedCarry) -> PlaceValues:
+        grid, rows = self._cell.grid, self.layout.place_rows
+        at = np.array(sorted({row.place for row in rows}), dtype=np.intp)
+        index = {place: k for k, place in enumerate(at.tolist())}
+        places = Places(
+            grid.basis[at],
+            grid.rate_basis[at],
+            np.array(self._cell.task.free_indices),
+            (carry.q[0][at], carry.q[1][at]),
         )
-        slack = np.where(multiplier > 0.0, high - value, value - low)
-        # A multiplier of an absent bound has nothing to be complementary to: it must vanish.
-        scaled = np.where(np.isfinite(slack), np.abs(slack), 1.0)
-        product = max(product, np.max(np.abs(multiplier) * scaled, initial=0.0))
-    return Residuals(float(np.max(np.abs(lagrangian))), float(violation), float(product))
+        local = tuple(PlaceRow(row.constraint, index[row.place]) for row in rows)
+        functions = self._cell.functions
+        return PlaceValues(local, places, functions.closures, functions.rows)
+
+    def _index_rows(self) -> None:
+        """Rows as arrays: what each takes of the values at samples, and its scale."""
+        forces = np.array([(r.robot, r.branch, r.sample) for r in self.layout.force_rows])
+        robot, branch, sample = forces.reshape(-1, 3).astype(np.intp).T
+        span = self._target.span[robot]
+        reference = self._cell.task.reference_force[robot]
+        self._owner = robot
+        self._mix = self._cell.coefficients[robot, branch] / (reference * span)[:, None]
+        self._anchor = self._target.anchor[robot] / span
+        self._force_column = self._forces.column[sample]
+        pressed = np.array([(r.robot, r.sample) for r in self.layout.pressure_rows])
+        self._pressed, sample = pressed.reshape(-1, 2).astype(np.intp).T
+        self._pressed_column = self._patches.column[sample]
+        self._scale = np.array([row.constraint.scale for row in self.layout.place_rows])
+
+    def _fixed_part(self) -> Array:
+        """The Jacobian's constant columns, of the peaks and the level."""
+        layout = self.layout
+        fixed = np.zeros((layout.n_rows, layout.n_variables))
+        fixed[np.arange(layout.forces.stop), layout.peaks.start + self._owner] = -1.0
+        fixed[layout.sides, layout.peaks] = np.eye(2)
+        fixed[layout.sides, layout.level] = -self._target.direction
+        return fixed
+
+    def constraints(self, z: Array) -> tuple[Array, Array]:
+        """See `Program`; what was evaluated last is remembered."""
+        key = z.tobytes()
+        if key != self._known:
+            self._found = self._evaluated(z)
+            self._known = key
+        return self._found
+
+    def _evaluated(self, z: Array) -> tuple[Array, Array]:
+        layout, half = self.layout, self._cell.unit.half
+        x = self._cell.unit.unscaled(z[layout.decision])
+        values = self._fixed @ z
+        values[layout.forces] -= self._anchor
+        values[layout.sides] -= self._target.offset
+        jacobian = self._fixed.copy()
+
+        split, slope = self._forces.first(x)
+        at = self._force_column
+        values[layout.forces] += np.einsum("rk,rk->r", self._mix, split[at])
+        jacobian[layout.forces, layout.decision] = (
+            np.matmul(self._mix[:, None, :], slope[at])[:, 0] * half
+        )
+        if len(self._pressed):
+            margin, slope = self._patches.first(x)
+            values[layout.patches] = margin[self._pressed_column, self._pressed]
+            jacobian[layout.patches, layout.decision] = (
+                slope[self._pressed_column, self._pressed] * half
+            )
+        if len(self._scale):
+            value, slope = self._places.first(waypoints_of(self._cell.task, x))
+            values[layout.places] = value / self._scale
+            jacobian[layout.places, layout.decision] = slope * half / self._scale[:, None]
+        return values, jacobian
+
+    def curvature(self, z: Array, multipliers: Array) -> Array:
+        """See `Program`."""
+        self.constraints(z)
+        layout, half = self.layout, self._cell.unit.half
+        x = self._cell.unit.unscaled(z[layout.decision])
+        weight = np.zeros((self._forces.count, 2))
+        np.add.at(weight, self._force_column, multipliers[layout.forces, None] * self._mix)
+        total = self._forces.second(x, weight)
+        if len(self._pressed):
+            weight = np.zeros((self._patches.count, 2))
+            where = (self._pressed_column, self._pressed)
+            np.add.at(weight, where, multipliers[layout.patches])
+            total += self._patches.second(x, weight)
+        if len(self._scale):
+            total += self._places.second(multipliers[layout.places] / self._scale)
+        full = np.zeros((layout.n_variables, layout.n_variables))
+        full[layout.decision, layout.decision] = total * np.outer(half, half)
+        return full
+
+    def candidate(self, z: Array) -> Array:
+        """(n_var,) the decision vector at z, within its bounds and the box of trust."""
+        decision = self.layout.decision
+        xi = np.clip(z[decision], self.low[decision], self.high[decision])
+        return self._cell.unit.unscaled(xi)

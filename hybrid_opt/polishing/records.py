@@ -1,92 +1,20 @@
-"""Settings of the polish and what it reports."""
+"""What the polish reports."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.polishing.residuals import Residuals
 from symbolic.array import Array
-from symbolic.errors import SettingsError
 
-Method = Literal["pascoletti-serafini", "epsilon"]
 Aim = Literal["point", "extreme", "balance", "gap"]
 Status = Literal["accepted", "optimal", "rejected", "failed"]
-
-
-@dataclass(frozen=True)
-class PolishSettings:
-    """What decides the results of a polish.
-
-    Attributes:
-        points: attempts that one front may take; the front's own points get a sixth of them.
-        method: how a point is improved: along the diagonal (Pascoletti and Serafini 1984), or by
-            minimising one objective while the other is held (epsilon constraint).
-        max_iterations: of IPOPT in one round; to become feasible it may take more, see
-            `hybrid_opt.polishing.program.PATIENCE`.
-        rounds: of one point at most; see `hybrid_opt.polishing.solver`.
-        max_seconds: wall time after which a solve is given up. Generous, because a result that
-            depends on it cannot be repeated.
-        margin: kept from every constraint but clearances, in the constraint's own scale.
-        clearance: distance kept from obstacles [m]; lets the motion between samples be certified.
-        activity: obstacles nearer than this to the start get constraints at once [m].
-        tolerance: improvement of an objective below which a point counts as optimal already.
-    """
-
-    points: int = 22
-    method: Method = "pascoletti-serafini"
-    max_iterations: int = 15
-    rounds: int = 7
-    max_seconds: float = 60.0
-    margin: float = 1e-6
-    clearance: float = 8e-4
-    activity: float = 0.03
-    tolerance: float = 1e-6
-
-    def __post_init__(self) -> None:
-        """Check every value.
-
-        Raises:
-            SettingsError: with the value, and what is allowed.
-        """
-        if self.method not in get_args(Method):
-            raise SettingsError(
-                f"polish method {self.method!r}; known are {', '.join(get_args(Method))}"
-            )
-        for name, least in (("points", 0), ("max_iterations", 1), ("rounds", 1)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise SettingsError(
-                    f"polish {name} is {value!r}; allowed are whole numbers from {least}"
-                )
-        for name in ("max_seconds", "margin", "clearance", "activity", "tolerance"):
-            if not getattr(self, name) > 0.0:
-                raise SettingsError(f"polish {name} is {getattr(self, name)!r}; it must exceed 0")
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """How well a solution satisfies the optimality conditions of the smooth problem.
-
-    Recomputed here from the functions of the problem and the multipliers that the solver returned.
-
-    Attributes:
-        stationarity: largest entry of the Lagrangian's gradient (scaled variables).
-        feasibility: largest violation of a constraint or bound of the smooth problem.
-        complementarity: largest product of a multiplier and its constraint's slack.
-    """
-
-    stationarity: float
-    feasibility: float
-    complementarity: float
-
-
-UNKNOWN = Residuals(np.nan, np.nan, np.nan)
-"""Of a solve that returned nothing."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ TIE = 1e-4
 
 @dataclass(frozen=True)
 class Target:
-    """Parameters of `symbolic.smooth.problem`; all (2,) but cost (3,)."""
+    """See `hybrid_opt.polishing.program`; all (2,) but cost (3,): of the level and both peaks."""
 
     anchor: Array
     span: Array
@@ -36,10 +36,6 @@ class Target:
         """Per robot whether its force matters for more than ties."""
         first, second = (self.offset < NO_LIMIT).tolist()
         return first, second
-
-    def vector(self) -> Array:
-        """In the order of the problem's parameters."""
-        return np.concatenate([self.anchor, self.span, self.direction, self.offset, self.cost])
 
 
 def pascoletti_serafini(anchor: Array, span: Array, direction: Array | None = None) -> Target:

@@ -26,6 +26,9 @@ LONG = 0.25
 """Bodies longer than wide by more than this [m] are also compared along their own axes: across
 the world's axes, a slanted body seems wider by up to that much."""
 
+BOX_NUMBERS = 30
+"""Length of `Scene.box_numbers`."""
+
 VAST = 2.0
 """Obstacles this many times as wide as a body is long (a floor) need no such comparison."""
 
@@ -96,11 +99,37 @@ class Scene:
             and isinstance(second.pieces[0].shape, Box)
         )
 
-    def separations(self, i: int, j: int) -> list[ca.SX]:
-        """The gaps between a `separable` pair along single directions; `bound` is the largest."""
-        body, obstacle = self.geometry.bodies[i], self.geometry.bodies[j]
-        (piece,) = obstacle.pieces
-        return _gaps(self._obstacle_intervals(i, body, piece))
+    def separations(self, i: int, obstacle: ca.SX) -> list[ca.SX]:
+        """The gaps between the payload, body i, and a fixed box along single directions; `bound`
+        is the largest.
+
+        Args:
+            obstacle: (BOX_NUMBERS,) of the box, see `box_numbers`; may be symbols.
+        """
+        A, low, high = ca.reshape(obstacle[:9], 3, 3).T, obstacle[9:12], obstacle[12:15]
+        rotation, centre = ca.reshape(obstacle[15:24], 3, 3).T, obstacle[24:27]
+        half = obstacle[27:]
+        # A key of its own, because other symbols may come next.
+        moving = self._interval(i, _Axes(f"obstacle {len(self._intervals)}", A))
+        pairs = [(own, (low[k], high[k])) for k, own in enumerate(moving)]
+        own = self._own_axes(self.geometry.bodies[i].frame)
+        middle, turned = ca.mtimes(own.A, centre), ca.mtimes(own.A, rotation)
+        for k, interval in enumerate(self._interval(i, own)):
+            reach = sum(half[m] * self.soft.absolute_above(turned[k, m]) for m in range(3))
+            pairs.append((interval, (middle[k] - reach, middle[k] + reach)))
+        return _gaps(pairs)
+
+    def box_numbers(self, j: int) -> Array:
+        """(BOX_NUMBERS,) of the fixed box j of a `separable` pair: the axes along which it is
+        compared (3, 3), its extent along them, low (3,) and high (3,), its rotation (3, 3),
+        centre (3,) and half edges (3,)."""
+        (piece,) = self.geometry.bodies[j].pieces
+        assert isinstance(piece.shape, Box)
+        A = np.array(ca.DM(self._axes_of(piece).A))
+        high, low = support(piece, A), -support(piece, -A)
+        rotation, half = clean(piece.rotation), np.asarray(piece.shape.size) / 2.0
+        parts = (A, low, high, rotation, clean(piece.centre), half)
+        return np.concatenate([np.ravel(part) for part in parts])
 
     def _along(self, i: int, j: int, axes: _Axes) -> list[tuple[Interval, Interval]]:
         return list(zip(self._interval(i, axes), self._interval(j, axes), strict=True))

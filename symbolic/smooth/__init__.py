@@ -1,1 +1,1 @@
-"""The polish's nonlinear program: its rows with exact first and second derivatives."""
+"""The polish's smooth problem as expressions: samples, arms, and one file per kind of row."""

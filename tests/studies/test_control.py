@@ -13,7 +13,7 @@ from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.records import PolishSettings
+from hybrid_opt.polishing.settings import PolishSettings
 from studies import control
 from studies.reference_front import ReferenceFront
 from studies.run import StudySettings, run_study

@@ -25,7 +25,8 @@ from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.records import PolishSettings, outcome_from_json, outcome_to_json
+from hybrid_opt.polishing.records import outcome_from_json, outcome_to_json
+from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hybrid_opt.polishing.attempt import Lost, solve_safely
-from hybrid_opt.polishing.records import UNKNOWN
-from hybrid_opt.polishing.solver import Solution, SolveTask
+from hybrid_opt.polishing.point import Solution, SolveTask
+from hybrid_opt.polishing.residuals import UNKNOWN
 from hybrid_opt.polishing.targets import pascoletti_serafini
 
 TASK = SolveTask(np.ones(2), pascoletti_serafini(np.zeros(2), np.ones(2)))

@@ -15,14 +15,14 @@ from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing import front as front_module
 from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.front import FrontPolisher, polish_front
+from hybrid_opt.polishing.point import PolishSolver, Solution, SolveTask
 from hybrid_opt.polishing.records import (
     PolishedFront,
     PolishOutcome,
-    PolishSettings,
     outcome_from_json,
     outcome_to_json,
 )
-from hybrid_opt.polishing.solver import PolishSolver, Solution, SolveTask
+from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.file import load

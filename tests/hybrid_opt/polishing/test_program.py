@@ -1,157 +1,170 @@
-"""IPOPT on small programs with known answers, and the residuals of what it returns."""
+"""The assembled program: values against the full model, all derivatives against differences."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 
-from hybrid_opt.polishing.program import FEASIBLE, PATIENCE, Program, ipopt, residuals, run
-from hybrid_opt.polishing.records import PolishSettings
-from symbolic.smooth.problem import SmoothProblem
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.polishing.functions import polish_functions
+from hybrid_opt.polishing.grid import Grid
+from hybrid_opt.polishing.layout import ForceRow, PlaceRow, PressureRow, Row
+from hybrid_opt.polishing.placed_carry import CarryReader
+from hybrid_opt.polishing.program import SmoothCell, SmoothProgram
+from hybrid_opt.polishing.targets import Target
+from symbolic.array import Array
+from symbolic.smooth.clearance import Clearance
+from symbolic.smooth.joint_limit import JointLimit
+from symbolic.smooth.passage import Passing, Separation
+from symbolic.smooth.place import PlaceConstraint
+from symbolic.smooth.reach import Reach
+from symbolic.workcell.file import load
+from tests.symbolic.workcell.samples import RACK
 
+TRANSFER = RACK.with_name("transfer.toml")
 
-def problem_of(objective: ca.SX, g: ca.SX, z: ca.SX, p: ca.SX) -> SmoothProblem:
-    """A problem without physics, its functions written out by CasADi."""
-    lam_f, lam_g = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", g.shape[0])
-    lagrangian = lam_f * objective + ca.dot(lam_g, g)
-    names = ["x", "p"]
-    return SmoothProblem(
-        nlp=ca.Function("nlp", [z, p], [objective, g], names, ["f", "g"]),
-        grad_f=ca.Function(
-            "nlp_grad_f",
-            [z, p],
-            [objective, ca.densify(ca.gradient(objective, z))],
-            names,
-            ["f", "grad_f_x"],
-        ),
-        jac_g=ca.Function("nlp_jac_g", [z, p], [g, ca.jacobian(g, z)], names, ["g", "jac_g_x"]),
-        hess_lag=ca.Function(
-            "nlp_hess_l",
-            [z, p, lam_f, lam_g],
-            [ca.triu(ca.hessian(lagrangian, z)[0])],
-            [*names, "lam_f", "lam_g"],
-            ["triu_hess_gamma_x_x"],
-        ),
-        force_rows=(),
-        pressure_rows=(),
-        place_rows=(),
-        row_scale=np.ones(0),
-        n_places=0,
-        scale=np.ones(2),
-        centre=np.zeros(2),
-    )
-
-
-def corner() -> tuple[SmoothProblem, Program]:
-    """Minimise (z_0 - 2)^2 + (z_1 - 2)^2 with z_0 + z_1 <= p and z_0 <= 0.5: (0.5, 0.5), p = 1."""
-    z, p = ca.SX.sym("z", 2), ca.SX.sym("p")
-    problem = problem_of(ca.sumsqr(z - 2.0), z[0] + z[1], z, p)
-    return problem, Program(
-        start=np.zeros(2),
-        parameters=np.array([1.0]),
-        low=np.array([-5.0, -5.0]),
-        high=np.array([0.5, 5.0]),
-        below=np.array([-np.inf]),
-        above=np.array([1.0]),
-    )
-
-
-def test_a_corner_is_found_and_its_residuals_vanish() -> None:
-    problem, program = corner()
-    tighter = replace(program, high=np.array([0.3, 5.0]))
-    answer = run(problem, ipopt(problem, PolishSettings()), tighter)
-    assert answer.converged
-    assert answer.usable
-    np.testing.assert_allclose(answer.x, [0.3, 0.7], atol=1e-5)
-    assert answer.residuals.stationarity < 1e-5
-    assert answer.residuals.feasibility < 1e-6
-    assert answer.residuals.complementarity < 1e-4
-
-
-@pytest.mark.parametrize(
-    ("z", "lam_x", "lam_g", "expected"),
-    [
-        # gradient (-3, -3) + multipliers: nothing left; everything on its bound
-        ([0.5, 0.5], [0.0, 0.0], [3.0], (0.0, 0.0, 0.0)),
-        # without multipliers the gradient is left over
-        ([0.5, 0.5], [0.0, 0.0], [0.0], (3.0, 0.0, 0.0)),
-        # violations of the constraint by 0.2 and of the bound by 0.1
-        ([0.6, 0.6], [0.0, 0.0], [2.8], (0.0, 0.2, 0.56)),
-        # a multiplier of a bound that is 5 away
-        ([0.0, 0.0], [0.0, -1.0], [4.0], (1.0, 0.0, 5.0)),
-    ],
+TARGET = Target(
+    anchor=np.array([0.42, 0.43]),
+    span=np.array([0.01, 0.02]),
+    direction=np.array([1.0, 0.7]),
+    offset=np.array([0.0, 0.1]),
+    cost=np.array([1.0, 1e-4, 2e-4]),
 )
-def test_residuals_by_hand(
-    z: list[float], lam_x: list[float], lam_g: list[float], expected: tuple[float, float, float]
-) -> None:
-    problem, program = corner()
-    found = residuals(problem, program, np.array(z), np.array(lam_x), np.array(lam_g))
-    values = (found.stationarity, found.feasibility, found.complementarity)
-    np.testing.assert_allclose(values, expected, atol=1e-12)
 
 
-def test_nan_in_a_derivative_is_told() -> None:
-    z, p = ca.SX.sym("z", 2), ca.SX.sym("p")
-    # At the start, (0, 0), the slope is zero over zero.
-    objective = ca.sqrt(z[0] * z[1])
-    problem = problem_of(objective, z[0] + z[1], z, p)
-    _, program = corner()
-    answer = run(problem, ipopt(problem, PolishSettings()), program)
-    assert not answer.converged
-    assert answer.message == "Invalid_Number_Detected"
-    assert np.isnan(answer.residuals.stationarity)
+@cache
+def evaluator(path: Path) -> CandidateEvaluator:
+    return CandidateEvaluator(load(path))
 
 
-def test_an_unbounded_program_diverges_without_harm() -> None:
-    z, p = ca.SX.sym("z", 2), ca.SX.sym("p")
-    problem = problem_of(-(z[0] ** 3), z[1] - z[0], z, p)
-    wide = Program(
-        start=np.ones(2),
-        parameters=np.array([0.0]),
-        low=np.full(2, -np.inf),
-        high=np.full(2, np.inf),
-        below=np.array([-np.inf]),
-        above=np.array([0.0]),
+@cache
+def made(path: Path) -> tuple[SmoothProgram, Array]:
+    """A program with rows of every kind around the hand-made trajectory, and a point near it."""
+    judge = evaluator(path)
+    task, grid = judge.workcell.task, Grid(judge.workcell.task)
+    cell = SmoothCell(judge.workcell, polish_functions(judge.workcell), grid)
+    x = task.initial.ravel()
+    carry = CarryReader(judge, grid).read(x)
+    box, *_ = sorted(cell.functions.rows.separable)
+    arms = [k for k in range(carry.clearance.shape[1]) if k not in cell.functions.rows.separable]
+    rows: list[Row] = [
+        ForceRow(robot, branch, sample)
+        for sample in range(0, task.samples, 7)
+        for robot in (0, 1)
+        for branch in (0, 3)
+    ]
+    rows += [
+        PressureRow(1, 0),
+        PressureRow(0, 40),
+        PressureRow(1, 40),
+        PressureRow(0, task.samples - 1),
+    ]
+    kinds: list[PlaceConstraint] = [
+        Clearance(pair) for pair in (arms[0], arms[len(arms) // 2], arms[-1])
+    ]
+    kinds += [Separation(box, 3), Passing(box, 5, 0), Reach(0), Reach(1)]
+    kinds += [JointLimit(0, 2, "lower"), JointLimit(1, 4, "upper")]
+    rows += [PlaceRow(kind, place) for kind in kinds for place in (44, 120, 222)]
+    program = SmoothProgram(cell, dict.fromkeys(rows, 0.01), TARGET, carry, x, 1.0)
+    z = program.start.copy()
+    z[program.layout.decision] += np.random.default_rng(0).uniform(-0.05, 0.05, task.n_var)
+    return program, z
+
+
+@pytest.mark.parametrize("path", [RACK, TRANSFER], ids=["rack", "transfer"])
+def test_jacobian_is_that_of_the_constraints(path: Path) -> None:
+    program, z = made(path)
+    step = 1e-6
+    columns = [
+        (program.constraints(z + step * d)[0] - program.constraints(z - step * d)[0]) / (2 * step)
+        for d in np.eye(len(z))
+    ]
+    exact = program.constraints(z)[1]
+    np.testing.assert_allclose(np.array(columns).T, exact, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("path", [RACK, TRANSFER], ids=["rack", "transfer"])
+def test_curvature_is_that_of_the_constraints(path: Path) -> None:
+    program, z = made(path)
+    multipliers = np.random.default_rng(1).normal(size=program.layout.n_rows)
+
+    def slope(at: Array) -> Array:
+        return program.constraints(at)[1].T @ multipliers
+
+    step = 1e-6
+    rows = [(slope(z + step * d) - slope(z - step * d)) / (2 * step) for d in np.eye(len(z))]
+    np.testing.assert_allclose(
+        np.array(rows), program.curvature(z, multipliers), rtol=1e-4, atol=1e-3
     )
-    answer = run(problem, ipopt(problem, PolishSettings(max_iterations=30)), wide)
-    assert not answer.converged
-    assert answer.message != "Solve_Succeeded"
-    assert isinstance(answer.x, np.ndarray)
 
 
-def test_an_infeasible_program_says_so() -> None:
-    z, p = ca.SX.sym("z", 2), ca.SX.sym("p")
-    problem = problem_of(ca.sumsqr(z), z[0] ** 2 + 1.0, z, p)
-    _, program = corner()
-    impossible = replace(program, start=program.start + 0.3, above=np.array([0.0]))
-    answer = run(problem, ipopt(problem, PolishSettings(max_iterations=200)), impossible)
-    assert not answer.converged
-    assert answer.residuals.feasibility > 0.5
+@pytest.mark.parametrize("path", [RACK, TRANSFER], ids=["rack", "transfer"])
+def test_rows_of_samples_are_what_the_evaluator_finds(path: Path) -> None:
+    program, z = made(path)
+    cell, layout = evaluator(path).workcell, program.layout
+    found = {k: v[0] for k, v in evaluator(path).outputs(program.candidate(z)[None]).items()}
+    values = program.constraints(z)[0]
+
+    leave = [
+        1.0
+        - (found["pressure_shift"][row.sample, row.robot] / cell.contacts[row.robot].patch_radius)
+        ** 2
+        for row in layout.pressure_rows
+    ]
+    np.testing.assert_allclose(values[layout.patches], leave, rtol=1e-9)
+
+    # The ruling branch is the evaluator's force; the others lie below it.
+    highest: dict[tuple[int, int], float] = {}
+    for row, value in zip(layout.force_rows, values[layout.forces].tolist(), strict=True):
+        key = (row.robot, row.sample)
+        scaled = (value + z[layout.peaks][row.robot]) * TARGET.span[row.robot]
+        highest[key] = max(highest.get(key, -np.inf), scaled + TARGET.anchor[row.robot])
+    forces = [
+        found["normal_force"][sample, robot] / cell.task.reference_force[robot]
+        for robot, sample in highest
+    ]
+    np.testing.assert_allclose(list(highest.values()), forces, rtol=1e-9)
 
 
-def curved() -> tuple[SmoothProblem, Program]:
-    """From outside onto a thin ring, which steps along its tangent violate again and again."""
-    z, p = ca.SX.sym("z", 2), ca.SX.sym("p")
-    problem = problem_of(-z[0] - z[1] ** 3, 100.0 * (ca.sumsqr(z) - 1.0), z, p)
-    return problem, Program(
-        start=np.array([0.1, 2.0]),
-        parameters=np.array([0.0]),
-        low=np.full(2, -5.0),
-        high=np.full(2, 5.0),
-        below=np.array([-1e-3]),
-        above=np.array([1e-3]),
+def test_rows_at_places_are_in_the_order_of_the_layout() -> None:
+    program, z = made(RACK)
+    layout = program.layout
+    values = program.constraints(z)[0][layout.places]
+    box = next(
+        row.constraint.pair for row in layout.place_rows if isinstance(row.constraint, Separation)
     )
+    grid = Grid(evaluator(RACK).workcell.task)
+    carry = CarryReader(evaluator(RACK), grid).read(program.candidate(z))
+    checked = 0
+    for row, value in zip(layout.place_rows, values.tolist(), strict=True):
+        kind = row.constraint
+        if isinstance(kind, JointLimit):
+            robot = evaluator(RACK).workcell.robots[kind.arm]
+            q = carry.q[kind.arm][row.place, kind.joint]
+            limit = robot.position_lower if kind.side == "lower" else robot.position_upper
+            expected = abs(q - limit[kind.joint])
+        elif isinstance(kind, Reach):
+            expected = carry.manipulability[row.place, kind.arm] ** 2 - 1.0
+            if row.place % grid.per_sample:
+                continue
+        elif isinstance(kind, Clearance):
+            assert value * kind.scale <= carry.clearance[row.place, kind.pair] + 1e-9
+            continue
+        else:
+            assert value * kind.scale <= carry.clearance[row.place, box] + 0.01
+            continue
+        assert value * kind.scale == pytest.approx(expected, rel=1e-6)
+        checked += 1
+    assert checked >= 6
 
 
-def test_a_solve_is_not_cut_off_where_it_violates_something() -> None:
-    problem, program = curved()
-    cut = run(problem, ipopt(problem, PolishSettings(max_iterations=1)), program)
-    assert cut.residuals.feasibility > FEASIBLE
-    assert cut.iterations == PATIENCE
-    patient = run(problem, ipopt(problem, PolishSettings(max_iterations=2)), program)
-    assert patient.message == "User_Requested_Stop"
-    assert 2 < patient.iterations < PATIENCE * 2
-    assert patient.residuals.feasibility <= FEASIBLE
+def test_the_box_of_trust_bounds_the_decision_vector() -> None:
+    program, _ = made(RACK)
+    task = evaluator(RACK).workcell.task
+    for z in (program.low, program.high):
+        x = program.candidate(z)
+        assert np.all(x >= task.lower - 1e-12)
+        assert np.all(x <= task.upper + 1e-12)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.polishing.records import PolishSettings
+from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.targets import (
     CLOSED_SIDE,
     balance,
@@ -18,7 +18,6 @@ from hybrid_opt.polishing.targets import (
     pascoletti_serafini,
 )
 from symbolic.errors import SettingsError
-from symbolic.smooth.problem import N_TARGET
 
 ANCHOR, SPAN = np.array([0.42, 0.43]), np.array([0.01, 0.02])
 shifts = st.tuples(*[st.floats(-0.02, 0.02)] * 2).map(np.array)
@@ -71,10 +70,6 @@ def test_a_normal_reaches_both_ends_of_its_chord_alike() -> None:
     normal = np.array([0.6, 0.8])
     target = pascoletti_serafini(ANCHOR, SPAN, normal)
     assert needed_level(target, -0.5 * normal) == pytest.approx(-0.5)
-
-
-def test_parameters_have_their_length() -> None:
-    assert pascoletti_serafini(ANCHOR, SPAN).vector().shape == (N_TARGET,)
 
 
 @pytest.mark.parametrize(

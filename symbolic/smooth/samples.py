@@ -1,4 +1,4 @@
-"""The payload's part of the smooth problem: what samples ask, with exact derivatives.
+"""What the smooth problem asks at samples: forces and pressure, with exact derivatives.
 
 All normal forces are the largest of functions that are linear in the normal component F_n and
 the tangential magnitude F_t of the required force (`contact_forces.normal_force_branches`), so
@@ -13,7 +13,6 @@ differences, have one function per end. Any other time law is differentiated as 
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import casadi as ca
@@ -21,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.physics.contact_forces import split_force
+from symbolic.physics.contact_forces import normal_force_branches, split_force
 from symbolic.physics.path import PathBasis, sample_basis, waypoint_matrix
 from symbolic.physics.payload_load import LOAD_OUTPUTS, paper_load_function, resultant_force
 from symbolic.physics.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.physics.time_law import timed_path
+from symbolic.smooth.keys import Block, Quantity, SampleKey
 from symbolic.workcell.records import Task, Workcell
 
 WINDOW = 5
@@ -37,81 +37,68 @@ class SampleBlock:
     """Samples that share one function.
 
     Attributes:
-        name: part of its functions' names, see `force_functions`.
+        block: which function serves them.
         samples: (calls, k) the k samples that each call serves.
         basis: (calls, width, n_waypoints) basis rows of each call's window.
     """
 
-    name: str
+    block: Block
     samples: NDArray[np.int64]
     basis: Array
 
 
-def sample_blocks(task: Task, wanted: Collection[int] | None = None) -> tuple[SampleBlock, ...]:
-    """How the task's samples are divided among functions.
-
-    Args:
-        wanted: samples without which a call is left out; None for all.
-    """
+def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
+    """How the task's samples are divided among functions."""
     n, position = task.samples, sample_basis(task).position
     if task.time_law != "constant":
-        every = [SampleBlock("path", np.arange(n)[None, :], position[None])]
-    else:
-        inner = np.arange(2, n - 2)
-        windows = np.array([position[k - 2 : k + 3] for k in inner])
-        every = [
-            SampleBlock("inner", inner[:, None], windows),
-            SampleBlock("first", np.array([[0, 1]]), position[None, :WINDOW]),
-            SampleBlock("last", np.array([[n - 2, n - 1]]), position[None, -WINDOW:]),
-        ]
-    if wanted is None:
-        return tuple(every)
-    chosen = [np.isin(block.samples, list(wanted)).any(axis=1) for block in every]
-    return tuple(
-        SampleBlock(block.name, block.samples[calls], block.basis[calls])
-        for block, calls in zip(every, chosen, strict=True)
-        if calls.any()
+        return (SampleBlock("path", np.arange(n)[None, :], position[None]),)
+    inner = np.arange(2, n - 2)
+    windows = np.array([position[k - 2 : k + 3] for k in inner]).reshape(
+        -1, WINDOW, position.shape[1]
+    )
+    return (
+        SampleBlock("inner", inner[:, None], windows),
+        SampleBlock("first", np.array([[0, 1]]), position[None, :WINDOW]),
+        SampleBlock("last", np.array([[n - 2, n - 1]]), position[None, -WINDOW:]),
     )
 
 
-def force_functions(workcell: Workcell) -> dict[str, ca.Function]:
-    """Values and derivatives of F_n and F_t [N] of every block of `sample_blocks`, by name.
+def branch_coefficients(workcell: Workcell) -> Array:
+    """(2, 5, 2): per robot and branch the coefficients of F_n and F_t in the normal force."""
+    f_n, f_t = ca.SX.sym("f_n"), ca.SX.sym("f_t")
+    friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
+    second = normal_force_branches(f_n, f_t, friction)
+    split = ca.vertcat(f_n, f_t)
+    return np.array([ca.DM(ca.jacobian(second + own * f_n, split)).full() for own in (1.0, 0.0)])
 
-    For a block that serves k samples, with x (n_var,) and basis (width, n_waypoints) of the
+
+def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[SampleKey, ca.Function]:
+    """Two values of each sample and their derivatives, for every block of `sample_blocks`.
+
+    For a block that serves k samples, with x (n_var,) and basis (n_waypoints, width) of the
     window, the last without effect where the block is the whole path:
 
-    force_NAME_value: x, basis -> (2 k,) = F_n, F_t of the first sample, of the second, ...
-    force_NAME_gradient: x, basis -> (n_var, 2 k), one column for each entry of the value.
-    force_NAME_hessian: x, basis, weight (2 k,) -> (n_var, n_var) of weight . value.
+    first: x, basis -> values (2 k,), both of the first sample, both of the second, ..., and
+        gradient (n_var, 2 k), one column for each value.
+    second: x, basis, weight (2 k,) -> hessian (n_var, n_var) of weight . values.
     """
-    return _sample_functions(workcell, "force", _split_function(workcell))
-
-
-def pressure_functions(workcell: Workcell) -> dict[str, ca.Function]:
-    """Values and derivatives of what the shifts of the centres of pressure leave of the patches.
-
-    As `force_functions`, with names that begin with `pressure` and 1 - (shift / patch radius)^2 of
-    contacts 1 and 2 in place of F_n and F_t.
-    """
-    return _sample_functions(workcell, "pressure", _margin_function(workcell))
-
-
-def _sample_functions(
-    workcell: Workcell, quantity: str, sample: ca.Function
-) -> dict[str, ca.Function]:
-    """The functions of all blocks for a function of pose, rate and second_rate of one sample."""
+    sample = _split_function(workcell) if quantity == "force" else _margin_function(workcell)
     if workcell.task.time_law != "constant":
         return _whole_path(workcell, quantity, sample)
-    columns = {"inner": (2,), "first": (0, 1), "last": (3, 4)}
-    functions: dict[str, ca.Function] = {}
-    for name, chosen in columns.items():
-        functions |= _window_functions(workcell, sample, chosen, f"{quantity}_{name}")
+    columns: dict[Block, tuple[int, ...]] = {"inner": (2,), "first": (0, 1), "last": (3, 4)}
+    functions: dict[SampleKey, ca.Function] = {}
+    for block, chosen in columns.items():
+        functions |= _window_functions(workcell, sample, chosen, quantity, block)
     return functions
 
 
 def _window_functions(
-    workcell: Workcell, sample: ca.Function, columns: tuple[int, ...], name: str
-) -> dict[str, ca.Function]:
+    workcell: Workcell,
+    sample: ca.Function,
+    columns: tuple[int, ...],
+    quantity: Quantity,
+    block: Block,
+) -> dict[SampleKey, ca.Function]:
     task = workcell.task
     n_waypoints = len(task.waypoints)
     x, basis = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", n_waypoints, WINDOW)
@@ -122,15 +109,17 @@ def _window_functions(
     values = _values(workcell, sample, own, window, columns)
     flat = ca.Function("values", [x, basis], [values]).expand()
     inputs = [ca.SX.sym("x", task.n_var), ca.SX.sym("basis", n_waypoints, WINDOW)]
-    return _derivatives(flat(*inputs), inputs, name)
+    return _derivatives(flat(*inputs), inputs, quantity, block)
 
 
-def _whole_path(workcell: Workcell, quantity: str, sample: ca.Function) -> dict[str, ca.Function]:
+def _whole_path(
+    workcell: Workcell, quantity: Quantity, sample: ca.Function
+) -> dict[SampleKey, ca.Function]:
     task = workcell.task
     x, unused = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", len(task.waypoints), task.samples)
     every = tuple(range(task.samples))
     values = _values(workcell, sample, sample_basis(task), waypoint_matrix(task, x), every)
-    return _derivatives(values, [x, unused], f"{quantity}_path")
+    return _derivatives(values, [x, unused], quantity, "path")
 
 
 def _values(
@@ -175,19 +164,21 @@ def _split_function(workcell: Workcell) -> ca.Function:
 
 
 def _derivatives(
-    values: ca.SX | ca.MX, inputs: list[ca.SX | ca.MX], name: str
-) -> dict[str, ca.Function]:
-    x, basis = inputs
+    values: ca.SX | ca.MX, inputs: list[ca.SX | ca.MX], quantity: Quantity, block: Block
+) -> dict[SampleKey, ca.Function]:
+    x = inputs[0]
     weight = type(x).sym("weight", values.shape[0])
     hessian, _ = ca.hessian(ca.dot(weight, values), x)
-    outputs = {
-        "value": ([x, basis], ["x", "basis"], [values], ["values"]),
-        "gradient": ([x, basis], ["x", "basis"], [ca.jacobian(values, x).T], ["gradient"]),
-        "hessian": ([x, basis, weight], ["x", "basis", "weight"], [hessian], ["hessian"]),
-    }
+    first, second = (SampleKey(quantity, block, order) for order in ("first", "second"))
+    names = ["x", "basis"]
+    results = ca.cse([ca.densify(r) for r in (values, ca.jacobian(values, x).T)])
     return {
-        f"{name}_{kind}": ca.Function(
-            f"{name}_{kind}", given, ca.cse([ca.densify(r) for r in results]), names_in, names_out
-        )
-        for kind, (given, names_in, results, names_out) in outputs.items()
+        first: ca.Function(first.name, inputs, results, names, ["values", "gradient"]),
+        second: ca.Function(
+            second.name,
+            [*inputs, weight],
+            ca.cse([ca.densify(hessian)]),
+            [*names, "weight"],
+            ["hessian"],
+        ),
     }

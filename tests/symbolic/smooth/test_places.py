@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,7 +15,13 @@ from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.geometry.clearance import screening_functions
 from symbolic.physics.rotation import rotation_matrix
 from symbolic.robot.arm import flange_target, manipulability, pose_error
-from symbolic.smooth.rows import RowFunctions, RowKind, solve_function
+from symbolic.smooth.clearance import Clearance
+from symbolic.smooth.closure import closure_functions
+from symbolic.smooth.joint_limit import JointLimit
+from symbolic.smooth.keys import ClosureKey
+from symbolic.smooth.passage import DIRECTIONS, Passing, Separation, gap_function
+from symbolic.smooth.place import Place, PlaceConstraint, row_function
+from symbolic.smooth.reach import Reach
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
@@ -28,8 +35,18 @@ def model() -> CellModel:
 
 
 @cache
-def rows() -> RowFunctions:
-    return RowFunctions(model())
+def place() -> Place:
+    return Place(model())
+
+
+def value_of(constraint: PlaceConstraint, *at: Array) -> float:
+    """A row's value at pose, rate and joints."""
+    numbers = [constraint.numbers(place())] if constraint.count(place()) else []
+    return float(row_function(place(), constraint, "first")(*at, *numbers)[0])
+
+
+def gaps_at(index: int, pose: Array) -> Array:
+    return np.array(gap_function(place())(pose, place().obstacle(index))).ravel()
 
 
 def pose_near_start(seed: int) -> Array:
@@ -39,10 +56,13 @@ def pose_near_start(seed: int) -> Array:
     return np.asarray(start + away + spread * np.random.default_rng(seed).uniform(-1, 1, 6))
 
 
+@cache
+def closure(arm: int) -> ca.Function:
+    return closure_functions(model(), arm)[ClosureKey(arm, "first")]
+
+
 def joints_at(pose: Array) -> tuple[Array, Array]:
-    first, second = (
-        np.array(solve_function(model(), arm)(pose, model().start[arm])).ravel() for arm in (0, 1)
-    )
+    first, second = (np.array(closure(arm)(pose, model().start[arm])[0]).ravel() for arm in (0, 1))
     return first, second
 
 
@@ -67,7 +87,7 @@ def test_a_smooth_clearance_never_exceeds_the_sharp_bound() -> None:
         q = joints_at(pose)
         bounds = np.array(sharp(pose, *q)).ravel()
         for index in range(0, len(bounds), 7):
-            smooth = float(rows().value(RowKind("clearance", index))(pose, STILL, *q))
+            smooth = value_of(Clearance(index), pose, STILL, *q)
             assert smooth <= bounds[index] + 1e-12
             assert smooth >= bounds[index] - 0.1
 
@@ -76,33 +96,31 @@ def test_the_largest_separation_is_the_sharp_bound() -> None:
     placements = (model().robots[0].joint_placements, model().robots[1].joint_placements)
     sharp = screening_functions(model().geometry, placements)["clearance"]
     names = model().geometry.pair_names
-    assert {"top board", "pallet in front"} <= {names[index][1] for index in rows().separable()}
+    assert {"top board", "pallet in front"} <= {names[index][1] for index in place().separable()}
     for seed in range(3):
         pose = pose_near_start(seed)
         bounds = np.array(sharp(pose, *joints_at(pose))).ravel()
-        for index in rows().separable():
-            gaps = np.array(rows().separations(index)(pose)).ravel()
+        for index in place().separable():
+            gaps = gaps_at(index, pose)
             assert gaps.max() == pytest.approx(bounds[index], abs=2e-4)
-            for direction in (0, len(gaps) - 1):
-                kind = RowKind("separation", index, direction=direction)
-                value = float(rows().value(kind)(pose, STILL, STILL, STILL))
+            assert len(gaps) == DIRECTIONS
+            for direction in (0, DIRECTIONS - 1):
+                value = value_of(Separation(index, direction), pose, STILL, STILL, STILL)
                 assert value == pytest.approx(gaps[direction], abs=1e-15)
 
 
 def test_a_passing_row_is_the_height_at_which_the_gaps_meet() -> None:
-    index = next(k for k in rows().separable() if model().geometry.pair_names[k][1] == "top board")
+    index = next(k for k in place().separable() if model().geometry.pair_names[k][1] == "top board")
     pose = np.array([-0.34, 0.01, 0.86, 0.01, 0.05, 0.02])
     rate = np.array([-2e-3, 1e-4, 2e-3, 1e-4, -2e-4, 1e-4])
-    gaps = rows().separations(index)
 
     def along(steps: float) -> Array:
-        return np.array(gaps(pose + steps * rate)).ravel()
+        return gaps_at(index, pose + steps * rate)
 
     slopes = (along(1e-4) - along(-1e-4)) / 2e-4
     before, after = int(np.argmin(slopes)), int(np.argmax(slopes))
     meeting = (along(0.0)[before] - along(0.0)[after]) / (slopes[after] - slopes[before])
-    kind = RowKind("passing", index, direction=before, after=after)
-    height = float(rows().value(kind)(pose, rate, STILL, STILL))
+    height = value_of(Passing(index, before, after), pose, rate, STILL, STILL)
     assert height == pytest.approx(along(0.0)[before] + meeting * slopes[before], abs=1e-7)
 
 
@@ -112,23 +130,23 @@ def test_joint_rows_are_their_definitions(arm: int) -> None:
     q = joints_at(pose)
     robot = model().workcell.robots[arm]
     for joint in range(6):
-        lower = float(rows().value(RowKind("lower", joint, arm))(pose, STILL, *q))
-        upper = float(rows().value(RowKind("upper", joint, arm))(pose, STILL, *q))
+        lower = value_of(JointLimit(arm, joint, "lower"), pose, STILL, *q)
+        upper = value_of(JointLimit(arm, joint, "upper"), pose, STILL, *q)
         assert lower == pytest.approx(q[arm][joint] - robot.position_lower[joint])
         assert upper == pytest.approx(robot.position_upper[joint] - q[arm][joint])
     jacobian = np.array(model().robots[arm].jacobian(q[arm]))
     share = abs(np.linalg.det(jacobian)) / robot.min_manipulability
-    value = float(rows().value(RowKind("singularity", -1, arm))(pose, STILL, *q))
+    value = value_of(Reach(arm), pose, STILL, *q)
     assert value == pytest.approx(share**2 - 1.0, rel=1e-9)
     assert float(manipulability(jacobian)) == pytest.approx(abs(np.linalg.det(jacobian)))
 
 
-def test_compiled_functions_take_the_place_of_their_names() -> None:
-    frequent = rows().frequent()
-    replaced = RowFunctions(model(), frequent)
-    kind = RowKind("singularity", -1, 0)
-    assert replaced.hessian(kind) is frequent["hessian_singularity_0_1"]
-    assert all(name == function.name() for name, function in frequent.items())
+def test_members_of_a_family_share_their_functions() -> None:
+    a, b = (row_function(place(), JointLimit(0, k, "upper"), "first") for k in (1, 4))
+    assert a.name() == b.name()
+    assert a.n_instructions() == b.n_instructions()
+    first, second = (row_function(place(), Reach(arm), "first") for arm in (0, 1))
+    assert first.name() != second.name()
 
 
 def test_rows_know_their_arms() -> None:
@@ -142,4 +160,4 @@ def test_rows_know_their_arms() -> None:
                 for name in pair
             )
         )
-        assert rows().arms(RowKind("clearance", index)) == expected
+        assert Clearance(index).arms(model()) == expected

@@ -11,8 +11,8 @@ import pytest
 
 from symbolic.array import Array
 from symbolic.functions.candidate import candidate_function
-from symbolic.smooth.forces import force_functions, pressure_functions, sample_blocks
-from symbolic.smooth.problem import branch_coefficients
+from symbolic.smooth.keys import Quantity, SampleKey
+from symbolic.smooth.samples import branch_coefficients, sample_blocks, sample_functions
 from symbolic.workcell.records import TimeLaw, Workcell
 from tests.symbolic.cells import hand_cell, hand_model
 
@@ -26,13 +26,13 @@ def random_x(cell: Workcell, seed: int) -> Array:
     return np.random.default_rng(seed).uniform(cell.task.lower, cell.task.upper)
 
 
-def split_of(cell: Workcell, functions: Mapping[str, ca.Function], x: Array) -> Array:
+def split_of(cell: Workcell, functions: Mapping[SampleKey, ca.Function], x: Array) -> Array:
     """(samples, 2) from the blocks, put in the samples' order."""
     split = np.full((cell.task.samples, 2), np.nan)
     for block in sample_blocks(cell.task):
-        value = functions[f"force_{block.name}_value"]
+        values = functions[SampleKey("force", block.block, "first")]
         for samples, basis in zip(block.samples, block.basis, strict=True):
-            split[samples] = np.array(value(x, basis.T)).reshape(-1, 2)
+            split[samples] = np.array(values(x, basis.T)[0]).reshape(-1, 2)
     return split
 
 
@@ -41,7 +41,7 @@ def split_of(cell: Workcell, functions: Mapping[str, ca.Function], x: Array) -> 
 def test_the_largest_branch_is_the_evaluators_normal_force(time_law: TimeLaw, samples: int) -> None:
     cell = cell_with(time_law, samples)
     evaluate = candidate_function(hand_model(cell))
-    coefficients, functions = branch_coefficients(cell), force_functions(cell)
+    coefficients, functions = branch_coefficients(cell), sample_functions(cell, "force")
     for seed in range(5):
         x = random_x(cell, seed)
         outputs = dict(zip(evaluate.name_out(), evaluate(x), strict=True))
@@ -52,30 +52,27 @@ def test_the_largest_branch_is_the_evaluators_normal_force(time_law: TimeLaw, sa
 
 @pytest.mark.parametrize("quantity", ["force", "pressure"])
 @pytest.mark.parametrize("time_law", ["constant", "ramped"])
-def test_derivatives_are_those_of_the_values(time_law: TimeLaw, quantity: str) -> None:
+def test_derivatives_are_those_of_the_values(time_law: TimeLaw, quantity: Quantity) -> None:
     cell = cell_with(time_law)
-    functions = {**force_functions(cell), **pressure_functions(cell)}
+    functions = sample_functions(cell, quantity)
     rng = np.random.default_rng(3)
     step = 1e-6
     for block in sample_blocks(cell.task):
-        value, gradient, hessian = (
-            functions[f"{quantity}_{block.name}_{kind}"]
-            for kind in ("value", "gradient", "hessian")
+        first, second = (
+            functions[SampleKey(quantity, block.block, order)] for order in ("first", "second")
         )
         x, basis = random_x(cell, 1), block.basis[len(block.basis) // 2].T
-        weight = rng.normal(size=value.size1_out(0))
+        weight = rng.normal(size=first.size1_out(0))
         slopes, curvature = [], []
         for direction in np.eye(cell.task.n_var):
-            ahead, behind = x + step * direction, x - step * direction
-            slopes.append((np.array(value(ahead, basis)) - np.array(value(behind, basis)))[:, 0])
-            curvature.append(
-                (np.array(gradient(ahead, basis)) - np.array(gradient(behind, basis))) @ weight
-            )
-        exact = np.array(gradient(x, basis))
+            ahead, behind = (first(x + sign * step * direction, basis) for sign in (1.0, -1.0))
+            slopes.append((np.array(ahead[0]) - np.array(behind[0]))[:, 0])
+            curvature.append((np.array(ahead[1]) - np.array(behind[1])) @ weight)
+        exact = np.array(first(x, basis)[1])
         np.testing.assert_allclose(np.array(slopes) / (2 * step), exact, rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(
             np.array(curvature) / (2 * step),
-            np.array(hessian(x, basis, weight)),
+            np.array(second(x, basis, weight)),
             rtol=1e-5,
             atol=1e-3,
         )

@@ -1,0 +1,1 @@
+"""What each kind of constraint calls near, requires and finds violated: one file per kind."""

@@ -1,0 +1,78 @@
+"""Normal forces below their peaks: which branches have rows at which samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from hybrid_opt.polishing.constraints.kind import Kind, Surroundings
+from hybrid_opt.polishing.layout import ForceRow
+from hybrid_opt.polishing.placed_carry import PlacedCarry
+from hybrid_opt.polishing.targets import Target
+from symbolic.array import Array
+
+CONE_TIGHT = 0
+"""Branch of the normal force that rules unless the box is accelerated across by nearly 1 g."""
+
+
+class Forces(Kind[ForceRow]):
+    """Rows of the branch with tight cones along the whole path, of others where they nearly rule.
+
+    The required value has no meaning: a force stays below the peak, which is a variable.
+    """
+
+    lasting = True
+
+    def __init__(self, around: Surroundings) -> None:
+        super().__init__(around)
+        grid = around.cell.grid
+        last = len(grid.sample_parameter) - 1
+        # One-sided differences make the forces of the first and last samples no smooth function.
+        self._ends = {0, 1, last - 1, last}
+        self._every = set(range(0, last, grid.samples(self.near_settings.force_stride)))
+        self._ties = set(range(0, last + 1, grid.samples(self.near_settings.tie_stride)))
+
+    def near(self, carry: PlacedCarry, target: Target) -> Iterable[ForceRow]:
+        """At every few samples, at the highest and beside them, where the sample decides."""
+        samples = self._every | self._ends | self._peaks(carry)
+        for robot, limited in enumerate(target.limits):
+            for sample in samples if limited else samples & self._ties:
+                yield ForceRow(robot, CONE_TIGHT, sample)
+        yield from self._other_branches(carry)
+
+    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
+        """Other branches that rule."""
+        return self._other_branches(carry)
+
+    def higher(self, carry: PlacedCarry, target: Target) -> set[ForceRow]:
+        """Rows at the peaks of a candidate whose forces are higher than the program foresaw."""
+        return {
+            ForceRow(robot, CONE_TIGHT, sample)
+            for robot, limited in enumerate(target.limits)
+            if limited
+            for sample in self._peaks(carry)
+        }
+
+    def _values(self, carry: PlacedCarry) -> Array:
+        """(samples, 2, branches) [N]."""
+        return np.asarray(np.einsum("rbk,nk->nrb", self.around.cell.coefficients, carry.split))
+
+    def _peaks(self, carry: PlacedCarry) -> set[int]:
+        """Samples at and beside local maxima of either robot's normal force."""
+        force = self._values(carry).max(axis=2)
+        inner = force[1:-1]
+        high = (inner >= force[:-2]) & (inner >= force[2:])
+        high &= inner >= self.near_settings.peak_share * inner.max(axis=0)
+        tops = np.flatnonzero(high.any(axis=1)) + 1
+        return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
+
+    def _other_branches(self, carry: PlacedCarry) -> list[ForceRow]:
+        """Force rows of other branches than the tight cones' that rule, or nearly do."""
+        force = self._values(carry)
+        share = 1.0 - self.near_settings.branch_share
+        near = force >= share * force.max(axis=2, keepdims=True)
+        near[:, :, CONE_TIGHT] = False
+        return [
+            ForceRow(robot, branch, sample) for sample, robot, branch in np.argwhere(near).tolist()
+        ]

@@ -1,0 +1,139 @@
+"""A candidate as the polish sees it: on the task's samples, and on places between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.polishing.grid import Grid, dipped
+from symbolic.array import Array
+from symbolic.robot.arm import REACH_TOLERANCE
+from symbolic.workcell.decision import waypoints_of
+
+DIPS_BELOW = 0.1
+"""Pairs that stay farther apart than this are not looked at between places [m]."""
+
+
+@dataclass(frozen=True)
+class PlacedCarry:
+    """A candidate on m places.
+
+    Attributes:
+        pose, rate: (m, 6) box poses [m, rad], and their first derivative with respect to the
+            path parameter.
+        q: both arms' joint positions, (m, n) each [rad]; beyond `reached` without meaning.
+        reached: places before the first that an arm does not reach.
+        stranded: the arms that do not reach all places.
+        clearance: (reached, n_pairs) lower bounds of every active pair's distance [m].
+        lowered: the same with the dips that are to be expected beside each place.
+        manipulability: (reached, 2) |det J| over its least value, between samples interpolated.
+        split: (n, 2) on samples: normal component, tangential magnitude of the required force [N].
+        peak: (2,) peak normal forces over their references.
+        shift: (n, 2) on samples: shifts of the centres of pressure over their patches' radii.
+    """
+
+    pose: Array
+    rate: Array
+    q: tuple[Array, Array]
+    reached: int
+    stranded: tuple[int, ...]
+    clearance: Array
+    lowered: Array
+    manipulability: Array
+    split: Array
+    peak: Array
+    shift: Array
+    _distances: Distances = field(repr=False)
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether both arms reach all places."""
+        return self.reached == len(self.pose)
+
+    def distance(self, wanted: NDArray[np.bool_]) -> Array:
+        """(reached, n_pairs) as `lowered`, those wanted raised by what FCL's distance exceeds the
+        bound where nothing touches [m]."""
+        return self._distances.at(wanted)
+
+
+class Distances:
+    """Distances of one candidate; each is measured when it is first asked for, and kept."""
+
+    def __init__(
+        self,
+        bounds: Array,
+        dips: Array,
+        measure: Callable[[Array, NDArray[np.bool_]], object],
+    ) -> None:
+        """bounds, dips: (n, n_pairs) and what they are lower beside; measure: raises bounds."""
+        self._bounds, self._dips, self._measure = bounds.copy(), dips, measure
+        self._known = np.zeros(bounds.shape, dtype=np.bool_)
+
+    def at(self, wanted: NDArray[np.bool_]) -> Array:
+        """All of them, the wanted measured."""
+        fresh = wanted & ~self._known
+        if fresh.any():
+            self._measure(self._bounds, fresh)
+            self._known |= fresh
+        return np.asarray(self._bounds - self._dips)
+
+
+class CarryReader:
+    """Evaluates candidates of one cell on the places of a grid."""
+
+    def __init__(self, evaluator: CandidateEvaluator, grid: Grid) -> None:
+        self._evaluator, self._grid = evaluator, grid
+        self._radii = [contact.patch_radius for contact in evaluator.workcell.contacts]
+
+    def read(self, x: Array) -> PlacedCarry:
+        """Evaluate a decision vector (n_var,)."""
+        evaluator, grid = self._evaluator, self._grid
+        found = {name: value[0] for name, value in evaluator.outputs(x[None]).items()}
+        waypoints = waypoints_of(evaluator.workcell.task, x)
+        pose = np.ascontiguousarray(grid.basis @ waypoints)
+        guesses = [grid.between(found[f"q_{arm}"]) for arm in (1, 2)]
+        posture = evaluator.functions["posture"].batch(pose, *guesses)
+        followed = np.column_stack(
+            [
+                (posture[f"residual_{arm}"].reshape(-1) <= REACH_TOLERANCE)
+                & (grid.between(found[f"lost_{arm}"].reshape(-1, 1))[:, 0] == 0.0)
+                for arm in (1, 2)
+            ]
+        )
+        lost = np.flatnonzero(~followed.all(axis=1))
+        reached = int(lost[0]) if len(lost) else len(followed)
+        q_1, q_2 = posture["q_1"], posture["q_2"]
+        limits = [robot.min_manipulability for robot in evaluator.workcell.robots]
+        measure = np.column_stack(
+            [found[f"manipulability_{arm}"].reshape(-1) / limits[arm - 1] for arm in (1, 2)]
+        )
+        force = found["normal_force"]
+        held = (pose[:reached], q_1[:reached], q_2[:reached])
+        bounds = evaluator.checker.bounds(*held)
+        near = bounds.min(axis=0, initial=np.inf) < DIPS_BELOW
+        lowered = bounds.copy()
+        lowered[:, near] = dipped(bounds[:, near])
+        return PlacedCarry(
+            pose=pose,
+            rate=grid.rate_basis @ waypoints,
+            q=(q_1, q_2),
+            reached=reached,
+            stranded=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
+            clearance=bounds,
+            lowered=lowered,
+            manipulability=grid.between(measure)[:reached],
+            split=np.column_stack(
+                [force[:, 0] - force[:, 1], found["tangential_force"].sum(axis=1)]
+            ),
+            peak=force.max(axis=0) / evaluator.workcell.task.reference_force,
+            shift=found["pressure_shift"] / self._radii,
+            _distances=Distances(
+                bounds,
+                bounds - lowered,
+                lambda raised, wanted: evaluator.checker.measure(*held, raised, wanted),
+            ),
+        )

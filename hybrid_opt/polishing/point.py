@@ -1,0 +1,165 @@
+"""One point's polish, in one page.
+
+Each round gathers the rows that are near the best candidate so far, solves the smooth program in
+a box about it, and has the full model judge the step. What the step violates is learned: its rows
+are added, or asked for more strictly, and where that is nothing new, the box is halved. A step
+that violates nothing and comes closer to the target is taken, so that the answer is never worse
+than the start. A step that ends inside the box at an optimum ends the polish.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.polishing.constraints.active import ActiveSet
+from hybrid_opt.polishing.constraints.kind import Surroundings
+from hybrid_opt.polishing.functions import PolishFunctions
+from hybrid_opt.polishing.grid import Grid
+from hybrid_opt.polishing.interior import dense
+from hybrid_opt.polishing.ipopt import ipopt
+from hybrid_opt.polishing.layout import Row
+from hybrid_opt.polishing.placed_carry import CarryReader, PlacedCarry
+from hybrid_opt.polishing.program import SmoothCell, SmoothProgram
+from hybrid_opt.polishing.residuals import UNKNOWN, Residuals
+from hybrid_opt.polishing.settings import PolishSettings, TrustSettings
+from hybrid_opt.polishing.solvers import Answer
+from hybrid_opt.polishing.targets import Target, level
+from hybrid_opt.polishing.trust import TrustRegion
+from symbolic.array import Array
+
+
+@dataclass(frozen=True)
+class SolveTask:
+    """A start and a target.
+
+    Attributes:
+        x: (n_var,) feasible decision vector to start from.
+        target: what to aim at.
+        radius: of the first box of trust, in halves of the decision variables' ranges.
+    """
+
+    x: Array
+    target: Target
+    radius: float = TrustSettings().first
+
+
+@dataclass
+class Solution:
+    """What a solve has come to; not yet believed.
+
+    Attributes:
+        x: (n_var,) the best candidate, the start where nothing was gained.
+        message: the solver's status in the last round.
+        converged: whether the last step ended inside the box at an optimum, by the solver's word.
+        usable: whether the solver returned numbers in any round.
+        residuals: of the round that gave x, or of the last one where nothing was gained.
+        iterations, rounds: in total.
+        rows: constraints at places of the path in the round of the residuals.
+    """
+
+    x: Array
+    message: str = ""
+    converged: bool = False
+    usable: bool = False
+    residuals: Residuals = UNKNOWN
+    iterations: int = 0
+    rounds: int = 0
+    rows: int = 0
+
+    def add(self, answer: Answer) -> None:
+        """Count a round."""
+        self.message, self.usable = answer.message, self.usable or answer.usable
+        self.iterations += answer.iterations
+        self.rounds += 1
+
+
+@dataclass
+class _Best:
+    """The candidate that a solve has reached, and the rows that it learned of, with what each
+    has to keep."""
+
+    x: Array
+    carry: PlacedCarry
+    learned: dict[Row, float] = field(default_factory=dict)
+
+
+class PolishSolver:
+    """Solves for one evaluator's cell. A resource: one per process."""
+
+    def __init__(
+        self, evaluator: CandidateEvaluator, functions: PolishFunctions, settings: PolishSettings
+    ) -> None:
+        grid = Grid(evaluator.workcell.task)
+        self._cell = SmoothCell(evaluator.workcell, functions, grid)
+        self._settings = settings
+        self._solve = {"ipopt": ipopt, "dense": dense}[settings.solve.solver]
+        self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
+        self._reader = CarryReader(evaluator, grid)
+
+    def solve(self, task: SolveTask) -> Solution:
+        """Improve towards the task's target."""
+        x = np.clip(task.x, self._cell.task.lower, self._cell.task.upper)
+        best, region = (
+            _Best(x, self._reader.read(x)),
+            TrustRegion(self._settings.trust, task.radius),
+        )
+        solution = Solution(x)
+        while solution.rounds < self._settings.rounds and not region.is_spent:
+            required = self._required(best, task.target, lenient=solution.rounds == 0)
+            program = SmoothProgram(
+                self._cell, required, task.target, best.carry, best.x, region.radius
+            )
+            answer = self._solve(program, self._settings)
+            solution.add(answer)
+            if not answer.usable:
+                region.lost()
+                continue
+            x = program.candidate(answer.z)
+            step, carry = self._cell.unit.step(best.x, x), self._reader.read(x)
+            violated = self._active.violated(carry, best.carry, required)
+            if violated or not carry.is_followed:
+                learned = self._learn(best, carry, violated, required)
+                region.refused(learned and carry.is_followed)
+            elif level(task.target, carry.peak) >= level(task.target, best.carry.peak):
+                higher = self._active.forces.higher(carry, task.target) - required.keys()
+                best.learned.update(dict.fromkeys(higher, 0.0))
+                if not higher:
+                    region.barren(step)
+            else:
+                self._move(best, x, carry)
+                solution.x, solution.residuals = x, answer.residuals
+                solution.converged = answer.converged and not region.holds(step)
+                region.taken(step)
+                if solution.converged:
+                    break
+            if not np.isfinite(solution.residuals.stationarity):
+                solution.residuals = answer.residuals
+        return solution
+
+    def _required(self, best: _Best, target: Target, lenient: bool) -> dict[Row, float]:
+        """The rows of the next round and what each has to keep."""
+        rows = self._active.near(best.carry, target) | best.learned.keys()
+        required = self._active.required(best.carry, rows, lenient)
+        for row, value in best.learned.items():
+            required[row] = max(value, required[row])
+        return required
+
+    def _learn(
+        self, best: _Best, carry: PlacedCarry, violated: set[Row], required: dict[Row, float]
+    ) -> bool:
+        """Take in what a step violated; whether that asks for anything new."""
+        demanded = self._active.demanded(carry, best.carry, violated, required)
+        stricter = False
+        for row, value in demanded.items():
+            asked = required.get(row, -np.inf)
+            stricter |= value > asked + self._settings.stricter
+            best.learned[row] = max(value, best.learned.get(row, -np.inf))
+        return stricter
+
+    def _move(self, best: _Best, x: Array, carry: PlacedCarry) -> None:
+        """Go on from a better candidate."""
+        best.x, best.carry = x, carry
+        best.learned = {row: v for row, v in best.learned.items() if self._active.lasting(row)}

@@ -1,0 +1,88 @@
+"""Values at chosen samples, with exact derivatives, by batches over the samples."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.function import NumericFunction
+from symbolic.array import Array
+from symbolic.smooth.keys import Quantity, SampleKey
+from symbolic.smooth.samples import SampleBlock
+
+NEGLIGIBLE = 1e-7
+"""Share of the largest weight below which a call's second derivatives are left out: those of
+samples far below the peak, whose multipliers vanish. It changes steps by as much, no solution."""
+
+
+@dataclass(frozen=True)
+class _Call:
+    """One function over some of its samples: both its orders, and its windows (calls, ., .)."""
+
+    first: NumericFunction
+    second: NumericFunction
+    basis: Array
+    served: int
+
+
+class SampleValues:
+    """Two values of each of some samples, from the decision vector.
+
+    Attributes:
+        column: (n_samples,) position of a sample among the values, -1 where it has none.
+        count: of samples with values.
+    """
+
+    def __init__(
+        self,
+        quantity: Quantity,
+        blocks: tuple[SampleBlock, ...],
+        functions: Mapping[SampleKey, NumericFunction],
+        wanted: Collection[int],
+    ) -> None:
+        """wanted: samples without which a call is left out."""
+        self._calls: list[_Call] = []
+        order: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)]
+        for block in blocks:
+            chosen = np.isin(block.samples, list(wanted)).any(axis=1)
+            if not chosen.any():
+                continue
+            order.append(block.samples[chosen].ravel())
+            self._calls.append(
+                _Call(
+                    functions[SampleKey(quantity, block.block, "first")],
+                    functions[SampleKey(quantity, block.block, "second")],
+                    np.ascontiguousarray(block.basis[chosen]),
+                    block.samples.shape[1],
+                )
+            )
+        served = np.concatenate(order)
+        self.count = len(served)
+        self.column = np.full(1 + max(int(block.samples.max(initial=0)) for block in blocks), -1)
+        self.column[served] = np.arange(len(served))
+
+    def first(self, x: Array) -> tuple[Array, Array]:
+        """Values (count, 2) and their gradients (count, 2, n_var)."""
+        values, gradients = [np.empty((0, 2))], [np.empty((0, 2, len(x)))]
+        for call in self._calls:
+            found = call.first.batch(x, call.basis)
+            values.append(found["values"].reshape(-1, 2))
+            gradients.append(found["gradient"].reshape(-1, 2, len(x)))
+        return np.concatenate(values), np.concatenate(gradients)
+
+    def second(self, x: Array, weight: Array) -> Array:
+        """(n_var, n_var) second derivatives of the values weighted by (count, 2)."""
+        total, start = np.zeros((len(x), len(x))), 0
+        least = NEGLIGIBLE * np.abs(weight).max(initial=0.0)
+        for call in self._calls:
+            n = len(call.basis)
+            own = weight[start : start + n * call.served].reshape(n, -1)
+            start += n * call.served
+            matter = np.abs(own).max(axis=1) > least
+            if matter.any():
+                hessian = call.second.batch(x, call.basis[matter], own[matter])["hessian"]
+                total += hessian.sum(axis=0)
+        return total

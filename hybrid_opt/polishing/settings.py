@@ -1,0 +1,183 @@
+"""Everything that decides what a polish finds, with what was measured. docs/polish.md has how.
+
+Widths along the path are in its parameter (the whole path is 1), distances in metres, steps in
+halves of the decision variables' ranges: none of them changes its meaning with the samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from symbolic.errors import SettingsError
+
+Method = Literal["pascoletti-serafini", "epsilon"]
+SolverName = Literal["ipopt", "dense"]
+
+
+@dataclass(frozen=True)
+class NearSettings:
+    """When a constraint is near enough to enter a program at once, and where along the path.
+
+    Attributes:
+        body_distance: pairs with an arm's body nearer than this get a row at their lowest [m].
+        measured_below: bounds lower than this are compared with FCL's distance [m].
+        beside_clearance: a violated clearance also gets rows this far to either side.
+        gap_distance, gap_stride: the payload's gaps below each distance [m] get a row in every
+            such stretch: they are cheap, because they need no joints, and decide where the path
+            may go.
+        kink_distance: kinks of the payload's clearance lower than this get a row [m].
+        beside_kink: around a kink without rows of a gap: they would hold the kink in its place.
+        kink_window: around a kink, where its height is measured.
+        joint_distance: joints nearer than this to a limit get a row [rad].
+        reach_share, reach_stride: where |det J| is below this share of its median along the path,
+            every such stretch gets a row: it bounds the reach, beyond which nothing is defined.
+        lost: this far after the loss of an arm there are rows, too.
+        force_stride: distance of force rows: forces are smooth along the path.
+        tie_stride: the same for a robot whose force only breaks ties.
+        peak_share: local maxima of the force above this share of the highest get rows.
+        branch_share: branches within this share of the ruling one get rows.
+        pressure_share: shifts of the centre of pressure beyond this share of the patch do.
+        beside_pressure: this far beside the farthest shift there are rows, too.
+    """
+
+    body_distance: float = 0.03
+    measured_below: float = 0.02
+    beside_clearance: float = 0.015
+    gap_distance: tuple[float, ...] = (0.03, 0.08)
+    gap_stride: tuple[float, ...] = (0.02, 0.04)
+    kink_distance: float = 0.06
+    beside_kink: float = 0.03
+    kink_window: float = 0.04
+    joint_distance: float = 0.05
+    reach_share: float = 0.5
+    reach_stride: float = 0.08
+    lost: tuple[float, ...] = (0.04, 0.08)
+    force_stride: float = 0.02
+    tie_stride: float = 0.06
+    peak_share: float = 0.98
+    branch_share: float = 0.02
+    pressure_share: float = 0.7
+    beside_pressure: float = 0.04
+
+
+@dataclass(frozen=True)
+class TrustSettings:
+    """The box of trust: half its width, in halves of the decision variables' ranges.
+
+    Attributes:
+        first, least, largest: of the radius; below the least a point is left.
+        halved: factor after a step that violates something that was asked for already.
+        quartered: factor after a step that brought nothing, or no answer.
+        doubled: factor after two steps in a row that the box stopped.
+        inside: steps shorter than this share of the radius were not stopped by the box.
+    """
+
+    first: float = 1.0
+    least: float = 1e-3
+    largest: float = 2.0
+    halved: float = 0.5
+    quartered: float = 0.25
+    doubled: float = 2.0
+    inside: float = 0.9
+
+
+@dataclass(frozen=True)
+class SolveSettings:
+    """How one program is solved.
+
+    Attributes:
+        solver: IPOPT, or the dense interior-point method of `hybrid_opt.polishing.interior`.
+        barrier: at the start. A search's point is near the solution but has no multipliers.
+        tolerance: of the optimality conditions, in the program's scaled rows and variables.
+        feasible: violation of a scaled row at which an iterate counts as feasible.
+        patience: times the wanted number of iterations that a solve may take to become feasible:
+            cut off wherever it stands, it ends in an obstacle more often than not.
+    """
+
+    solver: SolverName = "ipopt"
+    barrier: float = 1e-3
+    tolerance: float = 1e-6
+    feasible: float = 1e-3
+    patience: int = 3
+
+
+@dataclass(frozen=True)
+class FrontSettings:
+    """What a front's attempts go to.
+
+    Attributes:
+        own_share: of the attempts that go to points of the given front.
+        turns_per_gap: turns at the ends and the middle before one at a gap: they decide
+            hypervolume and payload.
+        progress: least gain of an attempt that counts as coming further, in units of the
+            reference force.
+        middle_stalls: attempts at the balanced middle in a row that came no further, after which
+            it is left.
+        small_radius: first box of trust of an attempt that goes on where the last came no further.
+        least_gap: gaps narrower than this are left, in units of the front's extent.
+        optimal: residual of stationarity below which a point that could not be improved counts as
+            optimal.
+    """
+
+    own_share: float = 1.0 / 6.0
+    turns_per_gap: int = 3
+    progress: float = 2e-5
+    middle_stalls: int = 2
+    small_radius: float = 0.1
+    least_gap: float = 0.02
+    optimal: float = 1e-3
+
+
+@dataclass(frozen=True)
+class PolishSettings:
+    """What decides the results of a polish.
+
+    Attributes:
+        points: attempts that one front may take.
+        method: how a point is improved: along the diagonal (Pascoletti and Serafini 1984), or by
+            minimising one objective while the other is held (epsilon constraint).
+        max_iterations: of the solver in one round; see `SolveSettings.patience`.
+        rounds: of one point at most; see `hybrid_opt.polishing.point`.
+        max_seconds: wall time after which a solve is given up. Generous, because a result that
+            depends on it cannot be repeated.
+        margin: kept from every constraint but clearances, in the constraint's own scale.
+        clearance: distance kept from obstacles [m]; lets the motion between samples be certified.
+        stricter: least rise of a required value that counts as a new demand [m, rad, 1].
+        tolerance: improvement of an objective below which a point counts as optimal already.
+        near, trust, solve, front: the parts' own.
+    """
+
+    points: int = 22
+    method: Method = "pascoletti-serafini"
+    max_iterations: int = 15
+    rounds: int = 7
+    max_seconds: float = 60.0
+    margin: float = 1e-6
+    clearance: float = 8e-4
+    stricter: float = 1e-4
+    tolerance: float = 1e-6
+    near: NearSettings = field(default_factory=NearSettings)
+    trust: TrustSettings = field(default_factory=TrustSettings)
+    solve: SolveSettings = field(default_factory=SolveSettings)
+    front: FrontSettings = field(default_factory=FrontSettings)
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            SettingsError: with the value, and what is allowed.
+        """
+        if self.method not in get_args(Method):
+            raise SettingsError(
+                f"polish method {self.method!r}; known are {', '.join(get_args(Method))}"
+            )
+        for name, least in (("points", 0), ("max_iterations", 1), ("rounds", 1)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise SettingsError(
+                    f"polish {name} is {value!r}; allowed are whole numbers from {least}"
+                )
+        for name in ("max_seconds", "margin", "clearance", "stricter", "tolerance"):
+            if not getattr(self, name) > 0.0:
+                raise SettingsError(f"polish {name} is {getattr(self, name)!r}; it must exceed 0")

@@ -1,0 +1,168 @@
+"""Both solvers on programs whose solutions are known, and the residuals of what they return."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from hybrid_opt.polishing.interior import dense
+from hybrid_opt.polishing.ipopt import ipopt
+from hybrid_opt.polishing.program import Program
+from hybrid_opt.polishing.residuals import residuals
+from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.solvers import Answer
+from symbolic.array import Array
+
+Solver = Callable[[Program, PolishSettings], Answer]
+
+SOLVERS = pytest.mark.parametrize("solve", [ipopt, dense])
+
+LONG = PolishSettings(max_iterations=200)
+
+
+@dataclass
+class Written:
+    """A program whose constraints are written as one CasADi expression."""
+
+    z: ca.SX
+    g: ca.SX
+    cost: Array
+    start: Array
+    low: Array
+    high: Array
+    below: Array
+    above: Array
+
+    def constraints(self, z: Array) -> tuple[Array, Array]:
+        found = ca.Function("g", [self.z], [self.g, ca.densify(ca.jacobian(self.g, self.z))])(z)
+        return np.array(found[0]).ravel(), np.array(found[1])
+
+    def curvature(self, z: Array, multipliers: Array) -> Array:
+        hessian = ca.hessian(ca.dot(self.g, ca.DM(multipliers)), self.z)[0]
+        return np.array(ca.Function("h", [self.z], [ca.densify(hessian)])(z))
+
+
+def written(g: Callable[[ca.SX], ca.SX], cost: list[float], start: list[float]) -> Written:
+    """Within a box of 5, g at most 0."""
+    n = len(start)
+    z = ca.SX.sym("z", n)
+    rows = g(z)
+    m = rows.shape[0]
+    return Written(
+        z,
+        rows,
+        np.array(cost),
+        np.array(start),
+        np.full(n, -5.0),
+        np.full(n, 5.0),
+        np.full(m, -np.inf),
+        np.zeros(m),
+    )
+
+
+def disc() -> Written:
+    """Minimise -z_0 - z_1 in the unit disc: both are sqrt(1/2), the multiplier is sqrt(1/2)."""
+    return written(lambda z: ca.sumsqr(z) - 1.0, [-1.0, -1.0], [0.1, -0.3])
+
+
+@SOLVERS
+def test_it_finds_the_optimum_of_a_convex_program(solve: Solver) -> None:
+    answer = solve(disc(), LONG)
+    assert answer.converged
+    np.testing.assert_allclose(answer.z, np.full(2, 0.5**0.5), atol=1e-5)
+    assert answer.residuals.stationarity < 1e-5
+    assert answer.residuals.feasibility < 1e-6
+    assert answer.residuals.complementarity < 1e-5
+
+
+@SOLVERS
+def test_bounds_hold_and_have_multipliers(solve: Solver) -> None:
+    program = disc()
+    program.high[0] = 0.5
+    answer = solve(program, LONG)
+    assert answer.converged
+    np.testing.assert_allclose(answer.z, [0.5, 0.75**0.5], atol=1e-5)
+    assert answer.residuals.stationarity < 1e-5
+
+
+@SOLVERS
+def test_it_finds_a_way_around_an_obstacle(solve: Solver) -> None:
+    """Minimise -z_0 outside a disc and below a slope: not convex, the far side is optimal."""
+
+    def rows(z: ca.SX) -> ca.SX:
+        return ca.vertcat(1.0 - ca.sumsqr(z), z[1] + 0.5 * z[0] - 3.0)
+
+    answer = solve(written(rows, [-1.0, -0.1], [-2.0, 0.7]), LONG)
+    assert answer.converged
+    np.testing.assert_allclose(answer.z, [5.0, 0.5], atol=1e-4)
+
+
+@SOLVERS
+def test_many_random_linear_programs_agree_with_simplex(solve: Solver) -> None:
+    from scipy.optimize import linprog
+
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        A, b = rng.normal(size=(12, 4)), rng.uniform(0.2, 1.0, 12)
+        cost = rng.normal(size=4)
+        rows = partial(_plane_values, A, b)
+        program = written(rows, list(cost), [0.0] * 4)
+        exact = linprog(cost, A, b, bounds=(-5.0, 5.0))
+        answer = solve(program, LONG)
+        assert answer.converged
+        assert float(cost @ answer.z) == pytest.approx(exact.fun, abs=1e-4)
+
+
+def _plane_values(A: Array, b: Array, z: ca.SX) -> ca.SX:
+    return ca.mtimes(ca.DM(A), z) - ca.DM(b)
+
+
+@SOLVERS
+def test_an_impossible_program_is_told(solve: Solver) -> None:
+    program = written(lambda z: ca.vertcat(z[0] + 1.0, 1.0 - z[0]), [1.0, 1.0], [0.0, 0.0])
+    answer = solve(program, LONG)
+    assert not answer.converged
+    assert answer.residuals.feasibility > 0.5
+
+
+@SOLVERS
+def test_a_solve_is_not_cut_off_where_it_violates_something(solve: Solver) -> None:
+    """From outside into a thin curved strip, which steps along its tangent leave again."""
+    z = ca.SX.sym("z", 2)
+    program = Written(
+        z,
+        100.0 * (ca.sumsqr(z) - 1.0),
+        np.array([-1.0, -2.0]),
+        np.array([0.1, 2.0]),
+        np.full(2, -5.0),
+        np.full(2, 5.0),
+        np.array([-1e-2]),
+        np.array([1e-2]),
+    )
+    few = PolishSettings(max_iterations=1)
+    cut = solve(program, few)
+    assert cut.iterations <= few.solve.patience
+    assert cut.residuals.feasibility > few.solve.feasible
+    patient = solve(program, replace(few, max_iterations=3))
+    assert 3 < patient.iterations < 3 * few.solve.patience
+    assert patient.residuals.feasibility <= few.solve.feasible
+
+
+def test_residuals_of_the_optimum_vanish_and_of_others_do_not() -> None:
+    program = disc()
+    best, multiplier, none = np.full(2, 0.5**0.5), np.array([0.5**0.5]), np.zeros(2)
+    exact = residuals(program, best, none, multiplier)
+    assert exact.stationarity < 1e-12
+    assert exact.feasibility < 1e-12
+    assert exact.complementarity < 1e-12
+    assert residuals(program, best, none, 2.0 * multiplier).stationarity == pytest.approx(1.0)
+    assert residuals(program, 2.0 * best, none, multiplier).feasibility == pytest.approx(3.0)
+    inside = residuals(program, 0.5 * best, none, multiplier)
+    assert inside.complementarity == pytest.approx(0.75 * 0.5**0.5)
+    # A multiplier of a bound that does not exist must vanish.
+    assert residuals(program, best, none, -multiplier).complementarity == pytest.approx(0.5**0.5)
