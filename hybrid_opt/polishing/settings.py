@@ -23,16 +23,16 @@ class NearSettings:
         body_distance: pairs with an arm's body nearer than this get a row at their lowest [m].
         measured_below: bounds lower than this are compared with FCL's distance [m].
         beside_clearance: a violated clearance also gets rows this far to either side.
-        gap_distance, gap_stride: the payload's gaps below each distance [m] get a row in every
-            such stretch: they are cheap, because they need no joints, and decide where the path
-            may go.
+        gap_distance, gap_stride: the payload's gaps below the distance [m] get a row in every such
+            stretch: they are cheap, because they need no joints, and decide where the path may go.
+        far_gap_distance, far_gap_stride: the same farther away, less densely.
         kink_distance: kinks of the payload's clearance lower than this get a row [m].
         beside_kink: around a kink without rows of a gap: they would hold the kink in its place.
         kink_window: around a kink, where its height is measured.
         joint_distance: joints nearer than this to a limit get a row [rad].
         reach_share, reach_stride: where |det J| is below this share of its median along the path,
             every such stretch gets a row: it bounds the reach, beyond which nothing is defined.
-        lost: this far after the loss of an arm there are rows, too.
+        lost: this far after the loss of an arm, and twice as far, there are rows, too.
         force_stride: distance of force rows: forces are smooth along the path.
         tie_stride: the same for a robot whose force only breaks ties.
         peak_share: local maxima of the force above this share of the highest get rows.
@@ -44,15 +44,17 @@ class NearSettings:
     body_distance: float = 0.03
     measured_below: float = 0.02
     beside_clearance: float = 0.015
-    gap_distance: tuple[float, ...] = (0.03, 0.08)
-    gap_stride: tuple[float, ...] = (0.02, 0.04)
+    gap_distance: float = 0.03
+    gap_stride: float = 0.02
+    far_gap_distance: float = 0.08
+    far_gap_stride: float = 0.04
     kink_distance: float = 0.06
     beside_kink: float = 0.03
     kink_window: float = 0.04
     joint_distance: float = 0.05
     reach_share: float = 0.5
     reach_stride: float = 0.08
-    lost: tuple[float, ...] = (0.04, 0.08)
+    lost: float = 0.04
     force_stride: float = 0.02
     tie_stride: float = 0.06
     peak_share: float = 0.98

@@ -32,9 +32,13 @@ class Separations(DistanceKind):
         for pair, gaps in near_gaps(self, carry):
             kinks = [kink for kink, _ in edges(gaps, settings.kink_distance)]
             height = gaps.max(axis=1)
+            stretches = (
+                (settings.gap_distance, settings.gap_stride),
+                (settings.far_gap_distance, settings.far_gap_stride),
+            )
             places = {
                 place
-                for distance, stride in zip(settings.gap_distance, settings.gap_stride, strict=True)
+                for distance, stride in stretches
                 for place in lowest(height, distance)
                 + lowest(height, distance, grid.places(stride))
                 if all(abs(place - kink) >= beside for kink in kinks)
@@ -102,7 +106,7 @@ def separation(pair: int, gaps: Array, place: int) -> PlaceRow:
 
 def near_gaps(kind: DistanceKind, carry: PlacedCarry) -> Iterable[tuple[int, Array]]:
     """Every separable pair that comes near, and its (reached, n) gaps [m]."""
-    farthest = max(kind.near_settings.gap_distance)
+    farthest = kind.near_settings.far_gap_distance
     for pair in np.flatnonzero(carry.clearance.min(axis=0) < farthest).tolist():
         if pair in kind.rows.separable:
             yield pair, gaps_of(kind, carry, pair)

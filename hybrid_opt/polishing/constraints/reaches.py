@@ -34,8 +34,8 @@ class Reaches(Kind[PlaceRow]):
             for place in lowest(carry.manipulability[:, arm], 1.0):
                 yield PlaceRow(Reach(arm), place)
         for arm in carry.stranded:
-            for width in (0.0, *self.near_settings.lost):
-                later = self.around.cell.grid.places(width) if width else 0
+            width = self.around.cell.grid.places(self.near_settings.lost)
+            for later in (0, width, 2 * width):
                 yield PlaceRow(Reach(arm), carry.reached + later)
 
     def demanded(

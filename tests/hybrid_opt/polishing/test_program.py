@@ -35,6 +35,16 @@ TARGET = Target(
 )
 
 
+CELLS = pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(RACK, id="rack"),
+        # The ramped time law is differentiated as a whole, which takes long to compile.
+        pytest.param(TRANSFER, id="transfer", marks=pytest.mark.slow),
+    ],
+)
+
+
 @cache
 def evaluator(path: Path) -> CandidateEvaluator:
     return CandidateEvaluator(load(path))
@@ -74,7 +84,7 @@ def made(path: Path) -> tuple[SmoothProgram, Array]:
     return program, z
 
 
-@pytest.mark.parametrize("path", [RACK, TRANSFER], ids=["rack", "transfer"])
+@CELLS
 def test_jacobian_is_that_of_the_constraints(path: Path) -> None:
     program, z = made(path)
     step = 1e-6
@@ -86,7 +96,7 @@ def test_jacobian_is_that_of_the_constraints(path: Path) -> None:
     np.testing.assert_allclose(np.array(columns).T, exact, rtol=1e-5, atol=1e-4)
 
 
-@pytest.mark.parametrize("path", [RACK, TRANSFER], ids=["rack", "transfer"])
+@CELLS
 def test_curvature_is_that_of_the_constraints(path: Path) -> None:
     program, z = made(path)
     multipliers = np.random.default_rng(1).normal(size=program.layout.n_rows)
@@ -101,7 +111,7 @@ def test_curvature_is_that_of_the_constraints(path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("path", [RACK, TRANSFER], ids=["rack", "transfer"])
+@CELLS
 def test_rows_of_samples_are_what_the_evaluator_finds(path: Path) -> None:
     program, z = made(path)
     cell, layout = evaluator(path).workcell, program.layout

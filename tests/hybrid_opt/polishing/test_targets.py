@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -87,3 +90,8 @@ def test_a_normal_reaches_both_ends_of_its_chord_alike() -> None:
 def test_wrong_settings_are_told(name: str, value: object) -> None:
     with pytest.raises(SettingsError, match=f"polish {name}"):
         PolishSettings(**{name: value})  # type: ignore[arg-type]
+
+
+def test_settings_are_the_same_after_json() -> None:
+    settings = asdict(PolishSettings())
+    assert json.loads(json.dumps(settings)) == settings
