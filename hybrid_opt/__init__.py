@@ -51,7 +51,7 @@ _HOMES = {
     "DualArmError": "symbolic.errors",
     "Front": "hybrid_opt.front",
     "Objective": "hybrid_opt.evaluate.objectives",
-    "PolishSettings": "hybrid_opt.polishing.records",
+    "PolishSettings": "hybrid_opt.polishing.settings",
     "SearchSettings": "hybrid_opt.metaheuristics.carries",
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",

@@ -61,7 +61,7 @@ def polish(
 
     Args:
         rng: spreads the starts of some attempts.
-        settings: see `hybrid_opt.polishing.records`; None for the defaults.
+        settings: see `hybrid_opt.polishing.settings`; None for the defaults.
 
     Raises:
         SettingsError: the cell's objectives are not both peak forces.

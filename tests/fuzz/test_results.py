@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import read_campaign
-from hybrid_opt.polishing.records import PolishSettings
+from hybrid_opt.polishing.settings import PolishSettings
 from studies.compare import compare
 from studies.report.data import gather_carries
 from studies.run import StudySettings, run_study
