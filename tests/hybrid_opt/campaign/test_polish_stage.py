@@ -133,7 +133,7 @@ def spoilt(document: Any, fault: str) -> Any:
     ("fault", "told"),
     [
         ("no point", "at front: found 0 points"),
-        ("too short", r"at front\[0\].x: found 3 numbers; allowed are 24"),
+        ("too short", r"at front\[0\].x: found 3 numbers; allowed are 18"),
         ("missing", r"at front\[0\].x: holds numbers that are missing"),
         ("huge", r"at front\[0\].x: is outside"),
         ("objectives", r"at front\[0\].objectives: no numbers of shape 2"),
