@@ -98,7 +98,8 @@ def strike(process: subprocess.Popen[bytes], way: str, rng: random.Random) -> No
             for one in [process.pid, *others]:
                 _signal(one, signal.SIGKILL)
         case "interrupt":  # as a terminal does it: all of the foreground hear it
-            os.killpg(process.pid, signal.SIGINT)
+            for one in [process.pid, *others]:
+                _signal(one, signal.SIGINT)
         case "terminate":
             process.terminate()
         case "kill a worker" if others:
