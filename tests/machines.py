@@ -158,7 +158,7 @@ _TURN = np.pi / 2.0
 MACHINES = {
     "tiago_dual": Machine(
         *_TIAGO.arms(_SIDES, (1.2, 1.2)),
-        (0.65, 0.0, 0.8),
+        (0.65, 0.0, 0.72),
         -_TURN,
         {"xyz": [0.05, 0.0, 0.0], "rpy": [0.0, _TURN, 0.0]},
     ),
