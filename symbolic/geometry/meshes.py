@@ -183,6 +183,8 @@ def _read(path: Path) -> trimesh.Trimesh:
         content = outside.read_bytes(path, outside.MESH_BYTES)
     except OutsideError as error:
         raise CollisionModelError(f"{path}: the mesh {error}; correct its path") from error
+    if kind == "dae" and b"<!DOCTYPE" in content:  # its entities may unfold without end
+        raise CollisionModelError(f"{path}: has a document type (<!DOCTYPE>); remove it")
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")

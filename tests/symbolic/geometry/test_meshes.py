@@ -185,6 +185,13 @@ def test_a_header_that_promises_more_than_there_is(tmp_path: Path) -> None:
             convex_pieces(path, ONES)
 
 
+def test_entities_are_not_unfolded(tmp_path: Path) -> None:
+    path = tmp_path / "m.dae"
+    path.write_text('<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><COLLADA>&b;</COLLADA>')
+    with pytest.raises(CollisionModelError, match=r"m\.dae: has a document type"):
+        convex_pieces(path, ONES)
+
+
 def test_a_pipe_is_no_mesh(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.stl")
     with pytest.raises(CollisionModelError, match=r"it is a pipe"):
