@@ -111,37 +111,42 @@ def _filled(driver: str, signature: Signature) -> str:
     )
 
 
-def operations(function: ca.Function) -> int:
+def operations(function: ca.Function, left_out: frozenset[str] = frozenset()) -> int:
     """Number of instructions that one evaluation runs.
 
-    Nested calls count with all their instructions, as often as they run; an instruction on a
-    whole vector counts once.
+    Nested calls count with all their instructions, as often as they run, both branches of a
+    choice as well; an instruction on a whole vector counts once.
+
+    Args:
+        left_out: names of functions that do not count.
     """
-    return _operations(function, {})
+    return _operations(function, {}, left_out)
 
 
-def _operations(function: ca.Function, known: dict[int, int]) -> int:
+def _operations(function: ca.Function, known: dict[int, int], left_out: frozenset[str]) -> int:
     key = hash(function)
+    if function.name() in left_out:
+        return 0
     if key not in known:
-        known[key] = _count(function, known)
+        known[key] = _count(function, known, left_out)
     return known[key]
 
 
-def _count(function: ca.Function, known: dict[int, int]) -> int:
+def _count(function: ca.Function, known: dict[int, int], left_out: frozenset[str]) -> int:
     if function.is_a("SXFunction"):
         return int(function.n_instructions())
     if function.is_a("MXFunction"):
         total = 0
         for k in range(function.n_instructions()):
             if function.instruction_id(k) == ca.OP_CALL:
-                total += _operations(function.instruction_MX(k).which_function(), known)
+                total += _operations(function.instruction_MX(k).which_function(), known, left_out)
             else:
                 total += 1
         return total
     inner = function.find_functions(0)
     if function.is_a("Map"):
-        return _repeats(function, inner[0]) * _operations(inner[0], known)
-    return 1 + sum(_operations(f, known) for f in inner)
+        return _repeats(function, inner[0]) * _operations(inner[0], known, left_out)
+    return 1 + sum(_operations(f, known, left_out) for f in inner)
 
 
 def _repeats(function: ca.Function, inner: ca.Function) -> int:

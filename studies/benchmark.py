@@ -1,10 +1,12 @@
 """What one candidate costs: compiled, interpreted and written plainly.
 
 `python -m studies.benchmark [WORKCELL]` measures milliseconds per candidate on one core, in the
-thread's own processor time, so that waiting for a busy machine does not count. The three ways
-take turns on the same candidates, and a ratio is the median over the rounds of the ratio within
-a round. The plain way is the reference that the tests hold the evaluator to (`studies.plain`). With
-collisions the same is measured on candidates of a search (`studies.benchmark_collisions`).
+thread's own processor time, so that waiting for a busy machine does not count. The three ways take
+turns, the compiled one with batches of a search's size, and a ratio is the median over the rounds
+of the ratio within a round. The plain way is the reference that the tests hold the evaluator to
+(`studies.plain`). With collisions the same is measured on candidates of a search
+(`studies.benchmark_collisions`). `--study` tells instead where the time of a study goes
+(`studies.benchmark_study`).
 
 The cost against the number of samples and of free waypoints is measured on cells derived from the
 given one: same start, goal and robots, the free waypoints spread along the hand-made trajectory.
@@ -30,7 +32,9 @@ from codegen.compiled import CompiledFunction
 from codegen.errors import CodegenError
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
-from studies.benchmark_collisions import with_collisions
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from studies.benchmark_collisions import POPULATION, with_collisions
+from studies.benchmark_study import profile_study, study_table
 from studies.benchmark_turns import Evaluate, interleaved, progress, summary
 from studies.plain.candidate import PlainEvaluator
 from studies.plain.verdict import PlainJudge
@@ -52,6 +56,9 @@ WAYPOINTS = (1, 2, 3, 4, 5, 6, 7, 8)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit code: 0, or 2 on bad input."""
     options = _parser().parse_args(arguments)
+    if options.study:
+        print(study_table(profile_study(_workcell(options.workcell), options.seed)))
+        return 0
     result = benchmark(
         _workcell(options.workcell), options.candidates, options.repeats, options.seed
     )
@@ -75,6 +82,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=0, help="of the candidates (default: 0)")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    parser.add_argument(
+        "--study", action="store_true", help="core-seconds by part of search, polish and timing"
+    )
     add_verbose(parser)
     return parser
 
@@ -108,14 +118,22 @@ def benchmark(
         raise SettingsError(f"--seed is {seed}; give 0 or more")
     progress(f"{workcell.name}: reading the robots, choosing start branches")
     model = build_cell_model(workcell)
-    x = _candidates(workcell.task, candidates, seed)
+    one_each = _candidates(workcell.task, candidates, seed)
+    batches = np.repeat(one_each[:, None], POPULATION, axis=1)
+    batches[:, 1:] = _candidates(workcell.task, candidates * (POPULATION - 1), seed + 1).reshape(
+        candidates, POPULATION - 1, -1
+    )
     progress("building the evaluator")
+    evaluator = CandidateEvaluator(workcell)
     ways: dict[str, Evaluate] = {
-        "compiled": _compiled(model),
+        "compiled": lambda x: evaluator.sampled(x, with_collisions=False),
         "interpreted": InterpretedFunction(dense(candidate_function(model))),
         "plain": PlainEvaluator(workcell, model.start),
     }
     progress(f"{candidates * repeats} rounds: {', '.join(ways)}")
+    x = {name: batches if name == "compiled" else one_each for name in ways}
+    times = interleaved(ways, x, repeats)
+    times["compiled"] /= POPULATION
     return {
         "workcell": workcell.name,
         "digest": workcell.digest,
@@ -130,7 +148,7 @@ def benchmark(
             "system": platform.platform(),
             "python": platform.python_version(),
         },
-        **summary(interleaved(ways, dict.fromkeys(ways, x), repeats)),
+        **summary(times),
         "with_collisions": with_collisions(
             workcell, PlainJudge(workcell, model.start), candidates, repeats, seed
         ),
@@ -245,17 +263,18 @@ def _report(result: Mapping[str, Any]) -> str:
         f"evaluations, batches of {collisions['population']})",
         *_ways(collisions),
         *_shares(collisions),
+        *_peak(collisions),
         "",
         "with collisions, means over random candidates",
         *_ways(collisions["random"]),
         *_shares(collisions["random"]),
         "",
-        "samples      ms per candidate",
+        "samples      ms per candidate, one at a time",
         *(f"{e['samples']:7d}  {e['compiled_ms']:20.3f}" for e in result["scaling"]["samples"]),
         f"line: {1e3 * line['ms_per_sample']:.2f} us per sample + {1e3 * line['fixed_ms']:.1f} us, "
         f"off by at most {100 * line['largest_relative_deviation']:.0f} %",
         "",
-        "waypoints    ms per candidate",
+        "waypoints    ms per candidate, one at a time",
         *(f"{e['waypoints']:7d}  {e['compiled_ms']:20.3f}" for e in result["scaling"]["waypoints"]),
     ]
     return "\n".join(rows)
@@ -268,6 +287,16 @@ def _ways(figures: Mapping[str, Any]) -> list[str]:
         f"interpreted  {figures['interpreted_ms']:16.3f}  "
         f"{figures['interpreted_over_compiled']:13.1f}",
         f"plain        {figures['plain_ms']:16.3f}  {figures['plain_over_compiled']:13.1f}",
+    ]
+
+
+def _peak(figures: Mapping[str, Any]) -> list[str]:
+    rate = f"{1e-9 * figures['operations_per_second']:.1f} billion operations a second"
+    if figures["share_of_peak"] is None:
+        return [f"{rate}, one evaluation at a time"]
+    return [
+        f"{rate}, {100 * figures['share_of_peak']:.0f} % of the core's peak (counted in the CasADi "
+        "functions; the peak is that of independent additions and multiplications, measured)"
     ]
 
 

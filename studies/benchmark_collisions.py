@@ -6,7 +6,6 @@ The plain way is the tests' reference: every pair of every sample goes to FCL.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,11 @@ import numpy as np
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.sampled import reached_samples
 from hybrid_opt.metaheuristics.problem import CarryProblem
 from hybrid_opt.metaheuristics.registry import make
 from hybrid_opt.metaheuristics.run import search
 from hybrid_opt.metaheuristics.settings import GeneticSettings
+from studies.benchmark_peak import candidate_operations, peak_operations
 from studies.benchmark_turns import Evaluate, interleaved, progress, summary
 from symbolic.array import Array
 from symbolic.functions.cell import cell_functions
@@ -64,12 +63,13 @@ def with_collisions(
         for name, function in cell_functions(workcell).items()
     }
     interpreted = CandidateEvaluator(workcell, functions=functions)
+    peak = peak_operations()
     ways: dict[str, Evaluate] = {
         "compiled": evaluator.evaluate,
         "interpreted": interpreted.evaluate,
         "plain": plain,
     }
-    figures = []
+    figures: list[dict[str, Any]] = []
     for what, batches in (("the search's", searched), ("random", uniform)):
         progress(f"{candidates * repeats} rounds on {what} candidates, with collisions")
         one_each = batches[:, 0]
@@ -85,49 +85,32 @@ def with_collisions(
             }
         )
     ours, random = figures
+    per_second = candidate_operations(workcell) / (1e-3 * ours["compiled_ms"])
+    ours["operations_per_second"] = per_second
+    ours["share_of_peak"] = per_second / peak if peak else None
     return {"evaluations": EVALUATIONS, "population": POPULATION, **ours, "random": random}
 
 
 def shares(evaluator: CandidateEvaluator, batches: Array, repeats: int) -> dict[str, float]:
     """Where the time of the compiled way goes, as shares of the whole.
 
-    candidate: path, arms and forces. bounds: the compiled clearances. judging: FCL on what they
-    leave open, its placements and the order of its work. rest: objectives and bookkeeping.
+    candidate: path, arms and forces. collisions: bounds, proofs and FCL. rest: objectives and
+    bookkeeping.
 
     Args:
         batches: (n, size, n_var).
         repeats: rounds with each batch.
     """
-    checker = evaluator.checker
-    samples, clearances = [], []
-    for batch in batches:
-        outputs = evaluator.outputs(batch)
-        carries = [_carry(outputs, row) for row in range(len(batch))]
-        samples.append(carries)
-        clearances.append([checker.bounds(*carry[:3]) for carry in carries])
-
-    def bound(k: Array) -> None:
-        for carry in samples[int(k)]:
-            checker.bounds(*carry[:3])
-
-    def judge(k: Array) -> None:
-        for carry, clearance in zip(samples[int(k)], clearances[int(k)], strict=True):
-            checker.check(*carry, clearance)
-
     ways: dict[str, Evaluate] = {
-        "whole": lambda k: evaluator.evaluate(batches[int(k)]),
-        "candidate": lambda k: evaluator.outputs(batches[int(k)]),
-        "bounds": bound,
-        "judging": judge,
+        "whole": evaluator.evaluate,
+        "with collisions": evaluator.sampled,
+        "candidate": lambda x: evaluator.sampled(x, with_collisions=False),
     }
-    times = interleaved(ways, dict.fromkeys(ways, np.arange(float(len(batches)))), repeats)
-    whole = times.pop("whole")
-    parts = {name: float(np.mean(value / whole)) for name, value in times.items()}
-    return parts | {"rest": 1.0 - sum(parts.values())}
-
-
-def _carry(outputs: Mapping[str, Array], row: int) -> tuple[Array, Array, Array, Array]:
-    """Pose, joints of both arms and time on the samples of a candidate that can collide."""
-    n = reached_samples(outputs, row)
-    pose, q_1, q_2, time = (outputs[name][row, :n] for name in ("pose", "q_1", "q_2", "time"))
-    return pose, q_1, q_2, time
+    times = interleaved(ways, dict.fromkeys(ways, batches), repeats)
+    part = {name: float(np.mean(value / times["whole"])) for name, value in times.items()}
+    collisions = part["with collisions"] - part["candidate"]
+    return {
+        "candidate": part["candidate"],
+        "collisions": collisions,
+        "rest": 1.0 - part["with collisions"],
+    }

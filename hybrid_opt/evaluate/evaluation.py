@@ -180,13 +180,20 @@ class CandidateEvaluator:
             SettingsError: x has the wrong shape.
         """
         x = self._checked(x)
+        sampled = self.sampled(x)
+        whole = self._kernel is None or self._needs is not None
+        return self._judge(x, sampled, sampled.outputs if whole else self.outputs(x))
+
+    def sampled(self, x: Array, with_collisions: bool = True) -> SampledVerdicts:
+        """What the samples of decision vectors (n, n_var) say, before objectives are known.
+
+        Args:
+            with_collisions: False leaves collisions out where the evaluation is in lanes.
+        """
+        x = self._checked(x)
         if self._kernel is None:
-            outputs = self.outputs(x)
-            return self._judge(x, one_by_one(outputs, self.checker), outputs)
-        sampled = self._kernel.evaluate(x, self._needs or (), threads=self._threads)
-        return self._judge(
-            x, sampled, sampled.outputs if self._needs is not None else self.outputs(x)
-        )
+            return one_by_one(self.outputs(x), self.checker)
+        return self._kernel.evaluate(x, self._needs or (), with_collisions, self._threads)
 
     def carry(self, x: Array) -> Carry:
         """One decision vector (n_var,) with its verdict, under the task's time law.
