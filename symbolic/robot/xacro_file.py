@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
@@ -77,8 +78,16 @@ def _expanded(
         return str(package)
 
     with _LOCK, contextlib.redirect_stderr(io.StringIO()):  # xacro keeps its state in its module
-        theirs = substitution_args._eval_find
+        theirs, their_parse = substitution_args._eval_find, xacro.parse
         substitution_args._eval_find = find
+
+        def parse(text: object, filename: str | None = None) -> object:
+            # Included files come through our door; a missing one may be optional.
+            if text is None and filename is not None and os.path.exists(filename):
+                text = outside.text(outside.read_bytes(Path(filename), outside.URDF_BYTES))
+            return their_parse(text, filename)
+
+        xacro.parse = parse
         xacro.all_includes.clear()
         try:
             document = xacro.process_file(str(path), mappings=dict(arguments))
@@ -91,7 +100,7 @@ def _expanded(
                 error
             )
         finally:
-            substitution_args._eval_find = theirs
+            substitution_args._eval_find, xacro.parse = theirs, their_parse
     for mesh in document.getElementsByTagName("mesh"):
         mesh.setAttribute("filename", _by_package(mesh.getAttribute("filename"), found))
     # What stands beside the root are comments that name this machine's folders.

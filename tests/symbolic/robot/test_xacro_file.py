@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -78,3 +79,14 @@ def test_generated_urdfs_that_keep_the_namespace_are_read_as_they_are(tmp_path: 
     path = write(tmp_path, '<link name="base"/>', "arm.urdf")
     assert not is_xacro(path.read_bytes())
     assert description_content(path) == path.read_bytes()
+
+
+def test_an_included_pipe_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    path = tmp_path / "arm.xacro"
+    path.write_text(
+        '<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+        '<xacro:include filename="pipe"/><link name="${1 + 1}"/></robot>'
+    )
+    with pytest.raises(OutsideError, match="it is a pipe"):
+        description_content(path)
