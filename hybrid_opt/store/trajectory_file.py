@@ -20,6 +20,7 @@ import numpy as np
 
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.functions import workcell_functions
+from hybrid_opt.store.files import storing
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import BundleError, OutsideError
@@ -195,13 +196,14 @@ def _figure(name: str, value: Any) -> float:
 
 def _write(path: Path, text: str) -> None:
     draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with draft.open("w", encoding="utf-8") as file:
-            file.write(text + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(draft, path)
-    except OSError as error:
-        with suppress(OSError):
-            draft.unlink()
-        raise ResultsError(f"{path}: cannot be written ({error.strerror})") from error
+    with storing(path):
+        try:
+            with draft.open("w", encoding="utf-8") as file:
+                file.write(text + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(draft, path)
+        except OSError:
+            with suppress(OSError):
+                draft.unlink()
+            raise
