@@ -24,7 +24,7 @@ compared to this instead of to their own size."""
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Agreement:
     """Worst relative differences of one function.
 
     Attributes:
@@ -57,7 +57,7 @@ def compare(
     *,
     samples: int = 20,
     cache: Cache | None = None,
-) -> Comparison:
+) -> Agreement:
     """Compare a compiled function, and its compiled derivative, with CasADi's own evaluation.
 
     Args:
@@ -90,7 +90,7 @@ def compare(
             key=_difference,
         )
     overall = max(worst, worst_derivative, key=_difference)
-    return Comparison(name, samples, worst[1], worst_derivative[1], overall[0])
+    return Agreement(name, samples, worst[1], worst_derivative[1], overall[0])
 
 
 def directional_derivative(function: ca.Function) -> ca.Function:

@@ -125,7 +125,7 @@ def _row(
 
 
 @dataclass(frozen=True)
-class Comparison:
+class AlgorithmTest:
     """All rows, and the rank tests of the first algorithm against each other one on the
     problem with its optimum inside the bounds (hypervolume, then IGD; Holm-corrected)."""
 
@@ -141,7 +141,7 @@ def compare(
     seeds: int,
     population: int = BAND_POPULATION,
     progress: bool = False,
-) -> Comparison:
+) -> AlgorithmTest:
     """Run every algorithm on every problem with every budget and seeds 0, 1, ...
 
     The problem with its optimum inside the bounds has its own budget and population.
@@ -183,7 +183,7 @@ def compare(
                 f"{done}/{len(tasks)} {target.name} {budget} {name}, {elapsed:.0f} s",
                 file=sys.stderr,
             )
-    return Comparison(seeds, tuple(rows), _tests(shifted))
+    return AlgorithmTest(seeds, tuple(rows), _tests(shifted))
 
 
 def _tests(shifted: dict[str, list[_Run]]) -> tuple[RankTest, ...]:
@@ -198,7 +198,7 @@ def _tests(shifted: dict[str, list[_Run]]) -> tuple[RankTest, ...]:
     return corrected(tests)
 
 
-def table(result: Comparison) -> str:
+def table(result: AlgorithmTest) -> str:
     """The comparison as text."""
     lines = [
         f"Mean over {result.seeds} seeds of the final front (limited size) and of all evaluated "

@@ -57,7 +57,7 @@ class ComparedFigure:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class CampaignComparison:
     """Two campaigns beside one another.
 
     Attributes:
@@ -76,7 +76,7 @@ class Comparison:
     only: tuple[tuple[str, ...], tuple[str, ...]]
 
 
-def compare(first: Path, second: Path) -> Comparison:
+def compare(first: Path, second: Path) -> CampaignComparison:
     """Compare two results folders.
 
     Raises:
@@ -104,7 +104,7 @@ def compare(first: Path, second: Path) -> Comparison:
         for name in shared
         for figure in _algorithm_figures(name, (runs[0], runs[1]), summaries, reference)
     ]
-    return Comparison(
+    return CampaignComparison(
         (str(first), str(second)),
         runs[0].workcell.digest == runs[1].workcell.digest,
         tuple(_differences(*(to_json(run.configuration) for run in runs))),
@@ -184,7 +184,7 @@ def _short(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def as_text(found: Comparison) -> str:
+def as_text(found: CampaignComparison) -> str:
     """A comparison for people."""
     lines = [f"A: {found.runs[0]}", f"B: {found.runs[1]}", ""]
     if not found.same_workcell:

@@ -13,7 +13,7 @@ import numpy as np
 
 from codegen.build import Build, FunctionReport, build_set
 from codegen.cache import Cache
-from codegen.check import Comparison, compare
+from codegen.check import Agreement, compare
 from studies.program import add_verbose, carried_out, run_program
 from studies.text_table import text_table
 
@@ -64,7 +64,7 @@ def _run(options: argparse.Namespace) -> int:
     cache = Cache()
     removed = cache.clean() if options.clean else None
     built: Build | None = None
-    comparisons: list[Comparison] = []
+    comparisons: list[Agreement] = []
     if options.workcell is not None:
         from hybrid_opt.evaluate.functions import workcell_key
         from symbolic.functions.cell import cell_functions
@@ -96,7 +96,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _print_json(
-    cache: Cache, removed: int | None, built: Build | None, comparisons: Sequence[Comparison]
+    cache: Cache, removed: int | None, built: Build | None, comparisons: Sequence[Agreement]
 ) -> None:
     result: dict[str, object] = {"cache": str(cache.folder)}
     if removed is not None:
@@ -111,7 +111,7 @@ def _print_json(
 
 
 def _print_tables(
-    cache: Cache, removed: int | None, built: Build | None, comparisons: Sequence[Comparison]
+    cache: Cache, removed: int | None, built: Build | None, comparisons: Sequence[Agreement]
 ) -> None:
     if removed is not None:
         print(f"{removed} libraries removed from {cache.folder}")

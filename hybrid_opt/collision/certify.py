@@ -9,7 +9,7 @@ import numpy as np
 
 from hybrid_opt.collision.between import PROOF_DEPTH, MotionVerdict, check_between
 from hybrid_opt.collision.checker import CollisionChecker
-from hybrid_opt.collision.verdict import Contact
+from hybrid_opt.collision.verdict import Touch
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
@@ -37,7 +37,7 @@ class Certificate:
     """
 
     is_free: bool
-    at_sample: Contact | None
+    at_sample: Touch | None
     at_parameter: float
     motion: MotionVerdict | None
     points: int

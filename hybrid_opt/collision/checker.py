@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
-from hybrid_opt.collision.verdict import Contact, Verdict, sample_durations
+from hybrid_opt.collision.verdict import Touch, Verdict, sample_durations
 from symbolic.array import Array
 from symbolic.geometry.bodies import PAYLOAD
 from symbolic.geometry.pairs import CellGeometry
@@ -25,7 +25,7 @@ RESTING_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionBounds:
     """Chord and bend (n, n_pairs) [m] of every pair between configurations, see
     `symbolic.geometry.motion_bounds`."""
 
@@ -156,11 +156,13 @@ class CollisionChecker:
             for row, pair in zip(rows, pairs, strict=True)
         ]
 
-    def motion(self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]) -> Motion:
+    def motion(
+        self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]
+    ) -> MotionBounds:
         """Bounds of every pair's motion between configurations (pose, q_1, q_2), each (n, 6)."""
         bounds = self._functions["motion"].batch(*start, *end)
         shape = (len(start[0]), len(self._pairs))
-        return Motion(bounds["chord"].reshape(shape), bounds["bend"].reshape(shape))
+        return MotionBounds(bounds["chord"].reshape(shape), bounds["bend"].reshape(shape))
 
     def measure(
         self,
@@ -198,11 +200,11 @@ class CollisionChecker:
 
     def min_distance(
         self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None
-    ) -> tuple[float, Contact | None]:
+    ) -> tuple[float, Touch | None]:
         """FCL's least distance [m] over all pairs and samples, and where it occurs.
 
         Pairs are measured in the order of their bounds, until no bound is lower than the best
-        distance. `Contact.time` is NaN.
+        distance. `Touch.time` is NaN.
         """
         if clearance is None:
             clearance = self.bounds(pose, q_1, q_2)
@@ -233,10 +235,10 @@ class CollisionChecker:
             return self.judge.collides(local, i, j)
         return self.judge.intersects(local, self.judge.shrunk_payload, j)
 
-    def _contact(self, sample: int, pair: int, time: Array | None) -> Contact:
+    def _contact(self, sample: int, pair: int, time: Array | None) -> Touch:
         first, second = self._names[pair]
         moment = float("nan") if time is None else float(time[sample])
-        return Contact(sample, moment, first, second)
+        return Touch(sample, moment, first, second)
 
     def _resting_pairs(self, centre: Array) -> frozenset[int]:
         """Pairs whose contact is allowed with the box centre here."""

@@ -11,7 +11,7 @@ from symbolic.array import Array
 
 
 @dataclass(frozen=True)
-class Contact:
+class Touch:
     """Two bodies in collision.
 
     Attributes:
@@ -43,7 +43,7 @@ class Verdict:
 
     colliding: NDArray[np.bool_]
     collision_time: float
-    first_contact: Contact | None
+    first_contact: Touch | None
     min_clearance: float
     open_samples: int
     fcl_calls: int

@@ -11,7 +11,7 @@ LEAST_SPAN = 2e-3
 """Least scale of an objective: of a front of one point, or one that is nearly flat."""
 
 
-class Archive:
+class GrowingFront:
     """The points that stand so far: rows of the given front, and new ones."""
 
     def __init__(self, x: Array, objectives: Array, parent: list[int]) -> None:

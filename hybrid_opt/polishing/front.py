@@ -16,7 +16,7 @@ import numpy as np
 
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
-from hybrid_opt.polishing.archive import Archive
+from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost, solve_safely
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.plan import Attempt, aimed, points, widest_gap
@@ -83,7 +83,7 @@ class FrontPolisher:
         unit = self._evaluation_seconds(x)
         found = self.evaluator.certified(self.evaluator.evaluate(x))
         feasible = np.flatnonzero(found.feasible)
-        archive = Archive(x[feasible], found.objectives[feasible], feasible.tolist())
+        archive = GrowingFront(x[feasible], found.objectives[feasible], feasible.tolist())
         run = _Run(self, archive, list(recorded), emit)
         if len(feasible) and self.settings.points:
             run.all(rng)
@@ -125,7 +125,7 @@ class _Run:
     def __init__(
         self,
         polisher: FrontPolisher,
-        archive: Archive,
+        archive: GrowingFront,
         recorded: list[PolishOutcome | Lost],
         emit: Callable[[PolishOutcome], None],
     ) -> None:

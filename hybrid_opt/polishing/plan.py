@@ -8,7 +8,7 @@ from math import ceil
 
 import numpy as np
 
-from hybrid_opt.polishing.archive import LEAST_SPAN, Archive
+from hybrid_opt.polishing.archive import LEAST_SPAN, GrowingFront
 from hybrid_opt.polishing.records import Aim
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.targets import (
@@ -39,7 +39,7 @@ class Attempt:
     radius: float
 
 
-def points(archive: Archive, settings: PolishSettings) -> list[Attempt]:
+def points(archive: GrowingFront, settings: PolishSettings) -> list[Attempt]:
     """Evenly spread points of the front, the balanced one among them."""
     rows = archive.rows()
     count = min(len(rows), ceil(settings.points * settings.front.own_share))
@@ -65,7 +65,7 @@ def points(archive: Archive, settings: PolishSettings) -> list[Attempt]:
 
 
 def aimed(
-    archive: Archive,
+    archive: GrowingFront,
     objective: int | None,
     stalls: int,
     settings: PolishSettings,
@@ -95,7 +95,7 @@ def aimed(
 
 
 def widest_gap(
-    archive: Archive, tried: Collection[bytes], settings: PolishSettings
+    archive: GrowingFront, tried: Collection[bytes], settings: PolishSettings
 ) -> tuple[Attempt, Array] | None:
     """An attempt in the widest gap between neighbours, along the normal of their chord.
 

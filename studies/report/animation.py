@@ -16,7 +16,7 @@ from hybrid_opt.display.scene import motion_points
 from hybrid_opt.display.solids import cell_solids
 from studies.errors import ReportError
 from studies.report.drawing import ISOMETRIC, cut_faces, draw_cell, draw_path, frame_axes
-from studies.report.records import Carry
+from studies.report.records import DrawnCarry
 from studies.report.style import in_style
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
@@ -33,7 +33,7 @@ COLOURS = 128
 """Of a GIF's palette."""
 
 
-def write_animation(geometry: CellGeometry, carry: Carry, path: Path) -> None:
+def write_animation(geometry: CellGeometry, carry: DrawnCarry, path: Path) -> None:
     """Write a carry in real time; the suffix decides the format, .gif or .mp4.
 
     Raises:
@@ -47,7 +47,7 @@ def write_animation(geometry: CellGeometry, carry: Carry, path: Path) -> None:
     writer(frames(geometry, carry), path)
 
 
-def frames(geometry: CellGeometry, carry: Carry) -> Iterator[NDArray[np.uint8]]:
+def frames(geometry: CellGeometry, carry: DrawnCarry) -> Iterator[NDArray[np.uint8]]:
     """(height, width, 3) pictures, evenly spaced in time."""
     faces = cut_faces(cell_solids(geometry))
     points = motion_points(geometry, carry.timed)

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt import carry as carries
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
 from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, ReplicaFigures
+from hybrid_opt.carry import Carry
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.selection import balanced, peak_normal_forces
@@ -24,7 +24,7 @@ from hybrid_opt.work.serial import SerialExecutor
 from studies.report.reach import reach_map
 from studies.report.records import (
     AlgorithmRuns,
-    Carry,
+    DrawnCarry,
     Front,
     ReachMap,
     ReportData,
@@ -81,7 +81,7 @@ def gather(root: Path, executor: Executor | None = None) -> ReportData:
     )
 
 
-def gather_carries(root: Path) -> tuple[CellGeometry, tuple[Carry, ...]]:
+def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
     """The cell, the hand-made trajectory and every algorithm's best selected one.
 
     Raises:
@@ -104,7 +104,7 @@ def _algorithms(
 
 def _best(
     results: CampaignResults, algorithms: tuple[AlgorithmRuns, ...], maker: _CarryMaker
-) -> tuple[Carry, ...]:
+) -> tuple[DrawnCarry, ...]:
     initial = maker.carry(initial_decision(results.workcell.task), INITIAL_LABEL)
     best = [algorithm.best for algorithm in algorithms]
     return (initial, *(carry for carry in best if carry is not None))
@@ -117,10 +117,10 @@ class _CarryMaker:
         self.evaluator = CandidateEvaluator(results.workcell, results.objectives)
         self.model = TimingModel(results.workcell)
 
-    def carry(self, x: Array, label: str) -> Carry:
+    def carry(self, x: Array, label: str) -> DrawnCarry:
         return shown(label, self.evaluator.carry(x))
 
-    def balanced(self, front: Front, label: str) -> Carry:
+    def balanced(self, front: Front, label: str) -> DrawnCarry:
         """The trajectory of least mean peak force of a front."""
         row = balanced(peak_normal_forces(self.evaluator, front.x))
         return self.carry(front.x[row], label)
@@ -140,12 +140,14 @@ def _timing(label: str, x: Array, model: TimingModel) -> TimedSelection:
     return TimedSelection(label, timed.report, timed.curve, timed.margins)
 
 
-def shown(label: str, carry: carries.Carry) -> Carry:
+def shown(label: str, carry: Carry) -> DrawnCarry:
     """A judged carry with what is drawn of it."""
     judgement = carry.judgement
     assert judgement is not None
     objectives = np.array(list(judgement.objectives.values()))
-    return Carry(label, carry.x, objectives, carry, payload_sensitivity(carry), judgement.feasible)
+    return DrawnCarry(
+        label, carry.x, objectives, carry, payload_sensitivity(carry), judgement.feasible
+    )
 
 
 def _algorithm(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from matplotlib.figure import Figure
 
 from studies.report import figures_carry, figures_cell, figures_fronts, figures_search
-from studies.report.records import Carry, ReportData
+from studies.report.records import DrawnCarry, ReportData
 from studies.report.style import in_style, settled
 
 
@@ -147,7 +147,7 @@ def _carry_figures(data: ReportData) -> Iterator[ReportFigure]:
         )
 
 
-def _motion(data: ReportData, carry: Carry, name: str) -> ReportFigure:
+def _motion(data: ReportData, carry: DrawnCarry, name: str) -> ReportFigure:
     return ReportFigure(
         name,
         f"The trajectory selected from {carry.label} at 0, 33, 66 and 100 % of its duration (paper "

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
-from studies.report.records import Carry, ReportData
+from studies.report.records import DrawnCarry, ReportData
 from studies.report.style import (
     FULL_WIDTH,
     INITIAL,
@@ -25,7 +25,7 @@ from symbolic.array import Array
 STATIC_COLOUR = "#b00020"
 
 
-def styled(data: ReportData) -> tuple[tuple[Carry, LineStyle], ...]:
+def styled(data: ReportData) -> tuple[tuple[DrawnCarry, LineStyle], ...]:
     """The hand-made trajectory and each algorithm's best one, with their looks."""
     best = [(a.best, series(a.index)) for a in data.algorithms]
     return ((data.initial, INITIAL), *((carry, look) for carry, look in best if carry is not None))

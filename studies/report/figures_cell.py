@@ -24,7 +24,7 @@ from studies.report.drawing import (
     draw_path,
     frame_axes,
 )
-from studies.report.records import Carry, ReachMap
+from studies.report.records import DrawnCarry, ReachMap
 from studies.report.style import ARMS, FULL_WIDTH, new_figure, panel_label, shortened
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
@@ -39,7 +39,7 @@ SHARES = (0.0, 0.33, 0.66, 1.0)
 """Of a carry's duration, as in the paper's Figures 14 and 15."""
 
 
-def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> Figure:
+def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) -> Figure:
     """Both arms' reach, the common region and the restricted workspace (paper Figure 4)."""
     figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
     corners = box_corners(*_reach_bounds(reach))
@@ -75,7 +75,7 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> 
     return figure
 
 
-def environment(geometry: CellGeometry, carry: Carry) -> Figure:
+def environment(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
     """The cell with the payload at its start: front, side and oblique (paper Figure 5)."""
     figure = new_figure(FULL_WIDTH, 0.34 * FULL_WIDTH)
     solids = cell_solids(geometry)
@@ -93,7 +93,7 @@ def environment(geometry: CellGeometry, carry: Carry) -> Figure:
     return figure
 
 
-def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> Figure:
+def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) -> Figure:
     """The first arm at the start and the region that its pad reaches (paper Figure 6)."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     left, right = figure.subplots(1, 2)
@@ -115,7 +115,7 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: Carry) -> Figu
     return figure
 
 
-def motion_sequence(geometry: CellGeometry, carry: Carry, columns: int = 2) -> Figure:
+def motion_sequence(geometry: CellGeometry, carry: DrawnCarry, columns: int = 2) -> Figure:
     """The cell at 0, 33, 66 and 100 % of a carry (paper Figures 14 and 15)."""
     rows = -(-len(SHARES) // columns)
     points = motion_points(geometry, carry.timed)
@@ -135,7 +135,7 @@ def motion_sequence(geometry: CellGeometry, carry: Carry, columns: int = 2) -> F
     return figure
 
 
-def paths(geometry: CellGeometry, carries: tuple[tuple[Carry, str, object], ...]) -> Figure:
+def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, str, object], ...]) -> Figure:
     """Paths of the box centre: y-z, x-y and oblique (paper Figure 13).
 
     Args:
@@ -166,7 +166,7 @@ def paths(geometry: CellGeometry, carries: tuple[tuple[Carry, str, object], ...]
     return figure
 
 
-def sample_at(carry: Carry, shares: Array) -> list[int]:
+def sample_at(carry: DrawnCarry, shares: Array) -> list[int]:
     """The samples nearest to shares of the duration."""
     moments = carry.timed.time[0] + shares * carry.timed.duration
     return [int(np.argmin(np.abs(carry.timed.time - moment))) for moment in moments]
@@ -176,7 +176,7 @@ def _metres(value: float) -> str:
     return f"{value:.2f} m".replace("-", "\N{MINUS SIGN}")
 
 
-def _start(carry: Carry) -> tuple[Array, Array]:
+def _start(carry: DrawnCarry) -> tuple[Array, Array]:
     return carry.timed.pose[0], carry.timed.q[0]
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.display.solids import Solid, cell_solids, frame_placements
 from studies.errors import ReportError
-from studies.report.records import Carry
+from studies.report.records import DrawnCarry
 from symbolic.array import Array
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry
@@ -41,7 +41,7 @@ class LiveView:
     def __init__(
         self,
         geometry: CellGeometry,
-        carries: tuple[Carry, ...],
+        carries: tuple[DrawnCarry, ...],
         port: int = 8080,
         host: str = "127.0.0.1",
     ) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from hybrid_opt import carry
 from hybrid_opt.display.scene import packed, scene_data
 from hybrid_opt.timing import TimingModel
-from studies.report.records import AlgorithmRuns, Carry, Front, ReportData
+from studies.report.records import AlgorithmRuns, DrawnCarry, Front, ReportData
 from studies.report.style import series
 from symbolic.array import Array
 
@@ -79,7 +79,7 @@ class PageData:
             **scene_data(data.geometry, data.carries[-1].timed),
         }
 
-    def _add_carry(self, carry: Carry) -> int:
+    def _add_carry(self, carry: DrawnCarry) -> int:
         label = carry.label if carry.feasible else f"{carry.label} (infeasible)"
         return self._add(label, carry.timed, carry.objectives)
 

@@ -18,7 +18,7 @@ from symbolic.workcell.records import Workcell
 
 
 @dataclass(frozen=True)
-class Carry:
+class DrawnCarry:
     """One trajectory with everything that is drawn of it.
 
     Attributes:
@@ -89,8 +89,8 @@ class AlgorithmRuns:
     index: int
     runs: tuple[Run, ...]
     representative: int
-    selected: Carry | None
-    hybrid_selected: Carry | None
+    selected: DrawnCarry | None
+    hybrid_selected: DrawnCarry | None
 
     @property
     def shown(self) -> Run:
@@ -98,7 +98,7 @@ class AlgorithmRuns:
         return self.runs[self.representative]
 
     @property
-    def best(self) -> Carry | None:
+    def best(self) -> DrawnCarry | None:
         """The polished selected trajectory where there is one, else the search's."""
         return self.hybrid_selected or self.selected
 
@@ -143,7 +143,7 @@ class ReportData:
     objective_titles: tuple[str, ...]
     static: Array
     algorithms: tuple[AlgorithmRuns, ...]
-    initial: Carry
+    initial: DrawnCarry
     timings: tuple[TimedSelection, ...]
     reach: ReachMap
 
@@ -153,7 +153,7 @@ class ReportData:
         return tuple(a for a in self.algorithms if a.selected is not None)
 
     @property
-    def carries(self) -> tuple[Carry, ...]:
+    def carries(self) -> tuple[DrawnCarry, ...]:
         """The initial trajectory and each algorithm's best selected one."""
         best = [algorithm.best for algorithm in self.algorithms]
         return (self.initial, *(carry for carry in best if carry is not None))

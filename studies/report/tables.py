@@ -8,7 +8,7 @@ import numpy as np
 
 from hybrid_opt.campaign.summary import FrontFigures
 from hybrid_opt.indicators.statistics import summarise
-from studies.report.records import AlgorithmRuns, Carry, ReportData
+from studies.report.records import AlgorithmRuns, DrawnCarry, ReportData
 from studies.report.table_text import NOTHING, Table, number
 from studies.terminal_summary import PAPER
 
@@ -110,7 +110,7 @@ def selected(data: ReportData, with_paper: bool) -> Table:
     )
 
 
-def _selections(algorithm: AlgorithmRuns) -> list[tuple[str, Carry]]:
+def _selections(algorithm: AlgorithmRuns) -> list[tuple[str, DrawnCarry]]:
     found = []
     if algorithm.selected is not None:
         found.append((algorithm.title, algorithm.selected))
@@ -119,7 +119,7 @@ def _selections(algorithm: AlgorithmRuns) -> list[tuple[str, Carry]]:
     return found
 
 
-def _forces(data: ReportData, carry: Carry, label: str) -> tuple[str, ...]:
+def _forces(data: ReportData, carry: DrawnCarry, label: str) -> tuple[str, ...]:
     normal = carry.timed.normal_force
     least, peak = normal.min(axis=0), normal.max(axis=0)
     still = float(np.mean(data.summary.static_hold.normal_force))

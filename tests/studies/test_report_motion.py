@@ -15,15 +15,15 @@ from studies.errors import ReportError
 from studies.report.__main__ import main
 from studies.report.animation import FRAMES_PER_SECOND, frames, write_animation
 from studies.report.live import LiveView
-from studies.report.records import Carry, ReportData
+from studies.report.records import DrawnCarry, ReportData
 
 
 @pytest.fixture(scope="module")
-def carry(data: ReportData) -> Carry:
+def carry(data: ReportData) -> DrawnCarry:
     return data.initial
 
 
-def test_a_gif_plays_in_real_time(data: ReportData, carry: Carry, tmp_path: Path) -> None:
+def test_a_gif_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
     path = tmp_path / "made" / "carry.gif"
     write_animation(data.geometry, carry, path)
     image = Image.open(path)
@@ -39,7 +39,7 @@ def test_a_gif_plays_in_real_time(data: ReportData, carry: Carry, tmp_path: Path
     ).mean() > 0.01
 
 
-def test_frames_show_the_motion_from_start_to_goal(data: ReportData, carry: Carry) -> None:
+def test_frames_show_the_motion_from_start_to_goal(data: ReportData, carry: DrawnCarry) -> None:
     pictures = list(frames(data.geometry, carry))
     assert len(pictures) == round(carry.timed.duration * FRAMES_PER_SECOND) + 1
     assert {picture.shape for picture in pictures} == {(400, 640, 3)}
@@ -47,7 +47,7 @@ def test_frames_show_the_motion_from_start_to_goal(data: ReportData, carry: Carr
     assert max(steps) > 0.1
 
 
-def test_an_mp4_plays_in_real_time(data: ReportData, carry: Carry, tmp_path: Path) -> None:
+def test_an_mp4_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
     path = tmp_path / "carry.mp4"
     write_animation(data.geometry, carry, path)
     count, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
@@ -55,7 +55,7 @@ def test_an_mp4_plays_in_real_time(data: ReportData, carry: Carry, tmp_path: Pat
     assert seconds == pytest.approx(carry.timed.duration, abs=2.0 / FRAMES_PER_SECOND)
 
 
-def test_another_suffix_is_refused(data: ReportData, carry: Carry, tmp_path: Path) -> None:
+def test_another_suffix_is_refused(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
     with pytest.raises(ReportError, match=r"\.gif or \.mp4"):
         write_animation(data.geometry, carry, tmp_path / "carry.avi")
 
