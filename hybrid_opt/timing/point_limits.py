@@ -9,6 +9,7 @@ from hybrid_opt.timing import rows as rows_of
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel, contact_torque
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.rows import STAGE_POINTS, PointRows
+from hybrid_opt.timing.use import limits_pressure
 from symbolic.array import Array
 
 POINT_TOLERANCE = 1e-3
@@ -107,15 +108,16 @@ class PointLimits:
     def ratios(self, a: Array, w: Array) -> Array:
         """Limits that are not convex, over their limits at the points, signed (n, k)."""
         columns: list[Array] = []
-        if not (self._limits.torque or self._limits.pressure):
-            return np.zeros((len(a), 0))
         p, workcell = self.points, self._model.workcell
+        pressure = limits_pressure(workcell, self._limits)
+        if not (self._limits.torque or pressure):
+            return np.zeros((len(a), 0))
         load = self._model.drive(p, np.sqrt(w), a)
         if self._limits.torque:
             own = p.torque_by_acceleration * a[:, None] + p.torque_by_speed * w[:, None]
             torque = contact_torque(p.wrench_torque, load) + own + p.torque_at_rest
             columns.append(torque / np.concatenate([r.torque_max for r in workcell.robots]))
-        if self._limits.pressure:
+        if pressure:
             radius = np.array([contact.patch_radius for contact in workcell.contacts])
             columns.append(load["pressure_shift"] / radius)
         return np.concatenate(columns, axis=1)

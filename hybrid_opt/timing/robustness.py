@@ -14,6 +14,8 @@ import numpy as np
 from hybrid_opt.carry import Carry
 from hybrid_opt.evaluate.static_hold import mass_at_reference, static_hold
 from hybrid_opt.timing.model import TimingModel, contact_torque
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.use import limits_pressure
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
 
@@ -144,9 +146,10 @@ class _Judge:
         reference = self.workcell.task.reference_force
         use = {
             "normal force": float((load["normal_force"] / reference).max()),
-            "pressure shift": float((load["pressure_shift"] / self._radius).max()),
             "joint torque": float((np.abs(torque) / self._torque_max).max()),
         }
+        if limits_pressure(self.workcell, TimingLimits()):
+            use["pressure shift"] = float((load["pressure_shift"] / self._radius).max())
         name = max(use, key=lambda key: use[key])
         return "" if use[name] <= 1.0 else name
 
@@ -173,7 +176,9 @@ def _centre_margin(judge: _Judge, axis: int, sign: float) -> Margin:
 
 
 def _patch_margins(carry: Carry, workcell: Workcell) -> list[Margin]:
-    """The least patch radius is the largest pressure shift, because no force depends on it."""
+    """The least patch radius is the largest pressure shift where no force depends on it."""
+    if not limits_pressure(workcell, TimingLimits()):
+        return []
     return [
         Margin(
             f"patch radius of {robot.name}",

@@ -50,7 +50,7 @@ def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict
     }
     if limits.torque:
         ratios["joint torque"] = np.abs(carry.torque) / joints("torque_max")
-    if limits.pressure:
+    if limits_pressure(workcell, limits):
         ratios["pressure shift"] = carry.pressure_shift / radius
     if limits.force is not None:
         ratios["normal force"] = carry.normal_force / limits.force
@@ -59,6 +59,15 @@ def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict
             linear / task.reference_speed, angular / task.reference_angular_speed
         )
     return ratios
+
+
+def limits_pressure(workcell: Workcell, limits: TimingLimits) -> bool:
+    """Whether the pressure's shift is a limit.
+
+    The joint allocation keeps it within the patches by pressing harder: there it is no limit, but
+    up to the patch's rim wherever the moments need it.
+    """
+    return limits.pressure and workcell.task.allocation == "paper"
 
 
 def limit_use(
