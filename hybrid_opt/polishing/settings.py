@@ -150,10 +150,10 @@ class PolishSettings:
         near, trust, solve, front: the parts' own.
     """
 
-    points: int = 20
+    points: int = 22
     method: Method = "pascoletti-serafini"
     max_iterations: int = 15
-    rounds: int = 12
+    rounds: int = 7
     max_seconds: float = 60.0
     margin: float = 1e-6
     clearance: float = 8e-4

@@ -19,7 +19,9 @@ from symbolic.errors import WorkcellError
 def load(path):
     if path.name != "cell.toml":
         raise WorkcellError(str(path), ("file: missing; name a workcell",))
-    task = types.SimpleNamespace(lower=np.full(3, 2.0), upper=np.full(3, 5.0))
+    task = types.SimpleNamespace(
+        lower=np.full(3, 2.0), upper=np.full(3, 5.0), time_law="constant"
+    )
     return types.SimpleNamespace(digest="tiny", task=task)
 
 def cell_functions(workcell):
@@ -90,7 +92,7 @@ def test_check_finds_a_difference(cache: Cache) -> None:
     edit = """
 import codegen.source as source
 plain = source.c_source
-source.c_source = lambda f: plain(f).replace("sqrt(", "1.000000001 * sqrt(")
+source.c_source = lambda f, *more: plain(f, *more).replace("sqrt(", "1.000000001 * sqrt(")
 """
     done = run(["cell.toml", "--check"], edit)
     assert done.returncode == 1, done.stdout + done.stderr
@@ -137,4 +139,4 @@ def test_without_a_compiler(cache: Cache) -> None:
     done = run(["cell.toml"], "import os; os.environ['CC'] = '/missing/cc'")
     assert done.returncode == 0
     assert "interpreted" in done.stdout
-    assert done.stderr.count("RuntimeWarning") == 1
+    assert done.stderr.count("SlowerWarning") == 1
