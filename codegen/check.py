@@ -49,19 +49,16 @@ class Agreement:
 
 
 def compare(
-    name: str,
     function: ca.Function,
     compiled: NumericFunction,
     bounds: Mapping[str, tuple[Array, Array]],
     rng: np.random.Generator,
-    *,
     samples: int = 20,
     cache: Cache | None = None,
 ) -> Agreement:
     """Compare a compiled function, and its compiled derivative, with CasADi's own evaluation.
 
     Args:
-        name: for the record.
         function: what `compiled` was made from.
         compiled: the function to check.
         bounds: by input name, between which limits inputs are drawn uniformly; the others are
@@ -90,7 +87,7 @@ def compare(
             key=_difference,
         )
     overall = max(worst, worst_derivative, key=_difference)
-    return Agreement(name, samples, worst[1], worst_derivative[1], overall[0])
+    return Agreement(function.name(), samples, worst[1], worst_derivative[1], overall[0])
 
 
 def directional_derivative(function: ca.Function) -> ca.Function:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybrid_opt.carry import Carry
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations, concatenated
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective
 from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
@@ -41,6 +42,7 @@ class Cell:
 
     Attributes:
         workcell: the description.
+        compiled: its compiled functions, made from one symbolic model.
         threads: candidates that are evaluated at the same time.
     """
 
@@ -57,6 +59,7 @@ class Cell:
             threads: for the evaluation of candidates; has no influence on results.
         """
         self.workcell = workcell
+        self.compiled = CompiledCell(workcell)
         self.threads = threads
         self._objectives = tuple(objectives)
 
@@ -82,21 +85,23 @@ class Cell:
             SettingsError: an objective is unknown.
             DualArmError: the model cannot be built.
         """
-        return CandidateEvaluator(self.workcell, self._objectives, self.threads)
+        return CandidateEvaluator(
+            self.workcell, self._objectives, self.threads, compiled=self.compiled
+        )
 
     @cached_property
     def timing_model(self) -> TimingModel:
         """What times carries."""
         from hybrid_opt.timing.model import TimingModel
 
-        return TimingModel(self.workcell)
+        return TimingModel(self.compiled)
 
     @cached_property
     def polish_functions(self) -> PolishFunctions:
         """What polishes are assembled from."""
         from hybrid_opt.polishing.functions import polish_functions
 
-        return polish_functions(self.workcell)
+        return polish_functions(self.compiled)
 
     @cached_property
     def static_hold(self) -> StaticHold:

@@ -32,6 +32,7 @@ from codegen.compiled import CompiledFunction
 from codegen.errors import CodegenError
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from studies.benchmark_collisions import POPULATION, with_collisions
 from studies.benchmark_study import profile_study, study_table
@@ -40,7 +41,7 @@ from studies.plain.candidate import PlainEvaluator
 from studies.plain.verdict import PlainJudge
 from studies.program import add_verbose, carried_out, run_program
 from symbolic.array import Array
-from symbolic.cell_model import CellModel, build_cell_model
+from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
 from symbolic.functions.candidate import candidate_function
 from symbolic.workcell.file import load
@@ -117,14 +118,15 @@ def benchmark(
     if seed < 0:
         raise SettingsError(f"--seed is {seed}; give 0 or more")
     progress(f"{workcell.name}: reading the robots, choosing start branches")
-    model = build_cell_model(workcell)
+    compiled = CompiledCell(workcell)
+    model = compiled.model
     one_each = _candidates(workcell.task, candidates, seed)
     batches = np.repeat(one_each[:, None], POPULATION, axis=1)
     batches[:, 1:] = _candidates(workcell.task, candidates * (POPULATION - 1), seed + 1).reshape(
         candidates, POPULATION - 1, -1
     )
     progress("building the evaluator")
-    evaluator = CandidateEvaluator(workcell)
+    evaluator = CandidateEvaluator(workcell, compiled=compiled)
     ways: dict[str, Evaluate] = {
         "compiled": lambda x: evaluator.sampled(x, with_collisions=False),
         "interpreted": InterpretedFunction(dense(candidate_function(model))),

@@ -60,7 +60,7 @@ def with_collisions(
     uniform = rng.uniform(evaluator.lower, evaluator.upper, size)
     functions = {
         name: InterpretedFunction(dense(function))
-        for name, function in cell_functions(workcell).items()
+        for name, function in cell_functions(evaluator.compiled.model).items()
     }
     interpreted = CandidateEvaluator(workcell, functions=functions)
     peak = peak_operations()
@@ -85,7 +85,7 @@ def with_collisions(
             }
         )
     ours, random = figures
-    per_second = candidate_operations(workcell) / (1e-3 * ours["compiled_ms"])
+    per_second = candidate_operations(evaluator.compiled.model) / (1e-3 * ours["compiled_ms"])
     ours["operations_per_second"] = per_second
     ours["share_of_peak"] = per_second / peak if peak else None
     return {"evaluations": EVALUATIONS, "population": POPULATION, **ours, "random": random}

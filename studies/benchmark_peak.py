@@ -7,8 +7,8 @@ import time
 
 from codegen.program import load_or_build_program
 from codegen.source import operations
+from symbolic.cell_model import CellModel
 from symbolic.functions.cell import kernel_functions
-from symbolic.workcell.records import Workcell
 
 ROUNDS = 2_000_000
 BEST_OF = 5
@@ -53,11 +53,11 @@ def peak_operations() -> float | None:
     return 16.0 * ROUNDS * int(library.dual_arm_lanes()) / min(times)
 
 
-def candidate_operations(workcell: Workcell) -> int:
+def candidate_operations(model: CellModel) -> int:
     """Operations of one candidate with collisions, counted in its CasADi functions.
 
     Without the branches that few samples take; a sine or cosine counts as one.
     """
-    functions = kernel_functions(workcell)
+    functions = kernel_functions(model)
     each = sum(operations(functions[name], RARE) for name in ("sample", "clearance"))
-    return operations(functions["path"]) + workcell.task.samples * each
+    return operations(functions["path"]) + model.workcell.task.samples * each

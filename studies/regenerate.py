@@ -66,26 +66,21 @@ def _run(options: argparse.Namespace) -> int:
     built: Build | None = None
     comparisons: list[Agreement] = []
     if options.workcell is not None:
-        from hybrid_opt.evaluate.functions import workcell_key
+        from hybrid_opt.compiled_cell import EVALUATOR_LANES, EVALUATORS, CompiledCell
         from symbolic.functions.cell import cell_functions
         from symbolic.workcell.file import load
 
         workcell = load(options.workcell)
-        made = cell_functions(workcell)
-        built = build_set(workcell_key(workcell), made, cache, rebuild=options.check, lanes=0)
+        cell = CompiledCell(workcell, cache)
+        made = cell_functions(cell.model)
+        built = build_set(
+            cell.key(EVALUATORS), made, cache, rebuild=options.check, lanes=EVALUATOR_LANES
+        )
         if options.check:
             bounds = {"x": (workcell.task.lower, workcell.task.upper)}
             rng = np.random.default_rng(options.seed)
             comparisons = [
-                compare(
-                    name,
-                    function,
-                    built.functions[name],
-                    bounds,
-                    rng,
-                    samples=options.samples,
-                    cache=cache,
-                )
+                compare(function, built.functions[name], bounds, rng, options.samples, cache)
                 for name, function in made.items()
             ]
     if options.json:

@@ -117,9 +117,7 @@ class _Intervals:
 
 def check_between(
     checker: CollisionChecker,
-    pose: Array,
-    q_1: Array,
-    q_2: Array,
+    configuration: Array,
     clearance: Array | None = None,
     depth: int = SEARCH_DEPTH,
     margin: float = 0.0,
@@ -127,15 +125,15 @@ def check_between(
     """Whether anything collides between n samples that are themselves free of collisions.
 
     Args:
-        pose: (n, 6) box poses [m, rad]; q_1, q_2: (n, 6) joint positions [rad]. Between samples
-            all of them move linearly.
+        configuration: (n, 18) box poses [m, rad] and both arms' joint positions [rad]. Between
+            samples all of them move linearly.
         clearance: (n, n_pairs) bounds if known already [m].
         depth: how often an interval is halved before it counts as undecided.
         margin: distance to be kept beyond the tolerance [m].
     """
     if clearance is None:
-        clearance = checker.bounds(pose, q_1, q_2)
-    return _Sweep(checker, margin).run(np.hstack([pose, q_1, q_2]), clearance, depth)
+        clearance = checker.bounds(*_split(configuration))
+    return _Sweep(checker, margin).run(configuration, clearance, depth)
 
 
 class _Sweep:

@@ -95,7 +95,7 @@ def certify(
     if verdict.first_contact is not None:
         hit = verdict.first_contact
         return Certificate(False, hit, float(u[hit.sample]), None, len(u), deviation)
-    motion = check_between(checker, *grid, clearance, depth, margin=2.0 * deviation)
+    motion = check_between(checker, np.hstack(grid), clearance, depth, 2.0 * deviation)
     where = float("nan")
     if motion.contact is not None:
         k = motion.contact.interval

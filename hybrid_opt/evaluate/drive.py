@@ -20,7 +20,6 @@ from hybrid_opt.evaluate.drive_constraints import (
 from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
 
 _AT_REST = {"normal force": FORCE_LIMIT, "joint torque": JOINT_TORQUE}
 
@@ -48,22 +47,16 @@ class Drive:
 class Driver:
     """Drives candidates of one workcell."""
 
-    def __init__(
-        self, workcell: Workcell, threads: int = 1, timer: PathTimer | None = None
-    ) -> None:
-        """Load or build the compiled timing.
+    def __init__(self, timer: PathTimer, threads: int = 1) -> None:
+        """Drive with a timer.
 
         Args:
-            workcell: its time law is 'optimal'.
-            threads: threads that share a batch.
-            timer: of the same workcell, where there is one.
-
-        Raises:
-            DualArmError: the model cannot be built.
+            timer: of a workcell whose time law is 'optimal'.
+            threads: threads that share a batch of candidates.
         """
-        self._task = workcell.task
+        self._task = timer.workcell.task
         self._threads = threads
-        self.timer = PathTimer(workcell, threads=threads) if timer is None else timer
+        self.timer = timer
 
     def outputs(self, candidate: NumericFunction, x: Array) -> dict[str, Array]:
         """Every per-sample output of decision vectors (n, n_var), driven.

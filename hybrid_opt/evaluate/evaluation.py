@@ -19,9 +19,9 @@ from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificate
 from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
-from hybrid_opt.evaluate.functions import workcell_functions
 from hybrid_opt.evaluate.kernel import load_kernel
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective, select_objectives
 from hybrid_opt.evaluate.sampled import SampledVerdicts, collision_shares, one_by_one
@@ -122,6 +122,7 @@ class CandidateEvaluator:
 
     Attributes:
         workcell: the cell.
+        compiled: where its functions come from.
         objectives, objective_names: what is minimised, and its names.
         functions: the cell's compiled functions by name.
         checker: FCL's verdict on samples.
@@ -136,6 +137,7 @@ class CandidateEvaluator:
         threads: int = 1,
         functions: Mapping[str, NumericFunction] | None = None,
         driver: Driver | None = None,
+        compiled: CompiledCell | None = None,
     ) -> None:
         """Load or build the compiled functions.
 
@@ -143,26 +145,28 @@ class CandidateEvaluator:
             objectives: what to minimise, by name or as one's own record.
             functions: those of `symbolic.functions.cell`, if not to be loaded or built here.
             driver: under the time law 'optimal', likewise.
+            compiled: where functions are taken from, if others share it.
 
         Raises:
             SettingsError: an objective is unknown or there twice.
             DualArmError: the model cannot be built (see `symbolic.cell_model`, `codegen`).
         """
         self.workcell = workcell
+        self.compiled = CompiledCell(workcell) if compiled is None else compiled
         self.objectives = select_objectives(objectives)
         self.objective_names = tuple(objective.name for objective in self.objectives)
         self._threads = threads
-        self.functions = workcell_functions(workcell) if functions is None else functions
+        self.functions = self.compiled.evaluators if functions is None else functions
         self._candidate = self.functions["candidate"]
         self.checker = CollisionChecker(build_geometry(workcell), self.functions)
-        self.driver = _driver(workcell, threads) if driver is None else driver
+        self.driver = _driver(self.compiled, threads) if driver is None else driver
         self.n_var = workcell.task.n_var
         self.lower = workcell.task.lower
         self.upper = workcell.task.upper
         self._needs = _needs(self.objectives)
         self._kernel = None
         if functions is None and self.driver is None:
-            self._kernel = load_kernel(workcell, self.checker, self.outputs)
+            self._kernel = load_kernel(self.compiled, self.checker, self.outputs)
 
     def outputs(self, x: Array) -> dict[str, Array]:
         """Every per-sample output for decision vectors (n, n_var), see
@@ -343,14 +347,15 @@ class CandidateEvaluator:
         )
 
 
-def _driver(workcell: Workcell, threads: int) -> Driver | None:
+def _driver(compiled: CompiledCell, threads: int) -> Driver | None:
     """What drives candidates under the time law 'optimal'."""
-    if workcell.task.time_law != "optimal":
+    if compiled.workcell.task.time_law != "optimal":
         return None
     # Not imported at the top: other time laws need no timing, and hence no CasADi.
     from hybrid_opt.evaluate.drive import Driver
+    from hybrid_opt.timing.path_timer import PathTimer
 
-    return Driver(workcell, threads)
+    return Driver(PathTimer(compiled, threads=threads), threads)
 
 
 def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:

@@ -15,19 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.cache import Cache
 from codegen.compiled import thread_pool, warn_one_lane
 from codegen.errors import CodegenError
 from codegen.function import available_cores
 from codegen.program import load_or_build_program
 from hybrid_opt.collision.checker import CollisionChecker
-from hybrid_opt.evaluate.functions import workcell_key
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.kernel_data import OPEN_PAIR, BatchData, judge_arrays, judge_data
 from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
 from symbolic.array import Array
 from symbolic.functions.candidate import CONSTRAINTS, SAMPLE_SIZES
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.workcell.records import Workcell
 
 _LEAST_ROOM = 4096
 """Open pairs that are collected before they are handed on, beside those of one pass."""
@@ -155,10 +153,9 @@ class Kernel:
 
 
 def load_kernel(
-    workcell: Workcell,
+    compiled: CompiledCell,
     checker: CollisionChecker,
     outputs: Callable[[Array], Mapping[str, Array]],
-    cache: Cache | None = None,
     lanes: int = 0,
 ) -> Kernel | None:
     """The kernel of a cell that was read from a file.
@@ -167,29 +164,30 @@ def load_kernel(
 
     Args:
         outputs: of decision vectors, as the candidate function has them.
-        cache: where the library is kept; by default the user's.
         lanes: candidates side by side; 0 for what suits the machine.
 
     Returns:
         None where there can be no kernel; with one warning where it can be but fails.
     """
-    if not workcell.digest:
+    if not compiled.is_identified:
         return None
 
     def make() -> Mapping[str, Any]:
         from symbolic.functions.cell import kernel_functions
 
-        return kernel_functions(workcell)
+        return kernel_functions(compiled.model)
 
     own = _definitions(checker.geometry) + "".join(
         files("hybrid_opt").joinpath(*path).read_text()
         for path in (("collision", "prejudge.c"), ("evaluate", "kernel.c"))
     )
-    library = load_or_build_program("kernel", workcell_key(workcell), make, own, cache, lanes)
+    library = load_or_build_program(
+        "kernel", compiled.key("kernel"), make, own, compiled.cache, lanes
+    )
     if library is None:
         return None
     kernel = Kernel(library, checker)
-    task = workcell.task
+    task = compiled.workcell.task
     x = np.random.default_rng(0).uniform(task.lower, task.upper, (kernel.lanes + 1, task.n_var))
     if _same(kernel.evaluate(x, tuple(SAMPLE_SIZES)), one_by_one(outputs(x), checker)):
         return kernel

@@ -59,7 +59,7 @@ class FrontPolisher:
             )
         self.evaluator, self.settings = evaluator, settings
         self.solver = PolishSolver(
-            evaluator, functions or polish_functions(evaluator.workcell), settings
+            evaluator, functions or polish_functions(evaluator.compiled), settings
         )
 
     def polish(

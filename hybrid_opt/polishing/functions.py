@@ -10,12 +10,10 @@ from typing import get_args
 import casadi as ca
 import numpy as np
 
-from codegen.build import build, load_or_build
-from codegen.cache import digest
 from codegen.function import NumericFunction
-from hybrid_opt.evaluate.functions import workcell_key
+from hybrid_opt.compiled_cell import CompiledCell
 from symbolic.array import Array
-from symbolic.cell_model import CellModel, build_cell_model
+from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
 from symbolic.smooth.closure import closure_functions
 from symbolic.smooth.joint_limit import JointLimit
@@ -24,7 +22,6 @@ from symbolic.smooth.passage import GAPS, Passing, Separation, gap_function
 from symbolic.smooth.place import Place, PlaceConstraint, row_function
 from symbolic.smooth.reach import Reach
 from symbolic.smooth.samples import sample_functions
-from symbolic.workcell.records import Workcell
 
 COMPILED = (
     Reach(0),
@@ -145,24 +142,23 @@ class PolishFunctions:
     rows: RowFunctions = field(repr=False)
 
 
-def polish_functions(workcell: Workcell) -> PolishFunctions:
+def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     """Load or build the functions of a workcell's smooth problem.
 
     Raises:
         SettingsError: the time law is 'optimal', which is no smooth function of the path.
         DualArmError: the cell's model cannot be built, or its functions not be compiled.
     """
-    if workcell.task.time_law == "optimal":
+    if compiled.workcell.task.time_law == "optimal":
         raise SettingsError(
             "the polish does not know the time law 'optimal'; search without it (--no-polish), or "
             "polish under 'constant' or 'ramped'"
         )
-    model = build_cell_model(workcell)
 
-    def make() -> dict[str, ca.Function]:
+    def make(model: CellModel) -> dict[str, ca.Function]:
         place, functions = Place(model), dict[str, ca.Function]()
         for quantity in QUANTITIES:
-            functions |= _named(sample_functions(workcell, quantity))
+            functions |= _named(sample_functions(model.workcell, quantity))
         for arm in ARMS:
             functions |= _named(closure_functions(model, arm))
         for constraint in COMPILED:
@@ -171,11 +167,7 @@ def polish_functions(workcell: Workcell) -> PolishFunctions:
                 functions[name] = row_function(place, constraint, order)
         return functions | {GAPS: gap_function(place)}
 
-    if workcell.digest:
-        key = digest("polish", str(_LEVELS), workcell_key(workcell))
-        built = load_or_build(key, make, levels=_LEVELS)
-    else:
-        built = build(make(), levels=_LEVELS).functions
+    built = compiled.functions("polish", make, str(_LEVELS), levels=_LEVELS)
     sample_keys = [
         SampleKey(q, block, order) for q in QUANTITIES for block in BLOCKS for order in ORDERS
     ]
@@ -184,7 +176,7 @@ def polish_functions(workcell: Workcell) -> PolishFunctions:
     return PolishFunctions(
         samples={key: built[key.name] for key in sample_keys if key.name in built},
         closures={key: built[key.name] for key in closure_keys},
-        rows=RowFunctions(model, {key: built[key.name] for key in row_keys}, built[GAPS]),
+        rows=RowFunctions(compiled.model, {key: built[key.name] for key in row_keys}, built[GAPS]),
     )
 
 

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.functions import workcell_functions
 from hybrid_opt.store.files import storing
 from symbolic import outside
 from symbolic.array import Array
@@ -98,7 +98,7 @@ def write_trajectory(
     x = np.asarray(x, dtype=float)
     if x.shape != (workcell.task.n_var,) or not np.isfinite(x).all():
         raise ResultsError(f"decision vector: expected {workcell.task.n_var} finite numbers")
-    outputs = workcell_functions(workcell)["candidate"](x)
+    outputs = CompiledCell(workcell).evaluators["candidate"](x)
     document = {
         "format": FORMAT,
         "version": VERSION,

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.build import build, load_or_build
-from codegen.cache import Cache, digest
 from codegen.function import NumericFunction
 from hybrid_opt.carry import ArmMotion, Carry, joints_of
-from hybrid_opt.evaluate.functions import workcell_functions, workcell_key
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.time_law import carry_under_time_law
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
@@ -68,6 +66,8 @@ class PathMotion:
 
 
 if TYPE_CHECKING:
+    import casadi as ca
+
     from hybrid_opt.evaluate.drive import Driver
 
 _BOX = (
@@ -94,19 +94,14 @@ class TimingModel:
 
     def __init__(
         self,
-        workcell: Workcell,
+        cell: Workcell | CompiledCell,
         stages: int = STAGES,
-        cache: Cache | None = None,
-        cell_model: CellModel | None = None,
     ) -> None:
         """Load or build the compiled functions.
 
         Args:
-            workcell: the cell.
+            cell: the cell; compiled, where others share its functions.
             stages: pieces of constant path acceleration.
-            cache: where compiled functions are kept; by default the user's.
-            cell_model: the cell's symbolic model, where other start postures than the stated
-                criterion's are wanted; the functions are then built from it.
 
         Raises:
             SettingsError: the number of stages is out of range.
@@ -114,21 +109,16 @@ class TimingModel:
         """
         if not 10 <= stages <= 2000:
             raise SettingsError(f"{stages} stages; allowed are 10 to 2000")
-        self.workcell = workcell
+        self._compiled = CompiledCell.of(cell)
+        self.workcell = workcell = self._compiled.workcell
         self.stages = stages
         self.joint_names = (joint_names(workcell.robots[0]), joint_names(workcell.robots[1]))
-        self._cache = cache
-        self._cell_model = cell_model
         samples = REFINEMENT * stages + 1
 
-        def make() -> Any:
-            return timing_functions(workcell, samples, cell_model)
+        def make(model: CellModel) -> dict[str, ca.Function]:
+            return timing_functions(model, samples)
 
-        if workcell.digest and cell_model is None:
-            key = digest("timing", workcell_key(workcell), str(samples))
-            self._functions = load_or_build(key, make, cache)
-        else:  # nothing identifies these functions but themselves
-            self._functions = build(make(), cache).functions
+        self._functions = self._compiled.functions("timing", make, str(samples))
 
     def path_motion(self, x: Array) -> PathMotion:
         """The geometry at `REFINEMENT` samples per stage, uniform in u.
@@ -223,18 +213,20 @@ class TimingModel:
         from hybrid_opt.evaluate.drive import Driver
         from hybrid_opt.timing.path_timer import PathTimer
 
-        timer = PathTimer(self.workcell, cache=self._cache, cell_model=self._cell_model)
-        return Driver(self.workcell, timer=timer)
+        return Driver(PathTimer(self._compiled))
 
     @cached_property
     def _search_functions(self) -> Mapping[str, NumericFunction]:
-        if self._cell_model is None:
-            return workcell_functions(self.workcell, self._cache)
-        made = {"candidate": candidate_function(self._cell_model)} | {
-            f"inverse_dynamics_{i + 1}": robot.inverse_dynamics
-            for i, robot in enumerate(self._cell_model.robots)
-        }
-        return build(made, self._cache).functions
+        if self._compiled.is_identified:
+            return self._compiled.evaluators
+
+        def make(model: CellModel) -> dict[str, ca.Function]:
+            return {"candidate": candidate_function(model)} | {
+                f"inverse_dynamics_{i + 1}": robot.inverse_dynamics
+                for i, robot in enumerate(model.robots)
+            }
+
+        return self._compiled.functions("search carry", make)
 
     def _checked(self, x: Array) -> Array:
         x = np.ascontiguousarray(x, dtype=float)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from importlib.resources import files
 
 from codegen.build import load_or_compile
-from codegen.cache import Cache, digest, source_digest
+from codegen.cache import digest, source_digest
 from codegen.compiler import find_compiler
 from codegen.function import NumericFunction
 from codegen.signature import Signature
-from hybrid_opt.evaluate.functions import workcell_key
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.records import TimingStatus
 from symbolic.workcell.records import Workcell
 
@@ -37,9 +37,7 @@ OUTCOMES = (
 """What its statuses mean."""
 
 
-def passes_function(
-    workcell: Workcell, stages: int, cache: Cache | None = None, *, identified: bool = True
-) -> NumericFunction | None:
+def passes_function(compiled: CompiledCell, stages: int) -> NumericFunction | None:
     """The timing of one path from its limits; None without a C compiler, or where the contact
     forces are allocated jointly.
 
@@ -53,16 +51,15 @@ def passes_function(
     use are those of standing still.
 
     Args:
-        workcell: the cell.
+        compiled: the cell.
         stages: pieces of constant path acceleration.
-        cache: where compiled functions are kept; by default the user's.
-        identified: whether the workcell's digest stands for it; otherwise its C text does.
     """
+    workcell, cache = compiled.workcell, compiled.cache
     if workcell.task.allocation != "paper":
         return None  # the passes know the paper's normal forces in closed form, and no others
-    if identified and workcell.digest:
+    if compiled.is_identified:
         own = source_digest("hybrid_opt")
-        key = digest("path timing", workcell_key(workcell), str(stages), own)
+        key = compiled.key("path timing", str(stages), own)
         return load_or_compile(key, lambda: _source(workcell, stages), cache)
     if find_compiler() is None:
         return None

@@ -8,22 +8,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from codegen.build import build, load_or_build
-from codegen.cache import Cache, digest
-from hybrid_opt.evaluate.functions import workcell_key
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.model import TimingModel, joint_names
 from hybrid_opt.timing.passes import KINDS, OUTCOMES, passes_function
 from hybrid_opt.timing.path_check import LEAST_LENGTH, arm_checks
 from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
-from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Workcell
+
+if TYPE_CHECKING:
+    import casadi as ca
+
+    from symbolic.cell_model import CellModel
 
 PATH_STAGES = 100
 """Pieces of constant path acceleration."""
@@ -73,21 +75,16 @@ class PathTimer:
 
     def __init__(
         self,
-        workcell: Workcell,
+        cell: Workcell | CompiledCell,
         stages: int = PATH_STAGES,
-        cache: Cache | None = None,
-        cell_model: CellModel | None = None,
         threads: int = 1,
         lanes: int = 0,
     ) -> None:
         """Load or build the compiled functions.
 
         Args:
-            workcell: the cell.
+            cell: the cell; compiled, where others share its functions.
             stages: pieces of constant path acceleration.
-            cache: where compiled functions are kept; by default the user's.
-            cell_model: the cell's symbolic model, where it does not follow from the workcell's
-                files alone.
             threads: threads that share a batch.
             lanes: paths of a batch that run side by side; 0 for what suits the machine. One lane
                 builds faster.
@@ -98,31 +95,24 @@ class PathTimer:
         """
         if not 10 <= stages <= 2000:
             raise SettingsError(f"{stages} stages; allowed are 10 to 2000")
-        self.workcell = workcell
+        self._compiled = compiled = CompiledCell.of(cell)
+        self.workcell = workcell = compiled.workcell
         self.stages = stages
-        self._cache = cache
-        self._cell_model = cell_model
         self._threads = threads
         self._joint_names = (joint_names(workcell.robots[0]), joint_names(workcell.robots[1]))
 
-        def make() -> Any:
+        def make(model: CellModel) -> dict[str, ca.Function]:
             # Not imported at the top: a warm start needs no CasADi.
             from symbolic.physics.path_limits import path_function, sample_limits_function
 
-            model = build_cell_model(workcell) if cell_model is None else cell_model
             return {
                 "path": path_function(model, 2 * stages + 1),
                 "sample_limits": sample_limits_function(model),
             }
 
-        identified = bool(workcell.digest) and cell_model is None
-        if identified:
-            key = digest("path limits", workcell_key(workcell), str(stages))
-            functions = load_or_build(key, make, cache, lanes=lanes)
-        else:
-            functions = build(make(), cache, lanes=lanes).functions
+        functions = compiled.functions("path limits", make, str(stages), lanes=lanes)
         self._path, self._limits = functions["path"], functions["sample_limits"]
-        self._passes = passes_function(workcell, stages, cache, identified=identified)
+        self._passes = passes_function(compiled, stages)
 
     @property
     def compiled(self) -> bool:
@@ -186,7 +176,7 @@ class PathTimer:
 
     @cached_property
     def _model(self) -> TimingModel:
-        return TimingModel(self.workcell, self.stages, self._cache, self._cell_model)
+        return TimingModel(self._compiled, self.stages)
 
     def _path_failure(self, paths: dict[str, Array], row: int) -> PathTiming | None:
         """Why a path cannot be timed at all."""

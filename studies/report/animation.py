@@ -15,7 +15,7 @@ from PIL import Image
 from hybrid_opt.display.scene import motion_points
 from hybrid_opt.display.solids import cell_solids
 from studies.errors import ReportError
-from studies.report.drawing import ISOMETRIC, cut_faces, draw_cell, draw_path, frame_axes
+from studies.report.drawing import ISOMETRIC, CutCell, draw_cell, draw_path, frame_axes
 from studies.report.records import DrawnCarry
 from studies.report.style import in_style
 from symbolic.array import Array
@@ -49,7 +49,7 @@ def write_animation(geometry: CellGeometry, carry: DrawnCarry, path: Path) -> No
 
 def frames(geometry: CellGeometry, carry: DrawnCarry) -> Iterator[NDArray[np.uint8]]:
     """(height, width, 3) pictures, evenly spaced in time."""
-    faces = cut_faces(cell_solids(geometry))
+    cell = CutCell.of(geometry, cell_solids(geometry))
     points = motion_points(geometry, carry.timed)
     timed = carry.timed
     count = max(2, round(timed.duration * FRAMES_PER_SECOND) + 1)
@@ -59,7 +59,7 @@ def frames(geometry: CellGeometry, carry: DrawnCarry) -> Iterator[NDArray[np.uin
         with in_style():
             figure = Figure(figsize=SIZE, dpi=DPI)
             axes = figure.add_axes((0.0, 0.0, 1.0, 0.93))
-            draw_cell(axes, geometry, faces, ISOMETRIC, pose[k], q[k])
+            draw_cell(axes, cell, ISOMETRIC, pose[k], q[k])
             draw_path(axes, ISOMETRIC, pose[: k + 1, :3], color="#b00020", linewidth=1.2)
             frame_axes(axes, ISOMETRIC, points)
             text = f"{carry.label}    t = {moment - timed.time[0]:5.2f} s"

@@ -90,6 +90,19 @@ class Faces:
     is_ground: bool
 
 
+@dataclass(frozen=True)
+class CutCell:
+    """A cell, and the faces of it that are drawn."""
+
+    geometry: CellGeometry
+    faces: tuple[Faces, ...]
+
+    @classmethod
+    def of(cls, geometry: CellGeometry, solids: Sequence[Solid]) -> CutCell:
+        """The cell with some of its solids."""
+        return cls(geometry, cut_faces(solids))
+
+
 def cut_faces(solids: Sequence[Solid]) -> tuple[Faces, ...]:
     """The solids' triangles cut to `MAX_EDGE`, coloured by the party they belong to."""
     faces = []
@@ -119,18 +132,17 @@ def _colour(solid: Solid) -> str:
 
 def draw_cell(
     axes: Axes,
-    geometry: CellGeometry,
-    faces: Sequence[Faces],
+    cell: CutCell,
     view: View,
     pose: Array,
     q: Array,
     hidden: tuple[str, ...] = (),
 ) -> None:
     """Draw the cell at one sample: pose (6,), q (12,). hidden: kinds of frames left out."""
-    placed = frame_placements(geometry, pose[None], q[None])
+    placed = frame_placements(cell.geometry, pose[None], q[None])
     corners, colours = [], []
     ground_corners = []
-    for part in faces:
+    for part in cell.faces:
         if part.frame.kind in hidden:
             continue
         T = placed[part.frame][0]

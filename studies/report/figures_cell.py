@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 
 from hybrid_opt.display.scene import motion_points
 from hybrid_opt.display.solids import cell_solids, extent_points
@@ -14,11 +17,10 @@ from studies.report.drawing import (
     FRONT,
     ISOMETRIC,
     SIDE,
-    Faces,
+    CutCell,
     View,
     aspect,
     box_corners,
-    cut_faces,
     draw_box_edges,
     draw_cell,
     draw_path,
@@ -50,7 +52,7 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry
         (right, SIDE, 1, "b", f"side view, slice at y = {_metres(middle[1])}"),
     ):
         _draw_reach(axes, reach, view, across, float(middle[across]))
-        draw_cell(axes, geometry, _fixed_faces(geometry), view, *_start(carry), hidden=("box",))
+        draw_cell(axes, _fixed(geometry), view, *_start(carry), hidden=("box",))
         for lower, upper in _free_bounds(geometry):
             draw_box_edges(axes, view, lower, upper, colors="#b00020", linewidths=0.9)
         panel_label(axes, letter, text)
@@ -79,7 +81,7 @@ def environment(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
     """The cell with the payload at its start: front, side and oblique (paper Figure 5)."""
     figure = new_figure(FULL_WIDTH, 0.34 * FULL_WIDTH)
     solids = cell_solids(geometry)
-    faces = cut_faces(solids)
+    cell = CutCell.of(geometry, solids)
     pose, q = _start(carry)
     points = extent_points(geometry, solids, pose[None], q[None])
     views = (FRONT, SIDE, ISOMETRIC)
@@ -87,7 +89,7 @@ def environment(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
     for axes, view, letter, text in zip(
         panels, views, "abc", ("front", "side", "oblique"), strict=True
     ):
-        draw_cell(axes, geometry, faces, view, pose, q)
+        draw_cell(axes, cell, view, pose, q)
         panel_label(axes, letter, text)
         frame_axes(axes, view, points)
     return figure
@@ -100,13 +102,14 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) ->
     robot = geometry.workcell.robots[0]
     arm = tuple(s for s in cell_solids(geometry) if s.group == "robot 1")
     pose, q = _start(carry)
-    draw_cell(left, geometry, cut_faces(arm), ISOMETRIC, pose, q)
+    cell = CutCell.of(geometry, arm)
+    draw_cell(left, cell, ISOMETRIC, pose, q)
     frame_axes(left, ISOMETRIC, extent_points(geometry, arm, pose[None], q[None]))
     panel_label(left, "a", f"arm {shortened(robot.name)!r} at the start")
     base = robot.T_world_base[:3, 3]
     index = int((base[0] - reach.lower[0]) / reach.step)
-    _fill(right, reach, reach.pads[0][index], (1, 2), FRONT, ARMS[0], HATCHES[0], 0.35)
-    draw_cell(right, geometry, cut_faces(arm), FRONT, pose, q)
+    _draw_slice(right, FRONT, reach, _Layer(reach.pads[0], ARMS[0], HATCHES[0], 0.35), 0, index)
+    draw_cell(right, cell, FRONT, pose, q)
     bounds = _reach_bounds(reach)
     occupied = np.flatnonzero(reach.pads[0].any(axis=(0, 2)))
     bounds[:, 1] = reach.lower[1] + reach.step * np.array([occupied[0] - 1, occupied[-1] + 2])
@@ -119,12 +122,12 @@ def motion_sequence(geometry: CellGeometry, carry: DrawnCarry, columns: int = 2)
     """The cell at 0, 33, 66 and 100 % of a carry (paper Figures 14 and 15)."""
     rows = -(-len(SHARES) // columns)
     points = motion_points(geometry, carry.timed)
-    faces = cut_faces(cell_solids(geometry))
+    cell = CutCell.of(geometry, cell_solids(geometry))
     figure = new_figure(FULL_WIDTH, 0.37 * FULL_WIDTH * rows)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     samples = sample_at(carry, np.array(SHARES))
     for axes, share, sample, letter in zip(panels, SHARES, samples, "abcd", strict=True):
-        draw_cell(axes, geometry, faces, ISOMETRIC, carry.timed.pose[sample], carry.timed.q[sample])
+        draw_cell(axes, cell, ISOMETRIC, carry.timed.pose[sample], carry.timed.q[sample])
         draw_path(
             axes, ISOMETRIC, carry.timed.pose[: sample + 1, :3], color="#b00020", linewidth=1.0
         )
@@ -141,7 +144,7 @@ def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, str, object],
     Args:
         carries: trajectory, colour and line style of each.
     """
-    faces = _fixed_faces(geometry)
+    cell = _fixed(geometry)
     points = np.concatenate([carry.timed.pose[:, :3] for carry, _, _ in carries])
     half = geometry.workcell.payload.size / 2.0
     near = box_corners(points.min(axis=0) - half, points.max(axis=0) + half)
@@ -151,7 +154,7 @@ def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, str, object],
     for axes, view, letter, text in zip(
         panels, views, "abc", ("y–z plane", "x–y plane", "oblique"), strict=True
     ):
-        draw_cell(axes, geometry, faces, view, *_start(carries[0][0]), hidden=("box", "link"))
+        draw_cell(axes, cell, view, *_start(carries[0][0]), hidden=("box", "link"))
         for carry, colour, line in carries:
             draw_path(
                 axes, view, carry.timed.pose[:, :3], color=colour, linestyle=line, label=carry.label
@@ -180,9 +183,9 @@ def _start(carry: DrawnCarry) -> tuple[Array, Array]:
     return carry.timed.pose[0], carry.timed.q[0]
 
 
-def _fixed_faces(geometry: CellGeometry) -> tuple[Faces, ...]:
+def _fixed(geometry: CellGeometry) -> CutCell:
     fixed = tuple(solid for solid in cell_solids(geometry) if solid.frame.kind == "world")
-    return cut_faces(fixed)
+    return CutCell.of(geometry, fixed)
 
 
 def _free_bounds(geometry: CellGeometry) -> list[tuple[Array, Array]]:
@@ -203,37 +206,38 @@ def _reach_bounds(reach: ReachMap) -> Array:
     return bounds
 
 
+@dataclass(frozen=True)
+class _Layer:
+    """A region of the grid and how its slices look.
+
+    Attributes:
+        mask: (nx, ny, nz) cells of the grid in the region.
+    """
+
+    mask: NDArray[np.bool_]
+    colour: str
+    hatch: str
+    alpha: float
+
+
 def _draw_reach(axes: Axes, reach: ReachMap, view: View, across: int, at: float) -> None:
     """Slices of the reach across a world axis; along the line between the arms only what both
     reach together, because their own regions would hide it."""
     index = int((at - reach.lower[across]) / reach.step)
-    kept = tuple(a for a in range(3) if a != across)
-    layers = [(reach.common, "#2a8f4d", "", 0.55)]
     if across == 0:
-        layers = [
-            *(
-                (pads, colour, hatch, 0.35)
-                for pads, colour, hatch in zip(reach.pads, ARMS, HATCHES, strict=True)
-            ),
-            *layers,
-        ]
-    for mask, colour, hatch, alpha in layers:
-        _fill(axes, reach, np.take(mask, index, axis=across), kept, view, colour, hatch, alpha)
+        for pads, colour, hatch in zip(reach.pads, ARMS, HATCHES, strict=True):
+            _draw_slice(axes, view, reach, _Layer(pads, colour, hatch, 0.35), across, index)
+    _draw_slice(axes, view, reach, _Layer(reach.common, "#2a8f4d", "", 0.55), across, index)
 
 
-def _fill(
-    axes: Axes,
-    reach: ReachMap,
-    mask: Array,
-    kept: tuple[int, ...],
-    view: View,
-    colour: str,
-    hatch: str,
-    alpha: float,
+def _draw_slice(
+    axes: Axes, view: View, reach: ReachMap, layer: _Layer, across: int, index: int
 ) -> None:
-    """A slice of the grid as a filled region; mask over the two kept world axes."""
+    """A slice of a region across a world axis, filled."""
+    mask = np.take(layer.mask, index, axis=across)
     if not mask.any():
         return
+    kept = [a for a in range(3) if a != across]
     centres = [
         reach.lower[a] + (np.arange(mask.shape[k]) + 0.5) * reach.step for k, a in enumerate(kept)
     ]
@@ -243,10 +247,10 @@ def _fill(
         centres[1],
         mask.T.astype(float),
         levels=(0.5, 1.5),
-        colors=[colour],
-        alpha=alpha,
-        hatches=[hatch],
+        colors=[layer.colour],
+        alpha=layer.alpha,
+        hatches=[layer.hatch],
         zorder=0.5,
     )
-    filled.set_edgecolor(colour)
+    filled.set_edgecolor(layer.colour)
     filled.set_linewidth(0.0)

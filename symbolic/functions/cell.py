@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import casadi as ca
 
-from symbolic.cell_model import build_cell_model
+from symbolic.cell_model import CellModel
 from symbolic.functions.candidate import candidate_function, sample_functions
 from symbolic.geometry.clearance import screening_functions
 from symbolic.robot.arm import posture_function
-from symbolic.workcell.records import Workcell
 
 
-def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
+def cell_functions(model: CellModel) -> dict[str, ca.Function]:
     """The functions by name.
 
     candidate: the evaluator of a whole candidate (`symbolic.functions.candidate`).
@@ -19,11 +18,7 @@ def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
     posture: both arms at one box pose (`symbolic.robot.arm.posture_function`).
     clearance, piece_poses, motion: collision bounds, placements and bounds of the motion
     (`symbolic.geometry.clearance.screening_functions`).
-
-    Raises:
-        DualArmError: the cell's model cannot be built.
     """
-    model = build_cell_model(workcell)
     placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
     return {
         "candidate": candidate_function(model),
@@ -33,16 +28,12 @@ def cell_functions(workcell: Workcell) -> dict[str, ca.Function]:
     }
 
 
-def kernel_functions(workcell: Workcell) -> dict[str, ca.Function]:
+def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
     """What a whole evaluation is put together from, sample by sample.
 
     path, start, predict, sample: see `symbolic.functions.candidate.sample_functions`.
     clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
-
-    Raises:
-        DualArmError: the cell's model cannot be built.
     """
-    model = build_cell_model(workcell)
     placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
     screening = screening_functions(model.geometry, placements)
     return sample_functions(model) | {

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import casadi as ca
 
-from symbolic.cell_model import CellModel, build_cell_model
+from symbolic.cell_model import CellModel
 from symbolic.physics.path_motion import arm_derivative_function, path_motion_function
 from symbolic.physics.payload_load import load_function, uncertain_load_function
-from symbolic.workcell.records import Workcell
 
 
-def timing_functions(
-    workcell: Workcell, samples: int, model: CellModel | None = None
-) -> dict[str, ca.Function]:
+def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
     """Functions for the timing of one workcell.
 
     path_motion: see `symbolic.physics.path_motion`, at that many samples. load, uncertain_load: see
     `symbolic.physics.payload_load`. arm_i per arm i = 1, 2: see
     `symbolic.physics.path_motion.arm_derivative_function`.
-
-    Raises:
-        DualArmError: the cell's model cannot be built.
     """
-    model = build_cell_model(workcell) if model is None else model
+    workcell = model.workcell
     functions = {
         "path_motion": path_motion_function(model, samples),
         "load": load_function(workcell),

@@ -37,9 +37,9 @@ def test_another_function_is_told_apart(cache: Cache) -> None:
     shifted = ca.Function("f", [x], [ca.sin(x) + 1e-9], ["x"], ["y"])
     bounds = {"x": (np.full(2, 0.5), np.full(2, 1.0))}
     rng = np.random.default_rng(0)
-    same = compare("f", function, compile_function(function, cache), bounds, rng, cache=cache)
+    same = compare(function, compile_function(function, cache), bounds, rng, cache=cache)
     assert same.agrees
-    other = compare("f", function, compile_function(shifted, cache), bounds, rng, cache=cache)
+    other = compare(function, compile_function(shifted, cache), bounds, rng, cache=cache)
     assert not other.agrees
     assert other.worst_output == "y"
     assert 1e-9 <= other.outputs < 3e-9
@@ -53,8 +53,6 @@ def test_inputs_stay_within_their_bounds(cache: Cache) -> None:
     other = ca.Function("f", [x], [x[0]], ["x"], ["y"])
     bounds = {"x": (np.full(2, 3.0), np.full(2, 4.0))}
     rng = np.random.default_rng(0)
-    assert compare("f", function, compile_function(other, cache), bounds, rng, cache=cache).agrees
+    assert compare(function, compile_function(other, cache), bounds, rng, cache=cache).agrees
     loose = {"x": (np.full(2, 2.0), np.full(2, 5.0))}
-    assert not compare(
-        "f", function, compile_function(other, cache), loose, rng, cache=cache
-    ).agrees
+    assert not compare(function, compile_function(other, cache), loose, rng, cache=cache).agrees

@@ -24,12 +24,16 @@ def load(path):
     )
     return types.SimpleNamespace(digest="tiny", task=task)
 
-def cell_functions(workcell):
+def build_cell_model(workcell):
+    return None
+
+def cell_functions(model):
     x, p = ca.MX.sym("x", 3), ca.MX.sym("p", 2, 2)
     # NaN outside the bounds of x.
     return {"roots": ca.Function("roots", [x, p], [ca.sqrt(x - 2), p @ p], ["x", "p"], ["y", "z"])}
 
-for name, content in {"functions.cell": cell_functions, "workcell.file": load}.items():
+faked = {"cell_model": build_cell_model, "functions.cell": cell_functions, "workcell.file": load}
+for name, content in faked.items():
     module = types.ModuleType(f"symbolic.{name}")
     setattr(module, content.__name__, content)
     sys.modules[module.__name__] = module

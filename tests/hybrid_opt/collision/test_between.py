@@ -55,7 +55,7 @@ def test_a_thin_plate_between_two_samples_is_found() -> None:
     judge = checker(thickness=0.001)
     samples = passing(np.array([-0.6, -0.2, 0.2, 0.6]))
     assert judge.check(*samples, np.arange(4.0)).is_free
-    verdict = check_between(judge, *samples)
+    verdict = check_between(judge, np.hstack(samples))
     assert verdict.status == "collision"
     assert verdict.unsafe.tolist() == [False, True, False]
     contact = verdict.contact
@@ -67,7 +67,7 @@ def test_a_thin_plate_between_two_samples_is_found() -> None:
 
 
 def test_the_same_motion_without_the_plate_is_free() -> None:
-    verdict = check_between(checker(), *passing(np.array([-0.6, -0.2, 0.2, 0.6])))
+    verdict = check_between(checker(), np.hstack(passing(np.array([-0.6, -0.2, 0.2, 0.6]))))
     assert (verdict.status, verdict.contact) == ("free", None)
     assert not verdict.unsafe.any()
 
@@ -91,7 +91,7 @@ def test_a_link_that_sweeps_through_a_plate_is_found() -> None:
     pose, _, q_2 = passing(np.array([0.5, 0.5]))
     samples = (pose, np.stack([start, end]), q_2)
     assert blocked.check(*samples, np.arange(2.0)).is_free
-    verdict = check_between(blocked, *samples)
+    verdict = check_between(blocked, np.hstack(samples))
     assert verdict.status == "collision"
     assert verdict.contact is not None
     assert verdict.contact.second == "plate"
@@ -104,7 +104,7 @@ def test_a_slit_is_passed_if_the_clearance_can_be_told(gap: float, status: str) 
     judge = checker(gap=gap)
     pose, q_1, q_2 = passing(np.zeros(3))
     pose[:, 1] = [-0.05, 0.0, 0.05]
-    verdict = check_between(judge, pose, q_1, q_2, depth=8)
+    verdict = check_between(judge, np.hstack([pose, q_1, q_2]), depth=8)
     assert verdict.status == status
     assert verdict.unsafe.any() == (status == "undecided")
     if status == "undecided":
@@ -113,7 +113,9 @@ def test_a_slit_is_passed_if_the_clearance_can_be_told(gap: float, status: str) 
 
 
 def test_colliding_samples_are_not_missed() -> None:
-    verdict = check_between(checker(thickness=0.001), *passing(np.array([-0.6, 0.1, 0.6])))
+    verdict = check_between(
+        checker(thickness=0.001), np.hstack(passing(np.array([-0.6, 0.1, 0.6])))
+    )
     assert verdict.status == "collision"
     assert verdict.unsafe.tolist() == [True, True]
 

@@ -10,6 +10,7 @@ import pytest
 
 from codegen.build import build
 from hybrid_opt import metaheuristics
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.drive import Driver
 from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
 from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
@@ -47,7 +48,7 @@ def evaluator() -> CandidateEvaluator:
         f"inverse_dynamics_{i + 1}": robot.inverse_dynamics for i, robot in enumerate(model.robots)
     }
     functions = build(made).functions
-    driver = Driver(cell, timer=PathTimer(cell, cell_model=model, lanes=1))
+    driver = Driver(PathTimer(CompiledCell(cell, model=model), lanes=1))
     return CandidateEvaluator(cell, DRIVABLE_OBJECTIVES, functions=functions, driver=driver)
 
 
@@ -138,8 +139,6 @@ def test_less_force_violates_more_and_costs_more() -> None:
 
 
 def test_the_time_law_is_part_of_what_functions_are_kept_by() -> None:
-    from hybrid_opt.evaluate.functions import workcell_key
-
     cell = replace(hand_cell(), digest="d")
     drivable = replace(cell, task=replace(cell.task, time_law="optimal"))
-    assert workcell_key(cell) != workcell_key(drivable)
+    assert CompiledCell(cell).key("set") != CompiledCell(drivable).key("set")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from codegen import compiled as compiled_module
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
-from hybrid_opt.evaluate.functions import workcell_functions
 from hybrid_opt.evaluate.kernel import Kernel, load_kernel
 from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
 from symbolic.array import Array
@@ -37,14 +37,14 @@ def stepwise(
     path: Path, objectives: tuple[str, ...] = ("peak_force_1", "peak_force_2")
 ) -> CandidateEvaluator:
     workcell = load(path)
-    made = CandidateEvaluator(workcell, objectives, functions=workcell_functions(workcell))
+    made = CandidateEvaluator(workcell, objectives, functions=CompiledCell(workcell).evaluators)
     assert made._kernel is None
     return made
 
 
 def kernel(path: Path, lanes: int) -> Kernel:
     ours = fused(path)
-    made = load_kernel(ours.workcell, ours.checker, ours.outputs, lanes=lanes)
+    made = load_kernel(ours.compiled, ours.checker, ours.outputs, lanes=lanes)
     assert made is not None
     assert made.lanes == lanes or lanes == 0
     return made
@@ -161,7 +161,7 @@ def test_a_kernel_that_differs_is_not_used(monkeypatch: pytest.MonkeyPatch) -> N
         return outputs | {"q_1": np.nextafter(outputs["q_1"], np.inf)}
 
     with pytest.warns(RuntimeWarning, match="it differs from the functions"):
-        assert load_kernel(ours.workcell, ours.checker, others) is None
+        assert load_kernel(ours.compiled, ours.checker, others) is None
 
 
 def test_without_a_compiler_there_is_no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,4 +169,4 @@ def test_without_a_compiler_there_is_no_kernel(monkeypatch: pytest.MonkeyPatch) 
     ours = fused(RACK)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert load_kernel(ours.workcell, ours.checker, ours.outputs) is None
+        assert load_kernel(ours.compiled, ours.checker, ours.outputs) is None

@@ -55,7 +55,7 @@ def made(path: Path) -> tuple[SmoothProgram, Array]:
     """A program with rows of every kind around the hand-made trajectory, and a point near it."""
     judge = evaluator(path)
     task, grid = judge.workcell.task, Grid(judge.workcell.task)
-    cell = SmoothCell(judge.workcell, polish_functions(judge.workcell), grid)
+    cell = SmoothCell(judge.workcell, polish_functions(judge.compiled), grid)
     x = task.initial.ravel()
     carry = CarryReader(judge, grid).read(x)
     box, *_ = sorted(cell.functions.rows.separable)

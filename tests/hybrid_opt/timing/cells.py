@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing import TimingModel
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
@@ -23,7 +24,7 @@ def hand_timing(stages: int = STAGES) -> TimingModel:
 
 def timing_of(cell: Workcell, stages: int = STAGES) -> TimingModel:
     """A cell of the hand-written kind, to be timed."""
-    return TimingModel(cell, stages, cell_model=hand_model(cell))
+    return TimingModel(CompiledCell(cell, model=hand_model(cell)), stages)
 
 
 def with_robots(cell: Workcell, **factors: float) -> Workcell:

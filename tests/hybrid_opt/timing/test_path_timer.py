@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing import (
     PathTimer,
     TimingLimits,
@@ -45,7 +46,7 @@ STATIC = 98.1 / 2.0
 
 
 def timer_of(cell: Workcell, stages: int = STAGES) -> PathTimer:
-    return PathTimer(cell, stages, cell_model=hand_model(cell), lanes=1)
+    return PathTimer(CompiledCell(cell, model=hand_model(cell)), stages, lanes=1)
 
 
 @cache

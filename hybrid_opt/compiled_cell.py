@@ -1,0 +1,115 @@
+"""A workcell's compiled functions, all made from one symbolic model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+from codegen.build import build, load_or_build
+from codegen.cache import Cache, digest, source_digest
+from codegen.function import NumericFunction
+from symbolic.workcell.records import Workcell
+
+if TYPE_CHECKING:
+    import casadi as ca
+
+    from symbolic.cell_model import CellModel
+
+
+class CompiledCell:
+    """What is compiled for a workcell. Share one wherever several sets of functions are needed.
+
+    A set is loaded where it was built before, also by other processes; then neither expressions
+    nor the model are made. Otherwise it is made from the model, which is built once.
+
+    Attributes:
+        workcell: the description.
+        cache: where libraries are kept, None for the user's folder.
+    """
+
+    def __init__(
+        self, workcell: Workcell, cache: Cache | None = None, model: CellModel | None = None
+    ) -> None:
+        """Nothing is built yet.
+
+        Args:
+            model: the cell's symbolic model where it does not follow from the workcell alone, such
+                as with other start postures than the stated criterion's.
+        """
+        self.workcell = workcell
+        self.cache = cache
+        self._given = model
+
+    @classmethod
+    def of(cls, cell: Workcell | CompiledCell) -> CompiledCell:
+        """A workcell to be compiled; one that is compiled already is shared."""
+        return cell if isinstance(cell, CompiledCell) else cls(cell)
+
+    @cached_property
+    def model(self) -> CellModel:
+        """The symbolic model.
+
+        Raises:
+            DualArmError: it cannot be built.
+        """
+        # Not imported at the top: a warm start needs neither CasADi nor Pinocchio.
+        from symbolic.cell_model import build_cell_model
+
+        return build_cell_model(self.workcell) if self._given is None else self._given
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether the workcell's files say what is compiled; otherwise only its own text does."""
+        return bool(self.workcell.digest) and self._given is None
+
+    def key(self, name: str, *details: str) -> str:
+        """What a set of functions is made from: the workcell, the symbolic package's sources, the
+        libraries that write the expressions (CasADi's version is part of every set's key)."""
+        libraries = [f"{library} {version(library)}" for library in ("pin", "scipy")]
+        law = self.workcell.task.time_law
+        cell = (self.workcell.digest, law, source_digest("symbolic"), *libraries)
+        return digest(name, *cell, *details)
+
+    def functions(
+        self,
+        name: str,
+        make: Callable[[CellModel], Mapping[str, ca.Function]],
+        *details: str,
+        lanes: int = 1,
+        levels: Mapping[str, int] | None = None,
+    ) -> dict[str, NumericFunction]:
+        """A set of functions, from the cache where it was built before.
+
+        Args:
+            name: of the set.
+            make: makes the functions from the model.
+            details: whatever else `make` depends on.
+            lanes, levels: see `codegen.build.build`.
+
+        Raises:
+            DualArmError: the model or its code cannot be built.
+        """
+        if not self.is_identified:
+            return build(make(self.model), self.cache, lanes=lanes, levels=levels).functions
+        key = self.key(name, *details)
+        return load_or_build(key, lambda: make(self.model), self.cache, lanes=lanes, levels=levels)
+
+    @cached_property
+    def evaluators(self) -> dict[str, NumericFunction]:
+        """Every function of `symbolic.functions.cell.cell_functions`."""
+
+        def make(model: CellModel) -> Mapping[str, ca.Function]:
+            from symbolic.functions.cell import cell_functions
+
+            return cell_functions(model)
+
+        return self.functions(EVALUATORS, make, lanes=EVALUATOR_LANES)
+
+
+EVALUATORS = "evaluators"
+"""Name of the set of a cell's evaluators."""
+
+EVALUATOR_LANES = 0
+"""As many as suit the machine."""

@@ -1,0 +1,77 @@
+"""One symbolic model serves every set of a cell's compiled functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import pytest
+
+import symbolic.cell_model
+from codegen.function import NumericFunction
+from codegen.interpreted import InterpretedFunction
+from codegen.source import dense
+from hybrid_opt import compiled_cell
+from hybrid_opt.cell import Cell
+from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.evaluate import kernel
+from symbolic.cell_model import CellModel
+from symbolic.workcell.records import Workcell
+from tests.symbolic.cells import hand_cell, hand_model, rack_cell
+
+
+def test_the_model_is_built_once_for_all_functions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if nothing had been compiled before; only the compiler is left out."""
+    models: list[CellModel] = []
+    build_cell_model = symbolic.cell_model.build_cell_model
+
+    def counted(workcell: Workcell) -> CellModel:
+        models.append(build_cell_model(workcell))
+        return models[-1]
+
+    def built(
+        key: str, make: Callable[[], Mapping[str, ca.Function]], *_: Any, **__: Any
+    ) -> dict[str, NumericFunction]:
+        return {name: InterpretedFunction(dense(function)) for name, function in make().items()}
+
+    def no_program(name: str, key: str, make: Callable[[], Any], *_: Any) -> None:
+        make()
+
+    monkeypatch.setattr(symbolic.cell_model, "build_cell_model", counted)
+    monkeypatch.setattr(compiled_cell, "load_or_build", built)
+    monkeypatch.setattr(kernel, "load_or_build_program", no_program)
+    cell = Cell(rack_cell())
+    assert not models
+    assert cell.evaluator.functions is cell.compiled.evaluators
+    assert cell.timing_model.search_carry(cell.initial).workcell is cell.workcell
+    assert cell.polish_functions.rows.model is cell.compiled.model
+    assert models == [cell.compiled.model]
+
+
+def test_a_compiled_cell_is_shared() -> None:
+    compiled = CompiledCell(hand_cell())
+    assert CompiledCell.of(compiled) is compiled
+    assert CompiledCell.of(compiled.workcell).workcell is compiled.workcell
+
+
+def test_keys_tell_sets_and_cells_apart() -> None:
+    cell = replace(hand_cell(), digest="one")
+    keys = [
+        CompiledCell(cell).key("set"),
+        CompiledCell(cell).key("other"),
+        CompiledCell(cell).key("set", "200"),
+        CompiledCell(replace(cell, digest="two")).key("set"),
+    ]
+    assert len(set(keys)) == len(keys)
+
+
+def test_a_given_model_is_not_what_the_files_say() -> None:
+    cell = hand_cell()
+    assert not CompiledCell(cell).is_identified
+    named = replace(cell, digest="one")
+    assert CompiledCell(named).is_identified
+    given = CompiledCell(named, model=hand_model(cell))
+    assert not given.is_identified
+    assert given.model.start is not None
