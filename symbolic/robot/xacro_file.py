@@ -1,30 +1,38 @@
 """Robot descriptions written as xacro macros, expanded to the URDF they stand for.
 
-xacro itself does it. The package `xacrodoc`, which wraps it, was looked at and left: it keeps one
-list of packages per process, and loses the folder that relative includes are relative to.
+xacro itself does it, in a process of its own that is bounded (`symbolic.robot.xacro_process`). The
+package `xacrodoc`, which wraps it, was looked at and left: it keeps one list of packages per
+process, and loses the folder that relative includes are relative to.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import io
+import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from threading import Lock
+from typing import Any
 
 from symbolic import outside
 from symbolic.errors import OutsideError
-from symbolic.robot.packages import PACKAGE_SCHEME, find_package
+from symbolic.robot.xacro_process import CPU_SECONDS
 
 XACRO_NAMESPACE = b"http://www.ros.org/wiki/xacro"
+WAIT_SECONDS = 60.0
+"""So long an expansion may take, its computing time being bounded more tightly."""
+
 _MACRO = re.compile(rb"<xacro:|\$\{|\$\(")
-_LOCK = Lock()
+_PROCESS = "symbolic.robot.xacro_process"
 
 Arguments = tuple[tuple[str, str], ...]
+Parts = tuple[tuple[str, bytes], ...]
 
 
 def description_content(
@@ -38,7 +46,8 @@ def description_content(
         package_dirs: folders of packages that `$(find NAME)` looks in first.
 
     Raises:
-        OutsideError: it cannot be read or expanded.
+        OutsideError: it cannot be read or expanded, or not within the bounds of
+            `symbolic.robot.xacro_process`.
     """
     content = outside.read_bytes(path, outside.URDF_BYTES)
     if not is_xacro(content):
@@ -48,6 +57,11 @@ def description_content(
     if parts != _state(path for path, _ in parts):  # an included file has changed since
         _expanded.cache_clear()
         expanded, _ = _expanded(*key)
+    if expanded is None:
+        raise OutsideError(
+            f"takes longer than {CPU_SECONDS} s to be expanded; does a macro call itself, or an "
+            "expression count too far?"
+        )
     return expanded
 
 
@@ -59,66 +73,57 @@ def is_xacro(content: bytes) -> bool:
 @lru_cache(maxsize=8)
 def _expanded(
     path: Path, content: bytes, arguments: Arguments, package_dirs: tuple[Path, ...]
-) -> tuple[bytes, tuple[tuple[str, bytes], ...]]:
-    """The expanded text, and path and digest of every file that was included."""
-    # Not imported at the top: most descriptions need no xacro.
-    import xacro
-    from xacro import substitution_args
+) -> tuple[bytes | None, Parts]:
+    """The expanded text, and path and digest of every file that was included.
 
-    found: dict[str, Path] = {}
-
-    def find(name: str) -> str:
-        package = find_package(name, package_dirs, path)
-        if package is None:
-            raise OutsideError(
-                f"names the package {name!r}, which is not found; name the folder that holds it "
-                "in package_dirs, or set ROS_PACKAGE_PATH or AMENT_PREFIX_PATH"
-            )
-        found[name] = package
-        return str(package)
-
-    with _LOCK, contextlib.redirect_stderr(io.StringIO()):  # xacro keeps its state in its module
-        theirs, their_parse = substitution_args._eval_find, xacro.parse
-        substitution_args._eval_find = find
-
-        def parse(text: object, filename: str | None = None) -> object:
-            # Included files come through our door; a missing one may be optional.
-            if text is None and filename is not None and os.path.exists(filename):
-                text = outside.text(outside.read_bytes(Path(filename), outside.URDF_BYTES))
-            return their_parse(text, filename)
-
-        xacro.parse = parse
-        xacro.all_includes.clear()
-        try:
-            document = xacro.process_file(str(path), mappings=dict(arguments))
-            included = tuple(dict.fromkeys(map(str, xacro.all_includes)))
-        except OutsideError:
-            raise
-        except Exception as error:  # a macro may raise anything
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise OutsideError(f"holds xacro macros that cannot be expanded: {reason[:300]}") from (
-                error
-            )
-        finally:
-            substitution_args._eval_find, xacro.parse = theirs, their_parse
-    for mesh in document.getElementsByTagName("mesh"):
-        mesh.setAttribute("filename", _by_package(mesh.getAttribute("filename"), found))
-    # What stands beside the root are comments that name this machine's folders.
-    return document.documentElement.toxml().encode(), _state(included)
-
-
-def _by_package(address: str, packages: Mapping[str, Path]) -> str:
-    """A mesh address without this machine's folders, as far as they are those of packages."""
-    for name, folder in packages.items():
-        start = f"{folder}/"
-        if address.removeprefix("file://").startswith(start):
-            return f"{PACKAGE_SCHEME}{name}/{address.removeprefix('file://').removeprefix(start)}"
-    return address
-
-
-def _state(paths: Iterable[str]) -> tuple[tuple[str, bytes], ...]:
-    """Each file with the digest of its content."""
-    return tuple(
-        (path, hashlib.sha256(outside.read_bytes(Path(path), outside.URDF_BYTES)).digest())
-        for path in paths
+    The text is None where it took too long: that is remembered too, since both robots of a cell
+    may name the file.
+    """
+    answer = _answer(
+        {
+            "path": str(path.absolute()),
+            "arguments": dict(arguments),
+            "package_dirs": [str(folder.absolute()) for folder in package_dirs],
+        }
     )
+    if answer is None:
+        return None, ()
+    if "refused" in answer:
+        raise OutsideError(answer["refused"])
+    return answer["urdf"].encode(), _state(answer["included"])
+
+
+def _answer(request: Any) -> Any:
+    """What the process says to a request; None where it takes too long."""
+    paths = [os.path.abspath(entry) for entry in sys.path]
+    with tempfile.TemporaryFile() as answer:
+        try:
+            code = subprocess.run(
+                [sys.executable, "-P", "-m", _PROCESS],
+                input=json.dumps(request).encode(),
+                stdout=answer,
+                stderr=subprocess.DEVNULL,
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+                timeout=WAIT_SECONDS,
+                check=False,
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return None
+        if code in (-signal.SIGXCPU, -signal.SIGKILL):
+            return None
+        answer.seek(0)
+        try:
+            return json.loads(answer.read())
+        except ValueError as error:
+            raise OutsideError(
+                f"holds xacro macros that cannot be expanded: their process ended with code {code}"
+            ) from error
+
+
+def _state(paths: Iterable[str]) -> Parts:
+    """Each file with the digest of its content; with nothing where it is missing."""
+    return tuple((path, _digest(path) if os.path.exists(path) else b"") for path in paths)
+
+
+def _digest(path: str) -> bytes:
+    return hashlib.sha256(outside.read_bytes(Path(path), outside.URDF_BYTES)).digest()
