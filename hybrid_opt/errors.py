@@ -1,10 +1,14 @@
 """What can go wrong with results and with those who compute them."""
 
-from symbolic.errors import DualArmError
+from symbolic.errors import DualArmError, DualArmWarning
 
 
 class ResultsError(DualArmError):
     """Stored results are missing, damaged, or belong to another configuration."""
+
+
+class DamagedResultsWarning(DualArmWarning):
+    """A stored result is damaged and is computed anew, to the same bits."""
 
 
 class DisplayError(DualArmError):

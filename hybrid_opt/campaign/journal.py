@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluation import REASONS, Evaluations
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.store.files import read_bytes, storing
 
 _MAGIC = b"DACARRY1"
@@ -71,6 +71,10 @@ def decode_generation(payload: bytes, n_var: int, n_obj: int) -> tuple[float, Ev
         raise ResultsError(f"a journal's block does not fit the problem ({error})") from error
     if offset != len(payload):
         raise ResultsError("a journal's block does not fit the problem (it is too long)")
+    reasons = arrays["reason"]
+    known = (reasons == FEASIBLE) | ((reasons >= 0) & (reasons < len(REASONS)))
+    if not (np.isfinite(seconds) and seconds >= 0.0 and known.all()):
+        raise ResultsError("a journal's block does not fit the problem (a value is none of its)")
     return float(seconds), Evaluations(**arrays)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ from hybrid_opt.campaign.progress import Advance, Progress
 from hybrid_opt.campaign.results import Replica, read_campaign
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Stage
-from hybrid_opt.errors import ResultsError
+from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.attempt import Lost, use_one_thread
 from hybrid_opt.polishing.front import FrontPolisher
@@ -40,7 +41,9 @@ from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.work.job import Job, give_up
+from symbolic import outside
 from symbolic.array import Array
+from symbolic.errors import OutsideError
 from symbolic.workcell.records import Workcell
 
 JUDGING_SECONDS = 30.0
@@ -94,7 +97,21 @@ def polish_stage(settings: PolishSettings) -> Stage:
     def run(folder: CampaignFolder, progress: Progress) -> None:
         _Polish(folder, settings).run(progress)
 
-    return Stage("polish", run, asdict(settings))
+    def whole(folder: CampaignFolder) -> bool:
+        # A front that cannot be read is the search's to compute anew.
+        replicas = read_campaign(folder.root).replicas
+        return all(_is_polished(folder, replica) for replica in replicas)
+
+    return Stage("polish", run, asdict(settings), whole)
+
+
+def _is_polished(folder: CampaignFolder, replica: Replica) -> bool:
+    """Whether a front's polish is there; a damaged one is told and computed anew."""
+    try:
+        return read_polished(folder.root, replica, folder.workcell) is not None
+    except ResultsError as error:
+        warnings.warn(str(error), DamagedResultsWarning, stacklevel=2)
+        return False
 
 
 def polish_replica(
@@ -105,7 +122,7 @@ def polish_replica(
     return polisher.polish(
         request.front_x,
         rng,
-        recorded=[_from_block(block) for block in request.recorded],
+        recorded=[_from_block(block, request) for block in request.recorded],
         emit=lambda outcome: emit(json.dumps(outcome_to_json(outcome)).encode()),
     )
 
@@ -115,9 +132,17 @@ def _block_of(lost: Lost) -> bytes:
     return json.dumps({"lost": lost.reason}).encode()
 
 
-def _from_block(block: bytes) -> PolishOutcome | Lost:
-    values = json.loads(block)
-    return Lost(values["lost"]) if "lost" in values else outcome_from_json(values)
+def _from_block(block: bytes, request: PolishRequest) -> PolishOutcome | Lost:
+    try:
+        values = outside.json_value(block)
+        if not isinstance(values, dict):
+            raise ResultsError("a recorded polish attempt is damaged (it is no object)")
+        return Lost(str(values["lost"])) if "lost" in values else outcome_from_json(values)
+    except (OutsideError, ResultsError) as error:
+        raise ResultsError(
+            f"{request.algorithm} replica {request.replica}: {error}; delete {JOURNAL} in its "
+            "folder of polished fronts to polish it anew"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -146,7 +171,7 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedR
     path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
     if not path.exists():
         return None
-    remedy = "delete it to polish again"
+    remedy = "--resume polishes it anew"
     document = read_record(PolishDocument, path, remedy)
     task, front = workcell.task, document.front
     if bool(front) != bool(len(replica.front)):
@@ -187,7 +212,7 @@ class _Polish:
         }
         replicas = read_campaign(folder.root).replicas
         self._all = len(replicas)
-        self._open = [replica for replica in replicas if not self._marker(replica).exists()]
+        self._open = [replica for replica in replicas if not _is_polished(folder, replica)]
         self._journals: dict[int, Journal] = {}
 
     def run(self, progress: Progress) -> None:

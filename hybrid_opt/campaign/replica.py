@@ -132,14 +132,11 @@ class _Recording:
     def evaluate(self, x: Array) -> Evaluations:
         recorded: Sequence[bytes] = self._request.recorded
         if len(self.seconds) < len(recorded):
-            seconds, generation = decode_generation(
-                recorded[len(self.seconds)], self.n_var, len(self.objective_names)
-            )
+            seconds, generation = self._repeated(recorded[len(self.seconds)])
             if not np.array_equal(generation.x, x):
-                raise ResultsError(
-                    f"{self._request.algorithm} replica {self._request.replica}: the journal holds "
-                    "other candidates than the search asks for, as after a change of the machine "
-                    "or of a library; delete the replica's folder to compute it anew"
+                raise self._unusable(
+                    "the journal holds other candidates than the search asks for, as after a "
+                    "change of the machine or of a library"
                 )
         else:
             generation = disarmed(self._evaluator.evaluate(x))
@@ -148,6 +145,18 @@ class _Recording:
         self.seconds.append(seconds)
         self._since = time.perf_counter()
         return generation
+
+    def _repeated(self, block: bytes) -> tuple[float, Evaluations]:
+        try:
+            return decode_generation(block, self.n_var, len(self.objective_names))
+        except ResultsError as error:
+            raise self._unusable(str(error)) from error
+
+    def _unusable(self, why: str) -> ResultsError:
+        return ResultsError(
+            f"{self._request.algorithm} replica {self._request.replica}: {why}; delete the "
+            "replica's folder to compute it anew"
+        )
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
         begin = time.perf_counter()

@@ -129,14 +129,15 @@ def read_configuration(root: str | Path) -> Configuration:
     path = Path(root) / CONFIGURATION
     if not path.exists():
         raise ResultsError(f"{root}: is no results folder, {CONFIGURATION} is missing")
-    document = read_json(path)
+    remedy = "run the study again into another --output"
+    document = read_json(path, remedy)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise ResultsError(f"{path}: `format` is not {FORMAT!r}")
+        raise ResultsError(f"{path}: `format` is not {FORMAT!r}; {remedy}")
     if document.get("version") != VERSION:
         raise ResultsError(
             f"{path}: version {document.get('version')!a}; this program reads {VERSION}"
         )
-    return from_json(Configuration, document, path, "run the study again into another --output")
+    return from_json(Configuration, document, path, remedy)
 
 
 def read_summary(root: str | Path) -> CampaignSummary:
@@ -165,7 +166,7 @@ def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str,
             f"{folder}: {algorithm} replica {number} is not finished; continue the campaign with "
             "--resume"
         )
-    marker = read_record(FinishedReplica, folder / DONE, "delete it and continue with --resume")
+    marker = read_record(FinishedReplica, folder / DONE, "--resume computes it anew")
     content = read_bytes(folder / EVALUATIONS)
     if marker.sha256.get(EVALUATIONS) != sha256(content):
         raise ResultsError(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from pathlib import Path
+
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.documents import FinishedReplica
 from hybrid_opt.campaign.execution import executor_for
@@ -18,10 +21,13 @@ from hybrid_opt.campaign.replica import (
     run_replica,
 )
 from hybrid_opt.campaign.stages import Stage
-from hybrid_opt.store.files import sha256, write_atomically, write_json
+from hybrid_opt.errors import DamagedResultsWarning, ResultsError
+from hybrid_opt.store.files import read_bytes, sha256, write_atomically, write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.work.job import Executor, Job, give_up
 from symbolic.workcell.decision import initial_decision
+
+ANEW = "--resume computes it anew"
 
 
 def search_stage(source: EvaluatorSource | None = None) -> Stage:
@@ -36,7 +42,40 @@ def search_stage(source: EvaluatorSource | None = None) -> Stage:
         maker = source or CellEvaluatorSource(cell, folder.settings.objectives)
         _Search(folder, maker).run(executor_for(folder.execution), progress)
 
-    return Stage("search", run)
+    def whole(folder: CampaignFolder) -> bool:
+        return all(is_whole(folder.root, *key) for key in _replicas(folder))
+
+    return Stage("search", run, whole=whole)
+
+
+def is_whole(root: Path, algorithm: str, replica: int) -> bool:
+    """Whether a replica is finished and its files are as they were written.
+
+    A search gives the same bits again, so what is damaged is told and computed anew.
+    """
+    folder = replica_folder(root, algorithm, replica)
+    if not (folder / DONE).exists():
+        return False
+    try:
+        marker = read_record(FinishedReplica, folder / DONE, ANEW)
+        for name in (EVALUATIONS, FRONT):
+            if marker.sha256.get(name) != sha256(read_bytes(folder / name)):
+                raise ResultsError(f"{folder / name}: damaged, its checksum differs; {ANEW}")
+    except ResultsError as error:
+        told = str(error).removesuffix(f"; {ANEW}")
+        warnings.warn(f"{told}; {ANEW}", DamagedResultsWarning, stacklevel=2)
+        return False
+    return True
+
+
+def _replicas(folder: CampaignFolder) -> list[tuple[str, int]]:
+    """Every algorithm and number; replica by replica, so that an early look finds all."""
+    settings = folder.settings
+    return [
+        (algorithm, replica)
+        for replica in range(settings.replicas)
+        for algorithm in settings.algorithms
+    ]
 
 
 class _Search:
@@ -46,13 +85,8 @@ class _Search:
         self._folder = folder
         self._job = Job(source, run_replica)
         self._identity = identity(folder.settings, folder.root, folder.workcell)
-        every = [
-            (algorithm, replica)
-            # Replica by replica, so that an early look finds every algorithm.
-            for replica in range(folder.settings.replicas)
-            for algorithm in folder.settings.algorithms
-        ]
-        self._open = [key for key in every if not self._is_done(*key)]
+        every = _replicas(folder)
+        self._open = [key for key in every if not is_whole(folder.root, *key)]
         self._done = (len(every) - len(self._open)) * folder.settings.evaluations
         self._journals: dict[int, Journal] = {}
 
@@ -72,18 +106,6 @@ class _Search:
                 journal.close()
 
     _advance: Advance
-
-    def _is_done(self, algorithm: str, replica: int) -> bool:
-        """Whether a replica is finished and its files are whole; damaged ones are made again."""
-        folder = replica_folder(self._folder.root, algorithm, replica)
-        if not (folder / DONE).exists():
-            return False
-        remedy = "delete it to compute the replica anew"
-        marker = read_record(FinishedReplica, folder / DONE, remedy)
-        return all(
-            (folder / name).exists() and sha256((folder / name).read_bytes()) == digest
-            for name, digest in marker.sha256.items()
-        )
 
     def _begin(self, index: int) -> int:
         """Open a replica's journal; the evaluations that it holds."""

@@ -2,8 +2,9 @@
 
 A stage reads what earlier stages left in the results folder and writes files of its own. Its
 marker, `stages/NAME.json`, is written when it begins and again when it is done. If a marker is
-missing or does not say 'done', the stage runs (again), so a stage that takes long keeps what it
-achieved in files of its own and continues from them. When a stage runs, all later ones do too.
+missing or does not say 'done', or files of the stage are damaged, it runs (again), so a stage that
+takes long keeps what it achieved in files of its own and continues from them. When a stage runs,
+all later ones do too.
 """
 
 from __future__ import annotations
@@ -31,15 +32,17 @@ class Stage:
         name: unique; names its marker.
         run: does it.
         settings: what decides its results besides the campaign, as JSON values.
+        whole: whether what it left is still there and undamaged; looked at once it is done.
     """
 
     name: str
     run: Callable[[CampaignFolder, Progress], None]
     settings: Mapping[str, Any] = field(default_factory=dict)
+    whole: Callable[[CampaignFolder], bool] = lambda folder: True
 
 
 def run_stages(folder: CampaignFolder, stages: Sequence[Stage], progress: Progress) -> None:
-    """Run the stages that are not done yet, in order.
+    """Run the stages that are not done yet, or whose files were damaged since, in order.
 
     Raises:
         ResultsError: a stage began with other settings.
@@ -49,7 +52,7 @@ def run_stages(folder: CampaignFolder, stages: Sequence[Stage], progress: Progre
         _check_settings(folder, stage)
     for number, stage in enumerate(stages):
         marker = _marker(folder, stage)
-        if _is_done(marker):
+        if _is_done(marker) and stage.whole(folder):
             continue
         # First of all, so that no moment exists at which they look done and are out of date.
         for later in stages[number + 1 :]:

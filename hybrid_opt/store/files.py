@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from hybrid_opt.errors import ResultsError
 from symbolic import outside
@@ -75,8 +75,12 @@ def write_json(path: Path, document: Any) -> None:
     write_atomically(path, (text + "\n").encode())
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, remedy: str = "") -> Any:
     """Read JSON values.
+
+    Args:
+        path: the file.
+        remedy: what to do where it is damaged.
 
     Raises:
         ResultsError: the file cannot be read or is not JSON.
@@ -84,11 +88,8 @@ def read_json(path: Path) -> Any:
     try:
         return outside.json_value(read_bytes(path))
     except OutsideError as error:
-        raise ResultsError(f"{path}: damaged ({error})") from error
-
-
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no number of JSON")
+        told = f"; {remedy}" if remedy else ""
+        raise ResultsError(f"{path}: damaged ({error}){told}") from error
 
 
 def read_bytes(path: Path) -> bytes:

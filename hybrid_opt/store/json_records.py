@@ -105,7 +105,7 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
     Raises:
         ResultsError: it cannot be read or is damaged.
     """
-    return from_json(kind, read_json(path), path, remedy)
+    return from_json(kind, read_json(path, remedy), path, remedy)
 
 
 def _read(kind: Any, value: Any, where: str) -> Any:

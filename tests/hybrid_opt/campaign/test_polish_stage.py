@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +22,18 @@ from hybrid_opt.campaign import (
 )
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.layout import JOURNAL, POLISH, polished_folder
-from hybrid_opt.campaign.polish_stage import polish_stage, read_polished
+from hybrid_opt.campaign.polish_stage import (
+    PolishRequest,
+    polish_replica,
+    polish_stage,
+    read_polished,
+)
 from hybrid_opt.campaign.results import read_campaign
-from hybrid_opt.errors import ResultsError
+from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.records import outcome_from_json, outcome_to_json
+from hybrid_opt.polishing.front import FrontPolisher
+from hybrid_opt.polishing.records import PolishedFront, outcome_from_json, outcome_to_json
 from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
@@ -102,6 +110,33 @@ def test_an_interrupted_polish_repeats_no_attempt(
     np.testing.assert_array_equal(one.objectives, other.objectives)
 
 
+def test_a_damaged_front_is_polished_anew(finished: Path, tmp_path: Path) -> None:
+    root = tmp_path / "results"
+    shutil.copytree(finished, root)
+    path = polished_folder(root, "nsga2", 0) / POLISH
+    before = json.loads(path.read_text())
+    path.write_text("{}")
+    with pytest.warns(DamagedResultsWarning, match=r"polish.json: damaged at front: is missing"):
+        run(root, resume=True)
+    assert json.loads(path.read_text())["front"] == before["front"]
+
+
+def test_a_recorded_attempt_of_nonsense_is_told() -> None:
+    request = PolishRequest(SETTINGS, "nsga2", 0, np.zeros((1, 18)), (b"[]",))
+    for block in (b"[]", b"{}", b"\xff", b'{"x": 1e999}', b"[" * 90):
+        with pytest.raises(ResultsError, match=r"nsga2 replica 0: .*; delete journal.bin in its"):
+            polish_replica(Repeating(), replace(request, recorded=(block,)), lambda message: None)
+
+
+class Repeating(FrontPolisher):
+    """A polisher that only reads what was recorded."""
+
+    def __init__(self) -> None: ...
+
+    def polish(self, *arguments: object, **recorded: object) -> PolishedFront:
+        raise AssertionError
+
+
 def test_other_settings_are_refused(finished: Path) -> None:
     execution = ExecutionSettings(finished, jobs=1, resume=True)
     other: Stage = polish_stage(PolishSettings(points=5))
@@ -147,5 +182,5 @@ def test_a_damaged_file_is_told(finished: Path, tmp_path: Path, fault: str, told
     path = polished_folder(tmp_path, "nsga2", 0) / POLISH
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(spoilt(whole, fault)))
-    with pytest.raises(ResultsError, match=rf"damaged {told}.*; delete it to polish again"):
+    with pytest.raises(ResultsError, match=rf"damaged {told}.*; --resume polishes it anew"):
         read_polished(tmp_path, replica, load(RACK))

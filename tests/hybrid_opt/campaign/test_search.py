@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,8 +21,10 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress, open_folder
+from hybrid_opt.campaign.identity import replica_identity
+from hybrid_opt.campaign.journal import Journal, encode_generation
 from hybrid_opt.campaign.results import read_campaign
-from hybrid_opt.errors import ResultsError, WorkerError
+from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError
 from symbolic.errors import DualArmError
 from symbolic.workcell.file import load
 from tests.hybrid_opt.campaign.fake import (
@@ -34,6 +38,7 @@ from tests.hybrid_opt.campaign.fake import (
 )
 
 SETTINGS = CampaignSettings(evaluations=200, replicas=2)
+FEW = CampaignSettings(evaluations=80, replicas=1)
 PROGRAM = [sys.executable, "-m", "tests.hybrid_opt.campaign.fake"]
 
 
@@ -42,6 +47,12 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return files_of(
         run_search(SETTINGS, ExecutionSettings(tmp_path_factory.mktemp("plain") / "a", jobs=1))
     )
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, bytes]]:
+    root = run_search(FEW, ExecutionSettings(tmp_path_factory.mktemp("few") / "a", jobs=1))
+    return root, files_of(root)
 
 
 def start(output: Path, *options: str, limit: int | None = None) -> subprocess.Popen[str]:
@@ -159,18 +170,67 @@ def test_resume_of_a_complete_campaign_evaluates_nothing(tmp_path: Path) -> None
     assert files_of(execution.output) == before
 
 
-def test_damaged_results_are_made_again(tmp_path: Path) -> None:
-    execution = ExecutionSettings(tmp_path / "a", 1, resume=True)
-    settings = replace(SETTINGS, evaluations=80, replicas=1)
-    before = files_of(run_search(settings, execution))
-    damaged = execution.output / "replicas/mopso/00/evaluations.csv.gz"
-    content = bytearray(damaged.read_bytes())
-    content[len(content) // 2] ^= 1
-    damaged.write_bytes(content)
-    with pytest.raises(ResultsError, match=r"damaged, its checksum differs"):
-        read_campaign(execution.output)
-    (execution.output / "stages/search.json").unlink()
-    assert files_of(run_search(settings, execution)) == before
+MARK = "replica.json"
+DAMAGED_MARKS: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "no object": lambda mark: [],
+    "nothing": lambda mark: {},
+    "no number": lambda mark: mark | {"seconds": "long"},
+    "infinite": lambda mark: mark | {"seconds": float("inf")},
+    "no checksums": lambda mark: mark | {"sha256": {}},
+    "checksums of others": lambda mark: mark | {"sha256": {"/dev/zero": "0" * 64}},
+}
+
+
+@pytest.mark.parametrize("damage", ["candidates", "pipe", "bytes", *DAMAGED_MARKS])
+def test_damaged_results_are_made_again(
+    tmp_path: Path, few: tuple[Path, dict[str, bytes]], damage: str
+) -> None:
+    whole, before = few
+    output = tmp_path / "a"
+    shutil.copytree(whole, output)
+    folder = output / "replicas/mopso/00"
+    candidates = folder / "evaluations.csv.gz"
+    if damage == "candidates":
+        content = bytearray(candidates.read_bytes())
+        content[len(content) // 2] ^= 1
+        candidates.write_bytes(content)
+    elif damage == "pipe":
+        candidates.unlink()
+        os.mkfifo(candidates)
+    elif damage == "bytes":
+        (folder / MARK).write_bytes(b"\xff{")
+    else:
+        mark = DAMAGED_MARKS[damage](json.loads((folder / MARK).read_bytes()))
+        (folder / MARK).write_text(json.dumps(mark))
+    with pytest.raises(ResultsError) as caught:
+        read_campaign(output)
+    assert "/replicas/mopso/00/" in str(caught.value)
+    execution = ExecutionSettings(output, 1, resume=True)
+    with pytest.warns(DamagedResultsWarning, match=r"replicas/mopso/00/.*--resume computes it"):
+        again = run_search(FEW, execution)
+    assert files_of(again) == before
+    assert read_campaign(output).replicas
+
+
+def test_a_journal_of_nonsense_is_told(tmp_path: Path, few: tuple[Path, dict[str, bytes]]) -> None:
+    whole, before = few
+    output = tmp_path / "a"
+    shutil.copytree(whole, output)
+    folder = output / "replicas/mopso/00"
+    (folder / MARK).unlink()
+    (output / "stages/search.json").unlink()
+    found = read_campaign(whole).of("mopso")[0].evaluations
+    stored = json.loads((output / "configuration.json").read_bytes())
+    head = replica_identity(stored, "mopso", 0)
+    for block in (b"\0" * 12, encode_generation(float("nan"), found)):
+        journal = Journal(folder / "journal.bin", head)
+        journal.append(block)
+        journal.close()
+        with pytest.raises(ResultsError, match=r"mopso replica 0: .* delete the replica's folder"):
+            run_search(FEW, ExecutionSettings(output, 1, resume=True))
+        (folder / "journal.bin").unlink()
+    shutil.rmtree(folder)
+    assert files_of(run_search(FEW, ExecutionSettings(output, 1, resume=True))) == before
 
 
 def test_a_killed_worker_is_replaced(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:

@@ -44,6 +44,22 @@ def test_done_stages_are_left_alone(tmp_path: Path) -> None:
     assert ran == ["search", "polish", "report", "polish", "report"]
 
 
+def test_a_stage_whose_files_are_damaged_runs_again(tmp_path: Path) -> None:
+    ran: list[str] = []
+    file = tmp_path / "kept"
+    stages = [
+        Stage("search", noting(ran, "search"), whole=lambda folder: file.exists()),
+        Stage("polish", noting(ran, "polish")),
+    ]
+    run(tmp_path, *stages)
+    file.touch()
+    run(tmp_path, *stages)
+    assert ran == ["search", "polish"]
+    file.unlink()
+    run(tmp_path, *stages)
+    assert ran == ["search", "polish"] * 2
+
+
 def test_an_interrupted_stage_runs_again_and_its_time_adds_up(tmp_path: Path) -> None:
     ran: list[str] = []
 
