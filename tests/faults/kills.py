@@ -1,23 +1,26 @@
 """Kill a study at random moments of every stage, resume it, and compare with one left in peace.
 
-`python -m tests.faults.kills --kills 50 --seed 1` does it fifty times and tells what it found. Each
-folder is struck once in every stage, in one of the ways a process dies: killed outright, alone or
-with all it has started, interrupted from the keyboard, asked to end, or robbed of a worker.
+`python -m tests.faults.kills --kills 50 --seed 1` does it until it has hit living programs fifty
+times, and tells what it found. Each folder is struck in every stage and before the first, in one of
+the ways a process dies: killed outright, alone or with all it has started, interrupted from the
+keyboard, asked to end, or robbed of a worker.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,6 +33,12 @@ SMALL = (
     *("--population", "nsga2=20", "--population", "mopso=20", "--jobs", "2"),
 )
 STAGES = ("search", "polish", "summary", "timing", "report")
+BEGINNING = "beginning"
+"""Before the first stage: the cell is read and its functions are compiled or loaded."""
+
+STRIKES = (BEGINNING, *sorted(2 * STAGES, key=STAGES.index))
+"""Where one folder is struck, in the order in which a study gets there."""
+
 WAYS = ("kill", "kill all", "interrupt", "terminate", "kill a worker")
 TIMES = {"seconds", "median_attempt_seconds", "equivalent_evaluations"}
 """Figures that are times, or follow from them."""
@@ -46,8 +55,17 @@ class Broken(AssertionError):
 
 @dataclass
 class Tally:
-    """What was done and found."""
+    """What was done and found; a hit met a living program, or a living worker of one.
 
+    Attributes:
+        hits: how often programs were struck.
+        misses: how often a program had ended before.
+        ways, stages: hits by the way and by the stage that was running.
+        ends: how programs that were struck ended.
+    """
+
+    hits: int = 0
+    misses: int = 0
     ways: Counter[str] = field(default_factory=Counter)
     stages: Counter[str] = field(default_factory=Counter)
     ends: Counter[str] = field(default_factory=Counter)
@@ -88,22 +106,23 @@ def session(leader: int) -> list[int]:
     return found
 
 
-def strike(process: subprocess.Popen[bytes], way: str, rng: random.Random) -> None:
-    """Let a program die in this way, or lose a worker."""
+def strike(process: subprocess.Popen[bytes], way: str, rng: random.Random) -> bool:
+    """Let a program die in this way, or lose a worker; whether there was anything to strike."""
     others = session(process.pid)
+    struck = [process.pid, *others]
+    number = signal.SIGKILL
     match way:
         case "kill":
-            process.kill()
-        case "kill all":
-            for one in [process.pid, *others]:
-                _signal(one, signal.SIGKILL)
+            struck = [process.pid]
         case "interrupt":  # as a terminal does it: all of the foreground hear it
-            for one in [process.pid, *others]:
-                _signal(one, signal.SIGINT)
+            number = signal.SIGINT
         case "terminate":
-            process.terminate()
-        case "kill a worker" if others:
-            _signal(rng.choice(others), signal.SIGKILL)
+            struck, number = [process.pid], signal.SIGTERM
+        case "kill a worker":
+            struck = rng.sample(others, min(1, len(others)))
+    for one in struck:
+        _signal(one, number)
+    return bool(struck)
 
 
 def _signal(one: int, number: int) -> None:
@@ -129,16 +148,30 @@ def ended(process: subprocess.Popen[bytes], said: Path) -> int:
     return code
 
 
+def running(output: Path) -> str:
+    """The stage that a study is at."""
+    return next((stage for stage in STAGES if _status(output, stage) == "running"), "between")
+
+
+def _status(output: Path, stage: str) -> str:
+    try:
+        found = json.loads((output / "stages" / f"{stage}.json").read_text())
+        return str(found["status"])
+    except (OSError, ValueError, KeyError):
+        return ""
+
+
 def wait_for(stage: str, output: Path, process: subprocess.Popen[bytes]) -> None:
-    """Wait until a stage is running, or the program has ended."""
-    path = output / "stages" / f"{stage}.json"
-    while process.poll() is None:
-        try:
-            if json.loads(path.read_text())["status"] in ("running", "done"):
-                return
-        except (OSError, ValueError, KeyError):
-            pass
+    """Wait until a stage is running or done, or the program has ended."""
+    while process.poll() is None and _status(output, stage) not in ("running", "done"):
         time.sleep(0.01)
+
+
+def linger(seconds: float, stage: str, output: Path, process: subprocess.Popen[bytes]) -> None:
+    """Let a stage run for a while, but neither into the next one nor to the program's end."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and process.poll() is None and _status(output, stage) != "done":
+        time.sleep(0.005)
 
 
 def durations(output: Path) -> dict[str, float]:
@@ -176,26 +209,39 @@ def differences(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
 
 
 def struck(
-    folder: Path, kills: int, took: dict[str, float], seed: int, tally: Tally
+    folder: Path, strikes: Sequence[str], took: dict[str, float], seed: int, tally: Tally
 ) -> dict[str, Any]:
-    """The contents of a study that was struck so often, and resumed after each time."""
+    """The contents of a study that was struck in these stages, in order, and resumed each time."""
     rng = random.Random(seed)
     report = "report" in took
     output, said = folder / "results", folder / "said"
-    stages = [stage for stage in STAGES if stage in took]
-    for k in range(kills):
-        stage, way = stages[k % len(stages)], rng.choice(WAYS)
-        process = started(study(output, output.exists(), report), said)
-        wait_for(stage, output, process)
-        moment = rng.uniform(0.0, took[stage])
-        time.sleep(moment)
-        alive = process.poll() is None
-        strike(process, way, rng)
-        code = ended(process, said)
+
+    def start() -> subprocess.Popen[bytes]:
+        return started(study(output, output.exists(), report), said)
+
+    process = start()
+    for stage in strikes:
+        if process.poll() is not None:
+            ended(process, said)
+            process = start()
+        if stage != BEGINNING:
+            wait_for(stage, output, process)
+        # A stage that was resumed has less to do than it had at first.
+        linger(rng.uniform(0.0, 0.7 * took[stage]), stage, output, process)
+        way, at = rng.choice(WAYS), running(output)
+        if process.poll() is not None:
+            tally.misses += 1
+            continue
+        if not strike(process, way, rng):
+            way = "kill"
+            strike(process, way, rng)
+        tally.hits += 1
         tally.ways[way] += 1
-        tally.stages[stage if alive else "too late"] += 1
-        tally.ends[str(code)] += 1
-    code = ended(started(study(output, output.exists(), report), said), said)
+        tally.stages[BEGINNING if stage == BEGINNING else at] += 1
+        if way != "kill a worker":  # a study goes on without one
+            tally.ends[str(ended(process, said))] += 1
+    ended(process, said)
+    code = ended(start(), said)
     if code != 0:
         raise Broken(f"cannot be resumed, exit code {code}:\n{said.read_text(errors='replace')}")
     return contents(output)
@@ -207,18 +253,12 @@ def undisturbed(folder: Path, report: bool) -> tuple[dict[str, Any], dict[str, f
     code = ended(started(study(output, False, report), said), said)
     if code != 0:
         raise Broken(f"exit code {code}:\n{said.read_text(errors='replace')}")
-    return contents(output), durations(output)
-
-
-def rounds(kills: int, each: int) -> Iterator[int]:
-    """How often each folder is struck, so that all are."""
-    while kills > 0:
-        yield min(kills, each)
-        kills -= each
+    took = durations(output)
+    return contents(output), took | {BEGINNING: took["search"]}
 
 
 def main() -> int:
-    """Kill, resume, compare; the exit code."""
+    """Kill, resume, compare until living programs were hit so often; the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.kills", description=__doc__)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
@@ -227,21 +267,22 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as place:
         (Path(place) / "peace").mkdir()
         expected, took = undisturbed(Path(place) / "peace", report=True)
-        print(
-            "undisturbed:",
-            {stage: round(seconds, 1) for stage, seconds in took.items()},
-            flush=True,
-        )
-        for number, kills in enumerate(rounds(options.kills, len(STAGES))):
+        print("undisturbed:", {name: round(s, 1) for name, s in took.items()}, flush=True)
+        for number in itertools.count():
+            left = options.kills - tally.hits
+            if left <= 0:
+                break
             folder = Path(place) / f"struck{number}"
             folder.mkdir()
             try:
-                found = struck(folder, kills, took, options.seed * 1000 + number, tally)
+                found = struck(folder, STRIKES[:left], took, options.seed * 1000 + number, tally)
                 different = differences(expected, found)
             except (Broken, subprocess.TimeoutExpired) as error:
                 different = [str(error)]
             wrong += bool(different)
-            print(f"folder {number}, {kills} kills:", different or "same", flush=True)
+            told = f"folder {number}: {tally.hits} hits, {tally.misses} too late:"
+            print(told, different or "same", flush=True)
+            shutil.rmtree(folder)
     print("ways:", dict(tally.ways))
     print("stages:", dict(tally.stages))
     print("exit codes:", dict(tally.ends))

@@ -21,9 +21,18 @@ TOKENS = (
     *rb"""\ud800 \u0000 null true <a> </link> &lt; &a; <!-- --> <![CDATA[ [[a]] { } ] " '
     """.split(),
     *(b"\0", b"\xff", b"\xef\xbb\xbf", b"\n", b"\r\n", b"<!DOCTYPE a>", b"1e999", b"-inf", b"NaN"),
+    *(b"${", b"}", b"$(arg", b"${1/0}", b"<xacro:if value='1'>"),
     *(b"[" * 200, b"a." * 200, b"9" * 5000, b"0x" + b"f" * 5000, b"/" * 300),
     b'<?xml version="1.0" encoding="utf-16"?>',
 )
+
+EXPRESSIONS = (
+    *("${1 + 1}", "${1 / 0}", "${'x' * 10**9}", "${10**5000}", "${[]}", "${}", "${", "$$", "$("),
+    *("${unknown}", "${mass}", "${float('nan')}", "${1e308 * 10}", "${python.range(9)}", "}"),
+    *("$(arg tool)", "$(arg unknown)", "$(find unknown)", "$(eval 2**9)", "$(env PATH)", "$(cwd)"),
+    *("${xacro.load_yaml('/dev/zero')}", "${xacro.load_yaml('.')}", "${xacro.fatal('a')}"),
+)
+"""What stands in the attributes of xacro files; elsewhere it is only an odd text."""
 
 NUMBERS = (0, -0.0, 1, -1, 2, 0.5, 1e-320, 1e-12, 1e6, 1e308, -1e308, 10**30, 10**400, 2**63, 1000)
 NOT_FINITE = (math.inf, -math.inf, math.nan)
@@ -143,6 +152,7 @@ def xml_damage(draw: st.DrawFn) -> Bytes:
         st.sampled_from(
             ["1 2 3", "0 0 0", "1e308 0 0", "nan 0 0", "1_0", "0x1p3", "1,0", "\u0661"]
         ),
+        st.sampled_from(EXPRESSIONS),
     )
     kinds = st.sampled_from(["value", "value", "value", "drop", "remove", "double", "move", "tag"])
     steps = draw(st.lists(st.tuples(kinds, share, share, values), min_size=1, max_size=3))

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -18,15 +19,36 @@ from hypothesis import strategies as st
 from symbolic.geometry.meshes import CollisionModelWarning, convex_pieces
 from symbolic.geometry.pairs import build_geometry
 from symbolic.robot.urdf import arm_model
+from symbolic.robot.xacro_file import XACRO_NAMESPACE
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage, xml_damage
 from tests.fuzz.promises import kept
 from tests.symbolic.workcell.samples import GOFA, RACK, sample_data, write
 
-FEW, MANY = 40, 1000
+FEW, FEW_PROCESSES, MANY = 40, 8, 1000
 SOUND = RACK.read_bytes().replace(b"../robots/gofa12.urdf", str(GOFA).encode())
 
+ElementTree.register_namespace("xacro", XACRO_NAMESPACE.decode())
+INCLUDED = f"""<robot xmlns:xacro="{XACRO_NAMESPACE.decode()}">
+<xacro:arg name="tool" default="tool"/><xacro:property name="mass" value="2.5"/>
+<xacro:macro name="part" params="name size:='0.1 0.1 ${{mass / 10}}' *at"><link name="${{name}}">
+<inertial><mass value="${{mass}}"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/>
+</inertial><collision><xacro:insert_block name="at"/><geometry><box size="${{size}}"/></geometry>
+</collision></link></xacro:macro></robot>"""
+XACRO = GOFA.read_text().replace(
+    "</robot>",
+    """<xacro:include filename="parts.xacro"/><xacro:if value="${mass > 1}"><xacro:part
+    name="$(arg tool)"><origin xyz="0 0 ${mass / 10}"/></xacro:part></xacro:if><joint name="j"
+    type="fixed"><parent link="tool0"/><child link="$(arg tool)"/></joint></robot>""",
+)
+XACRO = XACRO.replace("<robot ", f'<robot xmlns:xacro="{XACRO_NAMESPACE.decode()}" ')
+SRDF = b"""<?xml version="1.0"?><robot name="gofa"><group name="arm"><chain base_link="base_link"
+tip_link="tool0"/></group><group_state name="home" group="arm"><joint name="joint_1" value="0"/>
+</group_state><disable_collisions link1="link_1" link2="link_3" reason="Never"/>
+<disable_collisions link1="link_2" link2="link_4" reason="Never"/></robot>"""
+
+few_processes = settings(max_examples=FEW_PROCESSES, suppress_health_check=list(HealthCheck))
 quick = settings(max_examples=FEW, suppress_health_check=list(HealthCheck))
 thorough = settings(max_examples=MANY, suppress_health_check=list(HealthCheck))
 
@@ -72,6 +94,32 @@ def urdf(damaged: Bytes) -> None:
             sound_cell(cell)
 
 
+def xacro(share: float, damaged: Bytes) -> None:
+    files = {"arm.xacro": XACRO.encode(), "parts.xacro": INCLUDED.encode()}
+    name = "arm.xacro" if share < 0.5 else "parts.xacro"
+    with tempfile.TemporaryDirectory() as folder:
+        for file, content in files.items():
+            (Path(folder) / file).write_bytes(damaged(content) if file == name else content)
+        data: dict[str, Any] = sample_data()
+        for robot in data["robots"]:
+            robot["urdf"] = "arm.xacro"
+        path = write(Path(folder), data)
+        cell = kept(lambda: load(path), str(path))
+        if cell is not None:
+            sound_cell(cell)
+
+
+def srdf(damaged: Bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "arm.srdf").write_bytes(damaged(SRDF))
+        data: dict[str, Any] = sample_data()
+        data["robots"][0]["srdf"] = "arm.srdf"
+        path = write(Path(folder), data)
+        cell = kept(lambda: load(path), str(path))
+        if cell is not None:
+            sound_cell(cell)
+
+
 def mesh(kind: str, damaged: Bytes) -> None:
     sound = trimesh.creation.box((0.3, 0.2, 0.1)).export(file_type=kind)
     content = sound.encode() if isinstance(sound, str) else sound
@@ -90,14 +138,31 @@ TESTS: dict[str, tuple[Callable[..., None], tuple[st.SearchStrategy[Any], ...]]]
     "workcell, values": (workcell_tree, (tree_damage(),)),
     "urdf, bytes": (urdf, (byte_damage(),)),
     "urdf, elements": (urdf, (xml_damage(),)),
+    "xacro, bytes": (xacro, (st.floats(0.0, 1.0), byte_damage())),
+    "xacro, elements": (xacro, (st.floats(0.0, 1.0), xml_damage())),
+    "srdf, bytes": (srdf, (byte_damage(),)),
+    "srdf, elements": (srdf, (xml_damage(),)),
     "mesh": (mesh, (st.sampled_from(["stl", "stl_ascii", "obj", "ply", "off"]), byte_damage())),
 }
+
+
+@pytest.mark.parametrize("check", [xacro, srdf, urdf])
+def test_what_is_damaged_is_sound_at_first(check: Callable[..., None]) -> None:
+    seen: list[Workcell] = []
+
+    def asked(cell: Workcell) -> None:
+        seen.append(cell)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tests.fuzz.test_cell_files.sound_cell", asked)
+        check(*([0.0] if check is xacro else []), lambda content: content)
+    assert len(seen) == 1
 
 
 @pytest.mark.parametrize("kind", TESTS)
 def test_damage_is_told(kind: str) -> None:
     check, strategies = TESTS[kind]
-    quick(given(*strategies)(check))()
+    (few_processes if check is xacro else quick)(given(*strategies)(check))()
 
 
 @pytest.mark.slow

@@ -49,6 +49,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def damaged_copy(whole: Path) -> Path:
     """A copy whose files are damaged one at a time."""
+    gather_carries(whole)  # what it needs is compiled before it has to be quick
     return Path(shutil.copytree(whole, whole.with_name("damaged")))
 
 
