@@ -82,48 +82,63 @@ def scene_text(
     return f"""
 <mujoco>
   <compiler angle="radian"/>
-  <option timestep="{settings.time_step!r}" gravity="{_text(gravity)}" cone="elliptic" impratio="20"
-    integrator="implicitfast" solver="Newton" iterations="200" tolerance="1e-12"
-    noslip_iterations="{settings.noslip_iterations}" noslip_tolerance="1e-12"/>
+  {solver_options(settings.time_step, settings.noslip_iterations, gravity)}
   <default>
     <geom solref="{settings.contact_time!r} 1" solimp="0.99 0.9999 0.0001" condim="3"/>
   </default>
   <worldbody>
     <body name="carriage" gravcomp="1">
       <freejoint/>
-      <inertial pos="0 0 0" mass="{CARRIAGE_MASS!r}" diaginertia="{_text([CARRIAGE_MASS] * 3)}"/>
+      <inertial pos="0 0 0" mass="{CARRIAGE_MASS!r}"
+        diaginertia="{mjcf_text([CARRIAGE_MASS] * 3)}"/>
       {pads}
     </body>
     <body name="box">
       <freejoint name="box"/>
-      <inertial pos="{_text(payload.centre_of_mass)}" mass="{payload.mass!r}"
-        fullinertia="{_text(about)}"/>
-      <geom type="box" size="{_text(payload.size / 2.0)}" contype="0" conaffinity="1"/>
+      <inertial pos="{mjcf_text(payload.centre_of_mass)}" mass="{payload.mass!r}"
+        fullinertia="{mjcf_text(about)}"/>
+      <geom type="box" size="{mjcf_text(payload.size / 2.0)}" contype="0" conaffinity="1"/>
     </body>
   </worldbody>
 </mujoco>"""
 
 
-def _pad_text(contact: Contact, name: str, points: int, slides: bool) -> str:
+def solver_options(time_step: float, noslip_iterations: int, gravity: Array) -> str:
+    """MuJoCo's options: cones as they are, solved to many digits."""
+    return f"""<option timestep="{time_step!r}" gravity="{mjcf_text(gravity)}" cone="elliptic"
+    impratio="20" integrator="implicitfast" solver="Newton" iterations="200" tolerance="1e-12"
+    noslip_iterations="{noslip_iterations}" noslip_tolerance="1e-12"/>"""
+
+
+def contact_points(contact: Contact, points: int, T_body_pad: Array) -> str:
+    """Spheres on the rim of a patch that touch its plane, as geoms of the body that holds it."""
     angles = 2.0 * np.pi * np.arange(points) / points
-    spheres = "\n".join(
-        f'<geom type="sphere" size="{POINT_RADIUS!r}" contype="1" conaffinity="0" priority="1" '
-        f'friction="{contact.friction!r} 0 0" pos="{_text(place)}"/>'
-        for place in np.column_stack(
-            [
-                contact.patch_radius * np.cos(angles),
-                contact.patch_radius * np.sin(angles),
-                np.full(points, -POINT_RADIUS),
-            ]
-        )
+    in_pad = np.column_stack(
+        [
+            contact.patch_radius * np.cos(angles),
+            contact.patch_radius * np.sin(angles),
+            np.full(points, -POINT_RADIUS),
+        ]
     )
+    return "\n".join(
+        f'<geom type="sphere" size="{POINT_RADIUS!r}" contype="1" conaffinity="0" priority="1" '
+        f'friction="{contact.friction!r} 0 0" pos="{mjcf_text(place)}"/>'
+        for place in in_pad @ T_body_pad[:3, :3].T + T_body_pad[:3, 3]
+    )
+
+
+def _pad_text(contact: Contact, name: str, points: int, slides: bool) -> str:
     joint = '<joint name="press" type="slide" axis="0 0 1"/>' if slides else ""
-    at, turn = contact.T_box_pad[:3, 3], quaternion(contact.T_box_pad[:3, :3])
-    return f"""<body name="{name}" gravcomp="1" pos="{_text(at)}" quat="{_text(turn)}">
+    return f"""<body name="{name}" gravcomp="1" {placed(contact.T_box_pad)}>
         {joint}
         <inertial pos="0 0 0" mass="{PAD_MASS!r}" diaginertia="0.001 0.001 0.001"/>
-        {spheres}
+        {contact_points(contact, points, np.eye(4))}
       </body>"""
+
+
+def placed(T: Array) -> str:
+    """A transform (4, 4) as MJCF's attributes."""
+    return f'pos="{mjcf_text(T[:3, 3])}" quat="{mjcf_text(quaternion(T[:3, :3]))}"'
 
 
 def quaternion(rotation: Array) -> Array:
@@ -132,5 +147,6 @@ def quaternion(rotation: Array) -> Array:
     return last[..., [3, 0, 1, 2]]
 
 
-def _text(values: ArrayLike) -> str:
+def mjcf_text(values: ArrayLike) -> str:
+    """Numbers as an attribute's value."""
     return " ".join(repr(float(value)) for value in np.ravel(values))

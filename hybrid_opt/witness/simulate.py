@@ -6,16 +6,14 @@ within it, so that the pads move exactly as planned; the box, free, is held by f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.errors import WitnessError
 from hybrid_opt.witness.drive import Drive
+from hybrid_opt.witness.outcome import Outcome, Threshold, bisected, mujoco_module
 from hybrid_opt.witness.scene import CARRIAGE_MASS, SimulationSettings, scene_text
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
@@ -23,57 +21,8 @@ from symbolic.workcell.records import Workcell
 LOOKED_AT = 1e-3
 """Time between two looks at the slip [s]."""
 
-BEGINS = 0.1
-"""Share of the slip that counts as one at which it is said to begin."""
-
 RIM_POINTS = 8
 """Places on each patch's rim where the slip is measured."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What one simulation showed.
-
-    Attributes:
-        factor: multiple of the pressing force.
-        holds: whether the box slipped by less than the settings' slip.
-        time: (n,) when it was looked at, from the settled state on [s].
-        slip: (n, 2) largest displacement in the plane of each pad since then [m].
-        turn: (n,) angle by which the box turned on the carriage since then [rad].
-    """
-
-    factor: float
-    holds: bool
-    time: Array
-    slip: Array
-    turn: Array
-
-    @property
-    def pad(self) -> int:
-        """Index of the pad with the larger slip at the end."""
-        return int(self.slip[-1].argmax())
-
-    def begins(self, slip: float) -> float:
-        """Time at which the slip first exceeds a tenth of `slip` [s]; infinite where never."""
-        beyond = np.flatnonzero(self.slip.max(axis=1) > BEGINS * slip)
-        return float(self.time[beyond[0]]) if len(beyond) else float("inf")
-
-
-@dataclass(frozen=True)
-class Threshold:
-    """The least multiple of a force that holds.
-
-    Attributes:
-        slips, holds: simulations right below and above it.
-    """
-
-    slips: Outcome
-    holds: Outcome
-
-    @property
-    def factor(self) -> float:
-        """In the middle of both."""
-        return (self.slips.factor + self.holds.factor) / 2.0
 
 
 class Witness:
@@ -99,7 +48,7 @@ class Witness:
         """
         self.workcell = workcell
         self.settings = settings or SimulationSettings()
-        self._mujoco = _mujoco()
+        self._mujoco = mujoco_module()
         self._disturbance = disturbance
         self._models: dict[int, Any] = {}
         around = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
@@ -141,7 +90,7 @@ class Witness:
                 return Outcome(factor, False, np.array(time), np.array(slip), np.array(turn))
         return Outcome(factor, True, np.array(time), np.array(slip), np.array(turn))
 
-    def threshold(self, drive: Drive, low: float, high: float, steps: int) -> Threshold:
+    def threshold(self, drive: Drive, low: float, high: float, steps: int) -> Threshold[Outcome]:
         """The least factor that holds, by bisection.
 
         Args:
@@ -151,14 +100,7 @@ class Witness:
         Raises:
             WitnessError: the box holds at the lower or slips at the higher factor.
         """
-        slips, holds = self.simulate(drive, low), self.simulate(drive, high)
-        if slips.holds or not holds.holds:
-            what = f"holds at {low:g}" if slips.holds else f"slips at {high:g}"
-            raise WitnessError(f"the box {what} times the force; give other factors")
-        for _ in range(steps):
-            middle = self.simulate(drive, (slips.factor + holds.factor) / 2.0)
-            slips, holds = (slips, middle) if middle.holds else (middle, holds)
-        return Threshold(slips, holds)
+        return bisected(lambda factor: self.simulate(drive, factor), low, high, steps)
 
     def _model(self, leader: int) -> Any:
         if leader not in self._models:
@@ -174,14 +116,3 @@ class Witness:
         offset = drive.rotation[k].T @ (pose[:3] - drive.position[k])
         moved = self._rims @ turned.T + offset - self._rims
         return moved - (moved @ self._normal)[..., None] * self._normal, turned
-
-
-def _mujoco() -> ModuleType:
-    try:
-        import mujoco
-    except ImportError as error:
-        raise WitnessError(
-            "MuJoCo is not installed; install the extra: pip install -e '.[sim]'"
-        ) from error
-    module: ModuleType = mujoco
-    return module

@@ -1,0 +1,296 @@
+"""A whole cell in MuJoCo: both arms under their controllers, the box between their pads.
+
+Nothing moves but by the joints' torques, gravity and contacts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
+
+from hybrid_opt.witness.cell_scene import ArmSettings, cell_text, joint_names, joint_torque_max
+from hybrid_opt.witness.controller import ArmCommand, ArmState, Control, controllers
+from hybrid_opt.witness.drive import SAME_TIME
+from hybrid_opt.witness.outcome import Outcome, Threshold, bisected, mujoco_module
+from hybrid_opt.witness.pads import Pads
+from hybrid_opt.witness.reference import Reference
+from hybrid_opt.witness.scene import quaternion
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
+
+LOOKED_AT = 5e-3
+"""Time between two looks at the box [s]."""
+
+
+@dataclass(frozen=True)
+class ArmOutcome(Outcome):
+    """What one simulation of a whole cell showed, at n moments; the slip only while it is held.
+
+    Attributes:
+        normal_force, normal_force_reference: (n, 2) measured and commanded [N].
+        q: (n, all joints) [rad].
+        tracking_error: (n, all joints) reference less position [rad].
+        torque_use: (all joints,) largest torque of each joint over its largest allowed.
+        box_position: (n, 3) of the box frame [m].
+        box_rotation: (n, 3, 3) R_world_box.
+        misses: distance of the box from its goal at the end [m]; zero where there is none.
+        arrives: whether it held and the box ended at its goal.
+    """
+
+    normal_force: Array
+    normal_force_reference: Array
+    q: Array
+    tracking_error: Array
+    torque_use: Array
+    box_position: Array
+    box_rotation: Array
+    misses: float
+    arrives: bool
+
+
+class CellWitness:
+    """A workcell with its arms, as it really is.
+
+    Attributes:
+        workcell, settings: what is simulated, and how.
+        text: the MJCF document.
+        mujoco, model: the simulator and its model.
+        disturbance: (3,) [m/s^2].
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        settings: ArmSettings | None = None,
+        disturbance: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Describe the cell; nothing is simulated yet.
+
+        Args:
+            disturbance: (3,) acceleration that the pads have to give the box beside the motion's,
+                world frame [m/s^2].
+
+        Raises:
+            WitnessError: MuJoCo is not installed.
+        """
+        self.workcell = workcell
+        self.settings = settings or ArmSettings()
+        self.text = cell_text(workcell, self.settings)
+        self.disturbance = np.asarray(disturbance, dtype=float)
+        self.mujoco = mujoco_module()
+        self.model = self.mujoco.MjModel.from_xml_string(self.text)
+
+    def simulate(
+        self,
+        reference: Reference,
+        control: Control = "leader",
+        factor: float = 1.0,
+        leader: int = 0,
+    ) -> ArmOutcome:
+        """One job, up to its end or to a slip.
+
+        Args:
+            reference: what the cell is told; its workcell may differ from the simulated one in
+                payload, friction and the pads' places.
+            factor: multiple of the normal forces to press with.
+            leader: index of the arm that keeps its place under the control `leader`.
+        """
+        return _Run(self, reference, control, factor, leader).outcome()
+
+    def threshold(
+        self,
+        reference: Reference,
+        control: Control,
+        low: float,
+        high: float,
+        steps: int,
+    ) -> Threshold[ArmOutcome]:
+        """The least factor that holds, by bisection; see `hybrid_opt.witness.outcome.bisected`.
+
+        Raises:
+            WitnessError: the box holds at the lower or slips at the higher factor.
+        """
+        return bisected(lambda s: self.simulate(reference, control, s), low, high, steps)
+
+
+class _Run:
+    """One simulation."""
+
+    def __init__(
+        self,
+        witness: CellWitness,
+        reference: Reference,
+        control: Control,
+        factor: float,
+        leader: int,
+    ) -> None:
+        self._settings, self._workcell = witness.settings, witness.workcell
+        self._reference, self._factor = reference, factor
+        self._mujoco, self._model = witness.mujoco, witness.model
+        self._data = self._mujoco.MjData(self._model)
+        self._pads = Pads(self._mujoco, self._model, self._data, self._workcell)
+        names = joint_names(self._workcell)
+        self._q = np.array([int(self._model.joint(name).qposadr[0]) for name in names])
+        self._v = np.array([int(self._model.joint(name).dofadr[0]) for name in names])
+        box = self._model.joint("box")
+        self._box_q = slice(int(box.qposadr[0]), int(box.qposadr[0]) + 7)
+        self._box_v = slice(int(box.dofadr[0]), int(box.dofadr[0]) + 6)
+        split = len(self._workcell.robots[0].torque_max)
+        self._arms = (slice(0, split), slice(split, None))
+        self._ticks = _Ticks.of(reference, factor, self._settings)
+        self._limit = joint_torque_max(self._workcell)
+        self._torque_use = np.zeros(len(self._limit))
+        self._jacobian = np.zeros((6, self._model.nv))
+        self._standing = self._place(witness.disturbance)
+        stiffness = self._settings.joint_stiffness(self._workcell)
+        critical = 2.0 * np.sqrt(stiffness * self._joint_inertia())
+        damping = self._settings.damping_ratio * critical
+        gains = [(stiffness[arm], damping[arm]) for arm in self._arms]
+        self._controllers = controllers(control, leader, self._settings, (gains[0], gains[1]))
+
+    def outcome(self) -> ArmOutcome:
+        """Simulate."""
+        settings, pads, held = self._settings, self._pads, self._reference.job.held
+        per_tick = round(settings.control_period / settings.time_step)
+        every = max(1, round(LOOKED_AT / settings.control_period))
+        seen: list[tuple[Any, ...]] = []
+        settled: tuple[Array, Array] | None = None
+        holds = True
+        for k, time in enumerate(self._ticks.time):
+            measured = pads.normal_forces
+            self._begin_step(time)
+            self._data.qfrc_applied[self._v] = self._torque(k, measured)
+            if k % every == 0:
+                slip, turn = np.zeros(2), 0.0
+                if held[0] <= time <= held[1]:
+                    settled = settled or (pads.rims_on_box, pads.box_in_pad)
+                    slip = pads.slip(settled[0])
+                    turned = Rotation.from_matrix(settled[1].T @ pads.box_in_pad)
+                    turn = float(turned.magnitude())
+                joints = self._data.qpos[self._q].copy()
+                seen.append((time, slip, turn, measured, k, joints, *pads.box))
+                if not slip.max() <= settings.slip:
+                    holds = False
+                    break
+            self._mujoco.mj_step2(self._model, self._data)
+            for _ in range(per_tick - 1):
+                self._begin_step(time)
+                self._mujoco.mj_step2(self._model, self._data)
+        return self._told(seen, holds)
+
+    def _told(self, seen: list[tuple[Any, ...]], holds: bool) -> ArmOutcome:
+        columns = (np.array(values) for values in zip(*seen, strict=True))
+        time, slip, turn, force, ticks, q, position, rotation = columns
+        goal = self._reference.job.goal
+        misses = 0.0 if goal is None else float(np.linalg.norm(position[-1] - goal))
+        return ArmOutcome(
+            factor=self._factor,
+            holds=holds,
+            time=time,
+            slip=slip,
+            turn=turn,
+            normal_force=force,
+            normal_force_reference=self._ticks.normal_force[ticks],
+            q=q,
+            tracking_error=self._ticks.q[ticks] - q,
+            torque_use=self._torque_use,
+            box_position=position,
+            box_rotation=rotation,
+            misses=misses,
+            arrives=holds and misses <= self._settings.arrival,
+        )
+
+    def _place(self, disturbance: Array) -> Array:
+        """Put arms and box at their first poses; returns the box's (7,) as MuJoCo has it."""
+        data, job = self._data, self._reference.job
+        data.qpos[self._q], data.qvel[self._v] = self._ticks.q[0], self._ticks.q_rate[0]
+        rotation = Rotation.from_euler("xyz", job.start[3:])
+        # The arms grip where they were told: pads elsewhere on the box mean a box elsewhere.
+        pairs = zip(self._workcell.contacts, self._reference.workcell.contacts, strict=True)
+        displaced = np.mean([real.T_box_pad - told.T_box_pad for real, told in pairs], axis=0)
+        position = job.start[:3] - rotation.apply(displaced[:3, 3])
+        standing = np.concatenate([position, quaternion(rotation.as_matrix())])
+        data.qpos[self._box_q] = standing
+        box = int(self._model.body("box").id)
+        data.xfrc_applied[box, :3] = -self._workcell.payload.mass * disturbance
+        self._mujoco.mj_forward(self._model, data)
+        return standing
+
+    def _begin_step(self, time: float) -> None:
+        """First half of a step: places and contacts of this very moment."""
+        if time < self._reference.job.stands:
+            self._data.qpos[self._box_q] = self._standing
+            self._data.qvel[self._box_v] = 0.0
+        self._mujoco.mj_step1(self._model, self._data)
+        self._pads.mend_contacts()
+
+    def _torque(self, k: int, measured: Array) -> Array:
+        """(all joints,) torques at tick k, within what the joints can do."""
+        data, ticks = self._data, self._ticks
+        error = ticks.q[k] - data.qpos[self._q]
+        error_rate = ticks.q_rate[k] - data.qvel[self._v]
+        torque = np.empty(len(self._limit))
+        linear, angular = self._jacobian[:3], self._jacobian[3:]
+        for i, arm in enumerate(self._arms):
+            site = self._pads.sites[i]
+            self._mujoco.mj_jacSite(self._model, data, linear, angular, site)
+            state = ArmState(
+                error[arm],
+                error_rate[arm],
+                self._jacobian[:, self._v[arm]],
+                data.site_xmat[site].reshape(3, 3)[:, 2],
+                float(measured[i]),
+            )
+            command = ArmCommand(ticks.effort[k, arm], float(ticks.normal_force[k, i]))
+            torque[arm] = self._controllers[i].torque(command, state)
+        np.maximum(self._torque_use, np.abs(torque) / self._limit, out=self._torque_use)
+        return np.clip(torque, -self._limit, self._limit)
+
+    def _joint_inertia(self) -> Array:
+        """(all joints,) what each joint moves when the others stand still [kg m^2]."""
+        found = np.empty(len(self._v))
+        for k, joint in enumerate(self._v):
+            unit, moved = np.zeros(self._model.nv), np.zeros(self._model.nv)
+            unit[joint] = 1.0
+            self._mujoco.mj_mulM(self._model, self._data, moved, unit)
+            found[k] = moved[joint]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Ticks:
+    """References at the controllers' ticks: as in `Reference`, pressing times the factor."""
+
+    time: Array
+    q: Array
+    q_rate: Array
+    effort: Array
+    normal_force: Array
+
+    @classmethod
+    def of(cls, reference: Reference, factor: float, settings: ArmSettings) -> _Ticks:
+        motion, period = reference.motion, settings.control_period
+        begin, end = motion.time[[0, -1]]
+        time = begin + period * np.arange(round((end - begin) / period) + 1)
+        single = np.concatenate([[True], np.diff(motion.time) > SAME_TIME])
+        spline = CubicHermiteSpline(motion.time[single], motion.q[single], motion.q_rate[single])
+        at = np.minimum(time, end)
+
+        def linear(values: Array) -> Array:
+            return np.column_stack([np.interp(at, motion.time, column) for column in values.T])
+
+        counts = [len(robot.torque_max) for robot in reference.workcell.robots]
+        motors = settings.joint_armature(reference.workcell) * motion.q_second
+        more = (factor - 1.0) * np.repeat(reference.normal_force, counts, axis=1)
+        return cls(
+            time=time,
+            q=spline(at),
+            q_rate=spline(at, 1),
+            effort=linear(reference.effort + motors + more * reference.press_torque),
+            normal_force=factor * linear(reference.normal_force),
+        )

@@ -1,0 +1,231 @@
+"""What a simulated cell is told: where its joints have to be, how hard its pads have to press."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.robot.model import build_robot_model
+from symbolic.workcell.records import Robot, Workcell
+
+SETTLE = 0.3
+"""Time at rest before a carry begins [s]."""
+
+STANDS = 0.1
+"""Time of it for which something else still holds the box [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """Both arms' joints side by side at n moments, times not decreasing.
+
+    Attributes:
+        time: (n,) [s].
+        q, q_rate, q_second: (n, all joints) positions and their time derivatives [rad, s].
+    """
+
+    time: Array
+    q: Array
+    q_rate: Array
+    q_second: Array
+
+
+@dataclass(frozen=True, eq=False)
+class BoxJob:
+    """What is to happen to the box.
+
+    Attributes:
+        start: (6,) its pose at first.
+        goal: (3,) where its centre has to end [m]; None where nobody asks.
+        held: from when to when pads alone hold it: slip is measured in between [s].
+        stands: until when something that is not modelled holds it in place [s].
+    """
+
+    start: Array
+    goal: Array | None
+    held: tuple[float, float]
+    stands: float = -np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """References of a whole job at n moments.
+
+    Attributes:
+        workcell: the cell as it was planned for.
+        motion: the joints.
+        normal_force: (n, 2) force that each pad has to press with; zero where it need not touch
+            [N].
+        effort: (n, all joints) joint torques to feed forward, pressing included [N m].
+        press_torque: (n, all joints) torques of each arm's joints that press with 1 N.
+        job: what is to happen to the box.
+    """
+
+    workcell: Workcell
+    motion: JointMotion
+    normal_force: Array
+    effort: Array
+    press_torque: Array
+    job: BoxJob
+
+
+def job_reference(
+    workcell: Workcell,
+    motion: JointMotion,
+    normal_force: Array,
+    job: BoxJob,
+    effort: Array | None = None,
+) -> Reference:
+    """References from joints and forces.
+
+    Args:
+        normal_force: (n, 2) force that each pad has to press with [N].
+        effort: (n, all joints) joint torques to feed forward: inverse dynamics and the contacts'
+            wrenches, pressing included; without, inverse dynamics and pressing, so that the
+            controllers' stiffness has to carry the box [N m].
+
+    Raises:
+        SettingsError: the arrays do not fit one another, or times decrease.
+    """
+    n, joints = motion.q.shape
+    if motion.q_rate.shape != (n, joints) or motion.q_second.shape != (n, joints):
+        raise SettingsError("rates of the joints do not fit their positions")
+    if motion.time.shape != (n,) or normal_force.shape != (n, 2) or n < 2:
+        raise SettingsError(f"{len(motion.time)} times and {len(normal_force)} forces for {n} rows")
+    if (np.diff(motion.time) < 0.0).any():
+        raise SettingsError("times decrease")
+    pressing = press_torque(workcell, motion.q)
+    if effort is None:
+        repeated = np.repeat(normal_force, _counts(workcell), axis=1)
+        effort = inverse_dynamics(workcell, motion) + pressing * repeated
+    elif effort.shape != (n, joints):
+        raise SettingsError(f"efforts of shape {effort.shape} for {n} x {joints} joints")
+    return Reference(workcell, motion, normal_force, effort, pressing, job)
+
+
+def carry_reference(
+    cell: Cell, carry: Carry, press: Array | None = None, leader: int = 0
+) -> Reference:
+    """A carry from rest to rest, after some time at rest, with its whole planned wrenches.
+
+    Args:
+        press: (n,) normal force to command the arm that does not lead; its planned one by default
+            [N].
+        leader: index of the arm whose force is the planned one and what the other adds.
+
+    Raises:
+        SettingsError: the carry does not start and end at rest, or the force does not fit it.
+    """
+    if max(np.abs(carry.rate[[0, -1]]).max(), np.abs(carry.angular_velocity[[0, -1]]).max()) > 1e-3:
+        raise SettingsError("the carry does not start and end at rest; give one with a timing")
+    planned = carry.normal_force[:, 1 - leader]
+    if press is not None and press.shape != planned.shape:
+        raise SettingsError(f"forces of shape {press.shape} for {len(carry)} samples")
+    extra = np.zeros_like(planned) if press is None else press - planned
+    begin = float(carry.time[0])
+    motion = JointMotion(
+        time=np.concatenate([[begin - SETTLE, begin], carry.time]),
+        q=_with_rest(carry.q, 1.0),
+        q_rate=_with_rest(carry.side_by_side("q_rate"), 0.0),
+        q_second=_with_rest(carry.side_by_side("q_second"), 0.0),
+    )
+    pose, rate, second = (
+        _with_rest(values, keep)
+        for values, keep in ((carry.pose, 1.0), (carry.rate, 0.0), (carry.second_rate, 0.0))
+    )
+    model, workcell = cell.timing_model, carry.workcell
+    known = replace(carry, pose=pose, rate=rate, second_rate=second)
+    friction = np.array([contact.friction for contact in workcell.contacts])
+    load = model.uncertain_load(known, friction, workcell.payload.centre_of_mass)
+    wrenches = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
+    torque = np.einsum("nijk,nik->nij", model.wrench_torque(motion.q, pose), wrenches)
+    # At rest before the carry the pads press as they will have to when it begins.
+    extra = np.concatenate([[extra[0]] * 2, extra])
+    starting = (carry.normal_force[0] - load["normal_force"][0]).max()
+    extra[:2] += max(0.0, float(starting))
+    normal_force = load["normal_force"] + extra[:, None]
+    pressing = press_torque(workcell, motion.q)
+    own = inverse_dynamics(workcell, motion)
+    repeated = np.repeat(np.column_stack([extra, extra]), _counts(workcell), axis=1)
+    job = BoxJob(
+        start=carry.pose[0],
+        goal=carry.pose[-1, :3],
+        held=(begin - SETTLE / 2.0, float(carry.time[-1])),
+        stands=begin - SETTLE + STANDS,
+    )
+    effort = own + torque.reshape(len(own), -1) + pressing * repeated
+    return Reference(workcell, motion, normal_force, effort, pressing, job)
+
+
+def with_tracking_error(
+    reference: Reference, amplitude: float, rng: np.random.Generator
+) -> Reference:
+    """References whose joints are off by a random sinusoid each, which begins at zero.
+
+    Frequencies are drawn from 0.3 to 1.5 Hz. What is fed forward stays.
+
+    Args:
+        amplitude: of each joint's sinusoid [rad].
+    """
+    motion = reference.motion
+    joints = motion.q.shape[1]
+    omega = 2.0 * np.pi * rng.uniform(0.3, 1.5, joints)
+    phase = rng.uniform(0.0, 2.0 * np.pi, joints)
+    angle = np.outer(motion.time - motion.time[0], omega) + phase
+    off = amplitude * (np.sin(angle) - np.sin(phase)) / 2.0
+    rate = amplitude * omega * np.cos(angle) / 2.0
+    moved = replace(motion, q=motion.q + off, q_rate=motion.q_rate + rate)
+    return replace(reference, motion=moved)
+
+
+def press_torque(workcell: Workcell, q: Array) -> Array:
+    """(n, all joints) torques of each arm's joints that press with 1 N, at joints (n, all)."""
+    return np.concatenate(
+        [
+            _press_torque(robot, values)
+            for robot, values in zip(workcell.robots, _split(workcell, q), strict=True)
+        ],
+        axis=1,
+    )
+
+
+def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
+    """(n, all joints) torques that move the bare arms [N m]."""
+    found = []
+    parts = [_split(workcell, values) for values in (motion.q, motion.q_rate, motion.q_second)]
+    for robot, *rows in zip(workcell.robots, *parts, strict=True):
+        model = build_robot_model(robot).model
+        data = model.createData()
+        found.append(np.array([pin.rnea(model, data, *row) for row in zip(*rows, strict=True)]))
+    return np.concatenate(found, axis=1)
+
+
+def _press_torque(robot: Robot, q: Array) -> Array:
+    arm = build_robot_model(robot)
+    data, flange = arm.model.createData(), arm.flange_id
+    torque = np.empty_like(q)
+    for k, row in enumerate(q):
+        J = pin.computeFrameJacobian(arm.model, data, row, flange, pin.LOCAL)
+        force = robot.T_flange_pad[:3, 2]
+        torque[k] = J[:3].T @ force + J[3:].T @ np.cross(robot.T_flange_pad[:3, 3], force)
+    return torque
+
+
+def _split(workcell: Workcell, values: Array) -> tuple[Array, Array]:
+    first = _counts(workcell)[0]
+    return values[:, :first], values[:, first:]
+
+
+def _counts(workcell: Workcell) -> list[int]:
+    return [len(robot.torque_max) for robot in workcell.robots]
+
+
+def _with_rest(values: Array, keep: float) -> Array:
+    """Two rows before the others: the first one, times `keep`."""
+    return np.concatenate([keep * values[:1], keep * values[:1], values])

@@ -1,0 +1,206 @@
+"""Whole cells in the simulator: against closed forms at rest, and against the planner's torques."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+import mujoco
+
+from hybrid_opt.robust.cases import nominal_case
+from hybrid_opt.witness.arms import CellWitness
+from hybrid_opt.witness.cases import workcell_of_case
+from hybrid_opt.witness.cell_scene import ArmSettings, joint_names
+from hybrid_opt.witness.controller import CONTROLS, Control
+from hybrid_opt.witness.reference import (
+    BoxJob,
+    JointMotion,
+    Reference,
+    job_reference,
+    press_torque,
+    with_tracking_error,
+)
+from studies.plain.arm import PlainArm
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.workcell.records import Workcell
+from tests.symbolic.cells import hand_cell, start_posture
+
+WEIGHT = 98.1
+LEAST = WEIGHT / 2.0
+"""Normal force of either pad that holds the hand-written cell's box at rest [N]."""
+
+
+def standing(
+    cell: Workcell, force: float = LEAST, seconds: float = 0.4, carries: bool = True
+) -> Reference:
+    """The hand-written cell's box held still where the task begins.
+
+    Args:
+        carries: whether the box's weight is fed forward.
+    """
+    posture = start_posture(cell)
+    q = np.tile(np.concatenate(posture), (2, 1))
+    still = np.zeros_like(q)
+    motion = JointMotion(np.array([0.0, seconds]), q, still, still)
+    job = BoxJob(cell.task.waypoints[0].lower, None, (0.2, seconds), stands=0.1)
+    reference = job_reference(cell, motion, np.full((2, 2), force), job)
+    if not carries:
+        return reference
+    lifting = []
+    for robot, contact, joints in zip(cell.robots, cell.contacts, posture, strict=True):
+        arm = PlainArm(robot, contact)
+        to_pad = arm.place(joints).rotation @ robot.T_flange_pad[:3, 3]
+        up = np.array([0.0, 0.0, WEIGHT / 2.0])  # the base stands upright
+        lifting.append(arm.jacobian(joints).T @ np.concatenate([up, np.cross(to_pad, up)]))
+    return replace(reference, effort=reference.effort + np.concatenate(lifting))
+
+
+def pad_jacobian(cell: Workcell, witness: CellWitness, q: Array, pad: int) -> Array:
+    data = mujoco.MjData(witness.model)
+    for name, value in zip(joint_names(cell), q, strict=True):
+        data.joint(name).qpos = value
+    mujoco.mj_forward(witness.model, data)
+    linear, angular = np.zeros((2, 3, witness.model.nv))
+    site = witness.model.site(f"pad_{pad + 1}").id
+    mujoco.mj_jacSite(witness.model, data, linear, angular, site)
+    columns = [int(witness.model.joint(name).dofadr[0]) for name in joint_names(cell)]
+    normal: Array = data.site_xmat[site].reshape(3, 3)[:, 2] @ linear[:, columns]
+    return normal
+
+
+def test_pads_press_with_the_torques_of_the_simulators_jacobian() -> None:
+    cell, rng = hand_cell(), np.random.default_rng(1)
+    witness = CellWitness(cell)
+    for q in np.concatenate(start_posture(cell)) + rng.uniform(-0.5, 0.5, (5, 12)):
+        both = sum(pad_jacobian(cell, witness, q, pad) for pad in (0, 1))
+        np.testing.assert_allclose(press_torque(cell, q[None])[0], both, atol=1e-12)
+
+
+def test_pads_are_where_the_arms_hold_the_box() -> None:
+    cell = hand_cell()
+    witness = CellWitness(cell)
+    data = mujoco.MjData(witness.model)
+    posture = start_posture(cell)
+    for name, value in zip(joint_names(cell), np.concatenate(posture), strict=True):
+        data.joint(name).qpos = value
+    mujoco.mj_kinematics(witness.model, data)
+    for i, (robot, contact) in enumerate(zip(cell.robots, cell.contacts, strict=True)):
+        in_root = PlainArm(robot, contact).place(posture[i]).homogeneous
+        T_world_flange = robot.T_world_base @ in_root
+        T_world_pad = T_world_flange @ robot.T_flange_pad
+        np.testing.assert_allclose(data.site(f"pad_{i + 1}").xpos, T_world_pad[:3, 3], atol=1e-9)
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_a_box_at_rest_slips_below_the_least_force(control: Control) -> None:
+    """N = m g / (2 mu), arms and controllers included."""
+    cell = hand_cell()
+    witness, reference = CellWitness(cell), standing(cell, seconds=1.0)
+    assert not witness.simulate(reference, control, 0.97).holds
+    outcome = witness.simulate(reference, control, 1.03)
+    assert outcome.holds
+    assert outcome.arrives
+    assert outcome.turn.max() < 1e-4
+    np.testing.assert_allclose(outcome.normal_force[-1], 1.03 * LEAST, rtol=0.01)
+    assert (outcome.torque_use < 1.0).all()
+
+
+def test_what_is_fed_forward_holds_the_arms_without_error() -> None:
+    """Inverse dynamics of Pinocchio against MuJoCo's forward dynamics; without its weight fed
+    forward, the box gives way at the stiffness."""
+    cell = hand_cell()
+    errors = [
+        np.abs(CellWitness(cell).simulate(reference, "impedance").tracking_error[-1]).max()
+        for reference in (
+            standing(cell, 0.0, 0.1, carries=False),
+            standing(cell, 2.0 * LEAST, 1.0),
+            standing(cell, 2.0 * LEAST, 1.0, carries=False),
+        )
+    ]
+    assert errors[0] < 1e-5
+    assert errors[1] < 2e-5
+    assert errors[2] > 2e-4
+
+
+def test_a_softer_arm_sags_more() -> None:
+    cell = hand_cell()
+    found = [
+        CellWitness(cell, ArmSettings(stiffness=stiffness))
+        .simulate(standing(cell, 2.0 * LEAST, 1.0, carries=False), "impedance")
+        .tracking_error[-1]
+        for stiffness in (25.0, 50.0)
+    ]
+    np.testing.assert_allclose(found[0], 2.0 * found[1], rtol=0.05, atol=1e-6)
+
+
+def test_force_control_takes_what_a_wrong_reference_adds() -> None:
+    """Arms that are told to stand 0.5 mm too near press harder by position, not by force."""
+    cell = hand_cell()
+    reference = standing(cell, 1.5 * LEAST, 1.0)
+    q = reference.motion.q.copy()
+    for i, (robot, contact) in enumerate(zip(cell.robots, cell.contacts, strict=True)):
+        arm, part = PlainArm(robot, contact), slice(6 * i, 6 * i + 6)
+        pose = reference.job.start.copy()
+        pose[1] += -5e-4 if i == 0 else 5e-4
+        target = arm.flange_target(pose)
+        for _ in range(5):
+            q[:, part] = arm.newton_step(q[0, part], target)
+    nearer = replace(reference, motion=replace(reference.motion, q=q))
+    witness = CellWitness(cell)
+    excess = {
+        control: witness.simulate(nearer, control).normal_force[-1].mean() / (1.5 * LEAST) - 1.0
+        for control in CONTROLS
+    }
+    assert excess["impedance"] > 0.05
+    assert abs(excess["leader"]) < 0.01
+    assert 0.0 < excess["both"] < 0.5 * excess["impedance"]
+
+
+def test_the_simulated_case_differs_from_what_the_arms_were_told() -> None:
+    cell = hand_cell()
+    reference = standing(cell, 1.1 * LEAST)
+    case = nominal_case(cell)
+    case[0:2] *= 0.85
+    assert not CellWitness(workcell_of_case(cell, case)).simulate(reference).holds
+    assert not CellWitness(cell, disturbance=(0.0, 0.0, 2.0)).simulate(reference).holds
+    case = nominal_case(cell)
+    case[11:15] = [0.004, 0.0, 0.004, 0.0]
+    outcome = CellWitness(workcell_of_case(cell, case)).simulate(reference)
+    assert outcome.holds
+    moved = cell.contacts[0].T_box_pad[:3, :2] @ [0.004, 0.0]
+    start = reference.job.start[:3]
+    np.testing.assert_allclose(start - outcome.box_position[0], moved, atol=1e-12)
+
+
+def test_tracking_errors_begin_at_zero_and_stay_small() -> None:
+    reference = standing(hand_cell(), seconds=5.0)
+    motion = reference.motion
+    time = np.linspace(0.0, 5.0, 2001)
+    q = np.tile(motion.q[0], (len(time), 1))
+    longer = replace(reference, motion=JointMotion(time, q, 0.0 * q, 0.0 * q))
+    off = with_tracking_error(longer, 1e-3, np.random.default_rng(1)).motion
+    np.testing.assert_array_equal(off.q[0], q[0])
+    assert 2e-4 < np.abs(off.q - q).max() <= 1e-3
+    np.testing.assert_allclose(np.gradient(off.q, time, axis=0)[1:-1], off.q_rate[1:-1], atol=1e-4)
+
+
+def test_misuse_is_told() -> None:
+    cell = hand_cell()
+    reference = standing(cell)
+    force = reference.normal_force
+    backwards = replace(reference.motion, time=reference.motion.time[::-1])
+    with pytest.raises(SettingsError, match="times decrease"):
+        job_reference(cell, backwards, force, reference.job)
+    with pytest.raises(SettingsError, match="efforts of shape"):
+        job_reference(cell, reference.motion, force, reference.job, np.zeros((2, 3)))
+    with pytest.raises(SettingsError, match="3 forces for 2 rows"):
+        job_reference(cell, reference.motion, np.zeros((3, 2)), reference.job)
+    with pytest.raises(SettingsError, match="multiple of the time step"):
+        ArmSettings(control_period=7e-4)
+    with pytest.raises(SettingsError, match="two time steps"):
+        ArmSettings(time_step=0.01)
