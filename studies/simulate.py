@@ -21,8 +21,9 @@ from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.cases import witness_of_case
 from hybrid_opt.witness.drive import drive_of
+from hybrid_opt.witness.outcome import Outcome, Threshold
 from hybrid_opt.witness.scene import SimulationSettings
-from hybrid_opt.witness.simulate import Threshold, Witness
+from hybrid_opt.witness.simulate import Witness
 from studies.program import carried_out, run_program
 from symbolic.array import Array
 
@@ -112,7 +113,7 @@ def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
     return timing.carry
 
 
-def _tell(threshold: Threshold, settings: SimulationSettings) -> None:
+def _tell(threshold: Threshold[Outcome], settings: SimulationSettings) -> None:
     slips, holds = threshold.slips, threshold.holds
     print(
         f"  holds from {holds.factor:.4f} times the planned force on, slips at {slips.factor:.4f}: "
