@@ -12,6 +12,7 @@ its place.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -60,7 +61,6 @@ class MotionVerdict:
         unsafe: (n - 1,) intervals with a collision or undecided.
         intervals: intervals examined, halves included.
         added: configurations added between the samples.
-        fcl_calls: FCL queries made.
     """
 
     status: Status
@@ -68,7 +68,6 @@ class MotionVerdict:
     unsafe: NDArray[np.bool_]
     intervals: int
     added: int
-    fcl_calls: int
 
 
 @dataclass(frozen=True)
@@ -132,30 +131,69 @@ def check_between(
         margin: distance to be kept beyond the tolerance [m].
     """
     if clearance is None:
-        clearance = checker.bounds(*_split(configuration))
-    return _Sweep(checker, margin).run(configuration, clearance, depth)
+        clearance = checker.bounds(*split_configuration(configuration))
+    sampled = SampledMotions(configuration, clearance, (len(configuration),), np.array([margin]))
+    return check_all_between(checker, sampled, depth)[0]
+
+
+@dataclass(frozen=True)
+class SampledMotions:
+    """Several motions on their samples, one after the other.
+
+    Attributes:
+        configuration: (n, 18) box poses [m, rad] and both arms' joint positions [rad].
+        clearance: (n, n_pairs) lower bounds of the pairs' distances [m].
+        lengths: samples of each motion, at least two.
+        margin: (n_motions,) distance to be kept beyond the tolerance [m].
+    """
+
+    configuration: Array
+    clearance: Array
+    lengths: Sequence[int]
+    margin: Array
+
+
+def check_all_between(
+    checker: CollisionChecker, sampled: SampledMotions, depth: int = SEARCH_DEPTH
+) -> list[MotionVerdict]:
+    """`check_between` for several motions at once: the same verdicts, with fewer calls."""
+    return _Sweep(checker, sampled).run(depth)
 
 
 class _Sweep:
-    def __init__(self, checker: CollisionChecker, margin: float) -> None:
-        self.checker = checker
-        self.margin = margin
-        self.required = checker.geometry.workcell.collision.tolerance + margin
+    """All intervals of all motions, halved together.
 
-    def run(self, configuration: Array, clearance: Array, depth: int) -> MotionVerdict:
-        calls = self.checker.judge.calls
-        n = len(configuration) - 1
+    Attributes:
+        owner: (n_intervals,) motion that an interval belongs to.
+        first: (n_motions,) its first interval.
+        required: (n_intervals, 1) clearance to be kept [m].
+    """
+
+    def __init__(self, checker: CollisionChecker, sampled: SampledMotions) -> None:
+        self.checker = checker
+        self.sampled = sampled
+        intervals = np.asarray(sampled.lengths) - 1
+        self.owner = np.repeat(np.arange(len(intervals)), intervals)
+        self.first = np.cumsum(intervals) - intervals
+        tolerance = checker.geometry.workcell.collision.tolerance
+        self.required = tolerance + sampled.margin[self.owner][:, None]
+
+    def run(self, depth: int) -> list[MotionVerdict]:
+        configuration, clearance = self.sampled.configuration, self.sampled.clearance
+        n, n_motions = len(self.owner), len(self.sampled.lengths)
         unsafe = np.zeros(n, dtype=bool)
         hits: list[PassingContact] = []
-        examined = added = 0
+        examined, added = np.zeros(n_motions, dtype=int), np.zeros(n_motions, dtype=int)
         ends = _End(configuration, clearance.copy(), np.zeros(clearance.shape, dtype=bool))
-        earlier = np.arange(n + 1) < n
+        lasts = np.cumsum(self.sampled.lengths) - 1
+        starts = np.ones(len(configuration), dtype=bool)
+        starts[lasts] = False
+        stops = np.ones(len(configuration), dtype=bool)
+        stops[np.append(0, lasts[:-1] + 1)] = False
         pending = np.ones((n, clearance.shape[1]), dtype=bool)
-        work = self._intervals(
-            np.arange(n), np.zeros(n), 1.0, ends[earlier], ends[earlier[::-1]], pending
-        )
+        work = self._intervals(np.arange(n), np.zeros(n), 1.0, ends[starts], ends[stops], pending)
         for level in range(depth + 1):
-            examined += len(work.index)
+            examined += self._per_motion(work)
             work = self._uncleared(work)
             for end, fraction in ((work.a, 0.0), (work.b, 1.0)):
                 hit = self._measure(work, end, level == depth)
@@ -165,23 +203,46 @@ class _Sweep:
             work = self._uncleared(work[~unsafe[work.index]])
             if not len(work.index) or level == depth:
                 break
-            added += len(work.index)
+            added += self._per_motion(work)
             work = self._halves(work)
         left = [
             self._contact(work, row, int(np.flatnonzero(work.pending[row])[0]), 0.5)
             for row in range(len(work.index))
         ]
         unsafe[work.index] = True
-        found = sorted(hits or left, key=lambda contact: (contact.interval, contact.fraction))
-        status: Status = "collision" if hits else "undecided" if left else "free"
-        return MotionVerdict(
-            status=status,
-            contact=found[0] if found else None,
-            unsafe=unsafe,
-            intervals=examined,
-            added=added,
-            fcl_calls=self.checker.judge.calls - calls,
+        return [
+            self._verdict(k, unsafe, (hits, left), int(examined[k]), int(added[k]))
+            for k in range(n_motions)
+        ]
+
+    def _per_motion(self, work: _Intervals) -> NDArray[np.intp]:
+        """(n_motions,) intervals of each in the work list."""
+        return np.bincount(self.owner[work.index], minlength=len(self.sampled.lengths))
+
+    def _verdict(
+        self,
+        motion: int,
+        unsafe: NDArray[np.bool_],
+        contacts: tuple[list[PassingContact], list[PassingContact]],
+        examined: int,
+        added: int,
+    ) -> MotionVerdict:
+        """What was found for one motion, its intervals counted from its own first sample."""
+        first = int(self.first[motion])
+        hits, left = (
+            sorted(
+                (
+                    replace(contact, interval=contact.interval - first)
+                    for contact in found
+                    if self.owner[contact.interval] == motion
+                ),
+                key=lambda contact: (contact.interval, contact.fraction),
+            )
+            for found in contacts
         )
+        status: Status = "collision" if hits else "undecided" if left else "free"
+        earliest = next(iter(hits or left), None)
+        return MotionVerdict(status, earliest, unsafe[self.owner == motion], examined, added)
 
     def _intervals(
         self,
@@ -192,7 +253,9 @@ class _Sweep:
         b: _End,
         pending: NDArray[np.bool_],
     ) -> _Intervals:
-        motion = self.checker.motion(_split(a.configuration), _split(b.configuration))
+        motion = self.checker.motion(
+            split_configuration(a.configuration), split_configuration(b.configuration)
+        )
         return _Intervals(index, start, width, a, b, motion.chord, motion.bend, pending)
 
     def _uncleared(self, work: _Intervals) -> _Intervals:
@@ -201,7 +264,7 @@ class _Sweep:
         halfway = (c_a + c_b - work.chord) / 2.0
         one_sided = np.fmax(c_a, c_b) - work.chord
         kept = np.fmax(halfway, one_sided) - work.bend / 8.0
-        pending: NDArray[np.bool_] = work.pending & ~(kept > self.required)
+        pending: NDArray[np.bool_] = work.pending & ~(kept > self.required[work.index])
         left: NDArray[np.bool_] = np.any(pending, axis=1)
         return replace(work, pending=pending)[left]
 
@@ -210,15 +273,16 @@ class _Sweep:
 
         Returns (m,) the first colliding pair of each configuration, or -1.
         """
-        hopeless = ~(end.clearance - self.required > HALVING_WINS * work.chord)
+        beyond = end.clearance - self.required[work.index]
+        hopeless = ~(beyond > HALVING_WINS * work.chord)
         wanted = work.pending & (hopeless | last) & ~end.measured
         end.measured[wanted] = True
-        return self.checker.measure(*_split(end.configuration), end.clearance, wanted)
+        return self.checker.measure(*split_configuration(end.configuration), end.clearance, wanted)
 
     def _halves(self, work: _Intervals) -> _Intervals:
         """Both halves of every interval, the earlier first."""
         middle = (work.a.configuration + work.b.configuration) / 2.0
-        clearance = self.checker.bounds(*_split(middle))
+        clearance = self.checker.bounds(*split_configuration(middle))
         new = _End(middle, clearance, np.zeros(clearance.shape, dtype=bool))
         return self._intervals(
             np.repeat(work.index, 2),
@@ -235,7 +299,8 @@ class _Sweep:
         return PassingContact(int(work.index[row]), place, first, second)
 
 
-def _split(configuration: Array) -> tuple[Array, Array, Array]:
+def split_configuration(configuration: Array) -> tuple[Array, Array, Array]:
+    """Box poses (n, 6) and joint positions of both arms (n, 6) of configurations (n, 18)."""
     first, second, third = (np.ascontiguousarray(configuration[:, k : k + 6]) for k in (0, 6, 12))
     return first, second, third
 

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hybrid_opt.collision.between import PROOF_DEPTH, MotionVerdict, check_between
+from hybrid_opt.collision.between import (
+    PROOF_DEPTH,
+    MotionVerdict,
+    SampledMotions,
+    check_all_between,
+    split_configuration,
+)
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.collision.verdict import Touch
 from symbolic.array import Array
@@ -15,6 +22,10 @@ from symbolic.errors import SettingsError
 
 Configuration = Callable[[Array], tuple[Array, Array, Array]]
 """From path parameters (n,) to box poses (n, 6) and joint positions q_1, q_2 (n, 6)."""
+
+Configurations = Callable[[NDArray[np.intp], Array], Array]
+"""From paths (n,) and a path parameter (n,) on each to configurations (n, 18): box pose, q_1,
+q_2; NaN where an arm does not follow."""
 
 STRAIGHTNESS = 1e-4
 """Default for how far two bodies together may be off straight motion between grid points [m]."""
@@ -34,6 +45,7 @@ class Certificate:
         motion: the verdict between the grid points; None where a grid point collides.
         points: grid points used.
         deviation: largest measured distance of a pair from straight motion between them [m].
+        lost: an arm does not follow the path, at `at_parameter`.
     """
 
     is_free: bool
@@ -42,10 +54,13 @@ class Certificate:
     motion: MotionVerdict | None
     points: int
     deviation: float
+    lost: bool = False
 
     def __repr__(self) -> str:
         if self.is_free:
             return f"Certificate: free of collisions along the whole path ({self.points} points)"
+        if self.lost:
+            return f"Certificate: an arm does not follow the path at u = {self.at_parameter:.4f}"
         contact = self.at_sample or (None if self.motion is None else self.motion.contact)
         who = f"{contact.first} and {contact.second}" if contact is not None else "undecided"
         return f"Certificate: not free at u = {self.at_parameter:.4f}, {who}"
@@ -58,13 +73,7 @@ def certify(
     straightness: float = STRAIGHTNESS,
     depth: int = PROOF_DEPTH,
 ) -> Certificate:
-    """Prove that a continuous path is free of collisions, or find where it is not.
-
-    The grid is refined until no pair of bodies is, both together, farther than `straightness`
-    from straight motion (linear in joints and box pose) in the middle of any interval. The
-    straight motion is then checked by adaptive subdivision with a margin of twice that distance.
-    So the proof holds for a path whose largest distance from straight motion in an interval is
-    at most twice the one in its middle, as for every path that is smooth on the grid.
+    """`certify_all` for one path.
 
     Args:
         parameters: (n,) increasing path parameters to start from.
@@ -72,32 +81,150 @@ def certify(
     Raises:
         SettingsError: the path does not become straight on any grid.
     """
-    u = np.asarray(parameters, dtype=float)
+
+    def one(_: NDArray[np.intp], u: Array) -> Array:
+        return np.hstack(configuration(u))
+
+    return certify_all(checker, one, [parameters], straightness, depth)[0]
+
+
+def certify_all(
+    checker: CollisionChecker,
+    configurations: Configurations,
+    parameters: Sequence[Array],
+    straightness: float = STRAIGHTNESS,
+    depth: int = PROOF_DEPTH,
+) -> list[Certificate]:
+    """Prove that continuous paths are free of collisions, or find where they are not.
+
+    The grid of each is refined until no pair of bodies is, both together, farther than
+    `straightness` from straight motion (linear in joints and box pose) in the middle of any
+    interval. The straight motion is then checked by adaptive subdivision with a margin of twice
+    that distance. So the proof holds for a path whose largest distance from straight motion in an
+    interval is at most twice the one in its middle, as for every path that is smooth on the grid.
+
+    Args:
+        parameters: of every path (n,) increasing path parameters to start from.
+
+    Raises:
+        SettingsError: a path does not become straight on any grid.
+    """
+    grid = _straight_grid(checker, configurations, parameters, straightness)
+    clearance = checker.bounds(*split_configuration(grid.configuration))
+    found: list[Certificate | None] = [None] * len(parameters)
+    for path in range(len(parameters)):
+        found[path] = _failed_on_grid(checker, grid, path, clearance)
+    left = [path for path, certificate in enumerate(found) if certificate is None]
+    if left:
+        rows = np.isin(grid.owner, left)
+        lengths = np.bincount(grid.owner, minlength=len(parameters))[left]
+        margin = 2.0 * grid.deviation[left]
+        motions = SampledMotions(
+            grid.configuration[rows], clearance[rows], lengths.tolist(), margin
+        )
+        for path, motion in zip(left, check_all_between(checker, motions, depth), strict=True):
+            found[path] = _certificate_of(motion, grid.u[grid.owner == path], grid.deviation[path])
+    return [certificate for certificate in found if certificate is not None]
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Places on several paths, between which each is straight.
+
+    Attributes:
+        owner: (n,) path of each place, increasing.
+        u: (n,) its path parameter, increasing along each path.
+        configuration: (n, 18).
+        deviation: (n_paths,) largest measured distance from straight motion [m].
+    """
+
+    owner: NDArray[np.intp]
+    u: Array
+    configuration: Array
+    deviation: Array
+
+
+@dataclass(frozen=True)
+class _Stretches:
+    """Intervals of paths with the configurations at both ends."""
+
+    owner: NDArray[np.intp]
+    u_a: Array
+    u_b: Array
+    a: Array
+    b: Array
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> _Stretches:
+        return _Stretches(
+            self.owner[rows], self.u_a[rows], self.u_b[rows], self.a[rows], self.b[rows]
+        )
+
+
+def _straight_grid(
+    checker: CollisionChecker,
+    configurations: Configurations,
+    parameters: Sequence[Array],
+    straightness: float,
+) -> _Grid:
+    """See `certify_all`. A path that is lost at a place is not refined there."""
+    owner = np.repeat(np.arange(len(parameters)), [len(u) for u in parameters])
+    u = np.concatenate([np.asarray(grid, dtype=float) for grid in parameters])
+    placed = configurations(owner, u)
+    places = [(owner, u, placed)]
+    inside = owner[1:] == owner[:-1]
+    work = _Stretches(owner[:-1], u[:-1], u[1:], placed[:-1], placed[1:])[inside]
+    deviation = np.zeros(len(parameters))
     for _ in range(MOST_ROUNDS):
-        grid = configuration(u)
-        middle = configuration((u[:-1] + u[1:]) / 2.0)
-        straight = tuple((array[:-1] + array[1:]) / 2.0 for array in grid)
-        chords = checker.motion(middle, (straight[0], straight[1], straight[2])).chord
+        between = (work.u_a + work.u_b) / 2.0
+        middle = configurations(work.owner, between)
+        straight = (work.a + work.b) / 2.0
+        chords = checker.motion(split_configuration(middle), split_configuration(straight)).chord
         off = np.max(chords, axis=1, initial=0.0)
-        deviation = float(np.max(off))
-        if deviation <= straightness:
+        bent, lost = off > straightness, ~np.isfinite(middle).all(axis=1)
+        straight_enough = ~(bent | lost)
+        np.maximum.at(deviation, work.owner[straight_enough], off[straight_enough])
+        places.append(tuple(array[bent | lost] for array in (work.owner, between, middle)))
+        if not bent.any():
             break
-        split = off > straightness
-        u = np.sort(np.concatenate([u, ((u[:-1] + u[1:]) / 2.0)[split]]))
+        work, between, middle = work[bent], between[bent], middle[bent]
+        work = _Stretches(
+            np.concatenate([work.owner, work.owner]),
+            np.concatenate([work.u_a, between]),
+            np.concatenate([between, work.u_b]),
+            np.concatenate([work.a, middle]),
+            np.concatenate([middle, work.b]),
+        )
     else:
         raise SettingsError(
-            f"the path is still {deviation:g} m off straight motion in an interval of length "
-            f"{float(np.min(np.diff(u))):g}; it jumps or the straightness of {straightness:g} m "
-            "is too small"
+            f"the path is still {np.max(off):g} m off straight motion in an interval of length "
+            f"{float(np.min(work.u_b - work.u_a)):g}; it jumps or the straightness of "
+            f"{straightness:g} m is too small"
         )
-    clearance = checker.bounds(*grid)
-    verdict = checker.check(*grid, u, clearance)
-    if verdict.first_contact is not None:
-        hit = verdict.first_contact
-        return Certificate(False, hit, float(u[hit.sample]), None, len(u), deviation)
-    motion = check_between(checker, np.hstack(grid), clearance, depth, 2.0 * deviation)
+    owner, u, placed = (np.concatenate(arrays) for arrays in zip(*places, strict=True))
+    order = np.lexsort((u, owner))
+    return _Grid(owner[order], u[order], placed[order], deviation)
+
+
+def _failed_on_grid(
+    checker: CollisionChecker, grid: _Grid, path: int, clearance: Array
+) -> Certificate | None:
+    """The certificate of a path that is lost or collides at a grid point."""
+    rows = grid.owner == path
+    u, placed = grid.u[rows], grid.configuration[rows]
+    deviation = float(grid.deviation[path])
+    lost = ~np.isfinite(placed).all(axis=1)
+    if lost.any():
+        place = float(u[int(np.argmax(lost))])
+        return Certificate(False, None, place, None, len(u), deviation, lost=True)
+    hit = checker.check(*split_configuration(placed), u, clearance[rows]).first_contact
+    if hit is None:
+        return None
+    return Certificate(False, hit, float(u[hit.sample]), None, len(u), deviation)
+
+
+def _certificate_of(motion: MotionVerdict, u: Array, deviation: float) -> Certificate:
     where = float("nan")
     if motion.contact is not None:
         k = motion.contact.interval
         where = float(u[k] + motion.contact.fraction * (u[k + 1] - u[k]))
-    return Certificate(motion.status == "free", None, where, motion, len(u), deviation)
+    return Certificate(motion.status == "free", None, where, motion, len(u), float(deviation))

@@ -6,17 +6,23 @@ trajectories) is certified along the continuous path.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
-from hybrid_opt.collision.certify import Certificate, certify
+from hybrid_opt.collision.certify import Certificate, certify_all
 from hybrid_opt.collision.checker import CollisionChecker
 from symbolic.array import Array
 from symbolic.errors import DualArmError
 from symbolic.physics.path import path_basis
 from symbolic.robot.arm import REACH_TOLERANCE
+
+TOGETHER = 64
+"""Carries certified at once: enough for full lanes, few enough for the memory."""
 
 
 class LostPathError(DualArmError):
@@ -38,37 +44,43 @@ class SampledPath:
 
 
 def configurations(
-    path: SampledPath, posture: NumericFunction, u: Array
-) -> tuple[Array, Array, Array]:
-    """Box poses (n, 6) and joint positions of both arms (n, 6) at path parameters u (n,).
+    paths: Sequence[SampledPath], posture: NumericFunction, owner: NDArray[np.intp], u: Array
+) -> Array:
+    """Configurations (n, 18), box pose and both arms' joint positions, between the samples.
+
+    Joint positions are NaN where Newton's method does not reach a place from the samples around.
 
     Args:
+        paths: of one task.
         posture: compiled `symbolic.robot.arm.posture_function`.
-
-    Raises:
-        LostPathError: Newton's method does not reach a place from the samples around it.
+        owner: (n,) index of the path of each place.
+        u: (n,) its path parameter.
     """
-    poses = np.ascontiguousarray(path_basis(len(path.waypoints), u).position @ path.waypoints)
-    samples = np.linspace(0.0, 1.0, len(path.q_1))
-    guesses = [
-        np.column_stack([np.interp(u, samples, q[:, joint]) for joint in range(6)])
-        for q in (path.q_1, path.q_2)
-    ]
+    basis = path_basis(len(paths[0].waypoints), u).position
+    waypoints = np.array([path.waypoints for path in paths])
+    # Summed one by one: the same bits for any number of places.
+    poses = basis[:, :1] * waypoints[owner, 0]
+    for k in range(1, waypoints.shape[1]):
+        poses += basis[:, k : k + 1] * waypoints[owner, k]
+    place = u * (len(paths[0].q_1) - 1)
+    before = np.clip(place.astype(int), 0, len(paths[0].q_1) - 2)
+    share = (place - before)[:, None]
+    sampled = (np.array([path.q_1 for path in paths]), np.array([path.q_2 for path in paths]))
+    guesses = [(1.0 - share) * q[owner, before] + share * q[owner, before + 1] for q in sampled]
     found = posture.batch(poses, *guesses)
+    placed = np.hstack([poses, found["q_1"], found["q_2"]])
     reached = np.maximum(found["residual_1"], found["residual_2"]) <= REACH_TOLERANCE
-    if not reached.all():
-        place = u[int(np.argmin(reached))]
-        raise LostPathError(f"an arm does not follow the path between its samples, at u = {place}")
-    return poses, found["q_1"], found["q_2"]
+    placed[~np.ravel(reached), poses.shape[1] :] = np.nan
+    return placed
 
 
-def certificate(
-    checker: CollisionChecker, posture: NumericFunction, path: SampledPath
-) -> Certificate:
-    """The continuous verdict on a carry that is free on its samples.
-
-    Raises:
-        LostPathError: an arm does not follow the path between the samples.
-    """
-    samples = np.linspace(0.0, 1.0, len(path.q_1))
-    return certify(checker, lambda u: configurations(path, posture, u), samples)
+def certificates(
+    checker: CollisionChecker, posture: NumericFunction, paths: Sequence[SampledPath]
+) -> list[Certificate]:
+    """The continuous verdicts on carries of one task that are free on their samples."""
+    found: list[Certificate] = []
+    for first in range(0, len(paths), TOGETHER):
+        some = paths[first : first + TOGETHER]
+        samples = [np.linspace(0.0, 1.0, len(path.q_1)) for path in some]
+        found += certify_all(checker, partial(configurations, some, posture), samples)
+    return found

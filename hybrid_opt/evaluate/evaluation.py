@@ -20,7 +20,7 @@ from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificate
+from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificates
 from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
 from hybrid_opt.evaluate.kernel import load_kernel
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective, select_objectives
@@ -221,7 +221,13 @@ class CandidateEvaluator:
         (path,) = self._paths(self._checked(x)[:1])
         if path is None:
             raise LostPathError("an arm loses the path; no more can be said of its collisions")
-        return certificate(self.checker, self.functions["posture"], path)
+        (found,) = certificates(self.checker, self.functions["posture"], [path])
+        if found.lost:
+            place = found.at_parameter
+            raise LostPathError(
+                f"an arm does not follow the path between its samples, at u = {place}"
+            )
+        return found
 
     def _paths(self, x: Array) -> list[SampledPath | None]:
         """The carries of decision vectors (n, n_var) on their samples; None where one is lost."""
@@ -255,8 +261,8 @@ class CandidateEvaluator:
             if len(unproven) == 0:
                 break
             paths = self._paths(np.ascontiguousarray(evaluations.x[unproven]))
-            for row, path in zip(unproven.tolist(), paths, strict=True):
-                failure = self._failure_between_samples(path)
+            failures = self._failures_between_samples(paths)
+            for row, failure in zip(unproven.tolist(), failures, strict=True):
                 proven[row] = failure is None
                 if failure is not None:
                     feasible[row], position[row] = False, failure
@@ -270,15 +276,11 @@ class CandidateEvaluator:
             violation=violation,
         )
 
-    def _failure_between_samples(self, path: SampledPath | None) -> float | None:
+    def _failures_between_samples(self, paths: Sequence[SampledPath | None]) -> list[float | None]:
         """Path parameter where a carry is not proven free, None where it is throughout."""
-        if path is None:
-            return 0.0
-        try:
-            verdict = certificate(self.checker, self.functions["posture"], path)
-        except LostPathError:
-            return 0.0
-        return None if verdict.is_free else verdict.at_parameter
+        known = [path for path in paths if path is not None]
+        verdicts = iter(certificates(self.checker, self.functions["posture"], known))
+        return [0.0 if path is None else _failure(next(verdicts)) for path in paths]
 
     def _checked(self, x: Array) -> Array:
         x = np.ascontiguousarray(np.atleast_2d(x), dtype=float)
@@ -356,6 +358,13 @@ def _driver(compiled: CompiledCell, threads: int) -> Driver | None:
     from hybrid_opt.timing.path_timer import PathTimer
 
     return Driver(PathTimer(compiled, threads=threads), threads)
+
+
+def _failure(certificate: Certificate) -> float | None:
+    """Path parameter where a carry is not proven free, None where it is throughout."""
+    if certificate.is_free:
+        return None
+    return 0.0 if certificate.lost else certificate.at_parameter
 
 
 def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:

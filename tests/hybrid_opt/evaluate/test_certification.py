@@ -7,9 +7,11 @@ import pinocchio as pin
 import pytest
 
 from hybrid_opt import metaheuristics
+from hybrid_opt.collision.between import split_configuration
 from hybrid_opt.evaluate.certification import (
     LostPathError,
     SampledPath,
+    certificates,
     configurations,
 )
 from hybrid_opt.evaluate.evaluation import BETWEEN_SAMPLES, REASONS, CandidateEvaluator
@@ -36,11 +38,16 @@ def sampled(evaluator: CandidateEvaluator, x: Array) -> SampledPath:
     )
 
 
+def placed(evaluator: CandidateEvaluator, path: SampledPath, u: Array) -> tuple[Array, ...]:
+    owner = np.zeros(len(u), dtype=np.intp)
+    return split_configuration(configurations([path], evaluator.functions["posture"], owner, u))
+
+
 def test_places_between_samples_close_both_arms(evaluator: CandidateEvaluator) -> None:
     workcell = evaluator.workcell
     path = sampled(evaluator, workcell.task.initial.reshape(-1))
     u = np.random.default_rng(1).uniform(0.0, 1.0, 30)
-    poses, *joints = configurations(path, evaluator.functions["posture"], u)
+    poses, *joints = placed(evaluator, path, u)
     for robot, contact, q in zip(workcell.robots, workcell.contacts, joints, strict=True):
         model = build_robot_model(robot)
         data = model.model.createData()
@@ -56,7 +63,7 @@ def test_samples_are_places_on_the_path(evaluator: CandidateEvaluator) -> None:
     x = task.initial.reshape(-1)
     path = sampled(evaluator, x)
     samples = np.linspace(0.0, 1.0, task.samples)
-    poses, q_1, q_2 = configurations(path, evaluator.functions["posture"], samples)
+    poses, q_1, q_2 = placed(evaluator, path, samples)
     np.testing.assert_allclose(poses, evaluator.outputs(x)["pose"][0], atol=1e-12)
     np.testing.assert_allclose(q_1, path.q_1, atol=1e-5)
     np.testing.assert_allclose(q_2, path.q_2, atol=1e-5)
@@ -67,8 +74,50 @@ def test_a_path_that_an_arm_cannot_follow_is_told(evaluator: CandidateEvaluator)
     away = path.waypoints.copy()
     away[2, 2] += 3.0
     broken = SampledPath(away, path.q_1, path.q_2)
-    with pytest.raises(LostPathError, match="between its samples, at u"):
-        configurations(broken, evaluator.functions["posture"], np.array([0.1, 0.5]))
+    _, *joints = placed(evaluator, broken, np.array([0.0, 0.5]))
+    assert all(np.isfinite(q[0]).all() and np.isnan(q[1]).all() for q in joints)
+    (verdict,) = certificates(evaluator.checker, evaluator.functions["posture"], [broken])
+    assert verdict.lost
+    assert not verdict.is_free
+    assert 0.0 < verdict.at_parameter < 1.0
+    lost = np.array(evaluator.workcell.task.initial)
+    lost[0, 2] += 3.0
+    with pytest.raises(LostPathError, match="an arm"):
+        evaluator.certificate(lost.reshape(-1))
+
+
+def test_certificates_are_the_same_together_and_alone(evaluator: CandidateEvaluator) -> None:
+    """To the bit: free ones, colliding ones and one that an arm does not follow, in one call."""
+    rng = np.random.default_rng(5)
+    spread = 0.1 * (evaluator.upper - evaluator.lower)
+    x = evaluator.workcell.task.initial.reshape(-1) + spread * rng.uniform(
+        -1.0, 1.0, (60, evaluator.n_var)
+    )
+    x = x[evaluator.evaluate(x).reason != REASONS.index("reach_1")]
+    outputs = evaluator.outputs(x)
+    paths = [
+        SampledPath(waypoints_of(evaluator.workcell.task, one), q_1, q_2)
+        for one, q_1, q_2 in zip(x, outputs["q_1"], outputs["q_2"], strict=True)
+    ]
+    away = paths[3].waypoints.copy()
+    away[2, 2] += 3.0
+    paths[3] = SampledPath(away, paths[3].q_1, paths[3].q_2)
+    posture = evaluator.functions["posture"]
+    together = certificates(evaluator.checker, posture, paths)
+    alone = [certificates(evaluator.checker, posture, [path])[0] for path in paths]
+    assert {(c.is_free, c.lost, c.at_sample is None) for c in together} >= {
+        (True, False, True),
+        (False, False, False),
+        (False, True, True),
+    }
+    for a, b in zip(together, alone, strict=True):
+        for name in ("is_free", "lost", "at_sample", "points"):
+            assert getattr(a, name) == getattr(b, name)
+        np.testing.assert_array_equal([a.at_parameter, a.deviation], [b.at_parameter, b.deviation])
+        assert (a.motion is None) == (b.motion is None)
+        if a.motion is not None and b.motion is not None:
+            assert (a.motion.status, a.motion.contact) == (b.motion.status, b.motion.contact)
+            np.testing.assert_array_equal(a.motion.unsafe, b.motion.unsafe)
 
 
 def test_the_initial_trajectory_is_proven_free(evaluator: CandidateEvaluator) -> None:
