@@ -21,8 +21,8 @@ from symbolic.errors import DualArmError
 from symbolic.physics.path import path_basis
 from symbolic.robot.arm import REACH_TOLERANCE
 
-TOGETHER = 64
-"""Carries certified at once: enough for full lanes, few enough for the memory."""
+TOGETHER = 8
+"""Carries certified at once: enough to spare calls, few enough for their bounds to stay cached."""
 
 
 class LostPathError(DualArmError):
