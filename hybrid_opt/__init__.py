@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from hybrid_opt.branches import search_branches
     from hybrid_opt.carry import Carry
     from hybrid_opt.cell import Cell
     from hybrid_opt.door import polish, save, search, time_every_way, time_path
@@ -41,6 +42,7 @@ __all__ = [
     "polish",
     "save",
     "search",
+    "search_branches",
     "time_every_way",
     "time_path",
 ]
@@ -60,6 +62,7 @@ _HOMES = {
     "polish": "hybrid_opt.door",
     "save": "hybrid_opt.door",
     "search": "hybrid_opt.door",
+    "search_branches": "hybrid_opt.branches",
     "time_every_way": "hybrid_opt.door",
     "time_path": "hybrid_opt.door",
 }

@@ -77,6 +77,15 @@ class Cell:
         """
         return cls(load(Path(path)), objectives, threads)
 
+    def with_start_branches(self, branches: tuple[int, int]) -> Cell:
+        """The cell with the start branches that its file says are searched for decided, read anew.
+
+        Raises:
+            WorkcellError: the file was changed and is wrong now.
+        """
+        decided = load(self.workcell.source, decided=branches)
+        return Cell(decided, self._objectives, self.threads)
+
     @cached_property
     def evaluator(self) -> CandidateEvaluator:
         """What judges candidates.

@@ -217,9 +217,22 @@ def with_free_waypoints(task: Task, count: int) -> Task:
     knots = np.arange(len(points), dtype=float)
     at = np.linspace(0.0, knots[-1], count + 2)[1:-1]
     centres = np.column_stack([np.interp(at, knots, column) for column in points.T])
-    half = np.min(np.reshape(task.upper - task.lower, (-1, 6)), axis=0) / 2.0
+    spread = (task.upper - task.lower)[: task.n_box]
+    half = np.min(np.reshape(spread, (-1, 6)), axis=0) / 2.0
+    stretched = np.linspace(0.0, knots[-1], count + 2)
+    redundant = [
+        replace(
+            joint,
+            **{
+                key: np.interp(stretched, knots, getattr(joint, key))
+                for key in ("lower", "upper", "initial")
+            },
+        )
+        for joint in task.redundant
+    ]
     return replace(
         task,
+        redundant=tuple(redundant),
         waypoints=(
             task.waypoints[0],
             *(Waypoint(centre - half, centre + half) for centre in centres),

@@ -2,8 +2,8 @@
 
 Prints the cell's facts, the postures at the start, the static bound, the verdicts on the
 hand-made trajectory and on the straight line, the feasibility of random candidates by
-constraint and the collision pairs with the reasons for those left out; draws the cell and both
-arms' reach.
+constraint, with the pairs, joints and robots that are in the way most, and the number of collision
+pairs (--pairs lists them with the reasons for those left out); draws the cell and both arms' reach.
 """
 
 from __future__ import annotations
@@ -21,11 +21,23 @@ from studies.program import add_verbose, carried_out, run_program
 from symbolic.errors import SettingsError
 from symbolic.workcell.file import load
 
+_IN_THE_WAY = {
+    "pairs": "Pairs that collide first",
+    "joints": "Joints beyond a limit first",
+    "reach": "Robots that do not reach first",
+}
+MOST_TOLD = 10
+"""Of what is in the way, so much is told."""
+
 PROGRAM = "python -m studies.inspect"
 
 
-def as_text(found: Inspection) -> str:
-    """An inspection for people."""
+def as_text(found: Inspection, pairs: bool = False) -> str:
+    """An inspection for people.
+
+    Args:
+        pairs: whether every pair of bodies is listed.
+    """
     lines = [found.name, ""]
     lines += [f"  {heading}: {text}" for heading, text in found.facts.items()]
     lines += ["", "Postures at the start, best first (* used), along the hand-made trajectory"]
@@ -39,7 +51,9 @@ def as_text(found: Inspection) -> str:
         f"At rest, level: normal forces {still} N, objectives {share}; payload at the reference "
         f"force {found.static_payload_limit:.2f} kg",
         f"Hand-made trajectory: {_judged_text(found.initial)}",
+        *_why(found, "initial"),
         f"Straight line: {_judged_text(found.straight_line)}",
+        *_why(found, "straight_line"),
         "",
         f"{found.candidates} random candidates within the bounds (seed {found.seed}): "
         f"{100.0 * found.feasible_share:.1f} % feasible",
@@ -48,13 +62,25 @@ def as_text(found: Inspection) -> str:
         f"  {name.replace('_', ' ')}: {count} ({100.0 * count / found.candidates:.1f} %)"
         for name, count in found.infeasible_by_reason.items()
     ]
-    lines += ["", f"Collision pairs: {len(found.active_pairs)} checked"]
-    lines += [f"  {first} – {second}" for first, second in found.active_pairs]
-    lines.append(f"{len(found.excluded_pairs)} left out")
-    lines += [f"  {first} – {second}: {why}" for first, second, why in found.excluded_pairs]
+    for heading, title in _IN_THE_WAY.items():
+        counts = list(found.in_the_way[heading].items())[:MOST_TOLD]
+        if counts:
+            lines += ["", f"{title}, in {found.explained_candidates} of the infeasible ones:"]
+            lines += [f"  {name}: {count}" for name, count in counts]
+    checked, left_out = len(found.active_pairs), len(found.excluded_pairs)
+    lines += ["", f"Collision pairs: {checked} checked, {left_out} left out"]
+    if pairs:
+        lines += [f"  {first} – {second}" for first, second in found.active_pairs]
+        lines += [f"  {first} – {second}: {why}" for first, second, why in found.excluded_pairs]
+    else:
+        lines[-1] += " (--pairs lists them, and why)"
     if found.files:
         lines += ["", "Pictures: " + ", ".join(found.files)]
     return "\n".join(lines)
+
+
+def _why(found: Inspection, name: str) -> list[str]:
+    return [f"  {found.explained[name]}"] if name in found.explained else []
 
 
 def _branch_text(branch: Branch) -> str:
@@ -96,6 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="folder for the pictures (default: inspect/NAME of the workcell file)",
     )
     parser.add_argument("--no-pictures", action="store_true", help="draw nothing")
+    parser.add_argument("--pairs", action="store_true", help="list every pair of bodies")
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
     add_verbose(parser)
     options = parser.parse_args(arguments)
@@ -108,7 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.seed,
         None if options.no_pictures else output,
     )
-    print(json.dumps(asdict(found), indent=2) if options.json else as_text(found))
+    print(json.dumps(asdict(found), indent=2) if options.json else as_text(found, options.pairs))
     return 0
 
 

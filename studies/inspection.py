@@ -9,6 +9,7 @@ import numpy as np
 
 from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.explanation import explain, frequent
 from studies.report.data import shown
 from studies.report.figures_cell import environment, reachable_regions
 from studies.report.reach import reach_map
@@ -19,6 +20,9 @@ from symbolic.errors import SettingsError
 from symbolic.robot.branches import StartBranch, initial_poses
 from symbolic.workcell.decision import straight_line
 from symbolic.workcell.records import Workcell
+
+EXPLAINED = 200
+"""Most infeasible candidates that are looked at closer."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +52,13 @@ class Inspection:
         static_objectives: the same over the reference forces.
         static_payload_limit: payload that reaches the reference force at rest [kg].
         initial, straight_line: verdicts on the hand-made trajectory and on the straight line.
+        explained: by 'initial' and 'straight_line' what is in the way of them, where they fail.
         candidates: random candidates judged.
         seed: of their randomness.
         feasible_share: of them.
         infeasible_by_reason: of them, by the constraint violated first.
+        explained_candidates: infeasible ones of them that were looked at closer.
+        in_the_way: of these, how often each pair of bodies, joint and robot is in the way first.
         active_pairs: pairs of bodies that are checked.
         excluded_pairs: pairs that are not, and why.
         files: pictures written.
@@ -65,10 +72,13 @@ class Inspection:
     static_payload_limit: float
     initial: Judgement
     straight_line: Judgement
+    explained: dict[str, str]
     candidates: int
     seed: int
     feasible_share: float
     infeasible_by_reason: dict[str, int]
+    explained_candidates: int
+    in_the_way: dict[str, dict[str, int]]
     active_pairs: tuple[tuple[str, str], ...]
     excluded_pairs: tuple[tuple[str, str, str], ...]
     files: tuple[str, ...]
@@ -99,6 +109,7 @@ def inspect(workcell: Workcell, candidates: int, seed: int, output: Path | None)
     line = cell.carry(straight_line(workcell.task))
     assert initial.judgement is not None
     assert line.judgement is not None
+    failed = found[~found.feasible][:EXPLAINED]
     return Inspection(
         name=workcell.name,
         facts=_facts(workcell),
@@ -108,16 +119,28 @@ def inspect(workcell: Workcell, candidates: int, seed: int, output: Path | None)
         static_payload_limit=hold.payload_limit,
         initial=initial.judgement,
         straight_line=line.judgement,
+        explained=_explained(cell, {"initial": initial.x, "straight_line": line.x}),
         candidates=candidates,
         seed=seed,
         feasible_share=float(found.feasible.mean()),
         infeasible_by_reason=found.infeasible_by_reason,
+        explained_candidates=len(failed),
+        in_the_way=frequent(explain(cell.evaluator, failed)),
         active_pairs=geometry.pair_names,
         excluded_pairs=tuple(
             (names[p.first], names[p.second], p.reason) for p in geometry.excluded
         ),
         files=() if output is None else _draw(cell, initial, output),
     )
+
+
+def _explained(cell: Cell, candidates: dict[str, Array]) -> dict[str, str]:
+    """What is in the way of those that fail, by their names."""
+    found = {}
+    for name, x in candidates.items():
+        for explanation in explain(cell.evaluator, cell.evaluate(x)):
+            found[name] = str(explanation)
+    return found
 
 
 def _branches(cell: Cell, model: CellModel, arm: int) -> tuple[Branch, ...]:
@@ -144,10 +167,11 @@ def _clearance_mm(cell: Cell, arm: int, branch: StartBranch) -> float | None:
         return None
     pose = np.ascontiguousarray(initial_poses(cell.workcell)[:kept])
     path = np.ascontiguousarray(branch.path[:kept])
-    joints = (path, np.zeros_like(path)) if arm == 0 else (np.zeros_like(path), path)
+    absent = np.zeros((kept, cell.geometry.arms[1 - arm].joints))
+    joints = (path, absent) if arm == 0 else (absent, path)
     bounds = np.full((kept, len(cell.geometry.active)), np.inf)
     bounds[:, own] = checker.bounds(pose, *joints)[:, own]
-    return 1e3 * checker.min_distance(pose, *joints, bounds)[0]
+    return 1e3 * checker.min_distance(pose, joints[0], joints[1], bounds)[0]
 
 
 def _facts(workcell: Workcell) -> dict[str, str]:

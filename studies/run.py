@@ -17,6 +17,7 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
+from hybrid_opt.campaign.branch_choice import decided_cell, store_branches
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.polishing.settings import PolishSettings
@@ -92,9 +93,11 @@ def run_study(
     Raises:
         DualArmError: the workcell, a setting or the results folder is wrong, or work failed.
     """
-    with open_folder(settings, execution, load(workcell)) as folder:
+    cell, competition = decided_cell(load(workcell), settings, execution)
+    with open_folder(settings, execution, cell) as folder:
+        told = store_branches(folder.root, competition)
         run_stages(folder, stages(study), progress)
-        return terminal_summary(read_summary(folder.root), study.with_paper)
+        return told + terminal_summary(read_summary(folder.root), study.with_paper)
 
 
 def main(

@@ -26,7 +26,7 @@ class CellModel:
         robots: the models of the two arms.
         geometry: the collision bodies and the pairs to be checked.
         branches: per arm every branch at the start, best first.
-        start: (6,) joint positions of each arm at the first waypoint [rad].
+        start: (n,) joint positions of each arm at the first waypoint [rad].
     """
 
     workcell: Workcell
@@ -42,11 +42,16 @@ def build_cell_model(workcell: Workcell) -> CellModel:
     The workcell's `start_branch` picks from the ranked branches; -1 stands for the best.
 
     Raises:
-        RobotModelError: a URDF does not give a six-joint arm.
+        RobotModelError: a URDF does not give an arm.
         CollisionModelError: a collision shape is unusable.
         WorkcellError: an arm cannot reach the start, or a chosen branch does not exist.
     """
-    robots = (build_robot_model(workcell.robots[0]), build_robot_model(workcell.robots[1]))
+    task = workcell.task
+    first, second = (
+        build_robot_model(robot, task.redundant_of(i), task.extended_size)
+        for i, robot in enumerate(workcell.robots)
+    )
+    robots = (first, second)
     geometry = build_geometry(workcell)
     clearance = screening_functions(
         geometry, (robots[0].joint_placements, robots[1].joint_placements)
@@ -70,10 +75,10 @@ def build_cell_model(workcell: Workcell) -> CellModel:
             )
     if problems:
         raise WorkcellError(str(workcell.source), tuple(problems))
-    first, second = (
+    start = [
         np.array(found[max(workcell.start_branch[i], 0)].q) for i, found in enumerate(branches)
-    )
-    return CellModel(workcell, robots, geometry, branches, (first, second))
+    ]
+    return CellModel(workcell, robots, geometry, branches, (start[0], start[1]))
 
 
 def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
@@ -92,14 +97,14 @@ def _own_clearance(
 ) -> Callable[[Array, Array], float]:
     """Least clearance bound [m] of one arm over samples, the other arm left out.
 
-    The returned function takes box poses (n, 6) and the arm's joint positions (n, 6).
+    The returned function takes box poses (n, 6) and the arm's joint positions (n, joints).
     """
     rows = own_pairs(geometry, arm)
 
     def least(poses: Array, path: Array) -> float:
         if not rows:
             return float("inf")
-        absent = np.zeros_like(path)
+        absent = np.zeros((len(path), geometry.arms[1 - arm].joints))
         joints = (path, absent) if arm == 0 else (absent, path)
         bounds = np.array(clearance.map(len(poses))(poses.T, joints[0].T, joints[1].T))
         return float(bounds[rows].min())

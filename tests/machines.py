@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
@@ -190,12 +190,15 @@ def machine_cell(machine: Machine, folder: Path) -> Path:
     return write_cell(folder, robots, np.array([*machine.box, 0.0, 0.0, 0.0]), machine.spin)
 
 
-def single_cell(arm: Arm, folder: Path) -> Path:
-    """A workcell of two of the same arms, each based where its posture holds the box."""
+def single_cell(arm: Arm, folder: Path, locked: dict[str, float] | None = None) -> Path:
+    """A workcell of two of the same arms, each based where its posture holds the box.
+
+    Joints of the arms are locked as their posture has them, or as given.
+    """
     urdf = read_urdf(example_robot(arm.urdf))
-    locked = tuple(arm.locked.items())
-    moving = moving_joints(urdf, *arm.chain, locked)
-    model = reduced_model(urdf, held_joints(urdf, moving, locked))
+    held = tuple(arm.locked.items())
+    moving = moving_joints(urdf, *arm.chain, held)
+    model = reduced_model(urdf, held_joints(urdf, moving, held))
     data = model.createData()
     pin.framesForwardKinematics(model, data, np.array(arm.posture))
     T_root_flange = data.oMf[link_frame(model, arm.chain[1])].homogeneous
@@ -208,7 +211,8 @@ def single_cell(arm: Arm, folder: Path) -> Path:
         T_world_base = T_box_pad @ inverse(pad) @ inverse(T_root_flange)
         rpy = pin.rpy.matrixToRpy(T_world_base[:3, :3])
         base = {"xyz": T_world_base[:3, 3].tolist(), "rpy": rpy.tolist()}
-        robots.append(_robot(name, arm, base))
+        cell_arm = arm if locked is None else replace(arm, locked=locked)
+        robots.append(_robot(name, cell_arm, base))
     return write_cell(folder, robots, np.zeros(6))
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 CONFIGURATION = "configuration.json"
 SUMMARY = "summary.json"
+BRANCHES = "branches.json"
 WORKCELL = "workcell"
 REPLICAS = "replicas"
 STAGES = "stages"

@@ -75,7 +75,7 @@ class _End:
     """One end of m intervals.
 
     Attributes:
-        configuration: (m, 18) pose, q_1, q_2.
+        configuration: (m, 6 + all joints) pose, q_1, q_2.
         clearance: (m, n_pairs), raised in place where FCL measured [m].
         measured: (m, n_pairs) where it did.
     """
@@ -124,14 +124,14 @@ def check_between(
     """Whether anything collides between n samples that are themselves free of collisions.
 
     Args:
-        configuration: (n, 18) box poses [m, rad] and both arms' joint positions [rad]. Between
-            samples all of them move linearly.
+        configuration: (n, 6 + all joints) box poses [m, rad] and both arms' joint positions.
+            Between samples all of them move linearly.
         clearance: (n, n_pairs) bounds if known already [m].
         depth: how often an interval is halved before it counts as undecided.
         margin: distance to be kept beyond the tolerance [m].
     """
     if clearance is None:
-        clearance = checker.bounds(*split_configuration(configuration))
+        clearance = checker.bounds(*checker.split(configuration))
     sampled = SampledMotions(configuration, clearance, (len(configuration),), np.array([margin]))
     return check_all_between(checker, sampled, depth)[0]
 
@@ -141,7 +141,7 @@ class SampledMotions:
     """Several motions on their samples, one after the other.
 
     Attributes:
-        configuration: (n, 18) box poses [m, rad] and both arms' joint positions [rad].
+        configuration: (n, 6 + all joints) box poses [m, rad] and both arms' joint positions [rad].
         clearance: (n, n_pairs) lower bounds of the pairs' distances [m].
         lengths: samples of each motion, at least two.
         margin: (n_motions,) distance to be kept beyond the tolerance [m].
@@ -254,7 +254,7 @@ class _Sweep:
         pending: NDArray[np.bool_],
     ) -> _Intervals:
         motion = self.checker.motion(
-            split_configuration(a.configuration), split_configuration(b.configuration)
+            self.checker.split(a.configuration), self.checker.split(b.configuration)
         )
         return _Intervals(index, start, width, a, b, motion.chord, motion.bend, pending)
 
@@ -277,12 +277,12 @@ class _Sweep:
         hopeless = ~(beyond > HALVING_WINS * work.chord)
         wanted = work.pending & (hopeless | last) & ~end.measured
         end.measured[wanted] = True
-        return self.checker.measure(*split_configuration(end.configuration), end.clearance, wanted)
+        return self.checker.measure(*self.checker.split(end.configuration), end.clearance, wanted)
 
     def _halves(self, work: _Intervals) -> _Intervals:
         """Both halves of every interval, the earlier first."""
         middle = (work.a.configuration + work.b.configuration) / 2.0
-        clearance = self.checker.bounds(*split_configuration(middle))
+        clearance = self.checker.bounds(*self.checker.split(middle))
         new = _End(middle, clearance, np.zeros(clearance.shape, dtype=bool))
         return self._intervals(
             np.repeat(work.index, 2),
@@ -297,12 +297,6 @@ class _Sweep:
         first, second = self.checker.geometry.pair_names[pair]
         place = float(work.start[row]) + work.width * fraction
         return PassingContact(int(work.index[row]), place, first, second)
-
-
-def split_configuration(configuration: Array) -> tuple[Array, Array, Array]:
-    """Box poses (n, 6) and joint positions of both arms (n, 6) of configurations (n, 18)."""
-    first, second, third = (np.ascontiguousarray(configuration[:, k : k + 6]) for k in (0, 6, 12))
-    return first, second, third
 
 
 def _alternating(first: Array, second: Array) -> Array:

@@ -13,7 +13,6 @@ from hybrid_opt.collision.between import (
     MotionVerdict,
     SampledMotions,
     check_all_between,
-    split_configuration,
 )
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.collision.verdict import Touch
@@ -21,11 +20,11 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 
 Configuration = Callable[[Array], tuple[Array, Array, Array]]
-"""From path parameters (n,) to box poses (n, 6) and joint positions q_1, q_2 (n, 6)."""
+"""From path parameters (n,) to box poses (n, 6) and joint positions q_1, q_2."""
 
 Configurations = Callable[[NDArray[np.intp], Array], Array]
-"""From paths (n,) and a path parameter (n,) on each to configurations (n, 18): box pose, q_1,
-q_2; NaN where an arm does not follow."""
+"""From paths (n,) and a path parameter (n,) on each to configurations (n, 6 + all joints):
+box pose, q_1, q_2; NaN where an arm does not follow."""
 
 STRAIGHTNESS = 1e-4
 """Default for how far two bodies together may be off straight motion between grid points [m]."""
@@ -110,7 +109,7 @@ def certify_all(
         SettingsError: a path does not become straight on any grid.
     """
     grid = _straight_grid(checker, configurations, parameters, straightness)
-    clearance = checker.bounds(*split_configuration(grid.configuration))
+    clearance = checker.bounds(*checker.split(grid.configuration))
     found: list[Certificate | None] = [None] * len(parameters)
     for path in range(len(parameters)):
         found[path] = _failed_on_grid(checker, grid, path, clearance)
@@ -134,7 +133,7 @@ class _Grid:
     Attributes:
         owner: (n,) path of each place, increasing.
         u: (n,) its path parameter, increasing along each path.
-        configuration: (n, 18).
+        configuration: (n, 6 + all joints).
         deviation: (n_paths,) largest measured distance from straight motion [m].
     """
 
@@ -178,7 +177,7 @@ def _straight_grid(
         between = (work.u_a + work.u_b) / 2.0
         middle = configurations(work.owner, between)
         straight = (work.a + work.b) / 2.0
-        chords = checker.motion(split_configuration(middle), split_configuration(straight)).chord
+        chords = checker.motion(checker.split(middle), checker.split(straight)).chord
         off = np.max(chords, axis=1, initial=0.0)
         bent, lost = off > straightness, ~np.isfinite(middle).all(axis=1)
         straight_enough = ~(bent | lost)
@@ -216,7 +215,7 @@ def _failed_on_grid(
     if lost.any():
         place = float(u[int(np.argmax(lost))])
         return Certificate(False, None, place, None, len(u), deviation, lost=True)
-    hit = checker.check(*split_configuration(placed), u, clearance[rows]).first_contact
+    hit = checker.check(*checker.split(placed), u, clearance[rows]).first_contact
     if hit is None:
         return None
     return Certificate(False, hit, float(u[hit.sample]), None, len(u), deviation)

@@ -66,12 +66,21 @@ class CollisionChecker:
         self._names = geometry.pair_names
         self.resting_places = self._find_resting()
 
+    def split(self, configuration: Array) -> tuple[Array, Array, Array]:
+        """Box poses (n, 6) and both arms' joints (n, joints) from configurations (n, 6 + all
+        joints), each contiguous."""
+        ends = np.cumsum([6, self.geometry.arms[0].joints])
+        first, second, third = (
+            np.ascontiguousarray(part) for part in np.split(configuration, ends, axis=1)
+        )
+        return first, second, third
+
     def bounds(self, pose: Array, q_1: Array, q_2: Array) -> Array:
         """Lower bounds (n, n_pairs) of every active pair's distance [m].
 
         Args:
             pose: (n, 6) box poses [m, rad].
-            q_1, q_2: (n, 6) joint positions [rad].
+            q_1, q_2: (n, joints) joint positions [rad].
         """
         found = self._functions["clearance"].batch(pose, q_1, q_2)["clearance"]
         return found.reshape(len(pose), len(self._pairs))
@@ -89,7 +98,7 @@ class CollisionChecker:
 
         Args:
             pose: (n, 6) box poses [m, rad].
-            q_1, q_2: (n, 6) joint positions [rad].
+            q_1, q_2: (n, joints) joint positions [rad].
             time: (n,) or (n, 1) [s].
             clearance: (n, n_pairs) bounds if known already, else they are computed.
             screened: False gives every pair of every sample to FCL.
@@ -254,7 +263,7 @@ class CollisionChecker:
         """See `resting_places`."""
         task = self.geometry.workcell.task
         pairs = {names: k for k, names in enumerate(self._names)}
-        still = np.zeros((1, 6))
+        still = [np.zeros((1, arm.joints)) for arm in self.geometry.arms]
         found = []
         for allowed in task.allowed_contacts:
             pair = pairs.get((PAYLOAD, allowed.body))
@@ -263,7 +272,7 @@ class CollisionChecker:
             for waypoint in task.waypoints:
                 if not waypoint.is_fixed:
                     continue
-                self._place(waypoint.lower[None], still, still)
+                self._place(waypoint.lower[None], *still)
                 reach = self.geometry.workcell.collision.tolerance + self.resting_tolerance
                 if self.judge.distance(0, *self._pairs[pair]) <= reach:
                     found.append((pair, waypoint.lower[:3], allowed.departure))

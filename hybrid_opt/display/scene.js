@@ -50,11 +50,11 @@
       let parent = root;
       return arm.origins.map((origin, j) => {
         const fixed = fixedGroup(origin);
-        const turning = new THREE.Group();
+        const moving = new THREE.Group();
         parent.add(fixed);
-        fixed.add(turning);
-        parent = turning;
-        return { turning, axis: new THREE.Vector3(...arm.axes[j]) };
+        fixed.add(moving);
+        parent = moving;
+        return { moving, turns: arm.turning[j], axis: new THREE.Vector3(...arm.axes[j]) };
       });
     }
 
@@ -69,15 +69,17 @@
       const mesh = new THREE.Mesh(flat, new THREE.MeshLambertMaterial({ color: colour }));
       if (solid.kind === "world") this.scene.add(mesh);
       else if (solid.kind === "box") this.box.add(mesh);
-      else this.arms[solid.robot][solid.joint].turning.add(mesh);
+      else this.arms[solid.robot][solid.joint].moving.add(mesh);
     }
 
     /* pose: x y z roll pitch yaw; q: all joints, the second arm's after the first's. */
     place(pose, q) {
       this.box.position.set(pose[0], pose[1], pose[2]);
       this.box.rotation.set(pose[3], pose[4], pose[5], "ZYX");
-      this.arms.flat().forEach((joint, k) =>
-        joint.turning.quaternion.setFromAxisAngle(joint.axis, q[k]));
+      this.arms.flat().forEach((joint, k) => {
+        if (joint.turns) joint.moving.quaternion.setFromAxisAngle(joint.axis, q[k]);
+        else joint.moving.position.copy(joint.axis).multiplyScalar(q[k]);
+      });
       this.render();
     }
 

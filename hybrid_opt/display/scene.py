@@ -33,6 +33,7 @@ def scene_data(geometry: CellGeometry, carry: Carry) -> dict[str, Any]:
                 "root": arm.T_world_root.ravel().tolist(),
                 "origins": [origin.ravel().tolist() for origin in arm.origins],
                 "axes": arm.axes.tolist(),
+                "turning": list(arm.turning),
             }
             for arm in geometry.arms
         ],

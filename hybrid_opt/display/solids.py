@@ -82,14 +82,17 @@ def _mesh(piece: Piece) -> trimesh.Trimesh:
 
 
 def joint_placements(arm: ArmGeometry, q: Array) -> Array:
-    """(n, n_joints, 4, 4) of an arm's joint frames in the world at joints q (n, n_joints) [rad]."""
+    """(n, n_joints, 4, 4) of an arm's joint frames in the world at joints q (n, n_joints)."""
     placed = np.empty((*q.shape, 4, 4))
     T = np.broadcast_to(arm.T_world_root, (len(q), 4, 4))
     for j in range(q.shape[1]):
-        turn = np.zeros((len(q), 4, 4))
-        turn[:, :3, :3] = Rotation.from_rotvec(np.outer(q[:, j], arm.axes[j])).as_matrix()
-        turn[:, 3, 3] = 1.0
-        T = T @ arm.origins[j] @ turn
+        moved = np.tile(np.eye(4), (len(q), 1, 1))
+        along = np.outer(q[:, j], arm.axes[j])
+        if arm.turning[j]:
+            moved[:, :3, :3] = Rotation.from_rotvec(along).as_matrix()
+        else:
+            moved[:, :3, 3] = along
+        T = T @ arm.origins[j] @ moved
         placed[:, j] = T
     return placed
 

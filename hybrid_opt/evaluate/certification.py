@@ -20,6 +20,8 @@ from symbolic.array import Array
 from symbolic.errors import DualArmError
 from symbolic.physics.path import path_basis
 from symbolic.robot.arm import REACH_TOLERANCE
+from symbolic.workcell.decision import POSE_SIZE, place_redundant
+from symbolic.workcell.records import Task
 
 TOGETHER = 8
 """Carries certified at once: enough to spare calls, few enough for their bounds to stay cached."""
@@ -34,10 +36,12 @@ class SampledPath:
     """A carry on its samples, from which Newton's method reaches any other place.
 
     Attributes:
-        waypoints: (n_waypoints, 6) of the box path, angles unwrapped.
-        q_1, q_2: (n, 6) joint positions on samples uniform in the path parameter [rad].
+        task: whose path it is.
+        waypoints: (n_waypoints, 6 + m) of the box and the redundant joints, angles unwrapped.
+        q_1, q_2: (n, joints) joint positions on samples uniform in the path parameter [rad].
     """
 
+    task: Task
     waypoints: Array
     q_1: Array
     q_2: Array
@@ -46,7 +50,7 @@ class SampledPath:
 def configurations(
     paths: Sequence[SampledPath], posture: NumericFunction, owner: NDArray[np.intp], u: Array
 ) -> Array:
-    """Configurations (n, 18), box pose and both arms' joint positions, between the samples.
+    """Configurations (n, 6 + all joints), box pose and both arms' joints, between the samples.
 
     Joint positions are NaN where Newton's method does not reach a place from the samples around.
 
@@ -59,14 +63,16 @@ def configurations(
     basis = path_basis(len(paths[0].waypoints), u).position
     waypoints = np.array([path.waypoints for path in paths])
     # Summed one by one: the same bits for any number of places.
-    poses = basis[:, :1] * waypoints[owner, 0]
+    extended = basis[:, :1] * waypoints[owner, 0]
     for k in range(1, waypoints.shape[1]):
-        poses += basis[:, k : k + 1] * waypoints[owner, k]
+        extended += basis[:, k : k + 1] * waypoints[owner, k]
+    poses = np.ascontiguousarray(extended[:, :POSE_SIZE])
     place = u * (len(paths[0].q_1) - 1)
     before = np.clip(place.astype(int), 0, len(paths[0].q_1) - 2)
     share = (place - before)[:, None]
     sampled = (np.array([path.q_1 for path in paths]), np.array([path.q_2 for path in paths]))
     guesses = [(1.0 - share) * q[owner, before] + share * q[owner, before + 1] for q in sampled]
+    place_redundant(paths[0].task, extended, guesses)
     found = posture.batch(poses, *guesses)
     placed = np.hstack([poses, found["q_1"], found["q_2"]])
     reached = np.maximum(found["residual_1"], found["residual_2"]) <= REACH_TOLERANCE

@@ -9,6 +9,7 @@ The same evaluation also returns each constraint's violation for constraint domi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
@@ -22,16 +23,16 @@ from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificates
 from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
-from hybrid_opt.evaluate.kernel import load_kernel
+from hybrid_opt.evaluate.kernel import Kernel, load_kernel
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective, select_objectives
 from hybrid_opt.evaluate.sampled import SampledVerdicts, collision_shares, one_by_one
 from hybrid_opt.evaluate.time_law import carry_under_time_law
 from hybrid_opt.indicators.metrics import non_dominated
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.functions.candidate import CONSTRAINTS, SAMPLE_SIZES
+from symbolic.functions.candidate import CONSTRAINTS, SAMPLE_NAMES
 from symbolic.geometry.pairs import build_geometry
-from symbolic.workcell.decision import waypoints_of
+from symbolic.workcell.decision import extended_waypoints
 from symbolic.workcell.records import Workcell
 
 if TYPE_CHECKING:
@@ -164,9 +165,26 @@ class CandidateEvaluator:
         self.lower = workcell.task.lower
         self.upper = workcell.task.upper
         self._needs = _needs(self.objectives)
-        self._kernel = None
+        self._kernel: Kernel | None = None
+        self._begin: Array | None = None
         if functions is None and self.driver is None:
             self._kernel = load_kernel(self.compiled, self.checker, self.outputs)
+
+    def beginning_at(self, q_1: Array, q_2: Array) -> CandidateEvaluator:
+        """The same evaluator with other start postures: joints (n,) of each arm that hold the box
+        at the start. Its `outputs` and `carry` stay those of the cell's own branches.
+
+        Raises:
+            SettingsError: candidates of this cell are not evaluated in lanes.
+        """
+        if self._kernel is None or self._needs is None:
+            raise SettingsError(
+                "start branches are compared by the evaluation in lanes, which this cell, these "
+                "objectives or this machine do not have; give the robots' start_branch as numbers"
+            )
+        other = copy(self)
+        other._begin = np.concatenate([q_1, q_2]).astype(float)
+        return other
 
     def outputs(self, x: Array) -> dict[str, Array]:
         """Every per-sample output for decision vectors (n, n_var), see
@@ -197,7 +215,9 @@ class CandidateEvaluator:
         x = self._checked(x)
         if self._kernel is None:
             return one_by_one(self.outputs(x), self.checker)
-        return self._kernel.evaluate(x, self._needs or (), with_collisions, self._threads)
+        return self._kernel.evaluate(
+            x, self._needs or (), with_collisions, self._threads, self._begin
+        )
 
     def carry(self, x: Array) -> Carry:
         """One decision vector (n_var,) with its verdict, under the task's time law.
@@ -235,13 +255,18 @@ class CandidateEvaluator:
             outputs: Mapping[str, Array] = self.outputs(x)
         else:
             wanted = ("q_1", "q_2", "lost_1", "lost_2")
-            outputs = self._kernel.evaluate(x, wanted, with_collisions=False).outputs
+            outputs = self._kernel.evaluate(
+                x, wanted, with_collisions=False, begin=self._begin
+            ).outputs
         lost = np.any((outputs["lost_1"] > 0.0) | (outputs["lost_2"] > 0.0), axis=1)
         return [
             None
             if lost[k]
             else SampledPath(
-                waypoints_of(self.workcell.task, x[k]), outputs["q_1"][k], outputs["q_2"][k]
+                self.workcell.task,
+                extended_waypoints(self.workcell.task, x[k]),
+                outputs["q_1"][k],
+                outputs["q_2"][k],
             )
             for k in range(len(x))
         ]
@@ -374,4 +399,4 @@ def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
         if objective.needs is None:
             return None
         wanted |= set(objective.needs) - {"time"}
-    return tuple(sorted(wanted)) if wanted <= set(SAMPLE_SIZES) else None
+    return tuple(sorted(wanted)) if wanted <= SAMPLE_NAMES else None

@@ -1,13 +1,13 @@
 /* Candidates in lanes, from the decision vector to the verdict on every sample.
 
-   Behind the cell's functions `path`, `start`, `predict`, `sample`, `clearance` and `piece_poses`
-   in lanes (symbolic.functions.cell) and the shapes' proofs (hybrid_opt/collision/prejudge.c). The
+   Behind the cell's functions `path`, `begin`, `start`, `predict`, `sample`, `clearance` and
+   `piece_poses` in lanes (symbolic.functions.cell) and the shapes' proofs (hybrid_opt/collision/prejudge.c). The
    numbers in capitals are defined by hybrid_opt/evaluate/kernel.py. */
 
 /* A pair of one sample that neither bounds nor proofs decide. */
 typedef struct {
   long long candidate, sample, pair;
-  double configuration[18]; /* box pose, joints of both arms */
+  double configuration[CONFIGURATION]; /* box pose, joints of both arms */
 } open_pair;
 
 typedef struct { long long pair; double place[3], departure; } resting_place;
@@ -26,7 +26,7 @@ typedef struct {
 /* Results of n candidates, an axis over them first. wanted: per output of `sample`, (n, samples,
    size) or null. */
 typedef struct {
-  const double* x;
+  const double *x, *begin; /* begin: both arms' joints at the first box pose, or the cell's own */
   long long n, with_collisions, room;
   double *time, *violation, *violation_time;
   long long *first_sample, *first_reason, *reached;
@@ -36,16 +36,17 @@ typedef struct {
   long long n_open;
 } batch_data;
 
-#define STATE start_OUT_0
+#define STATE MOST(start_OUT_0, start_OUT_1)
 #define MOST(a, b) ((a) > (b) ? (a) : (b))
 #define MOST_OF(what)                                                                        \
   MOST(MOST(MOST(path_##what, start_##what), MOST(predict_##what, sample_##what)),           \
-       MOST(clearance_##what, piece_poses_##what))
+       MOST(MOST(clearance_##what, piece_poses_##what), begin_##what))
 #define AFTER_STATES 2 /* outputs of `sample` before those that can be asked for */
 
 typedef struct {
-  lanes_real x[N_VAR], time[N_SAMPLES], pose[N_SAMPLES][6], rate[N_SAMPLES][6],
-      second_rate[N_SAMPLES][6], q[N_SAMPLES][2][6], state[2][2][STATE], outputs[SAMPLE_SIZE],
+  lanes_real x[N_VAR], time[N_SAMPLES], pose[N_SAMPLES][POSE_SIZE], rate[N_SAMPLES][6],
+      second_rate[N_SAMPLES][6], q[N_SAMPLES][2][MOST_JOINTS], state[2][2][STATE],
+      outputs[SAMPLE_SIZE], begin[2][MOST_JOINTS],
       clearance[N_PAIRS + 1], quaternions[4 * N_PIECES], positions[3 * N_PIECES],
       w[MOST_OF(W) + 1];
   const lanes_real* arg[MOST_OF(ARG) + 8];
@@ -65,6 +66,16 @@ static int follow(const batch_data* batch, long long first, int m) {
   lanes_mask first_sample = (lanes_mask){0} + N_SAMPLES, first_reason = (lanes_mask){0} - 1;
   lanes_mask reached = (lanes_mask){0} + N_SAMPLES;
   for (int c = 0; c < N_CONSTRAINTS; ++c) violation[c] = share[c] = zero;
+  if (batch->begin) {
+    const double* from = batch->begin;
+    for (int i = 0; i < 2; ++i)
+      for (int j = 0; j < N_JOINTS[i]; ++j) s->begin[i][j] = lanes_all_equal(*from++);
+  } else {
+    for (int i = 0; i < 2; ++i) s->res[i] = s->begin[i];
+    if (begin(s->arg, s->res, s->iw, s->w)) return 1;
+  }
+  s->arg[0] = s->pose[0];
+  for (int i = 0; i < 2; ++i) s->arg[1 + i] = s->begin[i];
   s->res[0] = s->state[0][0];
   s->res[1] = s->state[0][1];
   if (start(s->arg, s->res, s->iw, s->w)) return 1;
@@ -85,7 +96,8 @@ static int follow(const batch_data* batch, long long first, int m) {
     for (int i = 0; i < 2; ++i) s->res[i] = after[i];
     for (int o = 0; o < N_OUTPUTS; ++o) s->res[AFTER_STATES + o] = s->outputs + OUTPUT_AT[o];
     if (sample(s->arg, s->res, s->iw, s->w)) return 1;
-    for (int i = 0; i < 2; ++i) memcpy(s->q[k][i], s->outputs + Q_AT[i], sizeof s->q[k][i]);
+    for (int i = 0; i < 2; ++i)
+      memcpy(s->q[k][i], s->outputs + Q_AT[i], N_JOINTS[i] * sizeof(lanes_real));
     lanes_mask lost = (s->outputs[LOST_AT[0]] > zero) | (s->outputs[LOST_AT[1]] > zero);
     lanes_mask now = lost & (reached == N_SAMPLES);
     reached = (now & k) | (~now & reached);
@@ -178,7 +190,9 @@ static int collide(batch_data* batch, const judge_data* judge, long long first, 
   for (int k = 0; k < N_SAMPLES; ++k) {
     unsigned alive = 0, placed_already = 0;
     lanes_real sum = lanes_all_equal(0.0);
-    for (int j = 0; j < 6; ++j) sum += s->pose[k][j] + s->q[k][0][j] + s->q[k][1][j];
+    for (int j = 0; j < 6; ++j) sum += s->pose[k][j];
+    for (int i = 0; i < 2; ++i)
+      for (int j = 0; j < N_JOINTS[i]; ++j) sum += s->q[k][i][j];
     /* What is not finite is no posture; the candidate fails for that. */
     unsigned finite = lanes_bits(lanes_fabs(sum) < lanes_all_equal(INFINITY));
     for (int l = 0; l < m; ++l) alive |= (unsigned)(k < batch->reached[first + l]) << l;
@@ -212,11 +226,10 @@ static int collide(batch_data* batch, const judge_data* judge, long long first, 
         one->candidate = first + l;
         one->sample = k;
         one->pair = pair;
-        for (int j = 0; j < 6; ++j) {
-          one->configuration[j] = lane_of(s->pose[k] + j, l);
-          one->configuration[6 + j] = lane_of(s->q[k][0] + j, l);
-          one->configuration[12 + j] = lane_of(s->q[k][1] + j, l);
-        }
+        double* into = one->configuration;
+        for (int j = 0; j < 6; ++j) *into++ = lane_of(s->pose[k] + j, l);
+        for (int i = 0; i < 2; ++i)
+          for (int j = 0; j < N_JOINTS[i]; ++j) *into++ = lane_of(s->q[k][i] + j, l);
       }
     }
     /* A sample that collides has no more to be judged. */
@@ -231,17 +244,17 @@ static int collide(batch_data* batch, const judge_data* judge, long long first, 
   return 0;
 }
 
-/* Evaluate candidates from `begin` on. Returns the candidate to go on with once the open pairs are
+/* Evaluate candidates from `from` on. Returns the candidate to go on with once the open pairs are
    taken, n at the end, or -1 where memory is short or a function failed. */
 DUAL_ARM_EXPORT long long dual_arm_evaluate(batch_data* batch, const judge_data* judge,
-                                            long long begin) {
+                                            long long from) {
   if (!own) {
     own = aligned_alloc(64, (sizeof(scratch) + 63) / 64 * 64);
     if (!own) return -1;
   }
   scratch* s = own;
   batch->n_open = 0;
-  for (long long first = begin; first < batch->n; first += DUAL_ARM_LANES) {
+  for (long long first = from; first < batch->n; first += DUAL_ARM_LANES) {
     if (batch->room - batch->n_open < DUAL_ARM_LANES * (long long)N_SAMPLES * N_PAIRS)
       return first;
     int m = batch->n - first < DUAL_ARM_LANES ? (int)(batch->n - first) : DUAL_ARM_LANES;

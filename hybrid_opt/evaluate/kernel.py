@@ -21,10 +21,16 @@ from codegen.function import available_cores
 from codegen.program import load_or_build_program
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.kernel_data import OPEN_PAIR, BatchData, judge_arrays, judge_data
+from hybrid_opt.evaluate.kernel_data import (
+    BatchData,
+    configuration_size,
+    judge_arrays,
+    judge_data,
+    open_pair,
+)
 from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
 from symbolic.array import Array
-from symbolic.functions.candidate import CONSTRAINTS, SAMPLE_SIZES
+from symbolic.functions.candidate import CONSTRAINTS, sample_sizes
 from symbolic.geometry.pairs import CellGeometry
 
 _LEAST_ROOM = 4096
@@ -45,7 +51,10 @@ class Kernel:
         self._evaluate.restype = ctypes.c_longlong
         self.lanes = int(library.dual_arm_lanes())
         self._checker = checker
-        self._samples = checker.geometry.workcell.task.samples
+        workcell = checker.geometry.workcell
+        self._samples = workcell.task.samples
+        self._sizes = sample_sizes(workcell)
+        self._open_pair = open_pair(workcell)
         self._keep = judge_arrays(checker)
         self._judge = judge_data(checker, self._keep)
         self._room = self.lanes * self._samples * len(checker.geometry.active) + _LEAST_ROOM
@@ -56,12 +65,15 @@ class Kernel:
         wanted: Sequence[str] = (),
         with_collisions: bool = True,
         threads: int = 1,
+        begin: Array | None = None,
     ) -> SampledVerdicts:
         """Evaluate decision vectors (n, n_var).
 
         Args:
-            wanted: of `SAMPLE_SIZES`, what is needed per sample.
+            wanted: of `sample_sizes`, what is needed per sample.
             with_collisions: False leaves collisions out.
+            begin: joints of both arms, side by side, that hold the box at the start; None for
+                those of the cell's start branches.
             threads: to spread the candidates over; 0 for one per core. Has no influence on the
                 results; FCL's part runs in the calling thread.
 
@@ -74,7 +86,7 @@ class Kernel:
             "violation": np.empty((n, len(CONSTRAINTS))),
             "violation_time": np.empty((n, len(CONSTRAINTS))),
         }
-        asked = {name: np.empty((n, samples, SAMPLE_SIZES[name])) for name in wanted}
+        asked = {name: np.empty((n, samples, self._sizes[name])) for name in wanted}
         whole = {name: np.empty(n, np.int64) for name in ("first_sample", "first_reason")}
         extra: dict[str, NDArray[Any]] = {
             "x": x,
@@ -85,14 +97,16 @@ class Kernel:
         n_threads = min(threads or available_cores(), max(n // self.lanes, 1))
         bounds = [n * k // n_threads for k in range(n_threads + 1)]
 
-        def run(begin: int, end: int) -> list[NDArray[np.void]]:
-            rows = slice(begin, end)
+        def run(first: int, end: int) -> list[NDArray[np.void]]:
+            rows = slice(first, end)
             addresses = [
-                asked[name][rows].ctypes.data if name in asked else None for name in SAMPLE_SIZES
+                asked[name][rows].ctypes.data if name in asked else None for name in self._sizes
             ]
-            found = self._run({k: v[rows] for k, v in arrays.items()}, addresses, with_collisions)
+            found = self._run(
+                {k: v[rows] for k, v in arrays.items()}, addresses, with_collisions, begin
+            )
             for part in found:
-                part["candidate"] += begin
+                part["candidate"] += first
             return found
 
         if n_threads == 1:
@@ -100,14 +114,14 @@ class Kernel:
         else:
             found = list(thread_pool().map(run, bounds[:-1], bounds[1:]))
         left = np.concatenate(
-            [np.empty(0, OPEN_PAIR), *(part for parts in found for part in parts)]
+            [np.empty(0, self._open_pair), *(part for parts in found for part in parts)]
         )
         colliding = extra["colliding"].astype(np.bool_)
         hit = self._judged(left)
         colliding[left["candidate"][hit], left["sample"][hit]] = True
         # A scalar per sample has no axis of its own.
         outputs |= {
-            name: values[:, :, 0] if SAMPLE_SIZES[name] == 1 else values
+            name: values[:, :, 0] if self._sizes[name] == 1 else values
             for name, values in asked.items()
         }
         return SampledVerdicts(outputs, colliding=colliding, **whole)
@@ -117,22 +131,25 @@ class Kernel:
         arrays: Mapping[str, NDArray[Any]],
         wanted: Sequence[int | None],
         with_collisions: bool,
+        begin: Array | None,
     ) -> list[NDArray[np.void]]:
         """The kernel on candidates of one thread; the pairs that it leaves open."""
-        n, room = len(arrays["x"]), np.empty(self._room if with_collisions else 0, OPEN_PAIR)
+        n = len(arrays["x"])
+        room = np.empty(self._room if with_collisions else 0, self._open_pair)
         pointers = (ctypes.c_void_p * len(wanted))(*wanted)
         batch = BatchData(
             n=n,
+            begin=None if begin is None else begin.ctypes.data,
             with_collisions=with_collisions,
             room=self._room,
             wanted=ctypes.addressof(pointers),
             open=room.ctypes.data,
             **{name: array.ctypes.data for name, array in arrays.items()},
         )
-        begin, found = 0, []
-        while begin < n:
-            begin = self._evaluate(ctypes.byref(batch), ctypes.byref(self._judge), begin)
-            if begin < 0:
+        at, found = 0, []
+        while at < n:
+            at = self._evaluate(ctypes.byref(batch), ctypes.byref(self._judge), at)
+            if at < 0:
                 raise CodegenError(
                     "candidates cannot be evaluated: memory is short; evaluate fewer at once"
                 )
@@ -147,7 +164,7 @@ class Kernel:
         place = left["candidate"] * self._samples + left["sample"]
         new = np.concatenate([[True], place[1:] != place[:-1]])
         configuration = left["configuration"][new]
-        pose, q_1, q_2 = (np.ascontiguousarray(configuration[:, k : k + 6]) for k in (0, 6, 12))
+        pose, q_1, q_2 = self._checker.split(configuration)
         rows = (np.cumsum(new) - 1).tolist()
         return np.array(self._checker.collisions(pose, q_1, q_2, rows, left["pair"].tolist()))
 
@@ -189,7 +206,8 @@ def load_kernel(
     kernel = Kernel(library, checker)
     task = compiled.workcell.task
     x = np.random.default_rng(0).uniform(task.lower, task.upper, (kernel.lanes + 1, task.n_var))
-    if _same(kernel.evaluate(x, tuple(SAMPLE_SIZES)), one_by_one(outputs(x), checker)):
+    every = tuple(sample_sizes(compiled.workcell))
+    if _same(kernel.evaluate(x, every), one_by_one(outputs(x), checker)):
         return kernel
     warn_one_lane("kernel", "it differs from the functions that it is made of")
     return None
@@ -207,20 +225,27 @@ def _same(found: SampledVerdicts, expected: SampledVerdicts) -> bool:
 
 def _definitions(geometry: CellGeometry) -> str:
     """The numbers that kernel.c is written for."""
-    ends = np.cumsum(list(SAMPLE_SIZES.values()))
-    starts = dict(zip(SAMPLE_SIZES, [0, *ends.tolist()], strict=False))
+    workcell = geometry.workcell
+    sizes = sample_sizes(workcell)
+    ends = np.cumsum(list(sizes.values()))
+    starts = dict(zip(sizes, [0, *ends.tolist()], strict=False))
+    joints = [arm.joints for arm in geometry.arms]
     numbers = {
-        "N_VAR": geometry.workcell.task.n_var,
-        "N_SAMPLES": geometry.workcell.task.samples,
+        "N_VAR": workcell.task.n_var,
+        "N_SAMPLES": workcell.task.samples,
+        "POSE_SIZE": workcell.task.extended_size,
+        "MOST_JOINTS": max(joints),
+        "CONFIGURATION": configuration_size(workcell),
         "N_PAIRS": len(geometry.active),
         "N_PIECES": sum(len(body.pieces) for body in geometry.bodies),
         "N_CONSTRAINTS": len(CONSTRAINTS),
-        "N_OUTPUTS": len(SAMPLE_SIZES),
-        "SAMPLE_SIZE": sum(SAMPLE_SIZES.values()),
+        "N_OUTPUTS": len(sizes),
+        "SAMPLE_SIZE": sum(sizes.values()),
         "CONSTRAINT_AT": starts["constraint"],
     }
     lists = {
-        "OUTPUT_SIZE": list(SAMPLE_SIZES.values()),
+        "N_JOINTS": joints,
+        "OUTPUT_SIZE": list(sizes.values()),
         "OUTPUT_AT": list(starts.values()),
         "Q_AT": [starts["q_1"], starts["q_2"]],
         "LOST_AT": [starts["lost_1"], starts["lost_2"]],

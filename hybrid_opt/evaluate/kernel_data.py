@@ -14,25 +14,32 @@ from hybrid_opt.collision.judge import FCL_RESOLUTION
 from symbolic.array import Array
 from symbolic.geometry.bodies import PAYLOAD
 from symbolic.geometry.pieces import Capsule, ConvexShape, Hull
-from symbolic.workcell.records import Box, Cylinder, Sphere
+from symbolic.workcell.records import POSE_SIZE, Box, Cylinder, Sphere, Workcell
 
 PROOF_MARGIN = 5 * FCL_RESOLUTION
 """How clearly two shapes must be apart or intersect to be decided without FCL [m]."""
-
-OPEN_PAIR = np.dtype(
-    [
-        ("candidate", np.int64),
-        ("sample", np.int64),
-        ("pair", np.int64),
-        ("configuration", np.float64, 18),
-    ]
-)
-"""`open_pair` of kernel.c: a pair of a sample that is left to FCL."""
 
 _SHAPE = np.dtype(
     [("kind", np.int64), ("first", np.int64), ("count", np.int64), ("size", np.float64, 3)]
 )
 _RESTING = np.dtype([("pair", np.int64), ("place", np.float64, 3), ("departure", np.float64)])
+
+
+def configuration_size(workcell: Workcell) -> int:
+    """Entries of a configuration: box pose, joints of the first and of the second arm."""
+    return POSE_SIZE + sum(len(robot.position_lower) for robot in workcell.robots)
+
+
+def open_pair(workcell: Workcell) -> np.dtype[np.void]:
+    """`open_pair` of kernel.c: a pair of a sample that is left to FCL."""
+    return np.dtype(
+        [
+            ("candidate", np.int64),
+            ("sample", np.int64),
+            ("pair", np.int64),
+            ("configuration", np.float64, configuration_size(workcell)),
+        ]
+    )
 
 
 class JudgeData(ctypes.Structure):
@@ -50,7 +57,7 @@ class BatchData(ctypes.Structure):
     """`batch_data` of kernel.c."""
 
     _fields_ = [
-        ("x", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("x", "begin")),
         *((name, ctypes.c_longlong) for name in ("n", "with_collisions", "room")),
         *((name, ctypes.c_void_p) for name in ("time", "violation", "violation_time")),
         *((name, ctypes.c_void_p) for name in ("first_sample", "first_reason", "reached")),

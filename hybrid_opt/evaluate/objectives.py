@@ -14,7 +14,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.decision import waypoints_of
+from symbolic.workcell.decision import initial_decision, waypoints_of
 from symbolic.workcell.records import Workcell
 
 Outputs = Mapping[str, Array]
@@ -132,7 +132,7 @@ def _time_average(values: Array, time: Array) -> Array:
 def _polygon_time(workcell: Workcell) -> float:
     """Time [s] along the hand-made trajectory's straight pieces at the reference speeds."""
     task = workcell.task
-    steps = np.diff(waypoints_of(task, task.initial), axis=0)
+    steps = np.diff(waypoints_of(task, initial_decision(task)), axis=0)
     lengths = np.linalg.norm(steps[:, :3], axis=1) / task.reference_speed
     turns = np.linalg.norm(steps[:, 3:], axis=1) / task.reference_angular_speed
     return float(np.maximum(lengths, turns).sum())

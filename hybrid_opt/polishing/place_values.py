@@ -20,6 +20,7 @@ from hybrid_opt.polishing.sample_values import NEGLIGIBLE
 from symbolic.array import Array
 from symbolic.smooth.keys import ClosureKey
 from symbolic.smooth.place import PlaceConstraint
+from symbolic.workcell.decision import POSE_SIZE
 
 Indices = NDArray[np.intp]
 
@@ -31,13 +32,14 @@ class Places:
     Attributes:
         basis, rate_basis: (m, n_waypoints): poses = basis @ waypoints, and their rates along the
             path parameter.
-        free: which waypoints are free.
+        free: rows and columns of the variables among the extended waypoints
+            (`Task.free_entries`).
         q: both arms' joints (m, n) [rad].
     """
 
     basis: Array
     rate_basis: Array
-    free: Indices
+    free: tuple[Indices, Indices]
     q: tuple[Array, Array]
 
 
@@ -101,9 +103,11 @@ class PlaceValues:
             )
             for own in members.values()
         ]
+        free_rows, self._columns = places.free
+        moved, self._free_rows = np.unique(free_rows, return_inverse=True)
+        self._basis, self._rate_basis = places.basis[:, moved], places.rate_basis[:, moved]
+        self._size = functions.model.workcell.task.extended_size
         self._arms = [self._arm(arm, closures) for arm in range(len(places.q))]
-        self._basis = places.basis[:, places.free]
-        self._rate_basis = places.rate_basis[:, places.free]
 
     def _arm(self, arm: int, closures: Mapping[ClosureKey, NumericFunction]) -> _Arm:
         needed = [group.places for group in self._groups if arm in group.arms]
@@ -111,27 +115,31 @@ class PlaceValues:
         position = np.full(len(self._places.basis), -1, dtype=np.intp)
         position[at] = np.arange(len(at))
         q = self._places.q[arm]
-        n, width = q.shape[1], 6
+        n = q.shape[1]
         return _Arm(
             places=at,
             position=position,
             first=closures[ClosureKey(arm, "first")],
             second=closures[ClosureKey(arm, "second")],
             q=q.copy(),
-            follow=np.zeros((len(at), width, n)),
+            follow=np.zeros((len(at), self._size, n)),
             pull=np.zeros((len(at), n, n)),
         )
 
     def first(self, waypoints: Array) -> tuple[Array, Array]:
-        """Values (rows,) and gradients (rows, n_free * 6) by the free waypoints (n_waypoints, 6).
+        """Values (rows,) and gradients (rows, variables) by the path's variables.
+
+        Args:
+            waypoints: (n_waypoints, 6 + m), extended.
 
         What is found on the way is kept for `second` at the same waypoints.
         """
-        self._pose = self._places.basis @ waypoints
-        self._rate = self._places.rate_basis @ waypoints
+        self._extended = self._places.basis @ waypoints
+        self._pose = self._extended[:, :POSE_SIZE]
+        self._rate = (self._places.rate_basis @ waypoints)[:, :POSE_SIZE]
         for arm, reference in zip(self._arms, self._places.q, strict=True):
             if len(arm.places):
-                found = arm.first.batch(self._pose[arm.places], reference[arm.places])
+                found = arm.first.batch(self._extended[arm.places], reference[arm.places])
                 # The interface's arrays are transposed matrices (`codegen.signature`).
                 arm.q[arm.places], arm.follow, arm.pull = (
                     found["q"],
@@ -139,15 +147,16 @@ class PlaceValues:
                     found["pull"],
                 )
         values = np.empty(self._count)
-        by_pose, by_rate = np.zeros((2, self._count, 6))
+        by_pose, by_rate = np.zeros((2, self._count, self._size))
         self._by_joints: list[list[Array]] = []
         for group in self._groups:
             found = group.first.batch(*self._inputs(group))
             values[group.rows] = found["value"]
             gradient = found["gradient"]
-            own, start = gradient[:, :6].copy(), 6
+            own, start = np.zeros((len(gradient), self._size)), 6
+            own[:, :6] = gradient[:, :6]
             if group.moving:
-                by_rate[group.rows], start = gradient[:, 6:12], 12
+                by_rate[group.rows, :6], start = gradient[:, 6:12], 12
             by_joints = []
             for index in group.arms:
                 arm = self._arms[index]
@@ -160,7 +169,7 @@ class PlaceValues:
             self._by_joints.append(by_joints)
         total = self._basis[self._at][:, :, None] * by_pose[:, None, :]
         total += self._rate_basis[self._at][:, :, None] * by_rate[:, None, :]
-        return values, total.reshape(self._count, -1)
+        return values, total[:, self._free_rows, self._columns]
 
     def _inputs(self, group: _Group, chosen: Indices | None = None) -> list[Array]:
         at, numbers = group.places, group.numbers
@@ -169,11 +178,11 @@ class PlaceValues:
         return [self._pose[at], self._rate[at], *[arm.q[at] for arm in self._arms], *numbers]
 
     def second(self, weight: Array) -> Array:
-        """Second derivatives (n_free * 6, n_free * 6) of the values weighted by (rows,), where
+        """Second derivatives (variables, variables) of the values weighted by (rows,), where
         `first` was evaluated last."""
         sizes = [arm.q.shape[1] for arm in self._arms]
-        starts = np.cumsum([12, *sizes])
-        # Per place by pose, rate and the joints of both arms.
+        starts = np.cumsum([2 * self._size, *sizes])
+        # Per place by extended pose, its rate and the joints of both arms.
         curvature = np.zeros((len(self._pose), starts[-1], starts[-1]))
         pulls = [np.zeros((len(arm.places), n)) for arm, n in zip(self._arms, sizes, strict=True)]
         least = NEGLIGIBLE * np.abs(weight).max(initial=0.0)
@@ -183,7 +192,7 @@ class PlaceValues:
                 continue
             at, own = group.places[chosen], weight[group.rows[chosen]]
             hessian = group.second.batch(*self._inputs(group, chosen), own)["hessian"]
-            ranges = [np.arange(12 if group.moving else 6)]
+            ranges = [np.arange(6), *([self._size + np.arange(6)] if group.moving else [])]
             for index, slope in zip(group.arms, by_joints, strict=True):
                 ranges.append(np.arange(starts[index], starts[index + 1]))
                 where = self._arms[index].position[at]
@@ -201,38 +210,44 @@ class PlaceValues:
             return
         nu = np.matmul(arm.pull[active], slopes[active, :, None])[:, :, 0]
         at = arm.places[active]
-        hessian = arm.second.batch(self._pose[at], arm.q[at], nu)["hessian"]
-        y = np.concatenate([np.arange(6), np.arange(start, start + arm.q.shape[1])])
+        hessian = arm.second.batch(self._extended[at], arm.q[at], nu)["hessian"]
+        y = np.concatenate([np.arange(self._size), np.arange(start, start + arm.q.shape[1])])
         curvature[at[:, None, None], y[None, :, None], y[None, None, :]] += hessian
 
     def _reduced(self, curvature: Array, starts: Array) -> Array:
-        """T^T H T: by pose and rate (places, 12, 12), the joints following the pose."""
-        total = curvature[:, :12, :12].copy()
+        """T^T H T: by extended pose and rate (places, 12 + 2 m, 12 + 2 m), the joints following."""
+        size, box = self._size, 2 * self._size
+        total = curvature[:, :box, :box].copy()
         at = np.unique(np.concatenate([arm.places for arm in self._arms]))
         if not len(at):
             return total
-        # T^T (places, 6, joints), both arms side by side.
-        T = np.zeros((len(self._pose), 6, starts[-1] - 12))
+        # T^T (places, 6 + m, joints), both arms side by side.
+        T = np.zeros((len(self._pose), size, starts[-1] - box))
         for index, arm in enumerate(self._arms):
-            T[arm.places, :, starts[index] - 12 : starts[index + 1] - 12] = arm.follow
+            T[arm.places, :, starts[index] - box : starts[index + 1] - box] = arm.follow
         T, H = T[at], curvature[at]
-        mixed = np.matmul(T, H[:, 12:, :12])
-        total[at, :6] += mixed
-        total[at, :, :6] += np.swapaxes(mixed, 1, 2)
-        total[at, :6, :6] += np.matmul(np.matmul(T, H[:, 12:, 12:]), np.swapaxes(T, 1, 2))
+        mixed = np.matmul(T, H[:, box:, :box])
+        total[at, :size] += mixed
+        total[at, :, :size] += np.swapaxes(mixed, 1, 2)
+        total[at, :size, :size] += np.matmul(np.matmul(T, H[:, box:, box:]), np.swapaxes(T, 1, 2))
         return total
 
     def _by_waypoints(self, curvature: Array) -> Array:
-        """Carry second derivatives by pose and rate over to the free waypoints, and sum them."""
-        n = self._basis.shape[1]
-        total = np.zeros((n * n, 36))
+        """Carry second derivatives by extended pose and rate over to the variables, and sum
+        them."""
+        n, size = self._basis.shape[1], self._size
+        total = np.zeros((n * n, size * size))
         bases = (self._basis, self._rate_basis)
         for i, left in enumerate(bases):
             for j, right in enumerate(bases):
-                block = curvature[:, 6 * i : 6 * i + 6, 6 * j : 6 * j + 6].reshape(-1, 36)
+                rows = slice(size * i, size * (i + 1))
+                columns = slice(size * j, size * (j + 1))
+                block = curvature[:, rows, columns].reshape(-1, size * size)
                 outer = (left[:, :, None] * right[:, None, :]).reshape(-1, n * n)
                 total += outer.T @ block
-        return total.reshape(n, n, 6, 6).transpose(0, 2, 1, 3).reshape(6 * n, 6 * n)
+        at = self._free_rows * size + self._columns
+        whole = total.reshape(n, n, size, size).transpose(0, 2, 1, 3).reshape(size * n, size * n)
+        return np.asarray(whole[np.ix_(at, at)])
 
 
 def row_numbers(

@@ -12,7 +12,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.grid import Grid, dipped
 from symbolic.array import Array
 from symbolic.robot.arm import REACH_TOLERANCE
-from symbolic.workcell.decision import waypoints_of
+from symbolic.workcell.decision import POSE_SIZE, extended_waypoints, place_redundant
 
 DIPS_BELOW = 0.1
 """Pairs that stay farther apart than this are not looked at between places [m]."""
@@ -93,9 +93,12 @@ class CarryReader:
         """Evaluate a decision vector (n_var,)."""
         evaluator, grid = self._evaluator, self._grid
         found = {name: value[0] for name, value in evaluator.outputs(x[None]).items()}
-        waypoints = waypoints_of(evaluator.workcell.task, x)
-        pose = np.ascontiguousarray(grid.basis @ waypoints)
+        task = evaluator.workcell.task
+        waypoints = extended_waypoints(task, x)
+        extended = grid.basis @ waypoints
+        pose = np.ascontiguousarray(extended[:, :POSE_SIZE])
         guesses = [grid.between(found[f"q_{arm}"]) for arm in (1, 2)]
+        place_redundant(task, extended, guesses)
         posture = evaluator.functions["posture"].batch(pose, *guesses)
         followed = np.column_stack(
             [
@@ -119,7 +122,7 @@ class CarryReader:
         lowered[:, near] = dipped(bounds[:, near])
         return PlacedCarry(
             pose=pose,
-            rate=grid.rate_basis @ waypoints,
+            rate=grid.rate_basis @ waypoints[:, :POSE_SIZE],
             q=(q_1, q_2),
             reached=reached,
             stranded=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
@@ -129,7 +132,7 @@ class CarryReader:
             split=np.column_stack(
                 [force[:, 0] - force[:, 1], found["tangential_force"].sum(axis=1)]
             ),
-            peak=force.max(axis=0) / evaluator.workcell.task.reference_force,
+            peak=force.max(axis=0) / task.reference_force,
             shift=found["pressure_shift"] / self._radii,
             _distances=Distances(
                 bounds,

@@ -33,7 +33,7 @@ from hybrid_opt.polishing.sample_values import SampleValues
 from hybrid_opt.polishing.targets import Target, needed_level
 from symbolic.array import Array
 from symbolic.smooth.samples import branch_coefficients, sample_blocks
-from symbolic.workcell.decision import waypoints_of
+from symbolic.workcell.decision import extended_waypoints
 from symbolic.workcell.records import Workcell
 
 SLACK = 0.1
@@ -142,7 +142,7 @@ class SmoothProgram:
         places = Places(
             grid.basis[at],
             grid.rate_basis[at],
-            np.array(self._cell.task.free_indices),
+            self._cell.task.free_entries,
             (carry.q[0][at], carry.q[1][at]),
         )
         local = tuple(PlaceRow(row.constraint, index[row.place]) for row in rows)
@@ -202,7 +202,7 @@ class SmoothProgram:
                 slope[self._pressed_column, self._pressed] * half
             )
         if len(self._scale):
-            value, slope = self._places.first(waypoints_of(self._cell.task, x))
+            value, slope = self._places.first(extended_waypoints(self._cell.task, x))
             values[layout.places] = value / self._scale
             jacobian[layout.places, layout.decision] = slope * half / self._scale[:, None]
         return values, jacobian

@@ -65,12 +65,15 @@ def replay(stored: StoredTrajectory, folder: Path) -> Replay:
     evaluator = CandidateEvaluator(workcell, objectives or PAPER_OBJECTIVES)
     carry = evaluator.carry(stored.x)
     recomputed = trajectory_figures(carry)
-    start = np.array([arm.q[0] for arm in carry.arms])
+    differences = [
+        float(np.abs(arm.q[0] - start).max())
+        for arm, start in zip(carry.arms, stored.start, strict=True)
+    ]
     return Replay(
         workcell,
         tuple(
             FigureComparison(name, value, recomputed.get(name))
             for name, value in stored.figures.items()
         ),
-        float(np.abs(start - stored.start).max()),
+        max(differences),
     )

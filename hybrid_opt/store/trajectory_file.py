@@ -50,14 +50,14 @@ class StoredTrajectory:
 
     Attributes:
         x: (n_var,) decision vector.
-        start: (2, 6) joint positions of both arms at the first sample [rad].
+        start: joint positions (joints,) of each arm at the first sample [rad or m].
         figures: the figures it was stored with, SI units.
         provenance: how it came about (algorithm, seed, versions, ...), JSON values.
         cell: the workcell's files.
     """
 
     x: Array
-    start: Array
+    start: tuple[Array, Array]
     figures: Mapping[str, float]
     provenance: Mapping[str, Any]
     cell: CellArchive
@@ -73,6 +73,11 @@ class StoredTrajectory:
             raise ResultsError(
                 f"decision: {len(self.x)} values; the stored workcell has {workcell.task.n_var}"
             )
+        for i, (robot, start) in enumerate(zip(workcell.robots, self.start, strict=True)):
+            if start.shape != robot.position_lower.shape:
+                raise ResultsError(
+                    f"start[{i}]: expected {len(robot.position_lower)} numbers, one per joint"
+                )
         return workcell
 
 
@@ -151,16 +156,16 @@ def _checked(data: Any) -> StoredTrajectory:
         raise ResultsError("figures and provenance: expected objects")
     return StoredTrajectory(
         x=_vector(data["decision"], "decision"),
-        start=np.array([_vector(row, f"start[{i}]", 6) for i, row in enumerate(start)]),
+        start=(_vector(start[0], "start[0]"), _vector(start[1], "start[1]")),
         figures=_figures(data["figures"]),
         provenance=data["provenance"],
         cell=archive_from_json(data["cell"]),
     )
 
 
-def _vector(value: Any, name: str, length: int | None = None) -> Array:
-    if not isinstance(value, list) or (length is not None and len(value) != length):
-        raise ResultsError(f"{name}: expected {length or 'an array of'} numbers")
+def _vector(value: Any, name: str) -> Array:
+    if not isinstance(value, list):
+        raise ResultsError(f"{name}: expected an array of numbers")
     if len(value) > MOST_NUMBERS:
         raise ResultsError(f"{name}: {len(value)} numbers; allowed are {MOST_NUMBERS}")
     numbers = np.array([_figure(f"{name}[{k}]", entry) for k, entry in enumerate(value)])

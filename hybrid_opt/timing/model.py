@@ -133,7 +133,7 @@ class TimingModel:
         for name in _ARMS:
             both = [out[f"{name}_{arm}"].reshape(n, -1) for arm in (1, 2)]
             values[name] = np.concatenate(both, axis=1)
-        values["wrench_torque"] = values["wrench_torque"].reshape(n, 2, 6, 6)
+        values["wrench_torque"] = values["wrench_torque"].reshape(n, -1, 6)
         return PathMotion(x=x, parameter=np.linspace(0.0, 1.0, n), **values)
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
@@ -149,15 +149,19 @@ class TimingModel:
         )
 
     def wrench_torque(self, q: Array, pose: Array) -> Array:
-        """(n, 2, 6, 6) from contact wrenches to joint torques, at joints (n, 12) and box poses."""
-        still = np.zeros_like(pose)
+        """(n, all joints, 6) from contact wrenches to joint torques, at joints (n, all joints) and
+        box poses (n, 6)."""
+        n = len(q)
+        still = np.zeros((n, self.workcell.task.extended_size))
+        extended = still.copy()
+        extended[:, :6] = pose  # the redundant joints are in q already
         matrices = [
-            self._functions[f"arm_{i + 1}"].batch(
-                np.ascontiguousarray(q[:, 6 * i : 6 * i + 6]), pose, still, still
-            )["wrench_torque"]
-            for i in (0, 1)
+            self._functions[f"arm_{i + 1}"]
+            .batch(np.ascontiguousarray(own), extended, still, still)["wrench_torque"]
+            .reshape(n, -1, 6)
+            for i, own in enumerate(joints_of(self.workcell, q))
         ]
-        return np.stack(matrices, axis=1).reshape(len(q), 2, 6, 6)
+        return np.concatenate(matrices, axis=1)
 
     def drive(self, motion: PathMotion, speed: Array, acceleration: Array) -> dict[str, Array]:
         """Loads of a path driven with u' and u'' (n,) per sample; see also `contact_torque`."""
@@ -176,7 +180,7 @@ class TimingModel:
             motion.q,
             motion.q_first * v,
             motion.q_second * w + motion.q_first * a,
-            contact_torque(motion.wrench_torque, load),
+            contact_torque(self.workcell, motion.wrench_torque, load),
             own + motion.torque_at_rest,
         )
         split = [joints_of(self.workcell, values) for values in joints]
@@ -237,20 +241,24 @@ class TimingModel:
 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:
-    """The six joints of a robot in the order of q."""
+    """The joints of a robot in the order of q."""
     return tuple(arm_model(robot).names)[1:]
 
 
-def contact_torque(wrench_torque: Array, load: Mapping[str, Array]) -> Array:
-    """(n, 12) joint torques of the contact wrenches [N m].
+def contact_torque(workcell: Workcell, wrench_torque: Array, load: Mapping[str, Array]) -> Array:
+    """(n, all joints) joint torques of the contact wrenches [N m].
 
     Args:
-        wrench_torque: (n, 2, 6, 6) from wrenches to torques.
+        workcell: the cell.
+        wrench_torque: (n, all joints, 6) from wrenches to torques, both arms side by side.
         load: outputs of `symbolic.physics.payload_load`.
     """
-    wrench = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
-    torque: Array = np.einsum("nijk,nik->nij", wrench_torque, wrench)
-    return torque.reshape(len(torque), 12)
+    first = len(workcell.robots[0].torque_max)
+    parts = (wrench_torque[:, :first], wrench_torque[:, first:])
+    torques = [
+        np.einsum("njk,nk->nj", part, load[f"wrench_{i}"]) for i, part in enumerate(parts, start=1)
+    ]
+    return np.concatenate(torques, axis=1)
 
 
 def _loads(load: dict[str, Array]) -> dict[str, Array]:

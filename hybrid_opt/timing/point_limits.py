@@ -115,7 +115,7 @@ class PointLimits:
         load = self._model.drive(p, np.sqrt(w), a)
         if self._limits.torque:
             own = p.torque_by_acceleration * a[:, None] + p.torque_by_speed * w[:, None]
-            torque = contact_torque(p.wrench_torque, load) + own + p.torque_at_rest
+            torque = contact_torque(workcell, p.wrench_torque, load) + own + p.torque_at_rest
             columns.append(torque / np.concatenate([r.torque_max for r in workcell.robots]))
         if pressure:
             radius = np.array([contact.patch_radius for contact in workcell.contacts])

@@ -142,7 +142,7 @@ class _Judge:
     def failure(self, friction: Array, centre: Array) -> str:
         """What is exceeded most, or '' where everything holds."""
         load = self._model.uncertain_load(self._carry, friction, centre)
-        torque = contact_torque(self._wrench_torque, load) + self._own_torque
+        torque = contact_torque(self.workcell, self._wrench_torque, load) + self._own_torque
         reference = self.workcell.task.reference_force
         use = {
             "normal force": float((load["normal_force"] / reference).max()),

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from studies.plain.motion import rotation
 from symbolic.array import Array
 from symbolic.robot.arm import (
+    BEGIN_STEPS,
     CHEAP_STEPS,
     FAR,
     MAX_JOINT_STEP,
@@ -36,12 +37,19 @@ def held_model(robot: Robot) -> tuple[pin.Model, list[int], Array]:
 
 
 class PlainArm:
-    """The numeric model of an arm and the pad that it holds the box with."""
+    """The numeric model of an arm and the pad that it holds the box with.
 
-    def __init__(self, robot: Robot, contact: Contact) -> None:
+    Args:
+        robot, contact: the arm and what it holds the box by.
+        redundant: indices of the joints that do not follow the box.
+    """
+
+    def __init__(self, robot: Robot, contact: Contact, redundant: tuple[int, ...] = ()) -> None:
         self.robot = robot
         self.contact = contact
+        self.redundant = list(redundant)
         self.model = pin.buildReducedModel(*held_model(robot))
+        self.following = [k for k in range(self.model.nq) if k not in redundant]
         self.flange = self.model.getFrameId(robot.flange, pin.FrameType.BODY)
         self.data = self.model.createData()
         self.T_root_world = pin.SE3(robot.T_world_base).inverse()
@@ -60,7 +68,7 @@ class PlainArm:
         return self.data.oMf[self.flange]
 
     def jacobian(self, q: Array) -> Array:
-        """(6, 6) of the flange, linear rows first, axes of the root."""
+        """(6, n) of the flange, linear rows first, axes of the root."""
         J: Array = pin.computeFrameJacobian(
             self.model, self.data, q, self.flange, pin.LOCAL_WORLD_ALIGNED
         )
@@ -75,13 +83,14 @@ class PlainArm:
             [target.translation - here.translation, turn * np.sinc(angle / np.pi)]
         )
         try:
-            step = np.linalg.solve(self.jacobian(q), error)
+            step = np.linalg.solve(self.jacobian(q)[:, self.following], error)
         except np.linalg.LinAlgError:
             return q
         if not np.abs(step).sum() < 1e9:
             return q
-        shortened: Array = q + step * (MAX_JOINT_STEP / max(np.abs(step).max(), MAX_JOINT_STEP))
-        return shortened
+        moved = q.copy()
+        moved[self.following] += step * (MAX_JOINT_STEP / max(np.abs(step).max(), MAX_JOINT_STEP))
+        return moved
 
     def residual(self, q: Array, target: pin.SE3) -> float:
         """Distance and twice the sine of half the angle between placement and target, joined."""
@@ -90,13 +99,17 @@ class PlainArm:
         distance = np.linalg.norm(target.translation - here.translation)
         return float(np.hypot(distance, 2.0 * np.sin(angle / 2.0)))
 
-    def search(self, previous: Array, change: Array, curve: Array, target: pin.SE3) -> Array:
-        """Joints (6,) for the next target by Newton's method from the joints before.
+    def search(
+        self, previous: Array, change: Array, curve: Array, target: pin.SE3, values: Array
+    ) -> Array:
+        """Joints (n,) for the next target by Newton's method from the joints before.
 
         Args:
-            change, curve: (6,) the last difference of the joints, and its difference.
+            change, curve: (n,) the last difference of the joints, and its difference.
+            values: of the redundant joints.
         """
         q, before = previous + change + curve, 0.0
+        q[self.redundant] = values
         for _ in range(CHEAP_STEPS):
             before = self.residual(q, target)
             q = self.newton_step(q, target)
@@ -105,28 +118,42 @@ class PlainArm:
         if self.residual(q, target) <= SURE:
             return q
         other = previous + change
+        other[self.redundant] = values
         for _ in range(NEWTON_STEPS):
             other = self.newton_step(other, target)
         return min(q, other, key=lambda found: self.residual(found, target))
 
-    def follow(self, start: Array, poses: Array, wrenches: Array) -> dict[str, Array]:
+    def begin(self, start: Array, pose: Array, values: Array) -> Array:
+        """The start posture with its redundant joints moved evenly to where they begin."""
+        q, change = start.copy(), np.zeros(len(start))
+        change[self.redundant] = (values - start[self.redundant]) / BEGIN_STEPS
+        for _ in range(BEGIN_STEPS if self.redundant else 0):
+            q = self.newton_step(q + change, self.flange_target(pose))
+        return q
+
+    def follow(
+        self, start: Array, poses: Array, wrenches: Array, values: Array | None = None
+    ) -> dict[str, Array]:
         """Every output of `symbolic.robot.arm.TRACK_OUTPUTS` along the samples.
 
         Args:
-            start: (6,) joints at the first pose [rad].
+            start: (joints,) at the first pose [rad or m].
             poses: (n, 6) of the box.
             wrenches: (n, 6) on the box about the nominal contact point, world axes.
+            values: (n, k) of the redundant joints.
         """
-        previous = start
-        change, curve = np.zeros(6), np.zeros(6)
-        predicted = start
+        values = np.zeros((len(poses), 0)) if values is None else values
+        previous = self.begin(start, poses[0], values[0])
+        change, curve = np.zeros(len(start)), np.zeros(len(start))
+        predicted = previous.copy()
+        predicted[self.redundant] = values[1]
         for _ in range(NEWTON_STEPS):
             predicted = self.newton_step(predicted, self.flange_target(poses[1]))
         lost = 0.0
         samples: dict[str, list[object]] = {}
         for k, (pose, wrench) in enumerate(zip(poses, wrenches, strict=True)):
             target = self.flange_target(pose)
-            q = self.search(previous, change, curve, target)
+            q = self.search(previous, change, curve, target, values[k])
             jump = np.abs(q - previous).max()
             if not (self.residual(q, target) <= REACH_TOLERANCE and jump <= MAX_JOINT_STEP):
                 lost = 1.0
@@ -143,7 +170,7 @@ class PlainArm:
                 "ik_residual": self.residual(q, target),
                 "lost": lost,
                 "limit_margin": np.min(margins),
-                "manipulability": abs(np.linalg.det(self.jacobian(q))),
+                "manipulability": abs(np.linalg.det(self.jacobian(q)[:, self.following])),
                 "joint_torque": self.jacobian(q).T @ at_flange,
             }
             for name, value in sample.items():

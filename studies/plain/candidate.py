@@ -12,7 +12,7 @@ import numpy as np
 
 from studies.plain.arm import PlainArm
 from studies.plain.load import sample_load
-from studies.plain.motion import timed_motion
+from studies.plain.motion import redundant_path, timed_motion
 from symbolic.array import Array
 from symbolic.functions.candidate import CONSTRAINTS, FRICTION_TOLERANCE
 from symbolic.robot.arm import REACH_TOLERANCE
@@ -40,15 +40,19 @@ class PlainEvaluator:
 
     Args:
         workcell: the cell.
-        start: joints (6,) of each arm at the first waypoint [rad].
+        start: joints (n,) of each arm at the first waypoint [rad or m].
     """
 
     def __init__(self, workcell: Workcell, start: tuple[Array, Array]) -> None:
         self.workcell = workcell
         self.start = start
         self.arms = [
-            PlainArm(robot, contact)
-            for robot, contact in zip(workcell.robots, workcell.contacts, strict=True)
+            PlainArm(
+                workcell.robots[i],
+                workcell.contacts[i],
+                tuple(joint for joint, _ in workcell.task.redundant_of(i)),
+            )
+            for i in (0, 1)
         ]
 
     def __call__(self, x: Array) -> PlainCandidate:
@@ -58,10 +62,12 @@ class PlainEvaluator:
             sample_load(self.workcell, *sample) for sample in zip(pose, rate, second, strict=True)
         ]
         load = {name: np.array([each[name] for each in loads]) for name in loads[0]}
+        values = redundant_path(self.workcell.task, x)
         outputs = {"time": time, "pose": pose, "rate": rate, "second_rate": second}
         outputs |= {name: value for name, value in load.items() if not name.startswith("wrench")}
         for i, arm in enumerate(self.arms):
-            followed = arm.follow(self.start[i], pose, load[f"wrench_{i + 1}"])
+            columns = [place - 6 for _, place in self.workcell.task.redundant_of(i)]
+            followed = arm.follow(self.start[i], pose, load[f"wrench_{i + 1}"], values[:, columns])
             outputs |= {f"{name}_{i + 1}": value for name, value in followed.items()}
         constraint = np.array([self._constraints(outputs, k) for k in range(len(time))])
         violated = np.maximum(constraint, 0.0)

@@ -17,10 +17,22 @@ from symbolic.workcell.records import Task
 
 def waypoints(task: Task, x: Array) -> Array:
     """All waypoints (n_waypoints, 6) of a decision vector, angles unwrapped."""
-    free = iter(np.reshape(x, (-1, 6)))
+    free = iter(np.reshape(x[: task.n_box], (-1, 6)))
     rows = np.array([w.lower if w.is_fixed else next(free) for w in task.waypoints])
     rows[:, 3:] = np.unwrap(rows[:, 3:], axis=0)
     return rows
+
+
+def redundant_path(task: Task, x: Array) -> Array:
+    """Values (samples, m) of the redundant joints of a decision vector."""
+    free = iter(x[task.n_box :])
+    columns = [
+        [low if low == high else next(free) for low, high in zip(j.lower, j.upper, strict=True)]
+        for j in task.redundant
+    ]
+    coefficients = natural_quintic(np.array(columns).reshape(-1, len(task.waypoints)).T)
+    u = np.linspace(0.0, 1.0, task.samples)
+    return np.array([evaluate_spline(coefficients, value) for value in u])
 
 
 def natural_quintic(points: Array) -> Array:

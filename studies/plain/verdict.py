@@ -42,7 +42,7 @@ class PlainJudge:
 
     Args:
         workcell: the cell.
-        start: joints (6,) of each arm at the first waypoint [rad].
+        start: joints (n,) of each arm at the first waypoint [rad].
     """
 
     def __init__(self, workcell: Workcell, start: tuple[Array, Array]) -> None:

@@ -62,7 +62,7 @@ def normal_forces(data: ReportData) -> Figure:
 
 
 def torque_use(workcell_torque: Array, torque: Array) -> Array:
-    """(12,) largest use of each joint's torque in percent."""
+    """(all joints,) largest use of each joint's torque in percent."""
     return np.asarray(100.0 * np.abs(torque).max(axis=0) / workcell_torque)
 
 
@@ -71,14 +71,17 @@ def joint_torques(data: ReportData) -> Figure:
     figure = new_figure(FULL_WIDTH, 0.98 * FULL_WIDTH)
     panels = figure.subplots(2, 2, subplot_kw={"projection": "polar"})
     limit = np.concatenate([robot.torque_max for robot in data.workcell.robots])
-    angles = np.linspace(0.0, 2.0 * np.pi, 7)
+    first = len(data.workcell.robots[0].torque_max)
     for row, (text, own) in enumerate((("contact wrench alone", False), ("with the arm", True))):
         for i, robot in enumerate(data.workcell.robots):
             axes = panels[row, i]
-            most = np.zeros(6)
+            own_joints = slice(0, first) if i == 0 else slice(first, None)
+            joints = len(robot.torque_max)
+            angles = np.linspace(0.0, 2.0 * np.pi, joints + 1)
+            most = np.zeros(joints)
             for carry, look in styled(data):
                 torque = carry.timed.torque if own else carry.timed.contact_torque
-                use = torque_use(limit, torque)[6 * i : 6 * i + 6]
+                use = torque_use(limit, torque)[own_joints]
                 most = np.maximum(most, use)
                 axes.plot(
                     angles,
@@ -89,7 +92,7 @@ def joint_torques(data: ReportData) -> Figure:
                     markersize=3,
                     label=carry.label,
                 )
-            axes.set_xticks(angles[:-1], [f"joint {j + 1}" for j in range(6)])
+            axes.set_xticks(angles[:-1], [f"joint {j + 1}" for j in range(joints)])
             axes.tick_params(axis="x", pad=4)
             _label_rings(axes, most)
             letter = "abcd"[2 * row + i]
@@ -101,11 +104,13 @@ def joint_torques(data: ReportData) -> Figure:
 
 def _label_rings(axes: Axes, most: Array) -> None:
     """Round values on the rings, written between the two neighbouring joints that leave most
-    room: most (6,) is the largest use of each [%]."""
+    room: most (n,) is the largest use of each [%]."""
     rings = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(0.0, 1.02 * float(most.max()))
     axes.set_ylim(0.0, rings[-1])
     axes.set_yticks(rings[1:-1], [f"{ring:g} %" for ring in rings[1:-1]], va="center", ha="center")
-    axes.set_rlabel_position(30.0 + 60.0 * int(np.argmin(most + np.roll(most, -1))))  # type: ignore[attr-defined]
+    step = 360.0 / len(most)
+    place = step / 2.0 + step * int(np.argmin(most + np.roll(most, -1)))
+    axes.set_rlabel_position(place)  # type: ignore[attr-defined]
 
 
 def pressure_shift(data: ReportData) -> Figure:

@@ -67,6 +67,7 @@ class PageData:
         return {
             "objectiveTitles": list(data.objective_titles),
             "robots": [robot.name for robot in data.workcell.robots],
+            "joints": [len(robot.torque_max) for robot in data.workcell.robots],
             "patchRadius": min(contact.patch_radius for contact in contacts),
             "rest": rest.tolist() if known_rest else None,
             "restForce": float(force.max()) if known_rest else None,
@@ -122,7 +123,7 @@ def _fronts(algorithm: AlgorithmRuns, symbol: str) -> list[tuple[str, Front, str
 
 
 def _samples(timed: carry.Carry) -> Array:
-    """(k, 23) time, pose, joints, normal forces and pressure shifts at some of the samples."""
+    """(k, 11 + all joints) time, pose, joints, normal forces, pressure shifts at some samples."""
     n = len(timed.time)
     peaks = [
         *timed.normal_force.argmax(axis=0),

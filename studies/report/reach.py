@@ -51,10 +51,15 @@ def last_points(arm: ArmGeometry, point: Array, rng: np.random.Generator, count:
 
     The points go from frame to frame, which takes a fraction of what whole placements take.
     """
-    q = rng.uniform(arm.lower, arm.upper, (count, 6))
+    q = rng.uniform(arm.lower, arm.upper, (count, arm.joints))
     points = np.broadcast_to(point, (count, 3))
-    for axis, origin, angle in zip(arm.axes[::-1], arm.origins[::-1], q.T[::-1], strict=True):
-        points = _moved(_turned(points, axis, angle), origin)
+    for joint in reversed(range(arm.joints)):
+        axis, value = arm.axes[joint], q[:, joint]
+        if arm.turning[joint]:
+            points = _turned(points, axis, value)
+        else:
+            points = points + np.outer(value, axis)
+        points = _moved(points, arm.origins[joint])
     return _moved(points, arm.T_world_root)
 
 

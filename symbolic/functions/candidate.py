@@ -10,7 +10,7 @@ import casadi as ca
 
 from symbolic.cell_model import CellModel
 from symbolic.physics.contact_forces import GRAVITY
-from symbolic.physics.path import sample_basis, waypoint_matrix
+from symbolic.physics.path import extended_matrix, sample_basis, waypoint_matrix
 from symbolic.physics.payload_load import LOAD_OUTPUTS, load_function
 from symbolic.physics.time_law import driven_path, timed_path
 from symbolic.robot.arm import (
@@ -18,7 +18,7 @@ from symbolic.robot.arm import (
     TRACK_OUTPUTS,
     follow_function,
     prediction_function,
-    start_state,
+    start_function,
     track_function,
 )
 from symbolic.workcell.records import Workcell
@@ -58,7 +58,7 @@ def candidate_function(model: CellModel) -> ca.Function:
 
     Outputs (NumPy shapes, n samples): time (n,) [s]; pose (n, 6), rate, second_rate (n, 6) with
     respect to time; those of `LOAD_OUTPUTS` without the wrenches; per robot i = 1, 2 those of
-    `TRACK_OUTPUTS` as q_i (n, 6) and so on; constraint (n, 9), see `CONSTRAINTS`; violation
+    `TRACK_OUTPUTS` as q_i (n, joints) and so on; constraint (n, 9), see `CONSTRAINTS`; violation
     (9,): largest positive value of each constraint over the samples; violation_time (9,): time
     for which each is violated, over the duration.
 
@@ -87,8 +87,10 @@ def candidate_function(model: CellModel) -> ca.Function:
         "second_rate": path.second_rate,
         **{name: load[name] for name in LOAD_OUTPUTS if not name.startswith("wrench")},
     }
+    whole = extended_matrix(workcell.task, inputs["x"], waypoints)
+    pose = ca.mtimes(whole, ca.DM(basis.position.T))
     for i in (0, 1):
-        tracked = _track(model, i, path.pose, load[f"wrench_{i + 1}"])
+        tracked = _track(model, i, pose, load[f"wrench_{i + 1}"])
         outputs |= {f"{name}_{i + 1}": tracked[name] for name in TRACK_OUTPUTS}
     constraint = _constraint_function(workcell).map(n)(
         *[outputs[name] for name in _CONSTRAINT_INPUTS]
@@ -119,52 +121,68 @@ _LOAD_SIZES = {
     "point_moment_residual": 3,
     "moment_residual": 3,
 }
-_ARM_SIZES = dict(zip(TRACK_OUTPUTS, (6, 1, 1, 1, 1, 6), strict=True))
 
-SAMPLE_SIZES = {
-    **_LOAD_SIZES,
-    **{f"{name}_{i}": size for i in (1, 2) for name, size in _ARM_SIZES.items()},
-    "constraint": len(CONSTRAINTS),
-}
-"""Outputs of `sample_functions`' `sample` after the states, and their entries; the candidate's
-function has the same ones."""
+SAMPLE_NAMES = frozenset(
+    (*_LOAD_SIZES, *(f"{name}_{i}" for i in (1, 2) for name in TRACK_OUTPUTS), "constraint")
+)
+"""Outputs of `sample_functions`' `sample` after the states."""
+
+
+def sample_sizes(workcell: Workcell) -> dict[str, int]:
+    """Outputs of `sample_functions`' `sample` after the states, and their entries; the candidate's
+    function has the same ones."""
+    sizes = dict(_LOAD_SIZES)
+    for i, robot in enumerate(workcell.robots, start=1):
+        joints = len(robot.position_lower)
+        own = dict.fromkeys(TRACK_OUTPUTS, 1) | {"q": joints, "joint_torque": joints}
+        sizes |= {f"{name}_{i}": size for name, size in own.items()}
+    return sizes | {"constraint": len(CONSTRAINTS)}
 
 
 def sample_functions(model: CellModel) -> dict[str, ca.Function]:
     """A candidate's function in parts, to be put together sample by sample; not for 'optimal'.
 
-    path: x (n_var,) -> time (1, n), pose, rate, second_rate (6, n). start: -> state_1, state_2
-    before the first sample. predict: state_1, state_2, pose (6,) of the second sample -> both
-    states before it. sample: pose, rate, second_rate (6,), state_1, state_2 -> next_state_1,
-    next_state_2, then `SAMPLE_SIZES`.
+    path: x (n_var,) -> time (1, n), pose (6 + m, n), extended by the redundant joints, rate,
+    second_rate (6, n). begin: -> joints of both arms at the first box pose. start: first pose, such
+    joints -> state_1, state_2 before the first sample. predict: state_1, state_2, second pose ->
+    both states before it. sample: pose, rate, second_rate, state_1, state_2 -> next_state_1,
+    next_state_2, then `sample_sizes`.
     """
     workcell = model.workcell
     x = ca.MX.sym("x", workcell.task.n_var)
-    path = timed_path(workcell.task, sample_basis(workcell.task), waypoint_matrix(workcell.task, x))
-    motion = [path.time, path.pose, path.rate, path.second_rate]
-    starts = [start_state(ca.SX(ca.DM(q))) for q in model.start]
-    states = [ca.MX.sym(f"state_{i}", starts[0].shape[0]) for i in (1, 2)]
-    box = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    basis = sample_basis(workcell.task)
+    waypoints = waypoint_matrix(workcell.task, x)
+    path = timed_path(workcell.task, basis, waypoints)
+    whole = ca.mtimes(extended_matrix(workcell.task, x, waypoints), ca.DM(basis.position.T))
+    motion = [path.time, whole, path.rate, path.second_rate]
+    pose = ca.MX.sym("pose", workcell.task.extended_size)
+    box = [pose[:6], *[ca.MX.sym(name, 6) for name in ("rate", "second_rate")]]
     outputs = dict(zip(LOAD_OUTPUTS, load_function(workcell).call(box), strict=True))
-    following, predicted = [], []
-    for i, state in enumerate(states):
+    states, starts, following, predicted = [], [], [], []
+    begins = [ca.MX.sym(f"begin_{i + 1}", len(q)) for i, q in enumerate(model.start)]
+    for i in (0, 1):
         arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
+        starts.append(start_function(*arm, f"arm_{i + 1}_start")(begins[i], pose))
+        state = ca.MX.sym(f"state_{i + 1}", starts[i].shape[0])
+        states.append(state)
         track = track_function(*arm, f"arm_{i + 1}_sample")
-        after, *tracked = track(state, box[0], outputs[f"wrench_{i + 1}"])
+        after, *tracked = track(state, pose, outputs[f"wrench_{i + 1}"])
         following.append(after)
         outputs |= {
             f"{name}_{i + 1}": value for name, value in zip(TRACK_OUTPUTS, tracked, strict=True)
         }
-        predicted.append(prediction_function(*arm, f"arm_{i + 1}_prediction")(state, box[0]))
+        predicted.append(prediction_function(*arm, f"arm_{i + 1}_prediction")(state, pose))
     inputs = [outputs[name] for name in _CONSTRAINT_INPUTS]
     outputs["constraint"] = _constraint_function(workcell)(*inputs)
-    results = [*following, *(outputs[name] for name in SAMPLE_SIZES)]
-    names = ["next_state_1", "next_state_2", *SAMPLE_SIZES]
-    given = [*box, *states]
+    sizes = sample_sizes(workcell)
+    results = [*following, *(outputs[name] for name in sizes)]
+    names = ["next_state_1", "next_state_2", *sizes]
+    given = [pose, *box[1:], *states]
     return {
         "path": ca.Function("path", [x], motion, {"cse": True}),
-        "start": ca.Function("start", [], starts),
-        "predict": ca.Function("predict", [*states, box[0]], predicted),
+        "begin": ca.Function("begin", [], [ca.SX(ca.DM(q)) for q in model.start]),
+        "start": ca.Function("start", [pose, *begins], starts),
+        "predict": ca.Function("predict", [*states, pose], predicted),
         "sample": ca.Function("sample", given, results, [v.name() for v in given], names),
     }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -57,7 +57,7 @@ class CollisionBody:
         pieces: its convex pieces, in that frame.
         is_tool: whether it is part of a robot's tool.
         carries: robots (0, 1) that are mounted on this link of a machine; None for a body that
-            is no standing part of one.
+            is neither a standing part of one nor moved by both.
     """
 
     name: str
@@ -74,19 +74,32 @@ class ArmGeometry:
 
     Attributes:
         T_world_root: (4, 4) of the URDF's root.
-        origins: (6, 4, 4), each joint's frame in the one before it (the first: in the root),
+        origins: (n, 4, 4), each joint's frame in the one before it (the first: in the root),
             at joint position zero.
-        axes: (6, 3) unit axis of each joint in its own frame.
+        axes: (n, 3) unit axis of each joint in its own frame.
+        turning: (n,) whether a joint turns about its axis; others slide along it.
         T_joint_box: (4, 4), the carried box in the last joint's frame.
-        lower, upper: (6,) joint limits [rad].
+        lower, upper: (n,) joint limits [rad or m].
     """
 
     T_world_root: Array
     origins: Array
     axes: Array
+    turning: tuple[bool, ...]
     T_joint_box: Array
     lower: Array
     upper: Array
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self.axes)
+
+    @property
+    def slides(self) -> Array:
+        """(n,) how far each joint may slide from position zero [m]; 0 of one that turns."""
+        most = np.maximum(np.abs(self.lower), np.abs(self.upper))
+        return np.asarray(np.where(self.turning, 0.0, most))
 
 
 def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
@@ -100,6 +113,9 @@ def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
     meshes = MeshReader()
     links = (arm_links(workcell.robots, 0), arm_links(workcell.robots, 1))
     bodies = [b for i in (0, 1) for b in _robot_bodies(workcell.robots[i], i, links[i], meshes)]
+    if one_machine(workcell.robots):  # what a joint of both arms moves belongs to the first
+        mount = f"{workcell.robots[0].name}/{links[1].mount}"
+        bodies = [replace(b, carries=(1,)) if b.name == mount else b for b in bodies]
     payload = Piece(Box(np.asarray(workcell.payload.size)), np.eye(4))
     bodies.append(CollisionBody(PAYLOAD, "payload", BOX, (payload,)))
     bodies += [b for i in (0, 1) for b in _standing_bodies(workcell.robots, i, links, meshes)]
@@ -125,12 +141,14 @@ def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model), np.zeros(model.nv))
     joints = range(1, model.njoints)
+    motions = np.array([np.asarray(data.joints[j].S).ravel() for j in joints])
     flange = model.frames[link_frame(model, robot.flange)]
     T_flange_box = robot.T_flange_pad @ np.linalg.inv(contact.T_box_pad)
     return ArmGeometry(
         T_world_root=robot.T_world_base,
         origins=np.array([model.jointPlacements[j].homogeneous for j in joints]),
-        axes=np.array([np.asarray(data.joints[j].S).ravel()[3:] for j in joints]),
+        axes=motions[:, :3] + motions[:, 3:],
+        turning=tuple(np.any(motions[:, 3:] != 0.0, axis=1).tolist()),
         T_joint_box=flange.placement.homogeneous @ T_flange_box,
         lower=robot.position_lower,
         upper=robot.position_upper,

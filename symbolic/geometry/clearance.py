@@ -32,7 +32,7 @@ def clearance_expressions(
 
     Args:
         R_box, p_box: (3, 3) and (3,), the box in the world.
-        placements_1, placements_2: per robot the rotations (3, 18) and positions (3, 6) of its
+        placements_1, placements_2: per robot the rotations (3, 3 n) and positions (3, n) of its
             joint frames in its root, side by side, as `RobotModel.joint_placements` gives them.
         softness: `EXACT` for screening; `Softness(width)` for bounds that are smooth, and lower
             by some multiples of the width [m].
@@ -49,7 +49,7 @@ def screening_functions(
 ) -> dict[str, ca.Function]:
     """The functions that collision checking calls, by name.
 
-    The first two take pose (6,), q_1 (6,) and q_2 (6,) [m, rad] of one sample.
+    The first two take pose (6,), q_1 and q_2 (n,) [m, rad] of one sample.
     clearance: -> clearance (n_pairs,), see `clearance_expressions`.
     piece_poses: -> quaternions (4, n_pieces) as w x y z, positions (3, n_pieces) [m]: every
     piece of every body in the world, in the bodies' order.
@@ -59,7 +59,7 @@ def screening_functions(
         joint_placements: of each robot, `RobotModel.joint_placements`.
     """
     pose = ca.SX.sym("pose", 6)
-    q = ca.SX.sym("q_1", 6), ca.SX.sym("q_2", 6)
+    q = [ca.SX.sym(f"q_{i}", arm.joints) for i, arm in enumerate(geometry.arms, start=1)]
     R, p = rotation_matrix(pose[3:]), pose[:3]
     first, second = (joint_placements[i](q[i]) for i in (0, 1))
     clearance = clearance_expressions(geometry, R, p, first, second, softness)

@@ -76,7 +76,7 @@ def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
     """Pairs within an arm whose chains of spheres cannot be told apart in many postures."""
     rng = np.random.default_rng(0)
     chains = [chain_cover(body) for body in geometry.bodies]
-    postures = [rng.uniform(arm.lower, arm.upper, (POSTURES, 6)) for arm in geometry.arms]
+    postures = [rng.uniform(arm.lower, arm.upper, (POSTURES, arm.joints)) for arm in geometry.arms]
     found = []
     for pair in geometry.active:
         a, b = geometry.bodies[pair.first], geometry.bodies[pair.second]

@@ -9,7 +9,9 @@ where the chord D bounds |x(1) - x(0)| and the bend K bounds |x''|. For the bodi
 
   |x''| <= sum_ij |dq_i| |dq_j| r_max(i,j),
 
-with r_j the largest distance of the body's points from the axis of joint j.
+with r_j the largest distance of the body's points from the axis of joint j. Where a joint slides,
+r_j = 1 bounds the motion by it, and in x'' it counts with the joints that turn before it only: what
+slides along a fixed line does not bend.
 """
 
 from __future__ import annotations
@@ -26,20 +28,24 @@ from symbolic.physics.rotation import rotation_matrix
 
 
 def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
-    """(6,) distance from each joint's axis that no point of a link's body exceeds [m].
+    """(n,) distance from each joint's axis that no point of a link's body exceeds [m]; 1 of a joint
+    that slides.
 
     Joints behind the body do not move it: zero. Own joint: from the shape; joints further down:
     with the chain between stretched.
     """
-    reach = np.zeros(6)
+    reach = np.zeros(arm.joints)
     last = body.frame.joint
     for j in range(last + 1):
-        if j == last:
+        if not arm.turning[j]:
+            reach[j] = 1.0
+        elif j == last:
             reach[j] = max(farthest_from_axis(p, np.zeros(3), arm.axes[j]) for p in body.pieces)
         else:
             offset = arm.origins[j + 1][:3, 3]
             across = offset - (offset @ arm.axes[j]) * arm.axes[j]
             reach[j] = float(np.linalg.norm(across)) + chain_radius(body, arm, j + 1)
+            reach[j] += float(arm.slides[j + 1])
     return reach
 
 
@@ -51,11 +57,14 @@ def motion_function(
     They are the sums of both bodies' chords and bends, see the module; of two links of one arm,
     the length of the path of one seen from the other, which needs no bend.
 
-    Inputs: pose_a, q_1_a, q_2_a, pose_b, q_1_b, q_2_b, each (6,) [m, rad].
+    Inputs: pose_a (6,), q_1_a, q_2_a (n,), then pose_b, q_1_b, q_2_b [m, rad].
     """
     ends = []
     for end in ("a", "b"):
-        pose, q_1, q_2 = (ca.SX.sym(f"{name}_{end}", 6) for name in ("pose", "q_1", "q_2"))
+        pose = ca.SX.sym(f"pose_{end}", 6)
+        q_1, q_2 = (
+            ca.SX.sym(f"q_{i}_{end}", arm.joints) for i, arm in enumerate(geometry.arms, start=1)
+        )
         placed = {WORLD: (ca.SX.eye(3), ca.SX.zeros(3)), BOX: (rotation_matrix(pose[3:]), pose[:3])}
         for i, (arm, q) in enumerate(zip(geometry.arms, (q_1, q_2), strict=True)):
             for j, joint in enumerate(world_placements(arm.T_world_root, joint_placements[i](q))):
@@ -106,7 +115,7 @@ def _body_motion(
         farthest = max(farthest_from_point(piece, np.zeros(3)) for piece in body.pieces)
         return chord, farthest * turn * turn
     reach = reach_about_joints(body, geometry.arms[body.frame.robot])
-    return chord, _bend(reach, steps[1 + body.frame.robot])
+    return chord, _bend(reach, geometry.arms[body.frame.robot], steps[1 + body.frame.robot])
 
 
 def _between_links(
@@ -118,11 +127,14 @@ def _between_links(
     return sum((reach[j] * step[j] for j in moving), ca.SX(0))
 
 
-def _bend(reach: Array, step: ca.SX) -> ca.SX:
+def _bend(reach: Array, arm: ArmGeometry, step: ca.SX) -> ca.SX:
     total, before = ca.SX(0), ca.SX(0)
-    for j in range(6):
-        total += reach[j] * step[j] * (step[j] + 2.0 * before)
-        before += step[j]
+    for j, turning in enumerate(arm.turning):
+        if turning:
+            total += reach[j] * step[j] * (step[j] + 2.0 * before)
+            before += step[j]
+        else:
+            total += 2.0 * reach[j] * step[j] * before
     return total
 
 

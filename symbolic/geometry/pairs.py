@@ -32,7 +32,10 @@ from symbolic.geometry.pieces import (
     farthest_from_point,
     swept_cylinder,
 )
-from symbolic.workcell.records import Workcell
+from symbolic.workcell.records import Box, Workcell
+
+MOST_ENTERED = 1e-3
+"""Depth by which a tool may be drawn into the payload, as pads that give way are [m]."""
 
 POSTURES = 300
 """Random postures in which a pair has to touch to count as always touching."""
@@ -94,11 +97,13 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
     """Read all shapes of a workcell and sort its pairs.
 
     Raises:
-        CollisionModelError: a shape is unusable, or an ignored pair names no body.
+        CollisionModelError: a shape is unusable, a part of a tool enters the payload, or an ignored
+            pair names no body.
     """
     bodies = collision_bodies(workcell)
     arms = (arm_geometry(workcell, 0), arm_geometry(workcell, 1))
     ignored = ignored_pairs(workcell, bodies)
+    _check_tools(bodies, arms)
     active, excluded = [], []
     always = _AlwaysTouching(bodies, arms)
     for i, j in combinations(range(len(bodies)), 2):
@@ -118,6 +123,25 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
     return CellGeometry(workcell, bodies, arms, tuple(active), tuple(excluded))
 
 
+def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]) -> None:
+    """The tools touch the payload that they hold, and do not enter it."""
+    payload = next(body for body in bodies if body.frame.kind == "box")
+    box = payload.pieces[0].shape
+    assert isinstance(box, Box)
+    inner = Box(np.maximum(box.size - 2.0 * MOST_ENTERED, 1e-6))
+    for body in bodies:
+        if not body.is_tool:
+            continue
+        core = Piece(inner, payload.pieces[0].pose)
+        held = core.moved(arms[body.frame.robot].T_joint_box)
+        if coal_distance((held,), body.pieces) <= 0.0:
+            raise CollisionModelError(
+                f"the tool part {body.name!r} enters the payload by more than "
+                f"{1e3 * MOST_ENTERED:g} mm where the robot holds it; move or shorten the part, or "
+                "move the pad's frame to its tip (robots.pad)"
+            )
+
+
 def _anchor(
     body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int
 ) -> CollisionBody:
@@ -125,7 +149,9 @@ def _anchor(
     if body.frame.kind != "box":
         return body
     pieces = tuple(piece.moved(arms[robot].T_joint_box) for piece in body.pieces)
-    return CollisionBody(body.name, body.group, Frame("link", robot, 5), pieces)
+    return CollisionBody(
+        body.name, body.group, Frame("link", robot, arms[robot].joints - 1), pieces
+    )
 
 
 def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:
@@ -203,6 +229,8 @@ def _never_meet(
         if high.frame.robot != robot or not own_base or high.frame.joint - low.frame.joint != 2:
             continue
         first = low.frame.joint + 1
+        if not all(arm.turning[first : first + 2]):
+            continue
         swept = _zone(high, arm, first)
         reach = farthest_from_axis(swept, np.zeros(3), arm.axes[first])
         turn = min(float(arm.upper[first] - arm.lower[first]), 2.0 * np.pi)
@@ -210,7 +238,7 @@ def _never_meet(
         least = np.inf
         while ranges:
             start, end = ranges.pop()
-            q = np.zeros(6)
+            q = np.zeros(arm.joints)
             q[first] = (start + end) / 2.0
             T = relative_placement(arm, low.frame.joint, first, q)
             gap = coal_distance((swept.moved(T),), low.pieces)
@@ -228,19 +256,20 @@ def _never_meet(
 def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
     """What a body behind joint `body.frame.joint` can reach, seen from joint `below` (-1: world).
 
-    One joint between them: the swept cylinder about its axis. More: the ball about the first
-    joint's origin whose radius is the stretched chain.
+    One joint that turns between them: the swept cylinder about its axis. Else the ball about the
+    first joint's origin whose radius is the stretched chain.
     """
     first = below + 1
     T = arm.T_world_root @ arm.origins[0] if first == 0 else arm.origins[first]
-    if body.frame.joint == first:
+    if body.frame.joint == first and arm.turning[first]:
         return swept_cylinder(body.pieces, np.zeros(3), arm.axes[first]).moved(T)
-    return ball(T[:3, 3], chain_radius(body, arm, first))
+    return ball(T[:3, 3], chain_radius(body, arm, first) + float(arm.slides[first]))
 
 
 def chain_radius(body: CollisionBody, arm: ArmGeometry, first: int) -> float:
     """Distance from the origin of joint `first` that no point of a body behind it exceeds [m]."""
-    offsets = np.linalg.norm(arm.origins[first + 1 : body.frame.joint + 1, :3, 3], axis=1)
+    behind = slice(first + 1, body.frame.joint + 1)
+    offsets = np.linalg.norm(arm.origins[behind, :3, 3], axis=1) + arm.slides[behind]
     own = max(farthest_from_point(piece, np.zeros(3)) for piece in body.pieces)
     return float(offsets.sum()) + own
 
@@ -253,7 +282,7 @@ class _AlwaysTouching:
     ) -> None:
         self.arms = arms
         rng = np.random.default_rng(0)
-        self.postures = [rng.uniform(arm.lower, arm.upper, (POSTURES, 6)) for arm in arms]
+        self.postures = [rng.uniform(arm.lower, arm.upper, (POSTURES, arm.joints)) for arm in arms]
 
     def reason(self, a: CollisionBody, b: CollisionBody) -> str:
         for robot in (0, 1):
@@ -273,10 +302,13 @@ class _AlwaysTouching:
 
 
 def relative_placement(arm: ArmGeometry, below: int, joint: int, q: Array) -> Array:
-    """(4, 4) of a joint's frame in the frame of an earlier joint (-1: world) at q (6,) [rad]."""
+    """(4, 4) of a joint's frame in the frame of an earlier joint (-1: world) at q (n,)."""
     T: Array = arm.T_world_root if below < 0 else np.eye(4)
     for k in range(below + 1, joint + 1):
-        turn = np.eye(4)
-        turn[:3, :3] = pin.exp3(arm.axes[k] * q[k])
-        T = T @ arm.origins[k] @ turn
+        moved = np.eye(4)
+        if arm.turning[k]:
+            moved[:3, :3] = pin.exp3(arm.axes[k] * q[k])
+        else:
+            moved[:3, 3] = arm.axes[k] * q[k]
+        T = T @ arm.origins[k] @ moved
     return T

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.expression import Expression
 from symbolic.workcell.records import Task
 
 
@@ -67,7 +68,7 @@ def sample_basis(task: Task) -> PathBasis:
     return path_basis(len(task.waypoints), np.linspace(0.0, 1.0, task.samples))
 
 
-def waypoint_matrix(task: Task, x: ca.MX | ca.SX) -> ca.MX | ca.SX:
+def waypoint_matrix(task: Task, x: Expression) -> Expression:
     """All waypoints (6, n_waypoints) from the decision vector (paper Eq. 17), angles unwrapped.
 
     Args:
@@ -88,7 +89,32 @@ def waypoint_matrix(task: Task, x: ca.MX | ca.SX) -> ca.MX | ca.SX:
     return ca.horzcat(*columns)
 
 
-def _unwrap(reference: ca.MX | ca.SX, angles: ca.MX | ca.SX) -> ca.MX | ca.SX:
+def extended_matrix(task: Task, x: Expression, waypoints: Expression) -> Expression:
+    """The extended waypoints (6 + m, n_waypoints): the redundant joints' values below the poses.
+
+    Args:
+        x: (n_var,) decision vector.
+        waypoints: (6, n_waypoints) from `waypoint_matrix`.
+    """
+    if not task.redundant:
+        return waypoints
+    at, rows = task.n_box, []
+    for joint in task.redundant:
+        row = []
+        for low, high in zip(joint.lower, joint.upper, strict=True):
+            row.append(x[at] if low < high else type(x)(low))
+            at += int(low < high)
+        rows.append(row)
+    # Column by column, a form that code for lanes knows.
+    return ca.horzcat(
+        *[
+            ca.vertcat(waypoints[:, k], *[row[k] for row in rows])
+            for k in range(len(task.waypoints))
+        ]
+    )
+
+
+def _unwrap(reference: Expression, angles: Expression) -> Expression:
     """Angles moved by full turns to lie within half a turn of the reference.
 
     Half a turn in either direction stays as it is written (NumPy's `unwrap`).

@@ -19,6 +19,7 @@ from symbolic.physics.path_motion import (
     BOX_OUTPUTS,
     arm_derivative_function,
     box_function,
+    extended_motion,
 )
 from symbolic.physics.pressure import pressure_shift
 from symbolic.robot.arm import TRACK_OUTPUTS, follow_function
@@ -84,30 +85,28 @@ def limit_layout(workcell: Workcell) -> LimitLayout:
 
 
 PATH_OUTPUTS = ("pose", "pose_first", "pose_second", "q_1", "q_2")
-"""Outputs of `path_function` that `sample_limits_function` takes."""
+"""Outputs of `path_function` that `sample_limits_function` takes; poses are extended by the
+redundant joints."""
 
 
 def path_function(model: CellModel, samples: int) -> ca.Function:
-    """Waypoints x to box and arms at uniform samples of u in [0, 1].
+    """The path's variables x (n_path,) to box and arms at uniform samples of u in [0, 1].
 
-    Outputs (NumPy shapes, n samples): those of `PATH_OUTPUTS`: the box pose and its derivatives by
-    u (n, 6), and both arms' joints (n, joints of the arm); then per arm i = 1, 2 ik_residual_i,
-    lost_i, limit_margin_i, manipulability_i (n,) as in `symbolic.robot.arm.TRACK_OUTPUTS`.
+    Outputs (NumPy shapes, n samples): those of `PATH_OUTPUTS`: the extended pose and its
+    derivatives by u (n, 6 + m), and both arms' joints (n, joints of the arm); then per arm
+    i = 1, 2 ik_residual_i, lost_i, limit_margin_i, manipulability_i (n,) as in
+    `symbolic.robot.arm.TRACK_OUTPUTS`.
 
     Args:
         model: the cell.
         samples: number of samples, at least 3.
     """
     workcell = model.workcell
-    x = ca.MX.sym("x", 6 * sum(not w.is_fixed for w in workcell.task.waypoints))
+    x = ca.MX.sym("x", workcell.task.n_path)
     waypoints = waypoint_matrix(workcell.task, x)
     basis = path_basis(len(workcell.task.waypoints), np.linspace(0.0, 1.0, samples))
-    outputs = {
-        name: ca.mtimes(waypoints, ca.DM(matrix.T))
-        for name, matrix in zip(
-            PATH_OUTPUTS, (basis.position, basis.first, basis.second), strict=False
-        )
-    }
+    moved = extended_motion(workcell.task, x, basis, waypoints)
+    outputs = dict(zip(PATH_OUTPUTS, moved, strict=False))
     no_wrench = ca.DM.zeros(6, samples)
     verdicts: dict[str, ca.MX] = {}
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
@@ -124,7 +123,8 @@ def sample_limits_function(model: CellModel) -> ca.Function:
     """A sample's `LimitLayout` row, limits (size,), from the `PATH_OUTPUTS` of the sample."""
     workcell = model.workcell
     payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
-    pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
+    given = [ca.SX.sym(name, task.extended_size) for name in ("pose", "first", "second")]
+    pose, first, second = (values[:6] for values in given)
     box = dict(zip(BOX_OUTPUTS, box_function(workcell)(pose, first, second), strict=True))
     rotation = ca.reshape(box["rotation"], 3, 3).T
     axes = ca.mtimes(rotation, ca.DM(workcell.contacts[0].T_box_pad[:3, :3]))
@@ -132,7 +132,7 @@ def sample_limits_function(model: CellModel) -> ca.Function:
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         q.append(ca.SX.sym(f"q_{i + 1}", len(robot.velocity_max)))
         derivatives = arm_derivative_function(robot, model.robots[i], contact, f"limits_of_{i + 1}")
-        arm = dict(zip(ARM_OUTPUTS, derivatives(q[i], pose, first, second), strict=True))
+        arm = dict(zip(ARM_OUTPUTS, derivatives(q[i], *given), strict=True))
         speed.append(arm["q_first"] / ca.DM(robot.velocity_max))
         by_a.append(arm["q_first"] / ca.DM(robot.acceleration_max))
         by_w.append(arm["q_second"] / ca.DM(robot.acceleration_max))
@@ -168,7 +168,7 @@ def sample_limits_function(model: CellModel) -> ca.Function:
     row = ca.vertcat(*[ca.densify(blocks[name]) for name in layout.sizes])
     return ca.Function(
         "sample_limits",
-        [pose, first, second, *q],
+        [*given, *q],
         ca.cse([row]),
         list(PATH_OUTPUTS),
         ["limits"],

@@ -12,12 +12,13 @@ import casadi as ca
 import numpy as np
 
 from symbolic.cell_model import CellModel
-from symbolic.physics.path import path_basis, waypoint_matrix
+from symbolic.physics.path import PathBasis, extended_matrix, path_basis, waypoint_matrix
 from symbolic.physics.pressure import required_moment
 from symbolic.physics.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.robot.arm import TRACK_OUTPUTS, box_flange, follow_function, joint_torque
 from symbolic.robot.model import RobotModel
-from symbolic.workcell.records import Contact, Robot, Workcell
+from symbolic.robot.newton import following_columns
+from symbolic.workcell.records import Contact, Robot, Task, Workcell
 
 BOX_OUTPUTS = (
     "rotation",
@@ -48,9 +49,9 @@ ARM_OUTPUTS = (
 )
 """Per sample and arm, beside those of `symbolic.robot.arm.TRACK_OUTPUTS` without its joint torque.
 
-q_first, q_second (6,): derivatives of the joints by u [rad]. torque_by_... and torque_at_rest
-(6,): the bare arm's inverse dynamics is torque_by_acceleration u'' + torque_by_speed u'^2 +
-torque_at_rest [N m]. wrench_torque (36,): the (6, 6) matrix, row by row, from the contact wrench
+q_first, q_second (n,): derivatives of the joints by u [rad or m]. torque_by_... and torque_at_rest
+(n,): the bare arm's inverse dynamics is torque_by_acceleration u'' + torque_by_speed u'^2 +
+torque_at_rest [N m]. wrench_torque (6 n,): the (n, 6) matrix, row by row, from the contact wrench
 (force and moment on the box about the nominal contact point, world axes) to joint torques.
 """
 
@@ -60,8 +61,8 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
 
     Outputs (NumPy shapes, n samples): pose, pose_first, pose_second (n, 6), the box pose and its
     derivatives by u; those of `BOX_OUTPUTS`; and per arm i = 1, 2 those of
-    `symbolic.robot.arm.TRACK_OUTPUTS` without the joint torque and of `ARM_OUTPUTS`, as q_i (n, 6)
-    and so on.
+    `symbolic.robot.arm.TRACK_OUTPUTS` without the joint torque and of `ARM_OUTPUTS`, as q_i
+    (n, joints) and so on.
 
     Args:
         samples: number of samples, at least 3.
@@ -78,20 +79,34 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
     box = box_function(workcell).map(samples)(pose, first, second)
     outputs |= dict(zip(BOX_OUTPUTS, box, strict=True))
     no_wrench = ca.DM.zeros(6, samples)
+    moved = extended_motion(workcell.task, x, basis, waypoints)
     for i in (0, 1):
         robot, contact = workcell.robots[i], workcell.contacts[i]
         follow = follow_function(robot, model.robots[i], contact, samples, f"path_arm_{i + 1}")
         tracked = dict(
-            zip(TRACK_OUTPUTS, follow(ca.DM(model.start[i]), pose, no_wrench), strict=True)
+            zip(TRACK_OUTPUTS, follow(ca.DM(model.start[i]), moved[0], no_wrench), strict=True)
         )
         del tracked["joint_torque"]
         arm = arm_derivative_function(robot, model.robots[i], contact, f"path_derivatives_{i + 1}")
-        derivatives = arm.map(samples)(tracked["q"], pose, first, second)
+        derivatives = arm.map(samples)(tracked["q"], *moved)
         derived = dict(zip(ARM_OUTPUTS, derivatives, strict=True))
         outputs |= {f"{name}_{i + 1}": value for name, value in (tracked | derived).items()}
     return ca.Function(
         "path_motion", [x], list(outputs.values()), ["x"], list(outputs), {"cse": True}
     )
+
+
+def extended_motion(task: Task, x: ca.MX, basis: PathBasis, waypoints: ca.MX) -> list[ca.MX]:
+    """Extended poses and their first and second derivative by u (6 + m, n), at the samples of a
+    basis.
+
+    Args:
+        x: (n_var,) decision vector.
+        waypoints: (6, n_waypoints) of the box.
+    """
+    whole = extended_matrix(task, x, waypoints)
+    matrices = (basis.position, basis.first, basis.second)
+    return [ca.mtimes(whole, ca.DM(matrix.T)) for matrix in matrices]
 
 
 def box_function(workcell: Workcell) -> ca.Function:
@@ -124,10 +139,13 @@ def arm_derivative_function(
 ) -> ca.Function:
     """`ARM_OUTPUTS` of one sample.
 
-    Inputs: q (6,) that holds the box at the pose; pose, first, second (6,): the box pose and its
-    derivatives by u.
+    Inputs: q (n,) that holds the box at the pose; pose, first, second (6 + m,): the extended pose
+    and its derivatives by u.
     """
-    q, pose, first, second = (ca.SX.sym(name, 6) for name in ("q", "pose", "first", "second"))
+    n = model.n_joints
+    q, names = ca.SX.sym("q", n), ("pose", "first", "second")
+    given = [ca.SX.sym(each, model.pose_size) for each in names]
+    pose, first, second = (values[:6] for values in given)
     rotation = rotation_matrix(pose[3:])
     omega = angular_velocity(pose[3:], first[3:])
     alpha = angular_acceleration(pose[3:], first[3:], second[3:])
@@ -144,10 +162,16 @@ def arm_derivative_function(
         ca.mtimes(to_root, alpha),
     )
     jacobian = model.jacobian(q)
-    Q, upper = ca.qr(jacobian)
-    q_first = ca.solve(upper, ca.mtimes(Q.T, twist))
-    q_second = ca.solve(upper, ca.mtimes(Q.T, twist_rate - model.drift(q, q_first)))
-    still = ca.SX.zeros(6)
+    following = list(model.following)
+    own = [model.with_redundant(ca.SX(n, 1), moved) for moved in given[1:]]
+    if model.redundant:  # J_following qd_following = twist - J_redundant qd_redundant
+        twist -= ca.mtimes(jacobian, own[0])
+        twist_rate -= ca.mtimes(jacobian, own[1])
+    Q, upper = ca.qr(following_columns(model, jacobian))
+    q_first, q_second = own
+    q_first[following] = ca.solve(upper, ca.mtimes(Q.T, twist))
+    q_second[following] = ca.solve(upper, ca.mtimes(Q.T, twist_rate - model.drift(q, q_first)))
+    still = ca.SX.zeros(n)
     at_rest = model.inverse_dynamics(q, still, still)
     wrench = ca.SX.sym("wrench", 6)
     torque = joint_torque(robot, contact, jacobian, rotation, wrench)
@@ -161,8 +185,8 @@ def arm_derivative_function(
     }
     return ca.Function(
         name,
-        [q, pose, first, second],
+        [q, *given],
         ca.cse([ca.densify(outputs[name]) for name in ARM_OUTPUTS]),
-        ["q", "pose", "first", "second"],
+        ["q", *names],
         list(ARM_OUTPUTS),
     )

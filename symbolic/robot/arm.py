@@ -1,8 +1,9 @@
 """One arm that follows the box: inverse kinematics along the samples, limits and joint load.
 
 Paper Eqs. 29-33 and 61-62. The flange's target follows from the box pose alone, so both arms
-keep the relative grasp exactly. Newton's method is warm started by quadratic extrapolation of the
-previous samples; what it reaches is measured, never assumed. Two cheap steps suffice nearly
+keep the relative grasp exactly; an arm's redundant joints are where the extended pose says
+(`RobotModel`), the other six follow. Newton's method is warm started by quadratic extrapolation of
+the previous samples; what it reaches is measured, never assumed. Two cheap steps suffice nearly
 everywhere, a third is made where the second started too far away, and where that is not enough,
 `NEWTON_STEPS` steps by the QR factors have the last word: a sample counts as lost only if they do
 not reach it either.
@@ -18,7 +19,7 @@ from symbolic.physics.pose import inverse
 from symbolic.physics.rotation import rotation_matrix
 from symbolic.robot.model import RobotModel
 from symbolic.robot.newton import MAX_JOINT_STEP as MAX_JOINT_STEP
-from symbolic.robot.newton import block_step
+from symbolic.robot.newton import block_step, following_columns
 from symbolic.robot.newton import manipulability as manipulability
 from symbolic.robot.newton import newton_step as newton_step
 from symbolic.robot.newton import pose_error as pose_error
@@ -30,6 +31,10 @@ Contacts = tuple[Contact, Contact]
 
 NEWTON_STEPS = 3
 """Newton steps per sample; extrapolation brings the start within their basin."""
+
+BEGIN_STEPS = 12
+"""Newton steps in which an arm's redundant joints go from the start posture to where a candidate
+has them at the first sample."""
 
 CHEAP_STEPS = 2
 """Newton steps by blocks that every sample gets."""
@@ -47,10 +52,11 @@ REACH_TOLERANCE = 1e-6
 TRACK_OUTPUTS = ("q", "ik_residual", "lost", "limit_margin", "manipulability", "joint_torque")
 """Outputs of `track_function` after the state.
 
-q (6,) [rad], held at the last reached sample once the path is lost. ik_residual: pose residual
-of q [m, rad]. lost: 0 while this and all earlier samples were reached without a jump, else 1.
-limit_margin: least distance to a joint limit, negative beyond it [rad]. manipulability: |det J|
-of the flange [m^3]. joint_torque (6,): torque that exerts the contact wrench [N m].
+q (n,) [rad, or m where a joint slides], held at the last reached sample once the path is lost.
+ik_residual: pose residual of q [m, rad]. lost: 0 while this and all earlier samples were reached
+without a jump, else 1. limit_margin: least distance to a joint limit, negative beyond it [rad].
+manipulability: |det J| of the flange by the six joints that follow [m^3]. joint_torque (n,): torque
+that exerts the contact wrench [N m, or N].
 """
 
 
@@ -85,10 +91,10 @@ def limit_margin(robot: Robot, q: ca.SX) -> ca.SX:
 def joint_torque(
     robot: Robot, contact: Contact, jacobian: ca.SX, rotation: ca.SX, wrench: ca.SX
 ) -> ca.SX:
-    """Joint torques (6,) that exert a contact wrench on the box (paper Eq. 45) [N m].
+    """Joint torques (n,) that exert a contact wrench on the box (paper Eq. 45) [N m].
 
     Args:
-        jacobian: (6, 6) of the flange in the robot's root frame, linear rows first.
+        jacobian: (6, n) of the flange in the robot's root frame, linear rows first.
         rotation: R_world_box (3, 3).
         wrench: (6,) on the box about the nominal contact point, world axes.
     """
@@ -103,21 +109,23 @@ def joint_torque(
 def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
     """One sample of an arm's motion, to be accumulated along the path.
 
-    Inputs: state (19,) = joints at the previous sample, their last change, that change's own
-    change, and `lost`; pose (6,) of the box; wrench (6,) on the box about the nominal contact
-    point. Outputs: the next state, then `TRACK_OUTPUTS`.
+    Inputs: state (3 n + 1,) = joints at the previous sample, their last change, that change's own
+    change, and `lost`; the extended pose; wrench (6,) on the box about the nominal contact point.
+    Outputs: the next state, then `TRACK_OUTPUTS`.
     """
-    state, pose, wrench = ca.MX.sym("state", 19), ca.MX.sym("pose", 6), ca.MX.sym("wrench", 6)
+    n = model.n_joints
+    state, pose = ca.MX.sym("state", 3 * n + 1), ca.MX.sym("pose", model.pose_size)
+    wrench = ca.MX.sym("wrench", 6)
     parts = _track_parts(robot, model, contact)
-    previous, lost = state[:6], state[18]
+    previous, lost = state[:n], state[3 * n]
     rotation, R_target, p_target = parts["target"](pose)
     target = (R_target, p_target)
-    q, before = parts["approach"](state, *target)
+    q, before = parts["approach"](state, pose, *target)
     following = lost < 0.5
     q = parts["closer"](ca.logic_and(following, ca.logic_not(before <= FAR)), q, *target)
     found = parts["place"](q, *target)
     unsure = ca.logic_and(following, ca.logic_not(found[1] <= SURE))
-    found = parts["again"](unsure, state, *target, *found)
+    found = parts["again"](unsure, state, pose, *target, *found)
     jump = ca.norm_inf(found[0] - previous)
     arrived = ca.logic_and(found[1] <= REACH_TOLERANCE, jump <= MAX_JOINT_STEP)
     lost = ca.fmax(lost, ca.logic_not(arrived))
@@ -128,7 +136,7 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
         name,
         [state, pose, wrench],
         [
-            ca.vertcat(q, change, change - state[6:12], lost),
+            ca.vertcat(q, change, change - state[n : 2 * n], lost),
             q,
             residual,
             lost,
@@ -142,28 +150,30 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
 def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str, ca.Function]:
     """The steps of `track_function`; those that begin with a condition do nothing without it.
 
-    target: pose -> R_world_box, and the flange's target. approach: state, target -> joints after
-    `CHEAP_STEPS`, the residual before the last. closer: joints, target -> joints one step on.
-    place: joints, target -> joints, residual, jacobian. again: state, target and what `place` found
-    -> the better of that and `NEWTON_STEPS` steps by QR. held: previous joints, target and what was
-    found -> what `place` finds at the previous joints. measures: joints, jacobian, R_world_box,
-    wrench -> limit margin, manipulability, joint torque.
+    target: pose -> R_world_box, and the flange's target. approach: state, pose, target -> joints
+    after `CHEAP_STEPS`, the residual before the last. closer: joints, target -> joints one step on.
+    place: joints, target -> joints, residual, jacobian. again: state, pose, target and what `place`
+    found -> the better of that and `NEWTON_STEPS` steps by QR. held: previous joints, target and
+    what was found -> what `place` finds at the previous joints. measures: joints, jacobian,
+    R_world_box, wrench -> limit margin, manipulability, joint torque.
     """
-    state, pose, wrench = ca.SX.sym("state", 19), ca.SX.sym("pose", 6), ca.SX.sym("wrench", 6)
-    q, R, p = ca.SX.sym("q", 6), ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
-    residual, jacobian = ca.SX.sym("residual"), ca.SX.sym("jacobian", 6, 6)
-    start = ca.SX.sym("start", 6)
-    rotation = rotation_matrix(pose[3:])
-    previous, change = state[:6], state[6:12]
+    n = model.n_joints
+    state, pose = ca.SX.sym("state", 3 * n + 1), ca.SX.sym("pose", model.pose_size)
+    wrench = ca.SX.sym("wrench", 6)
+    q, R, p = ca.SX.sym("q", n), ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
+    residual, jacobian = ca.SX.sym("residual"), ca.SX.sym("jacobian", 6, n)
+    start = ca.SX.sym("start", n)
+    rotation = rotation_matrix(pose[3:6])
+    previous, change = state[:n], state[n : 2 * n]
 
-    near = previous + (change + state[12:18])
+    near = model.with_redundant(previous + (change + state[2 * n : 3 * n]), pose)
     before = ca.SX(0)
     for _ in range(CHEAP_STEPS):
         near, before = block_step(model, near, R, p)
     place = _function("place", [q, R, p], _placed(model, q, R, p))
     found = [q, residual, jacobian]
 
-    other = previous + change
+    other = model.with_redundant(previous + change, pose)
     for _ in range(NEWTON_STEPS):
         other = newton_step(model, other, R, p)
     anew = _placed(model, other, R, p)
@@ -171,24 +181,24 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
     better = [ca.if_else(keep, a, b) for a, b in zip(found, anew, strict=True)]
     measures = [
         limit_margin(robot, q),
-        manipulability(jacobian),
+        manipulability(following_columns(model, jacobian)),
         joint_torque(robot, contact, jacobian, R, wrench),
     ]
     return {
         "target": _function(
             "target", [pose], [rotation, *flange_target(robot, contact, pose[:3], rotation)]
         ),
-        "approach": _function("approach", [state, R, p], [near, before]),
+        "approach": _function("approach", [state, pose, R, p], [near, before]),
         "closer": _where("closer", [q, R, p], [block_step(model, q, R, p)[0]], [q]),
         "place": place,
-        "again": _where("again", [state, R, p, *found], better, found),
+        "again": _where("again", [state, pose, R, p, *found], better, found),
         "held": _where("held", [start, R, p, *found], _placed(model, start, R, p), found),
         "measures": _function("measures", [q, jacobian, R, wrench], measures),
     }
 
 
 def _placed(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> list[ca.SX]:
-    """Joints (6,), their pose residual and their Jacobian (6, 6)."""
+    """Joints (n,), their pose residual and their Jacobian (6, n)."""
     R, p, jacobian = model.kinematics(q)
     return [q, pose_error(R_target, p_target, R, p)[1], jacobian]
 
@@ -211,16 +221,17 @@ def follow_function(
 ) -> ca.Function:
     """An arm's motion along all samples of a box path.
 
-    Inputs: start (6,), joints at the first pose [rad]; pose (6, samples) of the box; wrench
+    Inputs: start (n,), joints at the first box pose [rad]; pose (6 + m, samples), extended; wrench
     (6, samples) on the box about the nominal contact point. Outputs: `TRACK_OUTPUTS`.
 
     The second sample has no motion before it to extrapolate: Newton steps from the start posture
     predict it, and what they find takes the extrapolation's place.
     """
-    start, pose = ca.MX.sym("start", 6), ca.MX.sym("pose", 6, samples)
+    start, pose = ca.MX.sym("start", model.n_joints), ca.MX.sym("pose", model.pose_size, samples)
     wrench = ca.MX.sym("wrench", 6, samples)
     track = track_function(robot, model, contact, f"{name}_sample")
-    first = track(start_state(start), pose[:, 0], wrench[:, 0])
+    begin = start_function(robot, model, contact, f"{name}_start")
+    first = track(begin(start, pose[:, 0]), pose[:, 0], wrench[:, 0])
     predict = prediction_function(robot, model, contact, f"{name}_prediction")
     state = predict(first[0], pose[:, 1])
     rest = track.mapaccum(f"{name}_samples", samples - 1)(state, pose[:, 1:], wrench[:, 1:])
@@ -233,9 +244,27 @@ def follow_function(
     )
 
 
-def start_state(start: Expression) -> Expression:
-    """State of `track_function` before the first sample, from its joints (6,)."""
-    return ca.vertcat(start, type(start).zeros(13))
+def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
+    """State of `track_function` before the first sample.
+
+    Inputs: start (n,), joints at the first box pose; extended, the first extended pose. An arm's
+    redundant joints move from the one to the other, evenly, in `BEGIN_STEPS` Newton steps that keep
+    the box.
+    """
+    n = model.n_joints
+    start, pose = ca.MX.sym("start", n), ca.MX.sym("pose", model.pose_size)
+    q: Expression = start
+    if model.redundant:
+        q_start, at = ca.SX.sym("start", n), ca.SX.sym("q", n)
+        given = ca.SX.sym("pose", model.pose_size)
+        target = flange_target(robot, contact, given[:3], rotation_matrix(given[3:6]))
+        away = (model.with_redundant(q_start, given) - q_start) / BEGIN_STEPS
+        moved = newton_step(model, at + away, *target)
+        move = _function(f"{name}_step", [q_start, at, given], [moved])
+        for _ in range(BEGIN_STEPS):
+            q = move(start, q, pose)
+    state = ca.vertcat(q, ca.MX.zeros(2 * n + 1))
+    return ca.Function(name, [start, pose], [state], ["start", "pose"], ["state"])
 
 
 def prediction_function(
@@ -243,25 +272,27 @@ def prediction_function(
 ) -> ca.Function:
     """State of `track_function` after the first sample -> one that predicts the second.
 
-    Inputs: state (19,); pose (6,) of the box at the second sample.
+    Inputs: state (3 n + 1,); the extended pose of the second sample.
     """
-    state, pose = ca.SX.sym("state", 19), ca.SX.sym("pose", 6)
-    R_target, p_target = flange_target(robot, contact, pose[:3], rotation_matrix(pose[3:]))
-    q = start = state[:6]
+    n = model.n_joints
+    state, pose = ca.SX.sym("state", 3 * n + 1), ca.SX.sym("pose", model.pose_size)
+    R_target, p_target = flange_target(robot, contact, pose[:3], rotation_matrix(pose[3:6]))
+    start = state[:n]
+    q = model.with_redundant(start, pose)
     for _ in range(NEWTON_STEPS):
         q = newton_step(model, q, R_target, p_target)
-    predicting = ca.vertcat(start, q - start, ca.SX.zeros(6), state[18])
+    predicting = ca.vertcat(start, q - start, ca.SX.zeros(n), state[3 * n])
     return ca.Function(name, [state, pose], ca.cse([predicting]), ["state", "pose"], ["predicting"])
 
 
 def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Function:
     """Both arms' postures at one box pose, from nearby joint positions.
 
-    Inputs: pose (6,) of the box; guess_1, guess_2 (6,) [rad]. Outputs: q_1, q_2 (6,) after
-    `NEWTON_STEPS`; residual_1, residual_2, their pose residuals [m, rad].
+    Inputs: pose (6,) of the box; guess_1, guess_2 (n,) [rad], whose redundant joints stay. Outputs:
+    q_1, q_2 (n,) after `NEWTON_STEPS`; residual_1, residual_2, their pose residuals [m, rad].
     """
     pose = ca.SX.sym("pose", 6)
-    guesses = ca.SX.sym("guess_1", 6), ca.SX.sym("guess_2", 6)
+    guesses = [ca.SX.sym(f"guess_{i + 1}", model.n_joints) for i, model in enumerate(models)]
     rotation = rotation_matrix(pose[3:])
     postures, residuals = [], []
     for robot, model, contact, q in zip(robots, models, contacts, guesses, strict=True):

@@ -1,14 +1,16 @@
 """Every inverse-kinematics branch of an arm at a pose, and the ranking of start branches.
 
-A six-joint arm reaches a pose in up to sixteen ways. No closed form covers every arm (the GoFa's
+Six joints reach a pose in up to sixteen ways; an arm's redundant joints are where the hand-made
+trajectory has them at the start. No closed form covers every arm (the GoFa's
 wrist is offset), so Newton's method is run from a low-discrepancy set of starts over the whole
 joint range, all at once, and the distinct solutions are collected; each one's residual is checked.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
@@ -19,8 +21,8 @@ from symbolic.physics.pose import inverse, pose_matrix
 from symbolic.physics.time_law import timed_path
 from symbolic.robot.arm import TRACK_OUTPUTS, box_flange, follow_function
 from symbolic.robot.model import RobotModel
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.records import Contact, Robot, Workcell
+from symbolic.workcell.decision import extended_waypoints, initial_decision
+from symbolic.workcell.records import POSE_SIZE, Contact, Robot, Workcell
 
 N_STARTS = 1024
 """Starts of the search; a power of two keeps the Sobol points balanced."""
@@ -44,14 +46,14 @@ class StartBranch:
     """One way for one arm to hold the box at the start, and how the carry goes from there.
 
     Attributes:
-        q: (6,) joint positions at the first waypoint [rad].
+        q: (n,) joint positions at the first waypoint [rad].
         kept: samples of the hand-made trajectory that are reached, within limits and away from
             singularities, counted until the first that is not.
         clearance: least clearance bound of this arm along that trajectory [m]; infinite where
             no bound is given.
         limit_margin: least distance to a joint limit along it [rad].
         manipulability: least |det J| along it [m^3].
-        path: (n, 6), the joint path along it [rad].
+        path: (samples, n), the joint path along it [rad].
     """
 
     q: Array
@@ -73,26 +75,35 @@ class StartBranch:
 
 
 def inverse_kinematics(
-    robot: Robot, model: RobotModel, T_root_flange: Array, n_starts: int = N_STARTS
+    robot: Robot,
+    model: RobotModel,
+    T_root_flange: Array,
+    n_starts: int = N_STARTS,
+    redundant: Mapping[int, float] = MappingProxyType({}),
 ) -> Array:
     """All joint positions found for a flange pose, full turns of a joint counted once.
 
     Args:
         T_root_flange: (4, 4) wanted flange placement in the robot's root frame.
         n_starts: number of starts of the search, a power of two.
+        redundant: positions of the arm's redundant joints by their indices [rad or m].
 
     Returns:
-        (m, 6) [rad], sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`
+        (m, n) [rad], sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`
         and each joint on the turn that is nearest the middle of its range; postures with a joint
         that no turn brings within its limits are left out.
     """
     # Not imported at the top: it takes long to start, and a model from the cache needs no search.
     from scipy.stats import qmc
 
+    following = list(model.following)
     centre = (robot.position_lower + robot.position_upper) / 2.0
-    half = np.minimum((robot.position_upper - robot.position_lower) / 2.0, np.pi)
-    q = centre + (2.0 * qmc.Sobol(6, scramble=False).random(n_starts) - 1.0) * half
-    solved = [np.empty((0, 6))]
+    half = np.minimum((robot.position_upper - robot.position_lower) / 2.0, np.pi)[following]
+    q = np.tile(centre, (n_starts, 1))
+    q[:, following] += (2.0 * qmc.Sobol(6, scramble=False).random(n_starts) - 1.0) * half
+    for joint, value in redundant.items():
+        q[:, joint] = value
+    solved = [np.empty((0, model.n_joints))]
     for _ in range(MAX_ITERATIONS):
         error, jacobian, residual = _batch_error(model, q, T_root_flange)
         arrived = residual < SOLUTION_TOLERANCE
@@ -107,19 +118,24 @@ def inverse_kinematics(
         normal = np.einsum("nki,nkj->nij", jacobian, jacobian) + damping
         step = np.linalg.solve(normal, np.einsum("nki,nk->ni", jacobian, error)[..., None])[..., 0]
         largest = np.maximum(np.abs(step).max(axis=1, keepdims=True), STEP_LIMIT)
-        q = q + step * (STEP_LIMIT / largest)
+        q = q.copy()
+        q[:, following] += step * (STEP_LIMIT / largest)
     distinct = _distinct(np.concatenate(solved))
-    central = distinct + _central_turns(robot, distinct, distinct)
+    central = distinct + _central_turns(robot, model, distinct, distinct)
     within = (central >= robot.position_lower) & (central <= robot.position_upper)
     possible = central[within.all(axis=1)]
     return possible[np.lexsort(np.round(possible, 6).T[::-1])]
 
 
 def _batch_error(model: RobotModel, q: Array, target: Array) -> tuple[Array, Array, Array]:
-    """Newton's right-hand side (n, 6), Jacobian (n, 6, 6) and pose residual (n,)."""
+    """Newton's right-hand side (n, 6), Jacobian (n, 6, 6) by the joints that follow, and pose
+    residual (n,)."""
     n = len(q)
     R, p = model.placement.map(n)(q.T)
-    jacobian = np.array(model.jacobian.map(n)(q.T)).reshape(6, n, 6).transpose(1, 0, 2)
+    whole = np.array(model.jacobian.map(n)(q.T)).reshape(6, n, model.n_joints)
+    if model.redundant:
+        whole = np.delete(whole, [joint for joint, _ in model.redundant], axis=2)
+    jacobian = whole.transpose(1, 0, 2)
     rotation = np.array(R).reshape(3, n, 3).transpose(1, 0, 2)
     dR = np.einsum("ij,nkj->nik", target[:3, :3], rotation)
     axis = np.stack(
@@ -138,13 +154,15 @@ def _distinct(q: Array) -> Array:
         turns = [np.abs(np.remainder(row - other + np.pi, 2 * np.pi) - np.pi) for other in kept]
         if not any(np.all(turn < SAME_BRANCH) for turn in turns):
             kept.append(row)
-    return np.array(kept).reshape(-1, 6)
+    return np.array(kept).reshape(-1, q.shape[1])
 
 
-def _central_turns(robot: Robot, least: Array, greatest: Array) -> Array:
-    """Full turns [rad] that move a joint range nearest to the middle of the joint's limits."""
+def _central_turns(robot: Robot, model: RobotModel, least: Array, greatest: Array) -> Array:
+    """Full turns [rad] that move a joint range nearest to the middle of the joint's limits; none of
+    joints that slide and of redundant ones."""
     middle = (robot.position_lower + robot.position_upper) / 2.0
-    turns = np.round((middle - (least + greatest) / 2.0) / (2.0 * np.pi))
+    free = [turns and k in model.following for k, turns in enumerate(model.turning)]
+    turns = np.array(free) * np.round((middle - (least + greatest) / 2.0) / (2.0 * np.pi))
     return np.asarray(2.0 * np.pi * turns, dtype=np.float64)
 
 
@@ -161,19 +179,21 @@ def start_branches(
 
     Args:
         arm: 0 or 1.
-        clearance: from box poses (n, 6) and joint positions (n, 6) to the arm's least clearance
-            bound [m].
+        clearance: from box poses (n, 6) and joint positions (n, joints) to the arm's least
+            clearance bound [m].
     """
     robot, contact = workcell.robots[arm], workcell.contacts[arm]
     poses = initial_poses(workcell)
+    extended = np.column_stack([poses, initial_redundant(workcell)])
     target = start_flange(workcell, robot, contact)
     follow = follow_function(robot, model, contact, len(poses), f"follow_{arm + 1}")
     branches = []
-    for q in inverse_kinematics(robot, model, target):
-        tracked = follow(q, poses.T, np.zeros((6, len(poses))))
+    start = {joint: float(extended[0, place]) for joint, place in model.redundant}
+    for q in inverse_kinematics(robot, model, target, redundant=start):
+        tracked = follow(q, extended.T, np.zeros((6, len(poses))))
         result = {name: np.array(value) for name, value in zip(TRACK_OUTPUTS, tracked, strict=True)}
         tracked_path = result["q"].T
-        turns = _central_turns(robot, tracked_path.min(axis=0), tracked_path.max(axis=0))
+        turns = _central_turns(robot, model, tracked_path.min(axis=0), tracked_path.max(axis=0))
         # A path that leaves the limits may pull the start out of them, where the search found it.
         inside = (q + turns >= robot.position_lower) & (q + turns <= robot.position_upper)
         turns = np.where(inside, turns, 0.0)
@@ -201,6 +221,13 @@ def start_flange(workcell: Workcell, robot: Robot, contact: Contact) -> Array:
     start = workcell.task.waypoints[0].lower
     T_world_box = pose_matrix(start[:3], start[3:])
     return inverse(robot.T_world_base) @ T_world_box @ box_flange(robot, contact)
+
+
+def initial_redundant(workcell: Workcell) -> Array:
+    """Sampled values (n, m) of the redundant joints in the hand-made initial trajectory."""
+    task = workcell.task
+    values = extended_waypoints(task, initial_decision(task))[:, POSE_SIZE:]
+    return np.asarray(sample_basis(task).position @ values)
 
 
 def initial_poses(workcell: Workcell) -> Array:

@@ -1,8 +1,8 @@
 """Which links of a robot's description belong to which arm, where one machine has both arms.
 
 Two robots of a workcell that name one description at one place are the two arms of one machine.
-Every link is then modelled once: behind an arm's first moving joint it belongs to that arm, and
-what neither arm moves (torso, base, head) stands still for both.
+Every link is then modelled once: behind an arm's first moving joint it belongs to that arm, what
+a joint of both moves (a lift, a torso) to the first, and what neither moves stands still for both.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ class ArmLinks:
     """The links with collision shapes that are modelled as an arm's, in the order of its file.
 
     Attributes:
-        moved: links behind the arm's first moving joint.
+        moved: links behind the arm's first moving joint; those that only common joints move are
+            listed with the first arm alone.
         still: links that stand still, listed with one arm only.
         mount: the link with shapes that the arm is mounted on; '' where there is none.
     """
@@ -53,11 +54,25 @@ def arm_links(robots: Arms, i: int) -> ArmLinks:
         RobotModelError: see `symbolic.robot.urdf.arm_model`.
     """
     moved, still = _sorted_links(robots[i])
-    mount = _mount(robots[i], still)
+    shared = _moved_by(robots[i], common_joints(robots))
+    mount = _mount(robots[i], (*still, *shared))
     if one_machine(robots):
+        moved = moved if i == 0 else tuple(link for link in moved if link not in shared)
         _, still_for_other = _sorted_links(robots[1 - i])
         still = tuple(link for link in still if link in still_for_other) if i == 0 else ()
     return ArmLinks(moved, still, mount)
+
+
+def common_joints(robots: Arms) -> tuple[str, ...]:
+    """Joints that move both arms of one machine, in their order.
+
+    Raises:
+        RobotModelError: see `symbolic.robot.urdf.arm_model`.
+    """
+    if not one_machine(robots):
+        return ()
+    first, second = (tuple(arm_model(robot).names)[1:] for robot in robots)
+    return tuple(name for name in first if name in second)
 
 
 def machine_problem(robots: Arms) -> str:
@@ -74,15 +89,18 @@ def machine_problem(robots: Arms) -> str:
         moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
         chains.append(moving)
         held.append(dict(held_joints(urdf, moving, robot.locked_joints)))
-    common = [name for name in chains[0] if name in chains[1]]
-    if common:
-        return (
-            f"both chains move joint {common[0]!r}; allowed are arms that move apart from one "
-            "another: begin the chains behind it, or hold it with both robots (locked_joints)"
-        )
+    for k, robot in enumerate(robots):
+        urdf = robot_urdf(robot)
+        for name in chains[1 - k]:
+            if name not in chains[k] and _is_behind(urdf, robot.flange, (name,)):
+                return (
+                    f"joint {name!r} moves robot {robot.name!r} too, whose chain begins behind it; "
+                    "begin both chains before it, or hold it with both robots (locked_joints)"
+                )
     moved = {*chains[0], *chains[1]}
     for name, position in held[0].items():
-        if name in moved or _is_behind(robot_urdf(robots[0]), name, moved):
+        urdf = robot_urdf(robots[0])
+        if name in moved or _is_behind(urdf, urdf.joints[name].parent, moved):
             continue
         other = held[1].get(name, position)
         if other != position:
@@ -94,10 +112,9 @@ def machine_problem(robots: Arms) -> str:
     return ""
 
 
-def _is_behind(urdf: Urdf, name: str, joints: Collection[str]) -> bool:
-    """Whether a joint hangs on one of these joints."""
+def _is_behind(urdf: Urdf, link: str, joints: Collection[str]) -> bool:
+    """Whether a link hangs on one of these joints."""
     moved_by = {joint.child: other for other, joint in urdf.joints.items()}
-    link = urdf.joints[name].parent
     while link in moved_by:
         if moved_by[link] in joints:
             return True
@@ -116,8 +133,20 @@ def _sorted_links(robot: Robot) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return tuple(moved), tuple(still)
 
 
+def _moved_by(robot: Robot, joints: tuple[str, ...]) -> tuple[str, ...]:
+    """Links with shapes that hang on one of these joints and on no later one of the arm."""
+    if not joints:
+        return ()
+    model = arm_model(robot)
+    return tuple(
+        link
+        for link in robot_urdf(robot).collision_links
+        if model.names[model.frames[link_frame(model, link)].parentJoint] in joints
+    )
+
+
 def _mount(robot: Robot, still: tuple[str, ...]) -> str:
-    """The last link with shapes on the way from the root to the arm's first moving joint."""
+    """The last link with shapes on the way from the root to the arm's first own joint."""
     urdf = robot_urdf(robot)
     parents = {joint.child: joint.parent for joint in urdf.joints.values()}
     link = robot.flange

@@ -14,9 +14,10 @@ import casadi
 import pinocchio
 
 from symbolic.array import Array
+from symbolic.expression import Expression
 from symbolic.robot import bridge
-from symbolic.robot.urdf import N_JOINTS, arm_model, link_frame
-from symbolic.workcell.records import Robot
+from symbolic.robot.urdf import arm_model, link_frame
+from symbolic.workcell.records import POSE_SIZE, Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,23 +25,57 @@ class RobotModel:
     """An arm's numeric model and, built on first use, its CasADi functions.
 
     The functions are `casadi.Function` objects over SX with dense outputs; call them on SX, MX or
-    numbers. q (6,) [rad], v (6,) [rad/s], a (6,) [rad/s^2].
+    numbers. q (n,) [rad, or m where a joint slides], v (n,) and a (n,) its time derivatives.
+
+    What an arm follows is the extended pose (6 + m,): the box pose, then the values of the cell's m
+    redundant joints (`symbolic.workcell.records.RedundantJoint`). The arm's own redundant joints
+    are where it says; the other six follow the box.
 
     Attributes:
         name: the robot's name in the workcell.
         model: Pinocchio's numeric model with the locked joints removed; not to be modified. Its
             gravity is expressed in the root.
         flange: name of the flange frame.
+        redundant: of each redundant joint of the arm its index in q and its place in the extended
+            pose.
+        pose_size: entries of the extended pose, 6 + m.
     """
 
     name: str
     model: pinocchio.Model
     flange: str
+    redundant: tuple[tuple[int, int], ...] = ()
+    pose_size: int = POSE_SIZE
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """The six joints in the order of q."""
+        """The n joints in the order of q."""
         return tuple(self.model.names)[1:]
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints."""
+        return int(self.model.nq)
+
+    @property
+    def following(self) -> tuple[int, ...]:
+        """The six joints that follow the box, by their indices in q."""
+        set_apart = [joint for joint, _ in self.redundant]
+        return tuple(k for k in range(self.n_joints) if k not in set_apart)
+
+    @property
+    def turning(self) -> tuple[bool, ...]:
+        """Which joints turn; the others slide."""
+        return tuple(str(j.shortname()).startswith("JointModelR") for j in self.model.joints[1:])
+
+    def with_redundant(self, q: Expression, extended: Expression) -> Expression:
+        """Joints (n,) whose redundant ones are where the extended pose says."""
+        columns = dict(self.redundant)
+        if not columns:
+            return q
+        return casadi.vertcat(
+            *[extended[columns[k]] if k in columns else q[k] for k in range(self.n_joints)]
+        )
 
     @property
     def flange_id(self) -> int:
@@ -49,14 +84,14 @@ class RobotModel:
 
     @cached_property
     def kinematics(self) -> casadi.Function:
-        """q -> rotation (3, 3), position (3,) [m], jacobian (6, 6): `placement` and `jacobian`
+        """q -> rotation (3, 3), position (3,) [m], jacobian (6, n): `placement` and `jacobian`
         in one, sharing their common terms."""
         return bridge.frame_kinematics(self.model, self.flange_id)
 
     @cached_property
     def placement(self) -> casadi.Function:
         """q -> rotation (3, 3) and position (3,) [m] of the flange in the root."""
-        q = casadi.SX.sym("q", N_JOINTS)
+        q = casadi.SX.sym("q", self.n_joints)
         rotation, position, _ = self.kinematics(q)
         return casadi.Function(
             "placement", [q], [rotation, position], ["q"], ["rotation", "position"]
@@ -64,9 +99,9 @@ class RobotModel:
 
     @cached_property
     def jacobian(self) -> casadi.Function:
-        """q -> jacobian (6, 6) of the flange: rows 0-2 the linear velocity of its origin, rows 3-5
+        """q -> jacobian (6, n) of the flange: rows 0-2 the linear velocity of its origin, rows 3-5
         its angular velocity, both along the root's axes."""
-        q = casadi.SX.sym("q", N_JOINTS)
+        q = casadi.SX.sym("q", self.n_joints)
         return casadi.Function("jacobian", [q], [self.kinematics(q)[2]], ["q"], ["jacobian"])
 
     @cached_property
@@ -77,26 +112,32 @@ class RobotModel:
 
     @cached_property
     def joint_placements(self) -> casadi.Function:
-        """q -> rotations (3, 18) and positions (3, 6) [m] of the six joint frames in the root,
+        """q -> rotations (3, 3 n) and positions (3, n) [m] of the joint frames in the root,
         side by side in the order of q."""
         return bridge.joint_placements(self.model)
 
     @cached_property
     def inverse_dynamics(self) -> casadi.Function:
-        """q, v, a -> torque (6,) [N m] that moves the bare arm, gravity included."""
+        """q, v, a -> torque (n,) [N m, or N] that moves the bare arm, gravity included."""
         return bridge.inverse_dynamics(self.model)
 
 
-def build_robot_model(robot: Robot) -> RobotModel:
+def build_robot_model(
+    robot: Robot, redundant: tuple[tuple[int, int], ...] = (), pose_size: int = POSE_SIZE
+) -> RobotModel:
     """Read a robot's URDF and prepare its functions.
 
+    Args:
+        robot: the arm.
+        redundant, pose_size: see `RobotModel`; `symbolic.workcell.records.Task` gives them.
+
     Raises:
-        RobotModelError: the URDF cannot be read, or does not describe a serial arm of six revolute
-            joints that ends in the flange.
+        RobotModelError: the URDF cannot be read, or does not describe a serial arm that ends in
+            the flange.
     """
     model = arm_model(robot)
     model.gravity.linear = gravity_in_root(robot.T_world_base)
-    return RobotModel(robot.name, model, robot.flange)
+    return RobotModel(robot.name, model, robot.flange, redundant, pose_size)
 
 
 def gravity_in_root(T_world_base: Array) -> Array:

@@ -1,4 +1,7 @@
-"""Newton steps of a six-joint arm's inverse kinematics, and how near a posture is to singular."""
+"""Newton steps of an arm's inverse kinematics, and how near a posture is to singular.
+
+Six joints follow the flange; an arm's redundant ones stay where they are.
+"""
 
 from __future__ import annotations
 
@@ -34,24 +37,25 @@ def pose_error(R_target: ca.SX, p_target: ca.SX, R: ca.SX, p: ca.SX) -> tuple[ca
 
 
 def newton_step(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> ca.SX:
-    """One safeguarded Newton step of the inverse kinematics; q (6,) to q (6,)."""
+    """One safeguarded Newton step of the inverse kinematics; q (n,) to q (n,)."""
     R, p = model.placement(q)
     error, _ = pose_error(R_target, p_target, R, p)
-    Q, upper = ca.qr(model.jacobian(q))
+    Q, upper = ca.qr(following_columns(model, model.jacobian(q)))
     step = ca.solve(upper, ca.mtimes(Q.T, error))
-    return _limited(q, step)
+    return _limited(model, q, step)
 
 
 def block_step(
     model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """A Newton step of a six-joint arm with fewer operations, and the pose residual before it.
+    """A Newton step of the six joints with fewer operations, and the pose residual before it.
 
     The angular rows give three joints in terms of the others by Cramer's rule, and the rest is
     again a 3 by 3 system. Without pivoting: not to be trusted where the three axes nearly lie in a
     plane, of which the next residual tells.
     """
-    R, p, jacobian = model.kinematics(q)
+    R, p, whole = model.kinematics(q)
+    jacobian = following_columns(model, whole)
     error, residual = pose_error(R_target, p_target, R, p)
     inner = _independent_axes(model)
     outer = list(_others(inner))
@@ -66,7 +70,7 @@ def block_step(
     for group, values in ((outer, moved), (inner, rest)):
         for k, joint in enumerate(group):
             step[joint] = values[k]
-    return _limited(q, ca.vertcat(*step)), residual
+    return _limited(model, q, ca.vertcat(*step)), residual
 
 
 def _cramer(A: ca.SX) -> Callable[[ca.SX], ca.SX]:
@@ -80,11 +84,12 @@ def _cramer(A: ca.SX) -> Callable[[ca.SX], ca.SX]:
 
 @lru_cache(maxsize=8)
 def _independent_axes(model: RobotModel) -> tuple[int, ...]:
-    """The three joints whose axes keep farthest from a common plane, in most postures."""
+    """Of the six joints the three whose axes keep farthest from a common plane, in most
+    postures."""
     lower, upper = model.model.lowerPositionLimit, model.model.upperPositionLimit
-    postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, 6))
-    jacobians = np.array(model.jacobian.map(_POSTURES)(postures.T)).reshape(6, _POSTURES, 6)
-    axes = jacobians[3:].transpose(1, 0, 2)
+    postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, len(lower)))
+    jacobians = np.array(model.jacobian.map(_POSTURES)(postures.T)).reshape(6, _POSTURES, -1)
+    axes = jacobians[3:, :, list(model.following)].transpose(1, 0, 2)
 
     def volume(joints: tuple[int, ...]) -> float:
         return float(np.quantile(np.abs(np.linalg.det(axes[:, :, list(joints)])), 0.1))
@@ -92,17 +97,25 @@ def _independent_axes(model: RobotModel) -> tuple[int, ...]:
     return max(combinations(range(6), 3), key=volume)
 
 
-def _limited(q: ca.SX, step: ca.SX) -> ca.SX:
-    """q after a step that is shortened to `MAX_JOINT_STEP`."""
+def following_columns(model: RobotModel, jacobian: ca.SX) -> ca.SX:
+    """The columns (6, 6) of a Jacobian (6, n) that belong to the joints that follow the box."""
+    return jacobian[:, list(model.following)] if model.redundant else jacobian
+
+
+def _limited(model: RobotModel, q: ca.SX, step: ca.SX) -> ca.SX:
+    """q after a step of the six joints that is shortened to `MAX_JOINT_STEP`."""
     largest = ca.norm_inf(step)
     # At a singular posture the step is not a number: stay, and let the residual tell.
     usable = ca.norm_1(step) < 1e9
     scale = MAX_JOINT_STEP / ca.fmax(largest, MAX_JOINT_STEP)
-    return ca.vertcat(*[q[i] + ca.if_else(usable, scale * step[i], 0.0) for i in range(6)])
+    moved = list(ca.vertsplit(q))
+    for k, joint in enumerate(model.following):
+        moved[joint] = q[joint] + ca.if_else(usable, scale * step[k], 0.0)
+    return ca.vertcat(*moved)
 
 
 def manipulability(jacobian: ca.SX) -> ca.SX:
-    """|det J| [m^3] of a (6, 6) Jacobian (Yoshikawa's measure of a six-joint arm).
+    """|det J| [m^3] of a (6, 6) Jacobian (Yoshikawa's measure of six joints).
 
     By Laplace's expansion in minors of three rows: no division, so exact at singular postures.
     """

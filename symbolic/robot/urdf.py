@@ -1,4 +1,4 @@
-"""A robot's URDF as a serial arm of six revolute joints, and the files the URDF names.
+"""A robot's URDF as a serial arm of six joints or more, and the files the URDF names.
 
 `symbolic.robot.urdf_file` reads and checks the file.
 """
@@ -17,7 +17,8 @@ from symbolic.robot.urdf_file import Urdf, read_urdf
 from symbolic.workcell.reader import suggestion
 from symbolic.workcell.records import Robot
 
-N_JOINTS = 6
+FOLLOWING = 6
+"""Joints that follow the box; what an arm has beyond them is redundant."""
 
 
 def robot_urdf(robot: Robot) -> Urdf:
@@ -85,7 +86,7 @@ def arm_model(robot: Robot) -> pin.Model:
     """The model of a robot of a workcell: its chain, all else held, its tool's mass included.
 
     Raises:
-        RobotModelError: it is not a serial arm of six revolute joints with that flange.
+        RobotModelError: it is not a serial arm with that flange.
     """
     urdf = robot_urdf(robot)
     moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
@@ -102,23 +103,24 @@ def arm_model(robot: Robot) -> pin.Model:
 
 
 def structure_problem(model: pin.Model) -> str:
-    """Why a model is no serial arm of six revolute joints, or an empty string."""
+    """Why a model is no serial arm of at least six joints, or an empty string."""
     names = list(model.names)[1:]
-    if model.njoints - 1 != N_JOINTS:
+    if len(names) < FOLLOWING:
         return (
             f"found {len(names)} joints that are not locked ({listed(names)}); allowed are "
-            f"{N_JOINTS}, name others under locked_joints or pick a chain"
+            f"{FOLLOWING} or more that move the flange"
         )
     for joint, name in enumerate(names, start=1):
         kind = str(model.joints[joint].shortname())
-        if not kind.startswith("JointModelR") or model.joints[joint].nq != 1:
+        if not kind.startswith(("JointModelR", "JointModelP")) or model.joints[joint].nq != 1:
             return (
                 f"joint {name!r} is of kind {kind.removeprefix('JointModel')}; allowed are "
-                "revolute and continuous joints; hold others by locked_joints"
+                "revolute, continuous and prismatic joints; hold others by locked_joints"
             )
         if model.parents[joint] != joint - 1:
             return (
-                f"joint {name!r} does not follow the joint before it; allowed is one serial chain"
+                f"joint {name!r} does not follow the joint before it; allowed is one serial chain: "
+                "pick it (chain), or name joints that do not belong to it under locked_joints"
             )
     return ""
 

@@ -6,8 +6,9 @@ the pose by the implicit function, and a row c(pose, q) has the derivatives
     dq/dpose = -F_q^-1 F_pose,     nu = -F_q^-T c_q,     T = [I; dq/dpose],
     grad = T^T c_y,                Hessian = T^T (c_yy + sum_k nu_k F_k,yy) T,     y = (pose, q),
 
-which hold at a solution of F only: no derivative is taken through Newton's steps, so the joints
-only need to be right, not differentiable.
+where pose stands for the extended pose and F for as many equations as there are joints: six hold
+the box, one more ties each redundant joint to its value. They hold at a solution of F only: no
+derivative is taken through Newton's steps, so the joints only need to be right, not differentiable.
 """
 
 from __future__ import annotations
@@ -26,24 +27,28 @@ SOLVE_STEPS = 5
 def closure_functions(model: CellModel, arm: int) -> dict[ClosureKey, ca.Function]:
     """An arm's joints from a box pose, with what the derivatives of rows need.
 
-    first: pose (6,), q_reference (n,) -> q (n,) that hold the box; follow dq/dpose (n, 6); pull
-        -F_q^-1 (n, n), so that nu = pull^T c_q.
-    second: pose, q, nu (n,) -> hessian (6 + n, 6 + n) of nu . F by (pose, q).
+    first: pose (6 + m,), q_reference (n,) -> q (n,) that hold the box; follow dq/dpose
+        (n, 6 + m); pull -F_q^-1 (n, n), so that nu = pull^T c_q.
+    second: pose, q, nu (n,) -> hessian (6 + m + n, 6 + m + n) of nu . F by (pose, q).
     """
-    n = len(model.start[arm])
-    pose, reference, nu = ca.SX.sym("pose", 6), ca.SX.sym("q_reference", n), ca.SX.sym("nu", n)
-    cell, rotation = model.workcell, rotation_matrix(pose[3:])
+    own = model.robots[arm]
+    n = own.n_joints
+    pose, nu = ca.SX.sym("pose", own.pose_size), ca.SX.sym("nu", n)
+    reference = ca.SX.sym("q_reference", n)
+    cell, rotation = model.workcell, rotation_matrix(pose[3:6])
     target = flange_target(cell.robots[arm], cell.contacts[arm], pose[:3], rotation)
 
     joints = ca.SX.sym("q", n)
-    closure = pose_error(*target, *model.robots[arm].placement(joints))[0]
+    held = pose_error(*target, *own.placement(joints))[0]
+    tied = [pose[place] - joints[joint] for joint, place in own.redundant]
+    closure = ca.vertcat(held, *tied)
     pull = -ca.solve(ca.jacobian(closure, joints), ca.SX.eye(n))
     follow = ca.mtimes(pull, ca.jacobian(closure, pose))
     slopes = ca.Function("slopes", [pose, joints], [follow, pull])
 
-    q = reference
+    q = own.with_redundant(reference, pose)
     for _ in range(SOLVE_STEPS):
-        q = newton_step(model.robots[arm], q, *target)
+        q = newton_step(own, q, *target)
     first, second = ClosureKey(arm, "first"), ClosureKey(arm, "second")
     results = ca.cse([ca.densify(result) for result in (q, *slopes(pose, q))])
     curvature, _ = ca.hessian(ca.dot(nu, closure), ca.vertcat(pose, joints))

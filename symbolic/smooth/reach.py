@@ -8,7 +8,7 @@ from typing import ClassVar
 import casadi as ca
 
 from symbolic.cell_model import CellModel
-from symbolic.robot.arm import manipulability
+from symbolic.robot.newton import following_columns, manipulability
 from symbolic.smooth.place import Place, PlaceConstraint
 
 
@@ -32,7 +32,8 @@ class Reach(PlaceConstraint):
     def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
         """Zero at the least manipulability that the workcell allows."""
         least = place.model.workcell.robots[self.arm].min_manipulability
-        jacobian = place.model.robots[self.arm].jacobian(place.q[self.arm])
+        model = place.model.robots[self.arm]
+        jacobian = following_columns(model, model.jacobian(place.q[self.arm]))
         return (manipulability(jacobian) / least) ** 2 - 1.0
 
     def arms(self, model: CellModel) -> tuple[int, ...]:

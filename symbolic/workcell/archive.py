@@ -81,7 +81,7 @@ class _Same:
 @lru_cache(maxsize=4)
 def _archive(source: Path, digest: str, wanted: _Same) -> CellArchive:
     try:
-        current = load(source)
+        current = load(source, decided=wanted.workcell.start_branch)
     except DualArmError as error:
         raise BundleError(f"the workcell cannot be stored: {error}") from error
     if current.digest != digest or not _equal(current, wanted.workcell):

@@ -210,16 +210,25 @@ def check_reach(workcell: Workcell, problems: Problems) -> None:
 def stretched_length(robot: Robot) -> tuple[Array, float]:
     """Where the first joint stands (3,) [m] in the world, and an upper bound of the reach [m].
 
-    The bound is the sum of the distances between successive joints and the flange.
+    The bound is the sum of the distances between successive joints and the flange, and of how far
+    joints may slide.
 
     Raises:
-        RobotModelError: the robot's model is not a serial arm of six revolute joints.
+        RobotModelError: the robot's model is not a serial arm.
     """
     model = arm_model(robot)
     shoulder = robot.T_world_base @ np.append(model.jointPlacements[1].translation, 1.0)
     flange = model.frames[link_frame(model, robot.flange)].placement.translation
     offsets = [model.jointPlacements[joint].translation for joint in range(2, model.njoints)]
-    return shoulder[:3], float(sum(np.linalg.norm(offset) for offset in [*offsets, flange]))
+    slides = sum(
+        max(abs(low), abs(high))
+        for joint, low, high in zip(
+            model.joints[1:], robot.position_lower, robot.position_upper, strict=True
+        )
+        if str(joint.shortname()).startswith("JointModelP")
+    )
+    stretched = sum(np.linalg.norm(offset) for offset in [*offsets, flange])
+    return shoulder[:3], float(stretched + slides)
 
 
 def _fixed_poses(workcell: Workcell) -> Iterator[tuple[str, Array]]:

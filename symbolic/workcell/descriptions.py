@@ -56,7 +56,7 @@ def read_description(
     arguments = _read_xacro_arguments(table)
     locked = _read_locked(table)
     root, flange = _read_chain(table)
-    drop_links = _read_texts(table, "drop_links", "names or patterns of links")
+    drop_links = read_texts(table, "drop_links", "names or patterns of links")
     urdf = _read_urdf(table, path, arguments, package_dirs)
     if arguments and urdf is not None and not stored and not is_xacro(path.read_bytes()):
         told = f"given for {path.name}, which is no xacro file"
@@ -168,7 +168,7 @@ def _read_chain(table: Table) -> tuple[str, str]:
         table.problems.add(
             table.at("chain"), "found beside 'flange'; the chain's tip is the flange"
         )
-    links = _read_texts(table, "chain", "two links, root and tip")
+    links = read_texts(table, "chain", "two links, root and tip")
     if len(links) != 2 or links[0] == links[-1]:
         if table.problems.clean(table.at("chain")):
             table.problems.add(
@@ -179,7 +179,8 @@ def _read_chain(table: Table) -> tuple[str, str]:
     return links[0], links[1]
 
 
-def _read_texts(table: Table, key: str, meaning: str) -> tuple[str, ...]:
+def read_texts(table: Table, key: str, meaning: str) -> tuple[str, ...]:
+    """An array of texts; empty where the key is missing or holds something else."""
     value = table.raw(key, [])
     if not isinstance(value, list) or not all(isinstance(x, str) and x for x in value):
         table.problems.add(

@@ -10,9 +10,11 @@ from symbolic import outside
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.robot.urdf import resolve_mesh, robot_urdf
 from symbolic.robot.xacro_file import description_content
+from symbolic.workcell.branches import with_branches
 from symbolic.workcell.checks import check_all
 from symbolic.workcell.reader import Problems, Table
-from symbolic.workcell.records import Body, Mesh, Robot, Workcell
+from symbolic.workcell.records import SEARCHED, Body, Mesh, Robot, Workcell
+from symbolic.workcell.redundancy import read_redundant, with_redundancy
 from symbolic.workcell.robots import read_robot
 from symbolic.workcell.sections import read_body, read_collision, read_contact, read_payload
 from symbolic.workcell.task import read_task, with_force_limit
@@ -21,7 +23,12 @@ from symbolic.workcell.uncertainty import read_uncertainty
 Check = Callable[[Workcell], Iterable[str]]
 
 
-def load(path: str | Path, checks: Sequence[Check] = (), stored: bool = False) -> Workcell:
+def load(
+    path: str | Path,
+    checks: Sequence[Check] = (),
+    stored: bool = False,
+    decided: tuple[int, int] = (SEARCHED, SEARCHED),
+) -> Workcell:
     """The workcell that a TOML file describes.
 
     Args:
@@ -30,6 +37,7 @@ def load(path: str | Path, checks: Sequence[Check] = (), stored: bool = False) -
             start; each yields its problems as `key.path: what was found; what is allowed`.
         stored: whether it was unpacked from an archive: packages that `package_dirs` lacks are
             not looked for on this machine, and xacro files were expanded before.
+        decided: per robot the start branch that takes the place of "search" in the file.
 
     Raises:
         WorkcellError: with all problems of the file, each with its key path.
@@ -38,6 +46,7 @@ def load(path: str | Path, checks: Sequence[Check] = (), stored: bool = False) -
     try:
         source = outside.resolved(path)
         content = outside.read_bytes(source, outside.WORKCELL_BYTES)
+        content = with_branches(content, outside.toml_tables(content), decided)
         data = outside.toml_tables(content)
     except OutsideError as error:
         raise WorkcellError(str(path), (f"file: {error}",)) from error
@@ -58,7 +67,10 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     robots = [read_robot(entry, folder, stored) for entry in table.tables("robots", exactly=2)]
     payload = read_payload(table.table("payload"))
     contacts = [read_contact(entry, payload.size) for entry in table.tables("contacts", exactly=2)]
-    task = read_task(table.table("task"))
+    task_table = table.table("task")
+    task = read_task(task_table)
+    redundant = read_redundant(task_table, len(task.waypoints))
+    task_table.close()
     environment = tuple(read_body(entry, folder) for entry in table.tables("environment"))
     collision = read_collision(table.table("collision", {}))
     uncertainty = read_uncertainty(table.table("uncertainty", {}))
@@ -85,7 +97,7 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
         uncertainty=uncertainty,
     )
     check_all(workcell, problems)
-    return workcell
+    return with_redundancy(workcell, redundant, problems)
 
 
 def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Body]) -> str:

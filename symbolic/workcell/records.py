@@ -18,11 +18,18 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from symbolic.array import Array
 
 TimeLaw = Literal["constant", "ramped", "optimal"]
 Allocation = Literal["paper", "joint"]
+
+SEARCHED = -2
+"""`Workcell.start_branch` of a robot whose branches compete."""
+
+POSE_SIZE = 6
+"""x, y, z [m], roll, pitch, yaw [rad]."""
 
 
 @dataclass(frozen=True)
@@ -103,17 +110,20 @@ class Robot:
         T_world_base: (4, 4), the URDF's root in the world.
         T_flange_pad: (4, 4), the pad frame on the flange.
         tool: collision bodies of the tool, in the flange frame.
-        position_lower, position_upper: (6,) joint limits [rad].
-        velocity_max: (6,) [rad/s].
-        acceleration_max: (6,) [rad/s^2].
-        torque_max: (6,) [N m].
-        min_manipulability: least allowed |det J| of the flange-pad Jacobian [m^3].
+        position_lower, position_upper: (n,) joint limits [rad, or m where a joint slides].
+        velocity_max: (n,) [rad/s].
+        acceleration_max: (n,) [rad/s^2].
+        torque_max: (n,) [N m, or N].
+        min_manipulability: least allowed |det J| of the flange-pad Jacobian of the six joints that
+            follow the box [m^3].
         xacro_arguments: names and values of the xacro file's arguments.
         srdf: file whose disabled pairs of links are not checked for collision.
         chain_root: link of the URDF that the arm begins at, the flange being its other end; ''
             where every joint that is not locked belongs to the arm.
         drop_links: links, by name or pattern, that are left out with all that hangs on them.
         tool_load: mass and inertia of the tool; None where nothing is known of them.
+        redundant_joints: names of the joints beyond six, whose paths are part of the decision
+            vector; () where the arm has six.
     """
 
     name: str
@@ -135,6 +145,7 @@ class Robot:
     chain_root: str = ""
     drop_links: tuple[str, ...] = ()
     tool_load: ToolLoad | None = None
+    redundant_joints: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -224,6 +235,27 @@ class Waypoint:
 
 
 @dataclass(frozen=True)
+class RedundantJoint:
+    """A joint beyond the six that follow the box: its path is part of the decision vector.
+
+    Its values at the waypoints are joined by the spline of the box path. A joint that moves both
+    arms of a machine is one of these, not two.
+
+    Attributes:
+        name: robot and joint, as 'north/panda_joint3'.
+        drives: per robot its index among the arm's joints, -1 where it is none of them.
+        lower, upper: (n_waypoints,) bounds [rad or m]; equal where it is fixed.
+        initial: (n_waypoints,) its path in the hand-made trajectory [rad or m].
+    """
+
+    name: str
+    drives: tuple[int, int]
+    lower: Array
+    upper: Array
+    initial: Array
+
+
+@dataclass(frozen=True)
 class AllowedContact:
     """The payload may touch a named environment body near the fixed poses.
 
@@ -255,6 +287,7 @@ class Task:
         allocation: 'paper' (least forces first, then the moments) or 'joint' (the least forces
             that carry the moments as well).
         force_limit: (2,) bounds of the force limit, the last decision variable of 'optimal' [N].
+        redundant: the joints whose paths are decided beside the box's, see RedundantJoint.
     """
 
     waypoints: tuple[Waypoint, ...]
@@ -268,6 +301,21 @@ class Task:
     allowed_contacts: tuple[AllowedContact, ...]
     allocation: Allocation = "paper"
     force_limit: tuple[float, float] = (0.0, np.inf)
+    redundant: tuple[RedundantJoint, ...] = ()
+
+    @property
+    def extended_size(self) -> int:
+        """Entries of an extended pose: the box pose, then the redundant joints."""
+        return POSE_SIZE + len(self.redundant)
+
+    def redundant_of(self, arm: int) -> tuple[tuple[int, int], ...]:
+        """Of each redundant joint of robot `arm` its index in the arm and its place in the
+        extended pose."""
+        return tuple(
+            (joint.drives[arm], POSE_SIZE + k)
+            for k, joint in enumerate(self.redundant)
+            if joint.drives[arm] >= 0
+        )
 
     @property
     def free_indices(self) -> tuple[int, ...]:
@@ -276,8 +324,26 @@ class Task:
 
     @property
     def n_path(self) -> int:
-        """Number of variables of the path, six per free waypoint (paper Eq. 14)."""
-        return 6 * len(self.free_indices)
+        """Number of variables of the path: six per free waypoint (paper Eq. 14), then the free
+        values of the redundant joints, joint by joint."""
+        return len(self.free_entries[0])
+
+    @property
+    def n_box(self) -> int:
+        """Number of variables of the box path, the first of the decision vector."""
+        return POSE_SIZE * len(self.free_indices)
+
+    @property
+    def free_entries(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows and columns (n_path,) of the path's variables among the extended waypoints
+        (n_waypoints, 6 + m), whose columns are the pose and the redundant joints."""
+        free = np.array(self.free_indices, dtype=np.intp)
+        rows, columns = [np.repeat(free, POSE_SIZE)], [np.tile(np.arange(POSE_SIZE), len(free))]
+        for k, joint in enumerate(self.redundant):
+            moving = np.flatnonzero(joint.lower < joint.upper)
+            rows.append(moving)
+            columns.append(np.full(len(moving), POSE_SIZE + k))
+        return np.concatenate(rows), np.concatenate(columns)
 
     @property
     def n_var(self) -> int:
@@ -296,6 +362,7 @@ class Task:
 
     def _bounds(self, name: str, force: float) -> Array:
         parts = [getattr(self.waypoints[i], name) for i in self.free_indices]
+        parts += [getattr(joint, name)[joint.lower < joint.upper] for joint in self.redundant]
         return np.concatenate(parts + ([np.array([force])] if self.time_law == "optimal" else []))
 
 
@@ -337,7 +404,8 @@ class Workcell:
         robots: the two arms; robot i holds contact i.
         payload, contacts, task, environment, collision, uncertainty: see their records.
         start_branch: (2,) per robot the index of the start branch among the ranked branches,
-            or -1 for the stated criterion's choice.
+            -1 for the stated criterion's choice, or `SEARCHED`: all compete, see
+            `hybrid_opt.branches`, and until then it is the criterion's choice.
         source: the file it came from.
         digest: SHA-256 over the file and every file it names (URDF, meshes); identifies the
             cell in caches and results.

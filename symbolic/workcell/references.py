@@ -14,6 +14,7 @@ from symbolic.robot.packages import PACKAGE_SCHEME
 from symbolic.robot.urdf import resolve_mesh
 from symbolic.robot.urdf_file import parse_urdf
 from symbolic.robot.xacro_file import description_content
+from symbolic.workcell.branches import with_branches
 from symbolic.workcell.records import Robot, Workcell
 
 
@@ -30,7 +31,9 @@ class CellCollector:
 
     def collect(self, workcell: Workcell) -> None:
         """Add every file that the workcell names."""
-        data = parse_toml(self._text.encode("utf-8"))
+        text = self._text.encode("utf-8")
+        text = with_branches(text, parse_toml(text), workcell.start_branch)
+        self._text, data = outside.text(text), parse_toml(text)
         for robot, entry in zip(workcell.robots, data["robots"], strict=True):
             urdf = self._place(str(entry["urdf"]))
             folders = [self._place(str(folder)) for folder in entry.get("package_dirs", [])]

@@ -8,12 +8,12 @@ import numpy as np
 import pinocchio as pin
 
 from symbolic.array import Array
-from symbolic.robot.urdf import N_JOINTS
+from symbolic.robot.urdf import FOLLOWING
 from symbolic.robot.urdf_file import LARGEST_GYRATION
 from symbolic.workcell import quantities as quantity
-from symbolic.workcell.descriptions import read_description
+from symbolic.workcell.descriptions import read_description, read_texts
 from symbolic.workcell.reader import Quantity, Table, read_only
-from symbolic.workcell.records import Robot, ToolLoad
+from symbolic.workcell.records import SEARCHED, Robot, ToolLoad
 from symbolic.workcell.sections import read_body, read_inertia, read_pose
 
 # Joint accelerations are rarely published; this is slow for an arm of this class.
@@ -21,11 +21,9 @@ DEFAULT_ACCELERATION = 5.0  # [rad/s^2]
 DEFAULT_MIN_MANIPULABILITY = 0.005  # [m^3], exceeded by 9 of 10 random poses of a 1.3 m arm
 MAX_START_BRANCH = 1000
 
-_ONES = read_only(np.ones(N_JOINTS))
-
 
 def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot, int]:
-    """One arm and the index of its start branch (-1: the criterion's choice).
+    """One arm and the index of its start branch (-1: the criterion's choice, -2: searched for).
 
     Args:
         table: its section.
@@ -60,10 +58,30 @@ def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot,
         chain_root=described.chain_root,
         drop_links=described.drop_links,
         tool_load=_read_tool_load(table),
+        redundant_joints=_read_redundant(table, model),
     )
-    branch = table.integer("start_branch", -1, MAX_START_BRANCH, -1)
+    branch = SEARCHED
+    if table.raw("start_branch", -1) != "search":
+        branch = table.integer("start_branch", -1, MAX_START_BRANCH, -1)
     table.close()
     return robot, branch
+
+
+def _read_redundant(table: Table, model: pin.Model | None) -> tuple[str, ...]:
+    """The joints beyond six that the file names; () leaves the choice to the tool."""
+    names = read_texts(table, "redundant_joints", "names of joints")
+    if model is None or not names:
+        return names
+    beyond = model.nq - FOLLOWING
+    joints = list(model.names)[1:]
+    unknown = [name for name in names if name not in joints]
+    if unknown or len(set(names)) != beyond:
+        told = f"{unknown[0]!r}, which is none of them" if unknown else f"{len(set(names))} names"
+        table.problems.add(
+            table.at("redundant_joints"),
+            f"found {told}; allowed are {beyond} of the {len(joints)} joints: {', '.join(joints)}",
+        )
+    return names
 
 
 def _read_tool_load(table: Table) -> ToolLoad | None:
@@ -82,13 +100,14 @@ def _read_tool_load(table: Table) -> ToolLoad | None:
 
 
 def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array]:
-    """The limits, from the file or else from the URDF; (6,) each."""
+    """The limits, from the file or else from the URDF; (n,) each."""
+    n = FOLLOWING if model is None else model.nq
     from_urdf: dict[str, Array | None] = {
         "position_lower": None if model is None else model.lowerPositionLimit,
         "position_upper": None if model is None else model.upperPositionLimit,
         "velocity_max": None if model is None else model.velocityLimit,
         "torque_max": None if model is None else model.effortLimit,
-        "acceleration_max": np.full(N_JOINTS, DEFAULT_ACCELERATION),
+        "acceleration_max": np.full(n, DEFAULT_ACCELERATION),
     }
     allowed = {
         "position_lower": quantity.JOINT_POSITION,
@@ -97,10 +116,10 @@ def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array]:
         "torque_max": quantity.TORQUE,
         "acceleration_max": quantity.ANGULAR_ACCELERATION,
     }
-    limits = {key: _limit(table, key, allowed[key], from_urdf[key]) for key in allowed}
+    limits = {key: _limit(table, key, (allowed[key],) * n, from_urdf[key]) for key in allowed}
     problems = table.problems
     if model is not None and problems.clean(table.at("position_lower"), table.at("position_upper")):
-        for joint in range(N_JOINTS):
+        for joint in range(n):
             low, high = limits["position_lower"][joint], limits["position_upper"][joint]
             if low >= high:
                 problems.add(
@@ -111,19 +130,19 @@ def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array]:
     return limits
 
 
-def _limit(table: Table, key: str, allowed: Quantity, urdf_value: Array | None) -> Array:
+def _limit(table: Table, key: str, each: tuple[Quantity, ...], urdf_value: Array | None) -> Array:
     if key in table:
         # One number for all joints is right for a bound on magnitude, not for a range's end.
-        return table.vector(key, (allowed,) * N_JOINTS, scalar_fills=not key.startswith("position"))
+        return table.vector(key, each, scalar_fills=not key.startswith("position"))
     table.raw(key, None)
     if urdf_value is None:
-        return _ONES
-    for joint, value in enumerate(urdf_value):
+        return read_only(np.ones(len(each)))
+    for joint, (value, allowed) in enumerate(zip(urdf_value, each, strict=True)):
         if not allowed.contains(float(value)):
             table.problems.add(
                 table.at(key),
                 f"the URDF gives {value:g} for joint {joint + 1}; allowed is {allowed.allowed()}"
                 f"{allowed.suspicion(float(value))}; correct the URDF or give {key} here",
             )
-            return _ONES
+            return read_only(np.ones(len(each)))
     return read_only(urdf_value)

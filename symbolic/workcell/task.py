@@ -35,7 +35,10 @@ ABOVE_STILL = 1.001
 
 
 def read_task(table: Table) -> Task:
-    """What is to be carried where, and how a candidate is sampled and judged."""
+    """What is to be carried where, and how a candidate is sampled and judged.
+
+    The table stays open for `symbolic.workcell.redundancy`.
+    """
     problems = table.problems
     start = _fixed(table, "start")
     between = [waypoint for entry in table.tables("waypoints") for waypoint in _waypoints(entry)]
@@ -66,7 +69,6 @@ def read_task(table: Table) -> Task:
         allocation=cast("Allocation", table.choice("allocation", ALLOCATIONS, "paper")),
         force_limit=_force_limit(table),
     )
-    table.close()
     return task
 
 

@@ -19,6 +19,9 @@ MAX_MOVES = 2000
 LEAST_MOVE_TIME = 0.02
 """Shortest time of one move [s]: below it a controller cannot plan ahead."""
 
+AXES = 6
+"""Robot axes of a jointtarget."""
+
 APPROACH_SPEED = "v50"
 ZONE = "z1"
 _LINE_LENGTH = 60
@@ -28,8 +31,15 @@ def rapid_modules(carry: Carry) -> tuple[str, str]:
     """The modules of both tasks.
 
     Raises:
-        SettingsError: the time step is too short or the trajectory too long for RAPID.
+        SettingsError: an arm has more than six joints, the time step is too short or the
+            trajectory too long for RAPID.
     """
+    for robot, arm in zip(carry.workcell.robots, carry.arms, strict=True):
+        if arm.q.shape[1] != AXES:
+            raise SettingsError(
+                f"robot {robot.name!r} has {arm.q.shape[1]} joints; RAPID's jointtarget holds "
+                f"{AXES} robot axes, choose another format"
+            )
     moves = len(carry.time) - 1
     step = float(carry.time[1])
     if step < LEAST_MOVE_TIME or moves > MAX_MOVES:

@@ -3,7 +3,8 @@
 (function () {
   const data = JSON.parse(document.getElementById("report-data").textContent);
   const $ = (id) => document.getElementById(id);
-  const COLUMNS = { time: 0, pose: 1, q: 7, force: 19, shift: 21, width: 23 };
+  const FORCE = 7 + data.joints[0] + data.joints[1];
+  const COLUMNS = { time: 0, pose: 1, q: 7, force: FORCE, shift: FORCE + 2, width: FORCE + 4 };
   const CONFIG = { responsive: true, displaylogo: false,
     modeBarButtonsToRemove: ["lasso2d", "select2d", "autoScale2d"] };
   const PLAIN = { responsive: true, displayModeBar: false };
@@ -108,17 +109,24 @@
       line: { color: "#b00020", width: 1 } };
   }
 
+  /* One arm's joints of a list of both arms'. */
+  function useOf(use, i) {
+    return i === 0 ? use.slice(0, data.joints[0]) : use.slice(data.joints[0]);
+  }
+
   /* The direction [degrees] between the two neighbouring joints that leave most room. */
   function freeDirection(use) {
-    const most = [0, 1, 2, 3, 4, 5].map((j) => Math.max(use[j], use[j + 6]));
-    const taken = most.map((value, j) => value + most[(j + 1) % 6]);
-    return 30 + 60 * taken.indexOf(Math.min(...taken));
+    const count = Math.max(...data.joints), step = 360 / count;
+    const most = Array.from({ length: count }, (_, j) => Math.max(0,
+      ...data.robots.map((_, i) => (j < data.joints[i] ? useOf(use, i)[j] : 0))));
+    const taken = most.map((value, j) => value + most[(j + 1) % count]);
+    return step / 2 + step * taken.indexOf(Math.min(...taken));
   }
 
   function drawTorque(carry) {
-    const joints = [1, 2, 3, 4, 5, 6, 1].map((j) => "joint " + j);
     const traces = data.robots.map((robot, i) => {
-      const use = carry.torqueUse.slice(6 * i, 6 * i + 6);
+      const use = useOf(carry.torqueUse, i);
+      const joints = [...use.keys(), 0].map((j) => "joint " + (j + 1));
       return { type: "scatterpolar", mode: "lines+markers", name: plain(robot),
         r: [...use, use[0]], theta: joints,
         line: { color: ["#3b6ea8", "#a8733b"][i], dash: ["solid", "dash"][i] } };

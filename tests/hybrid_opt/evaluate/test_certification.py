@@ -7,7 +7,6 @@ import pinocchio as pin
 import pytest
 
 from hybrid_opt import metaheuristics
-from hybrid_opt.collision.between import split_configuration
 from hybrid_opt.evaluate.certification import (
     LostPathError,
     SampledPath,
@@ -21,7 +20,7 @@ from symbolic.array import Array
 from symbolic.physics.pose import inverse, pose_matrix
 from symbolic.robot.arm import box_flange
 from symbolic.robot.model import build_robot_model
-from symbolic.workcell.decision import waypoints_of
+from symbolic.workcell.decision import extended_waypoints
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
@@ -33,14 +32,14 @@ def evaluator() -> CandidateEvaluator:
 
 def sampled(evaluator: CandidateEvaluator, x: Array) -> SampledPath:
     outputs = evaluator.outputs(x)
-    return SampledPath(
-        waypoints_of(evaluator.workcell.task, x), outputs["q_1"][0], outputs["q_2"][0]
-    )
+    task = evaluator.workcell.task
+    return SampledPath(task, extended_waypoints(task, x), outputs["q_1"][0], outputs["q_2"][0])
 
 
 def placed(evaluator: CandidateEvaluator, path: SampledPath, u: Array) -> tuple[Array, ...]:
     owner = np.zeros(len(u), dtype=np.intp)
-    return split_configuration(configurations([path], evaluator.functions["posture"], owner, u))
+    found = configurations([path], evaluator.functions["posture"], owner, u)
+    return evaluator.checker.split(found)
 
 
 def test_places_between_samples_close_both_arms(evaluator: CandidateEvaluator) -> None:
@@ -73,7 +72,7 @@ def test_a_path_that_an_arm_cannot_follow_is_told(evaluator: CandidateEvaluator)
     path = sampled(evaluator, evaluator.workcell.task.initial.reshape(-1))
     away = path.waypoints.copy()
     away[2, 2] += 3.0
-    broken = SampledPath(away, path.q_1, path.q_2)
+    broken = SampledPath(path.task, away, path.q_1, path.q_2)
     _, *joints = placed(evaluator, broken, np.array([0.0, 0.5]))
     assert all(np.isfinite(q[0]).all() and np.isnan(q[1]).all() for q in joints)
     (verdict,) = certificates(evaluator.checker, evaluator.functions["posture"], [broken])
@@ -95,13 +94,14 @@ def test_certificates_are_the_same_together_and_alone(evaluator: CandidateEvalua
     )
     x = x[evaluator.evaluate(x).reason != REASONS.index("reach_1")]
     outputs = evaluator.outputs(x)
+    task = evaluator.workcell.task
     paths = [
-        SampledPath(waypoints_of(evaluator.workcell.task, one), q_1, q_2)
+        SampledPath(task, extended_waypoints(task, one), q_1, q_2)
         for one, q_1, q_2 in zip(x, outputs["q_1"], outputs["q_2"], strict=True)
     ]
     away = paths[3].waypoints.copy()
     away[2, 2] += 3.0
-    paths[3] = SampledPath(away, paths[3].q_1, paths[3].q_2)
+    paths[3] = SampledPath(task, away, paths[3].q_1, paths[3].q_2)
     posture = evaluator.functions["posture"]
     together = certificates(evaluator.checker, posture, paths)
     alone = [certificates(evaluator.checker, posture, [path])[0] for path in paths]

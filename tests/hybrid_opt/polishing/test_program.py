@@ -21,7 +21,9 @@ from symbolic.smooth.joint_limit import JointLimit
 from symbolic.smooth.passage import Passing, Separation
 from symbolic.smooth.place import PlaceConstraint
 from symbolic.smooth.reach import Reach
+from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.file import load
+from tests.redundant_cells import rack_on_rail
 from tests.symbolic.workcell.samples import RACK
 
 TRANSFER = RACK.with_name("transfer.toml")
@@ -52,11 +54,15 @@ def evaluator(path: Path) -> CandidateEvaluator:
 
 @cache
 def made(path: Path) -> tuple[SmoothProgram, Array]:
+    """`program_of` a cell."""
+    return program_of(evaluator(path))
+
+
+def program_of(judge: CandidateEvaluator) -> tuple[SmoothProgram, Array]:
     """A program with rows of every kind around the hand-made trajectory, and a point near it."""
-    judge = evaluator(path)
     task, grid = judge.workcell.task, Grid(judge.workcell.task)
     cell = SmoothCell(judge.workcell, polish_functions(judge.compiled), grid)
-    x = task.initial.ravel()
+    x = initial_decision(task)
     carry = CarryReader(judge, grid).read(x)
     box, *_ = sorted(cell.functions.rows.separable)
     arms = [k for k in range(carry.clearance.shape[1]) if k not in cell.functions.rows.separable]
@@ -86,7 +92,24 @@ def made(path: Path) -> tuple[SmoothProgram, Array]:
 
 @CELLS
 def test_jacobian_is_that_of_the_constraints(path: Path) -> None:
-    program, z = made(path)
+    require_jacobian(*made(path))
+
+
+@CELLS
+def test_curvature_is_that_of_the_constraints(path: Path) -> None:
+    require_curvature(*made(path))
+
+
+@pytest.mark.slow
+def test_derivatives_by_the_path_of_a_slide_are_exact(tmp_path: Path) -> None:
+    program, z = program_of(CandidateEvaluator(rack_on_rail(tmp_path, 0.3, 0.1)))
+    assert len(z) == 18 + 5 + 3
+    require_jacobian(program, z)
+    require_curvature(program, z)
+
+
+def require_jacobian(program: SmoothProgram, z: Array) -> None:
+    """It is that of differences."""
     step = 1e-6
     columns = [
         (program.constraints(z + step * d)[0] - program.constraints(z - step * d)[0]) / (2 * step)
@@ -96,9 +119,8 @@ def test_jacobian_is_that_of_the_constraints(path: Path) -> None:
     np.testing.assert_allclose(np.array(columns).T, exact, rtol=1e-5, atol=1e-4)
 
 
-@CELLS
-def test_curvature_is_that_of_the_constraints(path: Path) -> None:
-    program, z = made(path)
+def require_curvature(program: SmoothProgram, z: Array) -> None:
+    """It is that of differences."""
     multipliers = np.random.default_rng(1).normal(size=program.layout.n_rows)
 
     def slope(at: Array) -> Array:

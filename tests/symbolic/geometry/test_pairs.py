@@ -16,6 +16,7 @@ from symbolic.geometry.bodies import MeshReader, _link_pieces, collision_bodies
 from symbolic.geometry.coal_shapes import coal_distance
 from symbolic.geometry.pairs import build_geometry
 from symbolic.geometry.pieces import Capsule, Hull, Piece, support
+from symbolic.workcell.file import load
 from symbolic.workcell.records import (
     Body,
     Box,
@@ -32,6 +33,7 @@ from tests.symbolic.geometry.collision_cells import (
     random_configurations,
     ur10_cell,
 )
+from tests.symbolic.workcell.samples import RACK
 
 pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
 
@@ -239,3 +241,15 @@ def test_the_ur10_has_bodies_for_all_its_links() -> None:
             "pad",
         )
     ]
+
+
+def test_a_tool_that_enters_the_payload_is_told_by_name() -> None:
+    cell = load(RACK)
+    left = cell.robots[0]
+    part = left.tool[0]
+    assert isinstance(part.shape, Cylinder)
+    longer = replace(part, shape=replace(part.shape, length=part.shape.length + 0.01))
+    with pytest.raises(
+        CollisionModelError, match="'left/pad' enters the payload by more than 1 mm"
+    ):
+        build_geometry(replace(cell, robots=(replace(left, tool=(longer,)), cell.robots[1])))

@@ -11,7 +11,7 @@ import pytest
 
 from symbolic.errors import RobotModelError
 from symbolic.robot.chain import chain_joints, held_joints, without_links
-from symbolic.robot.machine import machine_problem
+from symbolic.robot.machine import common_joints, machine_problem
 from symbolic.robot.urdf import arm_model, reduced_model
 from symbolic.robot.urdf_file import Urdf, parse_urdf
 from symbolic.robot.urdf_joint import FULL_TURNS
@@ -157,18 +157,12 @@ def test_arms_of_one_machine_agree(tmp_path: Path) -> None:
     assert "'lift' of the machine is held at 0.3" in machine_problem((lifted, right))
     both = replace(left, flange="left_4", chain_root="base")
     other = replace(right, flange="right_4", chain_root="base")
-    assert "both chains move joint 'lift'" in machine_problem_of_prismatic(both, other)
+    assert machine_problem((both, other)) == ""
+    assert common_joints((both, other)) == ("lift",)
+    assert "'lift' moves robot 'right' too" in machine_problem((both, right))
     # The gripper of one arm is no business of the other.
     gripping = replace(left, locked_joints=(("left_grip", 0.3),))
     assert machine_problem((gripping, right)) == ""
-
-
-def machine_problem_of_prismatic(first: Robot, second: Robot) -> str:
-    """The lift as a revolute joint: prismatic ones are held."""
-    for robot in (first, second):
-        text = robot.urdf.read_text(encoding="utf-8").replace("prismatic", "revolute")
-        robot.urdf.write_text(text, encoding="utf-8")
-    return machine_problem((first, second))
 
 
 def test_the_tool_weighs_on_the_joints() -> None:

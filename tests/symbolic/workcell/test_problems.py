@@ -178,10 +178,10 @@ URDF_CASES: list[tuple[str, UrdfChange, str, str]] = [
     ("no robot", lambda _: "<a/>", "robots[0].urdf", "its root is <a>"),
     ("no links", lambda _: "<robot name='a'/>", "robots[0].urdf", "has no links"),
     (
-        "prismatic",
-        lambda text: text.replace('"joint_4" type="revolute"', '"joint_4" type="prismatic"'),
+        "planar",
+        lambda text: text.replace('"joint_4" type="revolute"', '"joint_4" type="planar"'),
         "robots[0].urdf",
-        "'joint_4' is of kind PX; allowed are revolute",
+        "'joint_4' is of kind Planar; allowed are revolute",
     ),
     (
         "branched",

@@ -1,0 +1,191 @@
+"""Which start branches a cell's arms take: pairs of them compete for evaluations.
+
+Successive halving (Karnin, Koren and Somekh, ICML 2013): in every round all pairs that are left get
+the same number of evaluations, and the better half goes on. A pair is as good as the hypervolume of
+the carries that it found so far; while it has none, as the least penalty. The rounds of a pair are
+one search: each begins with the best that the pair knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from math import ceil, log2
+
+import numpy as np
+
+from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations, concatenated
+from hybrid_opt.indicators.metrics import REFERENCE_POINT, front_rows, hypervolume
+from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
+from symbolic.array import Array
+from symbolic.errors import SettingsError, WorkcellError
+from symbolic.functions.candidate import CONSTRAINTS
+from symbolic.workcell.records import SEARCHED
+
+SAMPLED = 32
+"""Random candidates of which a pair has to hold one, where it does not hold the hand-made
+trajectory."""
+
+LEAST = 24
+"""Least evaluations of a pair in a round: fewer tell nothing."""
+
+BEST = 10
+"""Candidates that a pair's next round begins with."""
+
+_HOLDING = [
+    k
+    for k, name in enumerate(CONSTRAINTS)
+    if name.startswith(("reach", "joint_limits", "singularity"))
+]
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """What a pair of start branches came to.
+
+    Attributes:
+        branches: of both robots, among the ranked ones.
+        rounds: in which it took part, 0 where it holds no trajectory that was tried.
+        evaluations: it was given.
+        feasible_share: of these.
+        hypervolume: of what it found.
+        least_penalty: its least penalised objectives' mean.
+    """
+
+    branches: tuple[int, int]
+    rounds: int
+    evaluations: int
+    feasible_share: float
+    hypervolume: float
+    least_penalty: float
+
+
+@dataclass(frozen=True)
+class BranchCompetition:
+    """All pairs, best first: by rounds, then by hypervolume, then by penalty.
+
+    Attributes:
+        pairs: their results.
+        evaluations: of all pairs together.
+    """
+
+    pairs: tuple[PairResult, ...]
+    evaluations: int
+
+    @property
+    def winner(self) -> tuple[int, int]:
+        """The branches to take."""
+        return self.pairs[0].branches
+
+    def __str__(self) -> str:
+        first = self.pairs[0]
+        tried = sum(pair.rounds > 0 for pair in self.pairs)
+        text = (
+            f"start branches {first.branches[0]} and {first.branches[1]}, best of "
+            f"{tried} pairs in {self.evaluations} evaluations: hypervolume {first.hypervolume:.4f}"
+        )
+        others = [pair for pair in self.pairs[1:] if pair.rounds]
+        if not others:
+            return text
+        second = max(others, key=lambda pair: pair.hypervolume)
+        return (
+            f"{text}, {first.hypervolume - second.hypervolume:.4f} more than branches "
+            f"{second.branches[0]} and {second.branches[1]}"
+        )
+
+
+class _Pair:
+    """One pair and what it was given so far."""
+
+    def __init__(self, branches: tuple[int, int], evaluator: CandidateEvaluator) -> None:
+        self.branches, self.evaluator = branches, evaluator
+        self.rounds = 0
+        self._parts: list[Evaluations] = []
+
+    def search(self, algorithm: str, evaluations: int, rng: np.random.Generator) -> None:
+        """One round more."""
+        known = concatenated(self._parts)
+        order = np.argsort(known.penalised.mean(axis=1), kind="stable")
+        settings = SearchSettings(initial=known.x[order[: min(BEST, evaluations)]])
+        found = search_carries(self.evaluator, algorithm, evaluations, rng, settings)
+        self._parts.append(found.evaluations)
+        self.rounds += 1
+
+    def try_out(self, x: Array) -> bool:
+        """Whether both arms hold one of some candidates."""
+        found = self.evaluator.evaluate(x)
+        self._parts.append(found)
+        return bool(np.any(np.all(found.violation[:, _HOLDING] <= 0.0, axis=1)))
+
+    def result(self) -> PairResult:
+        """Where it stands."""
+        known = concatenated(self._parts)
+        rows = front_rows(known.objectives, known.feasible)
+        volume = hypervolume(known.objectives[rows], REFERENCE_POINT) if len(rows) else 0.0
+        return PairResult(
+            self.branches,
+            self.rounds,
+            len(known),
+            float(known.feasible.mean()),
+            float(volume),
+            float(known.penalised.mean(axis=1).min()),
+        )
+
+
+def search_branches(
+    cell: Cell, *, evaluations: int = 2000, rng: np.random.Generator, algorithm: str = "nsga2"
+) -> BranchCompetition:
+    """Let all pairs of start branches compete that hold the hand-made trajectory or a sampled one.
+
+    A robot whose `start_branch` is a number keeps it.
+
+    Args:
+        cell: the cell.
+        evaluations: about how many the competition may spend; at least `LEAST` per pair and round,
+            beside those in which pairs are tried out.
+        rng: its only randomness.
+        algorithm: that searches.
+
+    Raises:
+        SettingsError: candidates of this cell are not evaluated in lanes, or it has not two
+            objectives.
+        WorkcellError: no pair holds any trajectory that was tried.
+    """
+    if len(cell.objective_names) != len(REFERENCE_POINT):
+        raise SettingsError("start branches compete by the hypervolume of two objectives")
+    model, wanted = cell.compiled.model, cell.workcell.start_branch
+    choices = [
+        range(len(found)) if branch == SEARCHED else (max(branch, 0),)
+        for found, branch in zip(model.branches, wanted, strict=True)
+    ]
+    tried = np.vstack([cell.initial, cell.random(SAMPLED, rng)])
+    pairs: list[_Pair] = []
+    out: list[_Pair] = []
+    for first, second in product(*choices):
+        start = (model.branches[0][first].q, model.branches[1][second].q)
+        pair = _Pair((first, second), cell.evaluator.beginning_at(*start))
+        (pairs if pair.try_out(tried) else out).append(pair)
+    if not pairs:
+        raise WorkcellError(
+            str(cell.workcell.source),
+            (
+                "start_branch: no pair of start branches holds the hand-made trajectory or any of "
+                f"{SAMPLED} random ones; look at it with studies.inspect",
+            ),
+        )
+    rounds = max(ceil(log2(len(pairs))), 1)
+    left = pairs
+    for _ in range(rounds):
+        each = max(evaluations // (rounds * len(left)), LEAST)
+        for pair in left:
+            pair.search(algorithm, each, rng)
+        left = sorted(left, key=_standing)[: ceil(len(left) / 2)]
+    ranked = sorted([*pairs, *out], key=_standing)
+    results = tuple(pair.result() for pair in ranked)
+    return BranchCompetition(results, sum(pair.evaluations for pair in results))
+
+
+def _standing(pair: _Pair) -> tuple[float, float, float]:
+    result = pair.result()
+    return (-float(result.rounds), -result.hypervolume, result.least_penalty)

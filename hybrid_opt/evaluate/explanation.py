@@ -1,0 +1,151 @@
+"""Why a candidate is infeasible, in words that name what to change."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from hybrid_opt.evaluate.evaluation import COLLISION, REASONS, CandidateEvaluator, Evaluations
+from hybrid_opt.evaluate.sampled import reached_samples
+from symbolic.array import Array
+from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.robot.urdf import arm_model, link_frame
+from symbolic.workcell.records import Contact, Robot
+
+STEPS = 60
+"""Damped steps in which an arm goes as near to a pose as it can."""
+
+LEVER = 0.1
+"""What a turn counts beside a distance [m]."""
+
+DAMPING = 1e-4
+"""Of these steps, squared [m^2]."""
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What is in the way of one candidate where it first fails.
+
+    Attributes:
+        reason: one of `hybrid_opt.evaluate.evaluation.REASONS`.
+        position: path parameter of the sample.
+        sample: its number, from 0.
+        pair: names of the bodies that collide there, None for another reason.
+        joint: 'robot/joint' that is beyond a limit there, likewise.
+        excess: by how much [rad, or m of a joint that slides].
+        robot: name of the arm that does not reach, likewise.
+        missing: how far its flange stays from where it has to be, at best [m].
+    """
+
+    reason: str
+    position: float
+    sample: int
+    pair: tuple[str, str] | None = None
+    joint: str | None = None
+    excess: float = 0.0
+    robot: str | None = None
+    missing: float = 0.0
+
+    def __str__(self) -> str:
+        where = f"at {100.0 * self.position:.0f} % of the path (sample {self.sample})"
+        if self.pair is not None:
+            return f"{self.pair[0]} meets {self.pair[1]} {where}"
+        if self.joint is not None:
+            return f"{self.joint} is {self.excess:.3f} beyond its limit {where}"
+        if self.robot is not None:
+            return f"{self.robot} lacks {self.missing:.3f} m to its contact {where}"
+        return f"{self.reason.replace('_', ' ')} {where}"
+
+
+def explain(evaluator: CandidateEvaluator, evaluations: Evaluations) -> tuple[Explanation, ...]:
+    """Why each infeasible candidate is so, in order.
+
+    Args:
+        evaluator: that judged them.
+        evaluations: as it gave them.
+    """
+    rows = np.flatnonzero(~evaluations.feasible)
+    found = []
+    for row in rows.tolist():
+        outputs = evaluator.outputs(evaluations.x[row][None])
+        reason, position = REASONS[int(evaluations.reason[row])], float(evaluations.position[row])
+        found.append(_explained(evaluator, outputs, reason, position))
+    return tuple(found)
+
+
+def frequent(explanations: Iterable[Explanation]) -> dict[str, dict[str, int]]:
+    """How often each pair, joint and arm is in the way, the most frequent first."""
+    counts: dict[str, Counter[str]] = {"pairs": Counter(), "joints": Counter(), "reach": Counter()}
+    for one in explanations:
+        if one.pair is not None:
+            counts["pairs"][" – ".join(one.pair)] += 1
+        if one.joint is not None:
+            counts["joints"][one.joint] += 1
+        if one.robot is not None:
+            counts["reach"][one.robot] += 1
+    return {name: dict(count.most_common()) for name, count in counts.items()}
+
+
+def _explained(
+    evaluator: CandidateEvaluator, outputs: Mapping[str, Array], reason: str, position: float
+) -> Explanation:
+    workcell = evaluator.workcell
+    n = workcell.task.samples
+    sample = round(position * (n - 1)) if np.isfinite(position) else 0
+    kind, _, arm = reason.rpartition("_")
+    if reason == COLLISION:
+        reached = reached_samples(outputs, 0)
+        pose, q_1, q_2, time = (
+            outputs[name][0, :reached] for name in ("pose", "q_1", "q_2", "time")
+        )
+        contact = evaluator.checker.check(pose, q_1, q_2, time).first_contact
+        if contact is not None:
+            return Explanation(reason, position, sample, pair=(contact.first, contact.second))
+    elif kind == "joint_limits":
+        robot = workcell.robots[int(arm) - 1]
+        q = outputs[f"q_{arm}"][0, sample]
+        beyond = np.maximum(robot.position_lower - q, q - robot.position_upper)
+        joint = int(np.argmax(beyond))
+        name = f"{robot.name}/{list(arm_model(robot).names)[1 + joint]}"
+        return Explanation(reason, position, sample, joint=name, excess=float(beyond[joint]))
+    elif kind == "reach":
+        index = int(arm) - 1
+        robot, held = workcell.robots[index], workcell.contacts[index]
+        last = outputs[f"q_{arm}"][0, max(sample - 1, 0)]
+        missing = missing_reach(robot, held, outputs["pose"][0, sample], last)
+        return Explanation(reason, position, sample, robot=robot.name, missing=missing)
+    return Explanation(reason, position, sample)
+
+
+def missing_reach(robot: Robot, contact: Contact, pose: Array, q: Array) -> float:
+    """How far an arm's flange stays from where it would hold the box, at best [m].
+
+    The distance where position and orientation together are nearest, joints within their limits;
+    found by damped least squares from one posture, so another posture may come nearer.
+
+    Args:
+        robot, contact: the arm and its contact.
+        pose: (6,) of the box [m, rad].
+        q: (n,) posture to begin with.
+    """
+    model = arm_model(robot)
+    data, flange = model.createData(), link_frame(model, robot.flange)
+    T_box_flange = contact.T_box_pad @ inverse(robot.T_flange_pad)
+    target = inverse(robot.T_world_base) @ pose_matrix(pose[:3], pose[3:]) @ T_box_flange
+    least, distance = np.inf, np.inf
+    for _ in range(STEPS):
+        pin.framesForwardKinematics(model, data, q)
+        here = data.oMf[flange]
+        away = target[:3, 3] - here.translation
+        turn = pin.log3(target[:3, :3] @ here.rotation.T)
+        error = float(np.hypot(np.linalg.norm(away), LEVER * np.linalg.norm(turn)))
+        if error < least:
+            least, distance = error, float(np.linalg.norm(away))
+        J = pin.computeFrameJacobian(model, data, q, flange, pin.LOCAL_WORLD_ALIGNED)
+        step = J.T @ np.linalg.solve(J @ J.T + DAMPING * np.eye(6), np.concatenate([away, turn]))
+        q = np.clip(q + step, robot.position_lower, robot.position_upper)
+    return distance

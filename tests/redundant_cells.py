@@ -1,0 +1,69 @@
+"""Cells with redundant joints, and the same cells with these joints locked, for tests."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
+from tests.machines import MACHINES, SINGLE, machine_cell, single_cell
+from tests.symbolic.workcell.samples import RACK
+
+PANDA_JOINT = "panda_joint3"
+
+
+def locked_pandas(folder: Path, angle: float) -> Workcell:
+    """Two Pandas that carry a box a little, their third joints locked."""
+    return load(single_cell(SINGLE["panda"], folder, {PANDA_JOINT: angle}))
+
+
+def free_pandas(folder: Path, entry: str = "") -> Workcell:
+    """The same, these joints redundant; `entry` is what the file says of them."""
+    path = single_cell(SINGLE["panda"], folder, {})
+    if entry:
+        text = path.read_text()
+        given = f'"redundant" = [{{joint = "{PANDA_JOINT}", {entry}}}], "samples" ='
+        path.write_text(text.replace('"samples" =', given))
+    return load(path)
+
+
+def rack_on_rail(folder: Path, away: float, room: float = 0.0) -> Workcell:
+    """The rack, its left robot on a slide whose root stands `away` [m] behind its place: it is
+    there where the slide is out by as much, as in the hand-made trajectory. Elsewhere it may be as
+    far from there as there is room [m]."""
+    urdf = RACK.parent.parent / "robots/gofa12.urdf"
+    slide = """<link name="rail"/>
+  <joint name="slide" type="prismatic">
+    <parent link="rail"/><child link="base_link"/><axis xyz="1 0 0"/>
+    <limit lower="-9" upper="9" effort="2000" velocity="1.0"/>
+  </joint>
+  <link name="base_link">"""
+    (folder / "rail.urdf").write_text(urdf.read_text().replace('<link name="base_link">', slide, 1))
+    text = RACK.read_text().replace("../robots/gofa12.urdf", "rail.urdf", 1)
+    text = text.replace("../robots/gofa12.urdf", str(urdf))
+    # The root's x axis is the world's -y.
+    text = text.replace("[-0.15, 1.15, 0.20]", f"[-0.15, {1.15 + away}, 0.20]")
+    low, high = away - room, away + room
+    given = f'redundant = [{{joint = "slide", lower = {low}, upper = {high}, initial = {away}}}]'
+    path = folder / "cell.toml"
+    path.write_text(text.replace("[task]", f"[task]\n{given}"))
+    return load(path)
+
+
+def machine_on_lift(folder: Path, height: float, free: bool) -> Workcell:
+    """TIAGo's two arms, its lift a joint of both that is redundant or locked [m]."""
+    machine = MACHINES["tiago_dual"]
+    folder.mkdir(parents=True, exist_ok=True)
+    arms = []
+    for arm in (machine.left, machine.right):
+        held = arm.locked if free else arm.locked | {"torso_lift_joint": height}
+        arms.append(replace(arm, chain=("base_footprint", arm.chain[1]), locked=held))
+    x, y, z = machine.box
+    lifted = replace(machine, left=arms[0], right=arms[1], box=(x, y, z + height))
+    path = machine_cell(lifted, folder)
+    if free:
+        given = f'{{joint = "torso_lift_joint", initial = {height}}}'
+        text = path.read_text()
+        path.write_text(text.replace('"samples" =', f'"redundant" = [{given}], "samples" ='))
+    return load(path)
