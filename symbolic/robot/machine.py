@@ -54,10 +54,14 @@ def arm_links(robots: Arms, i: int) -> ArmLinks:
         RobotModelError: see `symbolic.robot.urdf.arm_model`.
     """
     moved, still = _sorted_links(robots[i])
-    shared = _moved_by(robots[i], common_joints(robots))
-    mount = _mount(robots[i], (*still, *shared))
+    mount = _mount(robots[i], still)
     if one_machine(robots):
-        moved = moved if i == 0 else tuple(link for link in moved if link not in shared)
+        on_common, for_other = (_moved_by(robots[arm], common_joints(robots)) for arm in (i, 1 - i))
+        shared = [link for link in on_common if link in for_other]
+        mount = _mount(robots[i], (*still, *shared))
+        moved = tuple(
+            link for link in moved if link not in on_common or (i == 0 and link in shared)
+        )
         _, still_for_other = _sorted_links(robots[1 - i])
         still = tuple(link for link in still if link in still_for_other) if i == 0 else ()
     return ArmLinks(moved, still, mount)
