@@ -180,7 +180,7 @@ class PathTimer:
 
     def _path_failure(self, paths: dict[str, Array], row: int) -> PathTiming | None:
         """Why a path cannot be timed at all."""
-        pose = paths["pose"][row]
+        pose = paths["pose"][row][:, :6]
         if float(np.abs(pose - pose[0]).max()) < LEAST_LENGTH:
             return self._failed(TimingStatus.NO_MOTION, Place("path length", "", "", 0, 0.0))
         sides = [

@@ -94,7 +94,7 @@ def joint_acceleration_rows(motion: PathMotion, workcell: Workcell) -> PointRows
     return PointRows(
         np.concatenate([alpha, -alpha], axis=1),
         np.concatenate([beta, -beta], axis=1),
-        np.ones((len(alpha), 24)),
+        np.ones((len(alpha), 2 * alpha.shape[1])),
     )
 
 
