@@ -25,7 +25,7 @@ _VIEWED = 12
 
 def scene_data(geometry: CellGeometry, carry: Carry) -> dict[str, Any]:
     """Shapes, joints and a good place to look from, as JSON values."""
-    points = motion_points(geometry, carry)
+    points = motion_points(geometry, carry.pose, carry.q)
     lower, upper = points.min(axis=0), points.max(axis=0)
     return {
         "arms": [
@@ -45,10 +45,10 @@ def scene_data(geometry: CellGeometry, carry: Carry) -> dict[str, Any]:
     }
 
 
-def motion_points(geometry: CellGeometry, carry: Carry) -> Array:
-    """(k, 3) what a picture of a whole carry has to show, see `extent_points`."""
-    every = slice(None, None, max(1, len(carry) // _VIEWED))
-    return extent_points(geometry, cell_solids(geometry), carry.pose[every], carry.q[every])
+def motion_points(geometry: CellGeometry, pose: Array, q: Array) -> Array:
+    """(k, 3) what a picture of a whole motion has to show, see `extent_points`."""
+    every = slice(None, None, max(1, len(pose) // _VIEWED))
+    return extent_points(geometry, cell_solids(geometry), pose[every], q[every])
 
 
 def scene_js() -> str:

@@ -90,7 +90,6 @@ class CellWitness:
         reference: Reference,
         control: Control = "leader",
         factor: float = 1.0,
-        leader: int = 0,
     ) -> ArmOutcome:
         """One job, up to its end or to a slip.
 
@@ -98,9 +97,8 @@ class CellWitness:
             reference: what the cell is told; its workcell may differ from the simulated one in
                 payload, friction and the pads' places.
             factor: multiple of the normal forces to press with.
-            leader: index of the arm that keeps its place under the control `leader`.
         """
-        return _Run(self, reference, control, factor, leader).outcome()
+        return _Run(self, reference, control, factor).outcome()
 
     def threshold(
         self,
@@ -127,7 +125,6 @@ class _Run:
         reference: Reference,
         control: Control,
         factor: float,
-        leader: int,
     ) -> None:
         self._settings, self._workcell = witness.settings, witness.workcell
         self._reference, self._factor = reference, factor
@@ -151,7 +148,9 @@ class _Run:
         critical = 2.0 * np.sqrt(stiffness * self._joint_inertia())
         damping = self._settings.damping_ratio * critical
         gains = [(stiffness[arm], damping[arm]) for arm in self._arms]
-        self._controllers = controllers(control, leader, self._settings, (gains[0], gains[1]))
+        self._controllers = controllers(
+            control, reference.leader, self._settings, (gains[0], gains[1])
+        )
 
     def outcome(self) -> ArmOutcome:
         """Simulate."""

@@ -22,6 +22,10 @@ from symbolic.physics.contact_forces import GRAVITY
 from symbolic.robot.urdf import arm_model
 from symbolic.workcell.records import Box, Cylinder, Sphere, Workcell
 
+SOFTNESS = "0.7 0.7 0.001"
+"""Of contacts: at 0.7 MuJoCo's regularisation lets a pad give by some hundredths of a millimetre.
+Much stiffer ones lose contact for single steps where accelerations jump."""
+
 SOLID = 'contype="2" conaffinity="0"'
 UNTOUCHED = 'contype="0" conaffinity="0"'
 
@@ -54,7 +58,7 @@ class ArmSettings:
     noslip_iterations: int = 30
     slip: float = 1e-3
     arrival: float = 5e-3
-    stiffness: float = 50.0
+    stiffness: float = 20.0
     damping_ratio: float = 0.7
     armature: float = 5e-3
     force_gain: float = 20.0
@@ -111,7 +115,7 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
   <compiler angle="radian" boundmass="0.001" boundinertia="0.000001" balanceinertia="true"/>
   {solver_options(settings.time_step, settings.noslip_iterations, np.array(GRAVITY))}
   <default>
-    <geom solref="{settings.contact_time!r} 1" solimp="0.99 0.9999 0.0001" condim="3"
+    <geom solref="{settings.contact_time!r} 1" solimp="{SOFTNESS}" condim="3"
       friction="{settings.support_friction!r} 0 0"/>
   </default>
   <asset>{"".join(meshes)}</asset>

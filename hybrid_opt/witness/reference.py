@@ -65,6 +65,7 @@ class Reference:
         effort: (n, all joints) joint torques to feed forward, pressing included [N m].
         press_torque: (n, all joints) torques of each arm's joints that press with 1 N.
         job: what is to happen to the box.
+        leader: index of the arm that keeps its place where the other alone controls its force.
     """
 
     workcell: Workcell
@@ -73,6 +74,7 @@ class Reference:
     effort: Array
     press_torque: Array
     job: BoxJob
+    leader: int = 0
 
 
 def job_reference(
@@ -160,7 +162,7 @@ def carry_reference(
         stands=begin - SETTLE + STANDS,
     )
     effort = own + torque.reshape(len(own), -1) + pressing * repeated
-    return Reference(workcell, motion, normal_force, effort, pressing, job)
+    return Reference(workcell, motion, normal_force, effort, pressing, job, leader)
 
 
 def with_tracking_error(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +34,35 @@ COLOURS = 128
 """Of a GIF's palette."""
 
 
-def write_animation(geometry: CellGeometry, carry: DrawnCarry, path: Path) -> None:
-    """Write a carry in real time; the suffix decides the format, .gif or .mp4.
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A motion to be shown.
+
+    Attributes:
+        label: what stands above it.
+        time: (n,) [s].
+        pose: (n, 6) of the box [m, rad].
+        q: (n, all joints) of both arms side by side [rad].
+    """
+
+    label: str
+    time: Array
+    pose: Array
+    q: Array
+
+    @classmethod
+    def of(cls, carry: DrawnCarry) -> Film:
+        """A carry as it was planned."""
+        return cls(carry.label, carry.timed.time, carry.timed.pose, carry.timed.q)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
+
+
+def write_animation(geometry: CellGeometry, film: Film, path: Path) -> None:
+    """Write a motion in real time; the suffix decides the format, .gif or .mp4.
 
     Raises:
         ReportError: the suffix is another, or the MP4 writer is not installed.
@@ -44,17 +72,16 @@ def write_animation(geometry: CellGeometry, carry: DrawnCarry, path: Path) -> No
         raise ReportError(f"animation {path.name!r}: the name must end in .gif or .mp4")
     writer = _write_gif if suffix == ".gif" else _write_mp4
     path.parent.mkdir(parents=True, exist_ok=True)
-    writer(frames(geometry, carry), path)
+    writer(frames(geometry, film), path)
 
 
-def frames(geometry: CellGeometry, carry: DrawnCarry) -> Iterator[NDArray[np.uint8]]:
+def frames(geometry: CellGeometry, film: Film) -> Iterator[NDArray[np.uint8]]:
     """(height, width, 3) pictures, evenly spaced in time."""
     cell = CutCell.of(geometry, cell_solids(geometry))
-    points = motion_points(geometry, carry.timed)
-    timed = carry.timed
-    count = max(2, round(timed.duration * FRAMES_PER_SECOND) + 1)
-    moments = np.linspace(timed.time[0], timed.time[-1], count)
-    pose, q = _at(moments, timed.time, timed.pose), _at(moments, timed.time, timed.q)
+    points = motion_points(geometry, film.pose, film.q)
+    count = max(2, round(film.duration * FRAMES_PER_SECOND) + 1)
+    moments = np.linspace(film.time[0], film.time[-1], count)
+    pose, q = _at(moments, film.time, film.pose), _at(moments, film.time, film.q)
     for k, moment in enumerate(moments):
         with in_style():
             figure = Figure(figsize=SIZE, dpi=DPI)
@@ -62,7 +89,7 @@ def frames(geometry: CellGeometry, carry: DrawnCarry) -> Iterator[NDArray[np.uin
             draw_cell(axes, cell, ISOMETRIC, pose[k], q[k])
             draw_path(axes, ISOMETRIC, pose[: k + 1, :3], color="#b00020", linewidth=1.2)
             frame_axes(axes, ISOMETRIC, points)
-            text = f"{carry.label}    t = {moment - timed.time[0]:5.2f} s"
+            text = f"{film.label}    t = {moment - film.time[0]:5.2f} s"
             figure.text(0.02, 0.95, text, fontsize=10)
             yield _pixels(figure)
 

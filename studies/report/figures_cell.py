@@ -121,7 +121,7 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) ->
 def motion_sequence(geometry: CellGeometry, carry: DrawnCarry, columns: int = 2) -> Figure:
     """The cell at 0, 33, 66 and 100 % of a carry (paper Figures 14 and 15)."""
     rows = -(-len(SHARES) // columns)
-    points = motion_points(geometry, carry.timed)
+    points = motion_points(geometry, carry.timed.pose, carry.timed.q)
     cell = CutCell.of(geometry, cell_solids(geometry))
     figure = new_figure(FULL_WIDTH, 0.37 * FULL_WIDTH * rows)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hybrid_opt.campaign.results import read_summary
 from studies.errors import ReportError
-from studies.report.animation import write_animation
+from studies.report.animation import Film, write_animation
 from studies.report.data import gather_carries
 from studies.report.generate import TABLES
 from studies.report.live import LiveView
@@ -23,7 +23,7 @@ def animate(root: Path, path: Path) -> None:
         DualArmError: the results, the suffix or a library do not fit.
     """
     geometry, carries = gather_carries(root)
-    write_animation(geometry, carries[min(1, len(carries) - 1)], path)
+    write_animation(geometry, Film.of(carries[min(1, len(carries) - 1)]), path)
 
 
 def insert_tables(root: Path, document: Path) -> None:

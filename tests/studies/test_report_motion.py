@@ -13,7 +13,7 @@ from PIL import Image, ImageSequence
 
 from studies.errors import ReportError
 from studies.report.__main__ import main
-from studies.report.animation import FRAMES_PER_SECOND, frames, write_animation
+from studies.report.animation import FRAMES_PER_SECOND, Film, frames, write_animation
 from studies.report.live import LiveView
 from studies.report.records import DrawnCarry, ReportData
 
@@ -25,7 +25,7 @@ def carry(data: ReportData) -> DrawnCarry:
 
 def test_a_gif_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
     path = tmp_path / "made" / "carry.gif"
-    write_animation(data.geometry, carry, path)
+    write_animation(data.geometry, Film.of(carry), path)
     image = Image.open(path)
     durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
     # GIF counts hundredths of a second, so a frame of 66.7 ms is written as 60 or 70.
@@ -40,7 +40,7 @@ def test_a_gif_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path:
 
 
 def test_frames_show_the_motion_from_start_to_goal(data: ReportData, carry: DrawnCarry) -> None:
-    pictures = list(frames(data.geometry, carry))
+    pictures = list(frames(data.geometry, Film.of(carry)))
     assert len(pictures) == round(carry.timed.duration * FRAMES_PER_SECOND) + 1
     assert {picture.shape for picture in pictures} == {(400, 640, 3)}
     steps = [np.abs(a.astype(int) - b).mean() for a, b in pairwise(pictures)]
@@ -49,7 +49,7 @@ def test_frames_show_the_motion_from_start_to_goal(data: ReportData, carry: Draw
 
 def test_an_mp4_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
     path = tmp_path / "carry.mp4"
-    write_animation(data.geometry, carry, path)
+    write_animation(data.geometry, Film.of(carry), path)
     count, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
     assert count == round(carry.timed.duration * FRAMES_PER_SECOND) + 1
     assert seconds == pytest.approx(carry.timed.duration, abs=2.0 / FRAMES_PER_SECOND)
@@ -57,7 +57,7 @@ def test_an_mp4_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path
 
 def test_another_suffix_is_refused(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
     with pytest.raises(ReportError, match=r"\.gif or \.mp4"):
-        write_animation(data.geometry, carry, tmp_path / "carry.avi")
+        write_animation(data.geometry, Film.of(carry), tmp_path / "carry.avi")
 
 
 def test_the_program_animates_a_results_folder(study: Path, tmp_path: Path) -> None:

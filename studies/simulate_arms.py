@@ -1,0 +1,115 @@
+"""`studies.simulate` with arms: a whole cell under its controllers."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
+from hybrid_opt.robust.cases import random_cases
+from hybrid_opt.robust.force import RobustModel
+from hybrid_opt.witness.arms import ArmOutcome, CellWitness
+from hybrid_opt.witness.cases import workcell_of_case
+from hybrid_opt.witness.cell_scene import ArmSettings
+from hybrid_opt.witness.controller import Control
+from hybrid_opt.witness.reference import Reference, carry_reference, with_tracking_error
+from studies.report.animation import Film, write_animation
+from studies.simulate_pads import is_uncertain, threshold_text, worst_friction
+from symbolic.array import Array
+
+LOW, HIGH, BISECTIONS = 0.9, 1.5, 8
+"""Factors between which a threshold is looked for, to about 0.2 %."""
+
+SHOWN_FACTOR = 1.1
+"""Of the force in the run that is described and filmed where nothing is uncertain."""
+
+
+def simulate_arms(
+    cell: Cell, carry: Carry, settings: ArmSettings, options: argparse.Namespace
+) -> str:
+    """The threshold of a carry and random cases, printed; returns the cell as MJCF.
+
+    Raises:
+        WitnessError: the box holds at the lower or slips at the upper factor.
+    """
+    control, leader = options.controller, options.leader - 1
+    witness = CellWitness(cell.workcell, settings)
+    reference = carry_reference(cell, carry, leader=leader)
+    print(
+        threshold_text(witness.threshold(reference, control, LOW, HIGH, BISECTIONS), settings.slip)
+    )
+    if options.sweep:
+        for factor in (0.5, 2.0):
+            step = factor * settings.time_step
+            period = max(step, settings.control_period)
+            other = replace(settings, time_step=step, control_period=period)
+            found = CellWitness(cell.workcell, other).threshold(
+                reference, control, LOW, HIGH, BISECTIONS
+            )
+            print(f"  with a time step of {step:g} s: {found.factor:.4f}")
+    pressed, factor = reference, SHOWN_FACTOR
+    if is_uncertain(cell.workcell):
+        force = RobustModel(cell.workcell).robust_force(carry, leader=leader)
+        peak = force.peak
+        pressed, factor = carry_reference(cell, carry, force.commanded, leader), 1.0
+        print(f"  robust forces up to {peak[0]:.2f} / {peak[1]:.2f} N:")
+    outcome = witness.simulate(pressed, control, factor)
+    _tell(outcome, carry)
+    if is_uncertain(cell.workcell):
+        _cases(cell, pressed, settings, options)
+        rubs_less = CellWitness(
+            workcell_of_case(cell.workcell, worst_friction(cell.workcell)), settings
+        )
+        least = rubs_less.simulate(reference, control)
+        word = "hold" if least.holds else "slip"
+        print(f"  least forces with the set's worst friction: {word}")
+    if options.film:
+        _film(cell, outcome, Path(options.film))
+    return witness.text
+
+
+def _tell(outcome: ArmOutcome, carry: Carry) -> None:
+    during = outcome.time >= carry.time[0]
+    missing = (outcome.normal_force / outcome.normal_force_reference)[during] - 1.0
+    print(
+        f"  at {outcome.factor:g} times the force the box "
+        f"{'arrives' if outcome.arrives else 'does NOT arrive'}: slip up to "
+        f"{1e3 * outcome.slip.max():.3f} mm, {1e3 * outcome.misses:.2f} mm from its goal; normal "
+        f"forces within {100.0 * np.abs(missing).max():.1f} % of their reference, rms "
+        f"{100.0 * np.sqrt((missing**2).mean()):.2f} %; joints off by up to "
+        f"{1e3 * np.abs(outcome.tracking_error[during]).max():.2f} mrad; torques up to "
+        f"{100.0 * outcome.torque_use.max():.0f} % of the largest"
+    )
+
+
+def _cases(
+    cell: Cell, pressed: Reference, settings: ArmSettings, options: argparse.Namespace
+) -> None:
+    """Random cases with tracking errors under the robust force."""
+    workcell, rng = cell.workcell, np.random.default_rng(options.seed)
+    control: Control = options.controller
+    slips = []
+    arrived = 0
+    for case in random_cases(workcell, workcell.uncertainty, options.runs, rng):
+        witness = CellWitness(workcell_of_case(workcell, case), settings, case[8:11])
+        told = with_tracking_error(pressed, options.tracking_error, rng)
+        outcome = witness.simulate(told, control)
+        arrived += outcome.arrives
+        slips.append(outcome.slip.max())
+    print(
+        f"  {arrived} of {len(slips)} random cases arrive (seed {options.seed}, joints off by up "
+        f"to {options.tracking_error:g} rad); slip up to {1e3 * max(slips):.3f} mm"
+    )
+
+
+def _film(cell: Cell, outcome: ArmOutcome, path: Path) -> None:
+    angles: Array = Rotation.from_matrix(outcome.box_rotation).as_euler("xyz")
+    pose = np.concatenate([outcome.box_position, angles], axis=1)
+    label = f"simulated, {outcome.factor:g} times the force"
+    write_animation(cell.geometry, Film(label, outcome.time, pose, outcome.q), path)
+    print(f"  film written to {path}")
