@@ -94,7 +94,7 @@ class ArmController:
             pressed = touches * (self._integral + self._drift_stiffness * distance)
             # Without the part that moves the pad along its normal.
             moved = np.concatenate([distance * state.normal, np.zeros(3)])
-            error = error - touches * np.linalg.solve(state.jacobian, moved)
+            error = error - touches * np.linalg.pinv(state.jacobian) @ moved
         sprung: Array = self._stiffness * error + self._damping * state.error_rate
         return command.effort + sprung + pressed * along
 

@@ -9,6 +9,7 @@ import pinocchio as pin
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
+from hybrid_opt.timing.model import contact_torque
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.robot.model import build_robot_model
@@ -145,8 +146,7 @@ def carry_reference(
     known = replace(carry, pose=pose, rate=rate, second_rate=second)
     friction = np.array([contact.friction for contact in workcell.contacts])
     load = model.uncertain_load(known, friction, workcell.payload.centre_of_mass)
-    wrenches = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
-    torque = np.einsum("nijk,nik->nij", model.wrench_torque(motion.q, pose), wrenches)
+    torque = contact_torque(workcell, model.wrench_torque(motion.q, pose), load)
     # At rest before the carry the pads press as they will have to when it begins.
     extra = np.concatenate([[extra[0]] * 2, extra])
     starting = (carry.normal_force[0] - load["normal_force"][0]).max()
@@ -161,7 +161,7 @@ def carry_reference(
         held=(begin - SETTLE / 2.0, float(carry.time[-1])),
         stands=begin - SETTLE + STANDS,
     )
-    effort = own + torque.reshape(len(own), -1) + pressing * repeated
+    effort = own + torque + pressing * repeated
     return Reference(workcell, motion, normal_force, effort, pressing, job, leader)
 
 

@@ -11,7 +11,10 @@ pytest.importorskip("mujoco")
 
 import mujoco
 
+from hybrid_opt.cell import Cell
 from hybrid_opt.robust.cases import nominal_case
+from hybrid_opt.timing import TimingLimits
+from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.arms import CellWitness
 from hybrid_opt.witness.cases import workcell_of_case
 from hybrid_opt.witness.cell_scene import ArmSettings, joint_names
@@ -20,6 +23,7 @@ from hybrid_opt.witness.reference import (
     BoxJob,
     JointMotion,
     Reference,
+    carry_reference,
     job_reference,
     press_torque,
     with_tracking_error,
@@ -28,7 +32,7 @@ from studies.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Workcell
-from tests.symbolic.cells import hand_cell, start_posture
+from tests.symbolic.cells import hand_cell, rack_cell, start_posture
 
 WEIGHT = 98.1
 LEAST = WEIGHT / 2.0
@@ -188,6 +192,27 @@ def test_tracking_errors_begin_at_zero_and_stay_small() -> None:
     np.testing.assert_array_equal(off.q[0], q[0])
     assert 2e-4 < np.abs(off.q - q).max() <= 1e-3
     np.testing.assert_allclose(np.gradient(off.q, time, axis=0)[1:-1], off.q_rate[1:-1], atol=1e-4)
+
+
+def test_a_carrys_references_are_the_planners_torques() -> None:
+    """The torques of the timing's compiled functions, and what pressing harder adds to them."""
+    cell = Cell(rack_cell())
+    carry = time_path(cell.timing_model, cell.initial, TimingLimits()).carry
+    assert carry is not None
+    planned = carry_reference(cell, carry)
+    np.testing.assert_allclose(planned.effort[2:], carry.torque, atol=1e-9)
+    np.testing.assert_allclose(planned.normal_force[2:], carry.normal_force, atol=1e-9)
+    harder = carry_reference(cell, carry, carry.normal_force[:, 0] + 7.0, leader=1)
+    assert harder.leader == 1
+    np.testing.assert_allclose(harder.normal_force[2:] - carry.normal_force, 7.0, atol=1e-9)
+    more = harder.effort[2:] - planned.effort[2:]
+    np.testing.assert_allclose(more, 7.0 * planned.press_torque[2:], atol=1e-9)
+    # At rest before, with what the beginning will need.
+    assert (planned.normal_force[0] >= carry.normal_force[0] - 1e-9).all()
+    with pytest.raises(SettingsError, match="samples"):
+        carry_reference(cell, carry, np.ones(3))
+    with pytest.raises(SettingsError, match="start and end at rest"):
+        carry_reference(cell, replace(carry, rate=np.ones_like(carry.rate)))
 
 
 def test_misuse_is_told() -> None:
