@@ -6,7 +6,7 @@ import ctypes
 import os
 import warnings
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
 from pathlib import Path
@@ -109,14 +109,7 @@ class CompiledFunction(NumericFunction):
         n: int,
         threads: int,
     ) -> None:
-        steps = [
-            _size(shape) if per_candidate else 0
-            for shape, per_candidate in zip(self.input_shapes, batched, strict=True)
-        ] + [_size(shape) for shape in self.output_shapes]
-        ports = (ctypes.c_longlong * (2 * len(steps)))()
-        for k, (array, step) in enumerate(zip([*inputs, *outputs], steps, strict=True)):
-            ports[2 * k] = _address(array)
-            ports[2 * k + 1] = step
+        ports = self._ports(inputs, batched, outputs)
         address = ctypes.addressof(ports)
         if threads == 1 or n == 1:
             self._run_chunk(address, 0, n)
@@ -143,6 +136,30 @@ class CompiledFunction(NumericFunction):
             chunks.clear()
         for future in futures:
             future.result()
+
+    def _ports(
+        self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
+    ) -> ctypes.Array[ctypes.c_longlong]:
+        """Address and step of every argument of a batch, as the driver wants them."""
+        steps = [
+            _size(shape) if per_candidate else 0
+            for shape, per_candidate in zip(self.input_shapes, batched, strict=True)
+        ] + [_size(shape) for shape in self.output_shapes]
+        ports = (ctypes.c_longlong * (2 * len(steps)))()
+        for k, (array, step) in enumerate(zip([*inputs, *outputs], steps, strict=True)):
+            ports[2 * k] = _address(array)
+            ports[2 * k + 1] = step
+        return ports
+
+    def _prepared(
+        self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
+    ) -> Callable[[int], None]:
+        ports = self._ports(inputs, batched, outputs)
+
+        def run(count: int, _memory: object = (inputs, outputs)) -> None:
+            self._run_chunk(ctypes.addressof(ports), 0, count)
+
+        return run
 
     def _run_chunk(self, ports_address: int, begin: int, end: int) -> None:
         if self.lanes > 1 and end - begin > 1:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -124,6 +124,37 @@ class NumericFunction(ABC):
             self._evaluate_batch(arrays, batched, outputs, n, threads or available_cores())
         return dict(zip(self.output_names, outputs, strict=True))
 
+    def prepared(self, n: int, shared: Collection[str] = ()) -> PreparedBatch:
+        """A batch of up to n evaluations on arrays that stay where they are.
+
+        For calls whose work is small beside `batch`'s own checks and allocations.
+
+        Args:
+            n: at least 1.
+            shared: names of inputs that have one value for all evaluations.
+        """
+        inputs = {
+            name: np.zeros(shape if name in shared else (n, *shape))
+            for name, shape in zip(self.input_names, self.input_shapes, strict=True)
+        }
+        outputs = {
+            name: np.zeros((n, *shape))
+            for name, shape in zip(self.output_names, self.output_shapes, strict=True)
+        }
+        batched = [name not in shared for name in self.input_names]
+        arrays = list(inputs.values()), list(outputs.values())
+        return PreparedBatch(inputs, outputs, n, self._prepared(arrays[0], batched, arrays[1]))
+
+    def _prepared(
+        self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
+    ) -> Callable[[int], None]:
+        """What evaluates the first so many of a batch on fixed arrays."""
+
+        def run(count: int) -> None:
+            self._evaluate_batch(inputs, batched, outputs, count, 1)
+
+        return run
+
     @abstractmethod
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
         """Evaluate once into a record of `Signature.output_record`."""
@@ -180,6 +211,38 @@ class NumericFunction(ABC):
 
     def _wrong_shape(self, name: str, found: Shape, needed: str) -> CodegenError:
         return CodegenError(f"{self.name}: input '{name}' has shape {found}, needed is {needed}")
+
+
+class PreparedBatch:
+    """A batch that is evaluated over and over. Not to be shared between threads.
+
+    Attributes:
+        inputs, outputs: by name; written into and read by the caller, overwritten by every call.
+        size: evaluations that there is room for.
+    """
+
+    def __init__(
+        self,
+        inputs: dict[str, Array],
+        outputs: dict[str, Array],
+        size: int,
+        run: Callable[[int], None],
+    ) -> None:
+        """See `NumericFunction.prepared`."""
+        self.inputs, self.outputs, self.size, self._run = inputs, outputs, size, run
+
+    def __call__(self, count: int | None = None) -> dict[str, Array]:
+        """Evaluate all, or the first `count` of them, and return the outputs.
+
+        Raises:
+            CodegenError: the function failed, or there is no room for so many.
+        """
+        wanted = self.size if count is None else count
+        if not 0 <= wanted <= self.size:
+            raise CodegenError(f"{wanted} evaluations wanted; there is room for {self.size}")
+        if wanted:
+            self._run(wanted)
+        return self.outputs
 
 
 def available_cores() -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,6 +42,26 @@ class InterpretedFunction(NumericFunction):
         evaluate()
         if buffer.ret():
             raise CodegenError(f"{self.name}: the function failed")
+
+    def _prepared(
+        self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
+    ) -> Callable[[int], None]:
+        buffers = []
+        for k in range(len(outputs[0]) if outputs else 0):
+            buffer, evaluate = self.function.buffer()
+            for i, (array, per_candidate) in enumerate(zip(inputs, batched, strict=True)):
+                buffer.set_arg(i, (array[k, ...] if per_candidate else array).data)
+            for i, array in enumerate(outputs):
+                buffer.set_res(i, array[k, ...].data)
+            buffers.append((buffer, evaluate))
+
+        def run(count: int, _memory: object = (inputs, outputs)) -> None:
+            for buffer, evaluate in buffers[:count]:
+                evaluate()
+                if buffer.ret():
+                    raise CodegenError(f"{self.name}: the function failed")
+
+        return run
 
     def _evaluate_batch(
         self,

@@ -57,7 +57,7 @@ def polish(
     rng: np.random.Generator,
     settings: PolishSettings | None = None,
 ) -> Front:
-    """Improve a front of the paper's two objectives with IPOPT.
+    """Improve a front of the paper's two objectives with an interior-point method.
 
     Args:
         rng: spreads the starts of some attempts.

@@ -109,7 +109,7 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         "--polish",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="improve every front with IPOPT (default: yes for the paper's two objectives)",
+        help="improve every front further (default: yes for the paper's two objectives)",
     )
     after.add_argument(
         "--polish-points",

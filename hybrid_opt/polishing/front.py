@@ -132,7 +132,8 @@ class _Run:
         self._evaluator, self._settings = polisher.evaluator, polisher.settings
         self._solver = polisher.solver
         self._archive, self._recorded, self._emit = archive, recorded, emit
-        self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
+        self._tried: set[tuple[int | None, bytes]] = set()
+        self._stalls = 0
         self.outcomes: list[PolishOutcome] = []
 
     def all(self, rng: np.random.Generator) -> None:
@@ -141,19 +142,20 @@ class _Run:
         while self._left() > 0:
             for _ in range(self._settings.front.turns_per_gap):
                 self._turn((0, 1), rng)
-                if self._stalls[None] < self._settings.front.middle_stalls:
+                if self._stalls < self._settings.front.middle_stalls:
                     self._turn((None,), rng)
             self._do(self._gap())
 
     def _turn(self, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
-        """An attempt at each of some aims, and whether it came further."""
-        before = [self._archive.best(objective)[1] for objective in objectives]
-        stalls = [self._stalls[objective] for objective in objectives]
-        pairs = zip(objectives, stalls, strict=True)
-        self._do([aimed(self._archive, *pair, self._settings, rng) for pair in pairs])
-        for objective, value in zip(objectives, before, strict=True):
-            further = self._archive.best(objective)[1] < value - self._settings.front.progress
-            self._stalls[objective] = 0 if further else self._stalls[objective] + 1
+        """An attempt at each of some aims."""
+        for objective in objectives:
+            before = self._archive.best(objective)[1]
+            attempt = aimed(self._archive, objective, self._tried, self._settings, rng)
+            self._tried.add((objective, attempt.x.tobytes()))
+            self._do([attempt])
+            further = self._archive.best(objective)[1] < before - self._settings.front.progress
+            if objective is None:
+                self._stalls = 0 if further else self._stalls + 1
 
     def _gap(self) -> list[Attempt]:
         """An attempt in the widest gap that was not tried, none where all are narrow."""

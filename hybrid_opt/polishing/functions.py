@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import get_args
 
 import casadi as ca
-import numpy as np
 
 from codegen.function import NumericFunction
+from codegen.interpreted import InterpretedFunction
 from hybrid_opt.compiled_cell import CompiledCell
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
@@ -49,48 +49,18 @@ _LEVELS = {
 """Optimisation levels of the compiler where size alone would choose too high a one: these are
 straight-line code of half a megabyte and more, called once per iteration or seldom."""
 
-
-_Prepared = tuple[list[Array], dict[str, Array], Callable[[], None], ca.FunctionBuffer]
-"""Inputs and outputs, what fills the outputs, and the buffer that has to live as long."""
-
-
-class Mapped:
-    """A CasADi function of SX over n rows at once, by the interpreter.
-
-    What a compiled function does in `batch`, for functions that are too many to compile.
-    """
-
-    def __init__(self, function: ca.Function) -> None:
-        self._function = function
-        self._shapes = [function.size_in(k) for k in range(function.n_in())]
-        self._prepared = lru_cache(maxsize=64)(self._prepare)
-
-    def batch(self, *inputs: Array) -> dict[str, Array]:
-        """The outputs by name, with a leading axis of rows, of inputs likewise."""
-        given, results, evaluate, _ = self._prepared(len(inputs[0]))
-        for array, value in zip(given, inputs, strict=True):
-            array[...] = value
-        evaluate()
-        return {name: result.copy() for name, result in results.items()}
-
-    def _prepare(self, n: int) -> _Prepared:
-        function = self._function.map(n)
-        buffer, evaluate = function.buffer()
-        given = [np.zeros((n, rows) if rows > 1 else (n,)) for rows, _ in self._shapes]
-        results = {}
-        for k in range(function.n_out()):
-            rows, columns = self._function.size_out(k)
-            shape = (n, columns, rows) if columns > 1 else (n, rows) if rows > 1 else (n,)
-            results[self._function.name_out(k)] = np.zeros(shape)
-        for k, array in enumerate(given):
-            buffer.set_arg(k, array.data)
-        for k, array in enumerate(results.values()):
-            buffer.set_res(k, array.data)
-        return given, results, evaluate, buffer
-
-
-RowFunction = NumericFunction | Mapped
-"""Anything with `batch`."""
+_LANE_LEVELS = dict.fromkeys(
+    [
+        *(SampleKey("force", "inner", order).name for order in ORDERS),
+        *(ClosureKey(arm, order).name for arm in ARMS for order in ORDERS),
+        *(RowKey(constraint.family, order).name for constraint in COMPILED for order in ORDERS),
+        GAPS,
+    ],
+    1,
+)
+"""What is evaluated in lanes, because it serves many samples or places at a call, and its level:
+higher ones compile three times as long and gain nothing (measured on the rack: every function
+within 5 %, one slower by 40 %)."""
 
 
 class RowFunctions:
@@ -104,18 +74,19 @@ class RowFunctions:
     ) -> None:
         self.model, self._compiled = model, compiled
         self._gaps, self._place = gaps, Place(model)
-        self._interpreted: dict[RowKey, Mapped] = {}
+        self._interpreted: dict[RowKey, NumericFunction] = {}
         self.numbers = lru_cache(maxsize=None)(self._numbers)
         self.obstacle = lru_cache(maxsize=None)(self._place.obstacle)
         self.separable = frozenset(self._place.separable())
 
-    def of(self, constraint: PlaceConstraint, order: Order) -> RowFunction:
+    def of(self, constraint: PlaceConstraint, order: Order) -> NumericFunction:
         """See `symbolic.smooth.place.row_function`."""
         key = RowKey(constraint.family, order)
         if key in self._compiled:
             return self._compiled[key]
         if key not in self._interpreted:
-            self._interpreted[key] = Mapped(row_function(self._place, constraint, order))
+            function = row_function(self._place, constraint, order)
+            self._interpreted[key] = InterpretedFunction(function)
         return self._interpreted[key]
 
     def _numbers(self, constraint: PlaceConstraint) -> Array:
@@ -155,7 +126,9 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
             "polish under 'constant' or 'ramped'"
         )
 
-    def make(model: CellModel) -> dict[str, ca.Function]:
+    @cache
+    def make() -> dict[str, ca.Function]:
+        model = compiled.model
         place, functions = Place(model), dict[str, ca.Function]()
         for quantity in QUANTITIES:
             functions |= _named(sample_functions(model.workcell, quantity))
@@ -167,7 +140,15 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
                 functions[name] = row_function(place, constraint, order)
         return functions | {GAPS: gap_function(place)}
 
-    built = compiled.functions("polish", make, str(_LEVELS), levels=_LEVELS)
+    def in_lanes(_: CellModel) -> dict[str, ca.Function]:
+        return {name: f for name, f in make().items() if name in _LANE_LEVELS}
+
+    def one_by_one(_: CellModel) -> dict[str, ca.Function]:
+        return {name: f for name, f in make().items() if name not in _LANE_LEVELS}
+
+    details, levels = str(_LANE_LEVELS), _LANE_LEVELS
+    built = compiled.functions("polish in lanes", in_lanes, details, levels=levels, lanes=0)
+    built |= compiled.functions("polish", one_by_one, str(_LEVELS), details, levels=_LEVELS)
     sample_keys = [
         SampleKey(q, block, order) for q in QUANTITIES for block in BLOCKS for order in ORDERS
     ]

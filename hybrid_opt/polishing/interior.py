@@ -1,11 +1,12 @@
 """A dense interior-point method for programs of few variables and many inequalities.
 
-The polish's programs have about twenty variables and one to two hundred rows, nearly all of them
+The polish's programs have about twenty variables and two hundred rows, nearly all of them
 inequalities. Condensed to the variables, Newton's system is a matrix of twenty by twenty, where a
-sparse solver factorises one of three hundred. The method is that of Waechter and Biegler (2006):
-a barrier that falls as its problems are solved, a filter, second-order corrections, with dense
-algebra and without its restoration phase. In its place slacks are renewed, and where that does
-not help, the answer is what was reached: the polish then tries a smaller box.
+sparse solver factorises one of four hundred. The barrier falls as its problems are solved, as with
+Waechter and Biegler (2006), but rows that hold go on to hold in every iterate, in place of their
+filter: a step is shortened until they do, and its slacks are what the rows keep (Byrd, Nocedal and
+Waltz 2003 call it the feasible mode). A solve may then be cut off anywhere, and large steps do not
+wander through obstacles. Rows that do not hold yet have slacks of their own and a price.
 
 With h(z) >= 0 all inequalities, h(z) - s = 0 and the multipliers y, each step solves
 
@@ -16,12 +17,11 @@ A = dh/dz, D = y / s, r = h - s, W the curvature of the Lagrangian, E that of th
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack
 
+from hybrid_opt.polishing.interior_steps import direction, estimated, kept, largest, until
 from hybrid_opt.polishing.program import Program
 from hybrid_opt.polishing.residuals import UNKNOWN, residuals
 from hybrid_opt.polishing.settings import PolishSettings
@@ -29,7 +29,22 @@ from hybrid_opt.polishing.solvers import Answer
 from symbolic.array import Array
 
 PUSH = 1e-4
-"""Least distance of the start from bounds, as a share of their width, and least slack."""
+"""Least distance of the start from bounds, as a share of their width."""
+
+HAIR = 1e-8
+"""By this share of their width bounds are wider for the solver; its answer is clipped."""
+
+SLACK = 1e-2
+"""Least slack at the start: rows nearer than that to their limit may come nearer for a while."""
+
+RAISED = 10.0
+"""Factor to the multiplier of a row that shortened a step."""
+
+LEAST = 1e-9
+"""Least slack of all."""
+
+RENEWALS = 3
+"""Times that the least slacks may be renewed where no step was found."""
 
 LINEAR, POWER = 0.2, 1.5
 """The barrier falls to the smaller one of this share of it and this power."""
@@ -40,23 +55,20 @@ SOLVED = 10.0
 TO_BOUNDARY = 0.99
 """Share of the way to a bound that a step may take."""
 
-ARMIJO, FILTER = 1e-4, 1e-5
-"""Shares of the predicted gain, and of the violation, that a step has to bring."""
+ARMIJO = 1e-4
+"""Share of the predicted gain that a step has to bring."""
 
-SHORTEST = 1e-4
-"""Shares of a step below which a line search gives up."""
+PENALTY = 2.0
+"""Price of a violation, over its multiplier."""
 
-CORRECTIONS = 2
-"""Second-order corrections of a full step that was refused for its violation."""
+TRIALS = 8
+"""Trials of a line search before it gives up."""
 
-SHIFT, SHIFTED = 1e-6, 8.0
-"""First shift that makes an indefinite matrix definite, and the factor to the next one."""
+SHORTENED = (0.1, 0.7)
+"""Least and largest share of a refused step that is tried next; parabolas tell which between."""
 
-RENEWALS = 3
-"""Times that the slacks may be renewed in a solve."""
-
-DUAL_RANGE = 1e10
-"""Multipliers stay within this factor of what the barrier asks for."""
+NEGLIGIBLE = 1e-3
+"""Share of the largest multiplier below which a row's curvature is left out of a step."""
 
 
 @dataclass
@@ -83,8 +95,11 @@ class DenseSolver:
         self._sign = np.concatenate([-np.ones(len(upper)), np.ones(len(lower))])
         self._shift = np.concatenate([program.above[upper], -program.below[lower]])
         self._mu = settings.solve.barrier
-        self._filter: list[tuple[float, float]] = []
-        self._renewals = 0
+        # Bounds are a hair wider than they are, so that no rounding puts an iterate on one.
+        hair = HAIR * (program.high - program.low)
+        self._low, self._high = program.low - hair, program.high + hair
+        self._inner = self._low + 1e-3 * hair, self._high - 1e-3 * hair
+        self._price, self._renewals = 0.0, 0
 
     def solve(self) -> Answer:
         """Iterate until an optimum, or as long as the settings allow."""
@@ -100,29 +115,31 @@ class DenseSolver:
                 message = "Stopped_Feasible"
                 break
             self._lower_barrier(now)
-            if not self._advance(now):
+            if not self._advance(now) and not self._renew(now):
                 message = "Step_Too_Short"
                 break
-        z = now.z
-        if not np.isfinite(z).all():
-            return Answer(z, "Not_Finite", False, False, UNKNOWN, iterations)
-        lam_g = np.zeros(len(self._program.below))
-        np.add.at(lam_g, self._rows, -self._sign * now.y)
+        z = np.clip(now.z, self._program.low, self._program.high)
+        lam_z, y = estimated(
+            self._program.cost, now.A, (now.h, now.z - self._low, self._high - now.z)
+        )
+        multipliers = lam_z, self._of_rows(y)
+        usable = bool(np.isfinite(z).all())
         return Answer(
             z=z,
-            message=message,
-            converged=message == "Solve_Succeeded",
-            usable=True,
-            residuals=residuals(self._program, z, now.high - now.low, lam_g),
+            message=message if usable else "Not_Finite",
+            converged=usable and message == "Solve_Succeeded",
+            usable=usable,
+            multipliers=multipliers,
+            residuals=residuals(self._program, z, *multipliers) if usable else UNKNOWN,
             iterations=iterations,
         )
 
     def _start(self) -> _State:
-        low, high = self._program.low, self._program.high
+        low, high = self._low, self._high
         push = PUSH * (high - low)
         z = np.clip(self._program.start, low + push, high - push)
         h, A = self._inequalities(z)
-        s = np.maximum(h, PUSH)
+        s = np.maximum(h, SLACK)
         return _State(z, s, self._mu / s, self._mu / (z - low), self._mu / (high - z), h, A)
 
     def _inequalities(self, z: Array) -> tuple[Array, Array]:
@@ -141,8 +158,8 @@ class DenseSolver:
         slope = program.cost - now.A.T @ now.y - now.low + now.high
         products = (
             now.s * now.y,
-            (now.z - program.low) * now.low,
-            (program.high - now.z) * now.high,
+            (now.z - self._low) * now.low,
+            (self._high - now.z) * now.high,
         )
         return float(
             max(
@@ -156,149 +173,113 @@ class DenseSolver:
         least = self._settings.solve.tolerance / SOLVED
         while self._mu > least and self._error(now, self._mu) <= SOLVED * self._mu:
             self._mu = max(least, min(LINEAR * self._mu, self._mu**POWER))
-            self._filter.clear()
 
     def _advance(self, now: _State) -> bool:
         """One step; whether one was found."""
         program, mu = self._program, self._mu
         D = now.y / now.s
-        to_low, to_high = now.z - program.low, program.high - now.z
-        multipliers = np.zeros(len(program.below))
-        np.add.at(multipliers, self._rows, -self._sign * now.y)
-        # The objective is linear: all curvature is the constraints'.
-        M = program.curvature(now.z, multipliers) + (now.A.T * D) @ now.A
+        to_low, to_high = now.z - self._low, self._high - now.z
+        # Rows that are far from ruling are left out of the curvature: most of its cost, and next to
+        # nothing of the step.
+        ruling = np.where(now.y > NEGLIGIBLE * now.y.max(initial=0.0), now.y, 0.0)
+        M = program.curvature(now.z, self._of_rows(ruling)) + (now.A.T * D) @ now.A
         M[np.diag_indices_from(M)] += now.low / to_low + now.high / to_high
-        factor = _factorised(M)
-        if factor is None:
-            return False
+        r = now.h - now.s
         fixed = -program.cost + mu / to_low - mu / to_high
-
-        def direction(r: Array) -> tuple[Array, Array]:
-            dz = lapack.dpotrs(factor, fixed + now.A.T @ (mu / now.s - D * r), lower=1)[0]
-            return dz, now.A @ dz + r
-
-        dz, ds = direction(now.h - now.s)
+        dz = direction(M, fixed + now.A.T @ (mu / now.s - D * r), self._high - self._low)
+        if dz is None:
+            return False
+        ds = now.A @ dz + r
         dy = mu / now.s - D * ds - now.y
         dlow = mu / to_low - now.low / to_low * dz - now.low
         dhigh = mu / to_high + now.high / to_high * dz - now.high
-        found = self._search(now, dz, ds, direction)
+        found = self._search(now, dz, ds)
         if found is None:
-            return self._renew(now)
+            return self._heed(now)
         now.z, now.s, now.h, now.A = found
         keep = max(TO_BOUNDARY, 1.0 - mu)
         dual = min(
-            _largest(v, dv, keep) for v, dv in ((now.y, dy), (now.low, dlow), (now.high, dhigh))
+            largest(v, dv, keep) for v, dv in ((now.y, dy), (now.low, dlow), (now.high, dhigh))
         )
-        now.y = _kept(now.y + dual * dy, mu / now.s)
-        now.low = _kept(now.low + dual * dlow, mu / (now.z - program.low))
-        now.high = _kept(now.high + dual * dhigh, mu / (program.high - now.z))
+        now.y = kept(now.y + dual * dy, mu / now.s)
+        now.low = kept(now.low + dual * dlow, mu / (now.z - self._low))
+        now.high = kept(now.high + dual * dhigh, mu / (self._high - now.z))
+        self._heed(now)
         return True
 
+    def _heed(self, now: _State) -> bool:
+        """Raise the multipliers of rows that shortened the last step, which bend away faster than
+        their slope tells: with them their curvature enters the next one. Whether any was raised."""
+        raised = np.where(self._blocking, np.minimum(1.0, RAISED * now.y), 0.0)
+        changed = bool((raised > now.y).any())
+        now.y = np.maximum(now.y, raised)
+        return changed
+
+    def _of_rows(self, y: Array) -> Array:
+        """(n_rows,) the inequalities' multipliers in CasADi's convention."""
+        multipliers = np.zeros(len(self._program.below))
+        np.add.at(multipliers, self._rows, -self._sign * y)
+        return multipliers
+
     def _search(
-        self,
-        now: _State,
-        dz: Array,
-        ds: Array,
-        direction: Callable[[Array], tuple[Array, Array]],
+        self, now: _State, dz: Array, ds: Array
     ) -> tuple[Array, Array, Array, Array] | None:
-        """Along a direction until the filter takes an iterate: z, s, h, A; None if none is."""
+        """Along a direction until an iterate is good enough: z, s, h, A; None if none is.
+
+        Rows that hold go on to hold: their slack is what they keep, so that an answer may be
+        taken wherever it is cut off.
+        """
         program, mu = self._program, self._mu
         keep = max(TO_BOUNDARY, 1.0 - mu)
-
-        def longest(dz: Array, ds: Array) -> float:
-            return min(
-                _largest(now.s, ds, keep),
-                _largest(now.z - program.low, dz, keep),
-                _largest(program.high - now.z, -dz, keep),
-            )
-
-        theta, phi = self._measures(now.z, now.s, now.h)
+        theta = float(np.abs(now.h - now.s).sum())
+        self._price = max(self._price, PENALTY * now.y.max(initial=0.0)) if theta > 0.0 else 0.0
         slope = float(
             program.cost @ dz
             - mu * (ds / now.s).sum()
-            - mu * (dz / (now.z - program.low) - dz / (program.high - now.z)).sum()
+            - mu * (dz / (now.z - self._low) - dz / (self._high - now.z)).sum()
+            - self._price * theta
         )
-        alpha = longest(dz, ds)
-        trials = 0
-        while alpha > SHORTEST:
-            z, s = now.z + alpha * dz, now.s + alpha * ds
+        before = self._merit(now.z, now.s, theta)
+        rounding = 1e-14 * max(1.0, abs(before))
+        held = now.h >= now.s
+        alpha = min(
+            largest(now.s, ds, keep),
+            largest(now.z - self._low, dz, keep),
+            largest(self._high - now.z, -dz, keep),
+        )
+        self._blocking = np.zeros(len(now.s), dtype=np.bool_)
+        for _ in range(TRIALS):
+            z, s = np.clip(now.z + alpha * dz, *self._inner), now.s + alpha * ds
             h, A = self._inequalities(z)
-            if self._accepts(theta, phi, slope, alpha, self._measures(z, s, h)):
-                return z, np.maximum(s, h), h, A
-            if trials == 0 and np.abs(h - s).sum() >= theta:
-                r = now.h - now.s
-                for _ in range(CORRECTIONS):
-                    r = alpha * r + h - s
-                    dz_2, ds_2 = direction(r)
-                    beta = longest(dz_2, ds_2)
-                    # The corrected step's slacks move by what the constraints are to do.
-                    z, s = now.z + beta * dz_2, now.s + beta * (ds_2 - r + now.h - now.s)
-                    if (s <= 0.0).any():
-                        break
-                    h, A = self._inequalities(z)
-                    if self._accepts(theta, phi, slope, alpha, self._measures(z, s, h)):
-                        return z, np.maximum(s, h), h, A
-            trials += 1
-            alpha /= 2.0
+            share = SHORTENED[0]
+            if np.isfinite(h).all():
+                lost = np.flatnonzero(held & (h < (1.0 - keep) * now.s))
+                if len(lost):
+                    share = until(now.s[lost], alpha * ds[lost], h[lost])
+                    self._blocking[lost] = True
+                else:
+                    s = np.maximum(np.where(held, h, np.maximum(s, h)), LEAST)
+                    merit = self._merit(z, s, float(np.abs(h - s).sum()))
+                    if merit <= before + ARMIJO * alpha * slope + rounding:
+                        return z, s, h, A
+                    share = -slope * alpha / (2.0 * (merit - before - slope * alpha))
+            alpha *= min(max(share, SHORTENED[0]), SHORTENED[1])
         return None
 
-    def _measures(self, z: Array, s: Array, h: Array) -> tuple[float, float]:
-        """Violation of h = s, and the barrier's objective."""
-        program = self._program
-        logs = np.log(s).sum() + np.log(z - program.low).sum() + np.log(program.high - z).sum()
-        return float(np.abs(h - s).sum()), float(program.cost @ z - self._mu * logs)
-
-    def _accepts(
-        self, theta: float, phi: float, slope: float, alpha: float, trial: tuple[float, float]
-    ) -> bool:
-        """Whether an iterate is better in violation or objective than all that were left."""
-        new_theta, new_phi = trial
-        if not np.isfinite(new_theta + new_phi):
-            return False
-        if any(new_theta >= t and new_phi >= p for t, p in self._filter):
-            return False
-        rounding = 1e-14 * max(1.0, abs(phi))
-        steep = slope < 0.0 and alpha * (-slope) ** 2.3 > theta**1.1 and theta <= 1e-4
-        if steep:
-            return new_phi <= phi + ARMIJO * alpha * slope + rounding
-        if new_theta <= (1.0 - FILTER) * theta or new_phi <= phi - FILTER * theta + rounding:
-            self._filter.append(((1.0 - FILTER) * theta, phi - FILTER * theta))
-            return True
-        return False
-
     def _renew(self, now: _State) -> bool:
-        """Slacks as the constraints are, and an empty filter; whether that changes anything."""
-        s = np.maximum(now.h, min(PUSH, self._mu))
-        changed = bool(self._filter) or not np.allclose(s, now.s, rtol=1e-6)
-        now.s, now.y = s, self._mu / s
-        self._filter.clear()
+        """Slacks as large as at the start; whether that changes anything."""
+        s = np.maximum(now.h, min(SLACK, 10.0 * self._mu))
+        changed = not np.allclose(s, now.s, rtol=1e-6)
+        now.y = np.where(s > now.s, self._mu / s, now.y)
+        now.s = s
         self._renewals += 1
         return changed and self._renewals <= RENEWALS
 
-
-def _largest(value: Array, change: Array, keep: float) -> float:
-    """Largest share of a change, at most 1, that leaves values above zero."""
-    falling = change < 0.0
-    if not falling.any():
-        return 1.0
-    return float(min(1.0, (-keep * value[falling] / change[falling]).min()))
-
-
-def _kept(value: Array, ideal: Array) -> Array:
-    """Multipliers within a range of what the barrier asks for."""
-    return np.clip(value, ideal / DUAL_RANGE, ideal * DUAL_RANGE)
-
-
-def _factorised(M: Array) -> Array | None:
-    """Lower Cholesky factor of a matrix, shifted until it is definite; None where it never is."""
-    shift, scale = 0.0, max(1.0, float(np.abs(np.diag(M)).max()))
-    while np.isfinite(scale) and shift < 1e12 * scale:
-        shifted = M + shift * np.eye(len(M)) if shift else M
-        factor, info = lapack.dpotrf(shifted, lower=1)
-        if info == 0:
-            return np.asarray(factor)
-        shift = max(SHIFT * scale, SHIFTED * shift)
-    return None
+    def _merit(self, z: Array, s: Array, theta: float) -> float:
+        """The barrier's objective, and the price of the violation of h = s."""
+        program = self._program
+        logs = np.log(s).sum() + np.log(z - self._low).sum() + np.log(self._high - z).sum()
+        return float(program.cost @ z - self._mu * logs + self._price * theta)
 
 
 def dense(program: Program, settings: PolishSettings) -> Answer:

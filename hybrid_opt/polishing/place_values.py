@@ -9,16 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.function import NumericFunction
-from hybrid_opt.polishing.functions import RowFunction, RowFunctions
+from codegen.function import NumericFunction, PreparedBatch
+from hybrid_opt.polishing.functions import RowFunctions
 from hybrid_opt.polishing.layout import PlaceRow
 from hybrid_opt.polishing.sample_values import NEGLIGIBLE
 from symbolic.array import Array
-from symbolic.smooth.keys import ClosureKey
+from symbolic.smooth.keys import ClosureKey, Order
 from symbolic.smooth.place import PlaceConstraint
 from symbolic.workcell.decision import POSE_SIZE
 
@@ -48,31 +49,31 @@ class _Group:
     """Rows of one family: their indices and places, and their functions.
 
     Attributes:
-        numbers: (rows, n) what tells them from each other, if anything does.
         moving: whether the rate is among what they depend on.
         arms: whose joints are.
     """
 
     rows: Indices
     places: Indices
-    numbers: tuple[Array, ...]
-    first: RowFunction
-    second: RowFunction
+    first: PreparedBatch
+    second: PreparedBatch
     moving: bool
     arms: tuple[int, ...]
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Arm:
-    """An arm where rows need it: which places, and what the last evaluation found there."""
+    """An arm where rows need it: which places, and the position of each place among them."""
 
     places: Indices
     position: Indices
-    first: NumericFunction
-    second: NumericFunction
-    q: Array
-    follow: Array
-    pull: Array
+    first: PreparedBatch
+    second: PreparedBatch
+
+    @property
+    def joints(self) -> int:
+        """How many it has."""
+        return int(self.first.outputs["q"].shape[1])
 
 
 class PlaceValues:
@@ -92,39 +93,35 @@ class PlaceValues:
         for k, row in enumerate(rows):
             members.setdefault(row.constraint.family, []).append(k)
         self._groups = [
-            _Group(
-                np.array(own, dtype=np.intp),
-                self._at[own],
-                row_numbers([rows[k].constraint for k in own], functions),
-                functions.of(rows[own[0]].constraint, "first"),
-                functions.of(rows[own[0]].constraint, "second"),
-                rows[own[0]].constraint.moving,
-                rows[own[0]].constraint.arms(functions.model),
-            )
-            for own in members.values()
+            self._group(rows, np.array(own, dtype=np.intp), functions) for own in members.values()
         ]
         free_rows, self._columns = places.free
         moved, self._free_rows = np.unique(free_rows, return_inverse=True)
         self._basis, self._rate_basis = places.basis[:, moved], places.rate_basis[:, moved]
         self._size = functions.model.workcell.task.extended_size
         self._arms = [self._arm(arm, closures) for arm in range(len(places.q))]
+        self._row_basis, self._row_rate_basis = self._basis[self._at], self._rate_basis[self._at]
+
+    def _group(self, rows: tuple[PlaceRow, ...], own: Indices, functions: RowFunctions) -> _Group:
+        constraints = [rows[k].constraint for k in own.tolist()]
+        first, second = (
+            functions.of(constraints[0], order).prepared(len(own)) for order in get_args(Order)
+        )
+        if "numbers" in first.inputs:
+            first.inputs["numbers"][...] = row_numbers(constraints, functions)[0]
+        arms = constraints[0].arms(functions.model)
+        return _Group(own, self._at[own], first, second, constraints[0].moving, arms)
 
     def _arm(self, arm: int, closures: Mapping[ClosureKey, NumericFunction]) -> _Arm:
         needed = [group.places for group in self._groups if arm in group.arms]
         at = np.unique(np.concatenate([np.empty(0, dtype=np.intp), *needed]))
         position = np.full(len(self._places.basis), -1, dtype=np.intp)
         position[at] = np.arange(len(at))
-        q = self._places.q[arm]
-        n = q.shape[1]
-        return _Arm(
-            places=at,
-            position=position,
-            first=closures[ClosureKey(arm, "first")],
-            second=closures[ClosureKey(arm, "second")],
-            q=q.copy(),
-            follow=np.zeros((len(at), self._size, n)),
-            pull=np.zeros((len(at), n, n)),
+        first, second = (
+            closures[ClosureKey(arm, order)].prepared(max(1, len(at))) for order in get_args(Order)
         )
+        first.inputs["q_reference"][: len(at)] = self._places.q[arm][at]
+        return _Arm(at, position, first, second)
 
     def first(self, waypoints: Array) -> tuple[Array, Array]:
         """Values (rows,) and gradients (rows, variables) by the path's variables.
@@ -134,120 +131,132 @@ class PlaceValues:
 
         What is found on the way is kept for `second` at the same waypoints.
         """
-        self._extended = self._places.basis @ waypoints
-        self._pose = self._extended[:, :POSE_SIZE]
-        self._rate = (self._places.rate_basis @ waypoints)[:, :POSE_SIZE]
-        for arm, reference in zip(self._arms, self._places.q, strict=True):
-            if len(arm.places):
-                found = arm.first.batch(self._extended[arm.places], reference[arm.places])
-                # The interface's arrays are transposed matrices (`codegen.signature`).
-                arm.q[arm.places], arm.follow, arm.pull = (
-                    found["q"],
-                    found["follow"],
-                    found["pull"],
-                )
+        extended, rate = self._places.basis @ waypoints, self._places.rate_basis @ waypoints
+        pose, rate = extended[:, :POSE_SIZE], rate[:, :POSE_SIZE]
+        for arm in self._arms:
+            count = len(arm.places)
+            arm.first.inputs["pose"][:count] = extended[arm.places]
+            arm.first(count)
         values = np.empty(self._count)
         by_pose, by_rate = np.zeros((2, self._count, self._size))
-        self._by_joints: list[list[Array]] = []
         for group in self._groups:
-            found = group.first.batch(*self._inputs(group))
-            values[group.rows] = found["value"]
-            gradient = found["gradient"]
-            own, start = np.zeros((len(gradient), self._size)), 6
-            own[:, :6] = gradient[:, :6]
+            inputs = group.first.inputs
+            inputs["pose"][...] = pose[group.places]
             if group.moving:
-                by_rate[group.rows, :6], start = gradient[:, 6:12], 12
-            by_joints = []
+                inputs["rate"][...] = rate[group.places]
             for index in group.arms:
                 arm = self._arms[index]
-                n = arm.q.shape[1]
-                by_joints.append(gradient[:, start : start + n])
-                start += n
-                follow = arm.follow[arm.position[group.places]]
-                own += np.matmul(follow, by_joints[-1][:, :, None])[:, :, 0]
+                inputs[f"q_{index + 1}"][...] = arm.first.outputs["q"][arm.position[group.places]]
+            found = group.first()
+            values[group.rows] = found["value"]
+            own = np.zeros((len(group.rows), self._size))
+            own[:, :POSE_SIZE] = found["gradient"][:, :6]
+            if group.moving:
+                by_rate[group.rows, :POSE_SIZE] = found["gradient"][:, 6:12]
+            for index, slope in self._by_joints(group):
+                # The interface's arrays are transposed matrices (`codegen.signature`).
+                arm = self._arms[index]
+                follow = arm.first.outputs["follow"][arm.position[group.places]]
+                own += np.matmul(follow, slope[:, :, None])[:, :, 0]
             by_pose[group.rows] = own
-            self._by_joints.append(by_joints)
-        total = self._basis[self._at][:, :, None] * by_pose[:, None, :]
-        total += self._rate_basis[self._at][:, :, None] * by_rate[:, None, :]
+        total = self._row_basis[:, :, None] * by_pose[:, None, :]
+        total += self._row_rate_basis[:, :, None] * by_rate[:, None, :]
         return values, total[:, self._free_rows, self._columns]
 
-    def _inputs(self, group: _Group, chosen: Indices | None = None) -> list[Array]:
-        at, numbers = group.places, group.numbers
-        if chosen is not None:
-            at, numbers = at[chosen], tuple(array[chosen] for array in numbers)
-        return [self._pose[at], self._rate[at], *[arm.q[at] for arm in self._arms], *numbers]
+    def _by_joints(self, group: _Group) -> list[tuple[int, Array]]:
+        """The gradients (rows, n) of the last values by the joints of each of a group's arms."""
+        found, start = [], 12 if group.moving else 6
+        for index in group.arms:
+            stop = start + self._arms[index].joints
+            found.append((index, group.first.outputs["gradient"][:, start:stop]))
+            start = stop
+        return found
 
     def second(self, weight: Array) -> Array:
         """Second derivatives (variables, variables) of the values weighted by (rows,), where
-        `first` was evaluated last."""
-        sizes = [arm.q.shape[1] for arm in self._arms]
-        starts = np.cumsum([2 * self._size, *sizes])
-        # Per place by extended pose, its rate and the joints of both arms.
-        curvature = np.zeros((len(self._pose), starts[-1], starts[-1]))
-        pulls = [np.zeros((len(arm.places), n)) for arm, n in zip(self._arms, sizes, strict=True)]
-        least = NEGLIGIBLE * np.abs(weight).max(initial=0.0)
-        for group, by_joints in zip(self._groups, self._by_joints, strict=True):
-            chosen = np.flatnonzero(np.abs(weight[group.rows]) > least)
-            if not len(chosen):
-                continue
-            at, own = group.places[chosen], weight[group.rows[chosen]]
-            hessian = group.second.batch(*self._inputs(group, chosen), own)["hessian"]
-            ranges = [np.arange(6), *([self._size + np.arange(6)] if group.moving else [])]
-            for index, slope in zip(group.arms, by_joints, strict=True):
-                ranges.append(np.arange(starts[index], starts[index + 1]))
-                where = self._arms[index].position[at]
-                np.add.at(pulls[index], where, own[:, None] * slope[chosen])
-            y = np.concatenate(ranges)
-            np.add.at(curvature, (at[:, None, None], y[None, :, None], y[None, None, :]), hessian)
-        for index, arm in enumerate(self._arms):
-            self._close(arm, pulls[index], curvature, starts[index])
-        return self._by_waypoints(self._reduced(curvature, starts))
-
-    def _close(self, arm: _Arm, slopes: Array, curvature: Array, start: int) -> None:
-        """Add the closure's curvature at all places of an arm, its joints from `start` on."""
-        active = np.flatnonzero(np.abs(slopes).max(axis=1, initial=0.0) > 0.0)
-        if not len(active):
-            return
-        nu = np.matmul(arm.pull[active], slopes[active, :, None])[:, :, 0]
-        at = arm.places[active]
-        hessian = arm.second.batch(self._extended[at], arm.q[at], nu)["hessian"]
-        y = np.concatenate([np.arange(self._size), np.arange(start, start + arm.q.shape[1])])
-        curvature[at[:, None, None], y[None, :, None], y[None, None, :]] += hessian
-
-    def _reduced(self, curvature: Array, starts: Array) -> Array:
-        """T^T H T: by extended pose and rate (places, 12 + 2 m, 12 + 2 m), the joints following."""
-        size, box = self._size, 2 * self._size
-        total = curvature[:, :box, :box].copy()
-        at = np.unique(np.concatenate([arm.places for arm in self._arms]))
-        if not len(at):
-            return total
-        # T^T (places, 6 + m, joints), both arms side by side.
-        T = np.zeros((len(self._pose), size, starts[-1] - box))
-        for index, arm in enumerate(self._arms):
-            T[arm.places, :, starts[index] - box : starts[index + 1] - box] = arm.follow
-        T, H = T[at], curvature[at]
-        mixed = np.matmul(T, H[:, box:, :box])
-        total[at, :size] += mixed
-        total[at, :, :size] += np.swapaxes(mixed, 1, 2)
-        total[at, :size, :size] += np.matmul(np.matmul(T, H[:, box:, box:]), np.swapaxes(T, 1, 2))
-        return total
-
-    def _by_waypoints(self, curvature: Array) -> Array:
-        """Carry second derivatives by extended pose and rate over to the variables, and sum
-        them."""
+        `first` was called last."""
         n, size = self._basis.shape[1], self._size
         total = np.zeros((n * n, size * size))
-        bases = (self._basis, self._rate_basis)
-        for i, left in enumerate(bases):
-            for j, right in enumerate(bases):
-                rows = slice(size * i, size * (i + 1))
-                columns = slice(size * j, size * (j + 1))
-                block = curvature[:, rows, columns].reshape(-1, size * size)
-                outer = (left[:, :, None] * right[:, None, :]).reshape(-1, n * n)
-                total += outer.T @ block
+        least = NEGLIGIBLE * np.abs(weight).max(initial=0.0)
+        pulls = [np.zeros((len(arm.places), arm.joints)) for arm in self._arms]
+        for group in self._groups:
+            chosen = np.flatnonzero(np.abs(weight[group.rows]) > least)
+            count = len(chosen)
+            if not count:
+                continue
+            own, at = weight[group.rows[chosen]], group.places[chosen]
+            inputs = group.second.inputs
+            for name, values in group.first.inputs.items():
+                inputs[name][:count] = values[chosen]
+            inputs["weight"][:count] = own
+            hessian = group.second(count)["hessian"][:count]
+            for index, slope in self._by_joints(group):
+                where = self._arms[index].position[at]
+                np.add.at(pulls[index], where, own[:, None] * slope[chosen])
+            if group.moving:
+                self._add_moving(total, at, hessian)
+            else:
+                self._add(total, at, self._reduced(hessian, group.arms, at, POSE_SIZE))
+        for index in range(len(self._arms)):
+            self._close(total, index, pulls[index])
         at = self._free_rows * size + self._columns
         whole = total.reshape(n, n, size, size).transpose(0, 2, 1, 3).reshape(size * n, size * n)
         return np.asarray(whole[np.ix_(at, at)])
+
+    def _close(self, total: Array, index: int, slopes: Array) -> None:
+        """Add the closure's curvature at the places of an arm where rows pull at its joints."""
+        arm = self._arms[index]
+        active = np.flatnonzero(np.abs(slopes).max(axis=1, initial=0.0) > 0.0)
+        count = len(active)
+        if not count:
+            return
+        found, inputs = arm.first.outputs, arm.second.inputs
+        inputs["pose"][:count] = arm.first.inputs["pose"][active]
+        inputs["q"][:count] = found["q"][active]
+        inputs["nu"][:count] = np.matmul(found["pull"][active], slopes[active, :, None])[:, :, 0]
+        hessian, at = arm.second(count)["hessian"][:count], arm.places[active]
+        self._add(total, at, self._reduced(hessian, (index,), at, self._size))
+
+    def _reduced(self, hessian: Array, arms: tuple[int, ...], at: Indices, own: int) -> Array:
+        """T^T H T: by extended pose (rows, 6 + m, 6 + m), the joints of some arms following it.
+
+        Args:
+            hessian: by the first `own` entries of the extended pose and by the joints.
+        """
+        reduced = np.zeros((len(at), self._size, self._size))
+        reduced[:, :own, :own] = hessian[:, :own, :own]
+        if not arms:
+            return reduced
+        follows = [self._arms[k].first.outputs["follow"][self._arms[k].position[at]] for k in arms]
+        follow = np.concatenate(follows, axis=2)
+        mixed = np.matmul(follow, hessian[:, own:, :own])
+        reduced[:, :, :own] += mixed
+        reduced[:, :own, :] += np.swapaxes(mixed, 1, 2)
+        turned = np.swapaxes(follow, 1, 2)
+        reduced += np.matmul(np.matmul(follow, hessian[:, own:, own:]), turned)
+        return reduced
+
+    def _add(self, total: Array, at: Indices, blocks: Array) -> None:
+        """Carry second derivatives (rows, 6 + m, 6 + m) by the extended pose over to the
+        waypoints."""
+        basis = self._basis[at]
+        _add_blocks(total, basis, basis, blocks)
+
+    def _add_moving(self, total: Array, at: Indices, hessian: Array) -> None:
+        """The same of second derivatives (rows, 12, 12) by pose and rate."""
+        bases = (self._basis[at], self._rate_basis[at])
+        blocks = np.zeros((len(at), self._size, self._size))
+        for i, left in enumerate(bases):
+            for j, right in enumerate(bases):
+                part = hessian[:, 6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
+                blocks[:, :POSE_SIZE, :POSE_SIZE] = part
+                _add_blocks(total, left, right, blocks)
+
+
+def _add_blocks(total: Array, left: Array, right: Array, blocks: Array) -> None:
+    n = left.shape[1]
+    outer = (left[:, :, None] * right[:, None, :]).reshape(-1, n * n)
+    total += outer.T @ blocks.reshape(len(blocks), -1)
 
 
 def row_numbers(

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.polishing.functions import RowFunctions
 from hybrid_opt.polishing.grid import Grid, dipped
 from symbolic.array import Array
 from symbolic.robot.arm import REACH_TOLERANCE
+from symbolic.smooth.reach import Reach
 from symbolic.workcell.decision import POSE_SIZE, extended_waypoints, place_redundant
 
 DIPS_BELOW = 0.1
@@ -30,7 +32,7 @@ class PlacedCarry:
         stranded: the arms that do not reach all places.
         clearance: (reached, n_pairs) lower bounds of every active pair's distance [m].
         lowered: the same with the dips that are to be expected beside each place.
-        manipulability: (reached, 2) |det J| over its least value, between samples interpolated.
+        manipulability: (reached, 2) |det J| over its least value.
         split: (n, 2) on samples: normal component, tangential magnitude of the required force [N].
         peak: (2,) peak normal forces over their references.
         shift: (n, 2) on samples: shifts of the centres of pressure over their patches' radii.
@@ -85,8 +87,8 @@ class Distances:
 class CarryReader:
     """Evaluates candidates of one cell on the places of a grid."""
 
-    def __init__(self, evaluator: CandidateEvaluator, grid: Grid) -> None:
-        self._evaluator, self._grid = evaluator, grid
+    def __init__(self, evaluator: CandidateEvaluator, grid: Grid, rows: RowFunctions) -> None:
+        self._evaluator, self._grid, self._rows = evaluator, grid, rows
         self._radii = [contact.patch_radius for contact in evaluator.workcell.contacts]
 
     def read(self, x: Array) -> PlacedCarry:
@@ -110,10 +112,11 @@ class CarryReader:
         lost = np.flatnonzero(~followed.all(axis=1))
         reached = int(lost[0]) if len(lost) else len(followed)
         q_1, q_2 = posture["q_1"], posture["q_2"]
-        limits = [robot.min_manipulability for robot in evaluator.workcell.robots]
-        measure = np.column_stack(
-            [found[f"manipulability_{arm}"].reshape(-1) / limits[arm - 1] for arm in (1, 2)]
-        )
+        rate = np.ascontiguousarray((grid.rate_basis @ waypoints)[:, :POSE_SIZE])
+        squares = [
+            1.0 + self._rows.of(Reach(arm), "first").batch(pose, rate, q_1, q_2)["value"]
+            for arm in (0, 1)
+        ]
         force = found["normal_force"]
         held = (pose[:reached], q_1[:reached], q_2[:reached])
         bounds = evaluator.checker.bounds(*held)
@@ -122,13 +125,13 @@ class CarryReader:
         lowered[:, near] = dipped(bounds[:, near])
         return PlacedCarry(
             pose=pose,
-            rate=grid.rate_basis @ waypoints[:, :POSE_SIZE],
+            rate=rate,
             q=(q_1, q_2),
             reached=reached,
             stranded=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
             clearance=bounds,
             lowered=lowered,
-            manipulability=grid.between(measure)[:reached],
+            manipulability=np.sqrt(np.maximum(np.column_stack(squares), 0.0))[:reached],
             split=np.column_stack(
                 [force[:, 0] - force[:, 1], found["tangential_force"].sum(axis=1)]
             ),

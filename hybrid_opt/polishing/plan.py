@@ -67,26 +67,26 @@ def points(archive: GrowingFront, settings: PolishSettings) -> list[Attempt]:
 def aimed(
     archive: GrowingFront,
     objective: int | None,
-    stalls: int,
+    tried: Collection[tuple[int | None, bytes]],
     settings: PolishSettings,
     rng: np.random.Generator,
 ) -> Attempt:
     """An attempt at an end of the front or at its balanced middle.
 
-    It goes on from the best point. Where the last attempt did not get further from there, it
-    takes smaller steps; where that does not help either, it starts from any point of the front:
-    another region may lead further down.
+    It goes on from the best point. Where that was tried already, it starts from any other point of
+    the front: ends lie in several basins, and another start may lead into a better one.
 
     Args:
         objective: whose end; None for the middle.
-        stalls: attempts in a row that came no further.
+        tried: earlier attempts, as their objective and their start's bytes.
     """
-    k, radius = archive.best(objective)[0], settings.trust.first
-    if stalls % 2 == 1:
+    rows, radius = archive.rows(), settings.trust.first
+    k = archive.best(objective)[0]
+    fresh = [row for row in rows if (objective, archive.x[row].tobytes()) not in tried]
+    if k not in fresh and fresh:
+        k = fresh[int(rng.integers(len(fresh)))]
+    elif not fresh:
         radius = settings.front.small_radius
-    elif stalls:
-        rows = archive.rows()
-        k = rows[int(rng.integers(len(rows)))]
     start, span = archive.objectives[k], np.full(2, LEAST_SPAN)
     if objective is None:
         return Attempt("balance", -1, archive.x[k], start, balance(start, span), radius)

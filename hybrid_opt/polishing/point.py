@@ -2,9 +2,10 @@
 
 Each round gathers the rows that are near the best candidate so far, solves the smooth program in
 a box about it, and has the full model judge the step. What the step violates is learned: its rows
-are added, or asked for more strictly, and where that is nothing new, the box is halved. A step
-that violates nothing and comes closer to the target is taken, so that the answer is never worse
-than the start. A step that ends inside the box at an optimum ends the polish.
+are added, or asked for more strictly, and where that is nothing new, the box is halved; the longest
+part of the step that violates nothing and comes closer to the target is taken, if there is one. A
+step that violates nothing and comes closer is taken as a whole, so that the answer is never worse
+than the start. One that ends inside the box at an optimum ends the polish.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ class PolishSolver:
         self._settings = settings
         self._solve = {"ipopt": ipopt, "dense": dense}[settings.solve.solver]
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
-        self._reader = CarryReader(evaluator, grid)
+        self._reader = CarryReader(evaluator, grid, functions.rows)
 
     def solve(self, task: SolveTask) -> Solution:
         """Improve towards the task's target."""
@@ -123,6 +124,10 @@ class PolishSolver:
             if violated or not carry.is_followed:
                 learned = self._learn(best, carry, violated, required)
                 region.refused(learned and carry.is_followed)
+                if (part := self._part(best, x, required, task.target)) is not None:
+                    self._move(best, *part)
+                    solution.x = best.x
+                    solution.residuals = program.residuals_at(best.x, best.carry, answer)
             elif level(task.target, carry.peak) >= level(task.target, best.carry.peak):
                 higher = self._active.forces.higher(carry, task.target) - required.keys()
                 best.learned.update(dict.fromkeys(higher, 0.0))
@@ -158,6 +163,23 @@ class PolishSolver:
             stricter |= value > asked + self._settings.stricter
             best.learned[row] = max(value, best.learned.get(row, -np.inf))
         return stricter
+
+    def _part(
+        self, best: _Best, x: Array, required: dict[Row, float], target: Target
+    ) -> tuple[Array, PlacedCarry] | None:
+        """The longest part of a refused step that violates nothing and comes closer to the target,
+        as a candidate and its carry; None if no part does."""
+        parts = self._settings.trust.parts
+        for k in range(parts, 0, -1):
+            part = best.x + k / (parts + 1) * (x - best.x)
+            carry = self._reader.read(part)
+            if (
+                carry.is_followed
+                and level(target, carry.peak) < level(target, best.carry.peak)
+                and not self._active.violated(carry, best.carry, required)
+            ):
+                return part, carry
+        return None
 
     def _move(self, best: _Best, x: Array, carry: PlacedCarry) -> None:
         """Go on from a better candidate."""

@@ -29,11 +29,13 @@ from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.layout import Layout, PlaceRow, Row
 from hybrid_opt.polishing.place_values import Places, PlaceValues
 from hybrid_opt.polishing.placed_carry import PlacedCarry
+from hybrid_opt.polishing.residuals import Residuals, residuals
 from hybrid_opt.polishing.sample_values import SampleValues
+from hybrid_opt.polishing.solvers import Answer
 from hybrid_opt.polishing.targets import Target, needed_level
 from symbolic.array import Array
 from symbolic.smooth.samples import branch_coefficients, sample_blocks
-from symbolic.workcell.decision import extended_waypoints
+from symbolic.workcell.decision import POSE_SIZE, extended_waypoints
 from symbolic.workcell.records import Workcell
 
 SLACK = 0.1
@@ -72,6 +74,7 @@ class SmoothCell:
     Attributes:
         task, functions, grid: the cell's.
         unit: the scaled decision vector.
+        free: rows and columns of the variables among the extended waypoints.
         blocks: how samples are divided among functions.
         coefficients: see `branch_coefficients`.
     """
@@ -81,6 +84,17 @@ class SmoothCell:
         self.unit = UnitBox.of(workcell.task)
         self.blocks = sample_blocks(workcell.task)
         self.coefficients = branch_coefficients(workcell)
+        self.free = workcell.task.free_entries
+        fixed = [waypoint.lower for waypoint in self.task.waypoints]
+        self._fixed = np.column_stack([fixed, *[joint.lower for joint in self.task.redundant]])
+
+    def waypoints(self, x: Array) -> Array:
+        """As `extended_waypoints`, which looks up what is known here and unwraps what need not
+        be."""
+        points = self._fixed.copy()
+        points[self.free] = x[: self.task.n_path]
+        turns = points[1:, 3:POSE_SIZE] - points[:-1, 3:POSE_SIZE]
+        return extended_waypoints(self.task, x) if np.abs(turns).max() > np.pi else points
 
 
 class SmoothProgram:
@@ -142,7 +156,7 @@ class SmoothProgram:
         places = Places(
             grid.basis[at],
             grid.rate_basis[at],
-            self._cell.task.free_entries,
+            self._cell.free,
             (carry.q[0][at], carry.q[1][at]),
         )
         local = tuple(PlaceRow(row.constraint, index[row.place]) for row in rows)
@@ -191,10 +205,11 @@ class SmoothProgram:
 
         split, slope = self._forces.first(x)
         at = self._force_column
-        values[layout.forces] += np.einsum("rk,rk->r", self._mix, split[at])
+        first, second = self._mix.T
+        values[layout.forces] += first * split[at, 0] + second * split[at, 1]
         jacobian[layout.forces, layout.decision] = (
-            np.matmul(self._mix[:, None, :], slope[at])[:, 0] * half
-        )
+            first[:, None] * slope[at, 0] + second[:, None] * slope[at, 1]
+        ) * half
         if len(self._pressed):
             margin, slope = self._patches.first(x)
             values[layout.patches] = margin[self._pressed_column, self._pressed]
@@ -202,7 +217,7 @@ class SmoothProgram:
                 slope[self._pressed_column, self._pressed] * half
             )
         if len(self._scale):
-            value, slope = self._places.first(extended_waypoints(self._cell.task, x))
+            value, slope = self._places.first(self._cell.waypoints(x))
             values[layout.places] = value / self._scale
             jacobian[layout.places, layout.decision] = slope * half / self._scale[:, None]
         return values, jacobian
@@ -225,6 +240,14 @@ class SmoothProgram:
         full = np.zeros((layout.n_variables, layout.n_variables))
         full[layout.decision, layout.decision] = total * np.outer(half, half)
         return full
+
+    def residuals_at(self, x: Array, carry: PlacedCarry, answer: Answer) -> Residuals:
+        """Residuals at a candidate that is not the answer itself, with the answer's multipliers."""
+        z, target = answer.z.copy(), self._target
+        z[self.layout.decision] = self._cell.unit.scaled(x)
+        phi = (carry.peak - target.anchor) / target.span
+        z[self.layout.peaks], z[self.layout.level] = phi, needed_level(target, phi)
+        return residuals(self, z, *answer.multipliers)
 
     def candidate(self, z: Array) -> Array:
         """(n_var,) the decision vector at z, within its bounds and the box of trust."""

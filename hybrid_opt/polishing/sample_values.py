@@ -4,26 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.function import NumericFunction
+from codegen.function import NumericFunction, PreparedBatch
 from symbolic.array import Array
-from symbolic.smooth.keys import Quantity, SampleKey
+from symbolic.smooth.keys import Order, Quantity, SampleKey
 from symbolic.smooth.samples import SampleBlock
 
 NEGLIGIBLE = 1e-7
-"""Share of the largest weight below which a call's second derivatives are left out: those of
-samples far below the peak, whose multipliers vanish. It changes steps by as much, no solution."""
+"""Share of the largest weight below which second derivatives are left out: those of rows that are
+far from ruling, whose multipliers vanish. It changes steps by as much, no solution."""
 
 
 @dataclass(frozen=True)
 class _Call:
-    """One function over some of its samples: both its orders, and its windows (calls, ., .)."""
+    """One function over some of its samples, which each evaluation serves `served` of: both its
+    orders, and its windows (calls, ., .)."""
 
-    first: NumericFunction
-    second: NumericFunction
+    first: PreparedBatch
+    second: PreparedBatch
     basis: Array
     served: int
 
@@ -51,14 +53,13 @@ class SampleValues:
             if not chosen.any():
                 continue
             order.append(block.samples[chosen].ravel())
-            self._calls.append(
-                _Call(
-                    functions[SampleKey(quantity, block.block, "first")],
-                    functions[SampleKey(quantity, block.block, "second")],
-                    np.ascontiguousarray(block.basis[chosen]),
-                    block.samples.shape[1],
-                )
+            basis = block.basis[chosen]
+            first, second = (
+                functions[SampleKey(quantity, block.block, o)].prepared(len(basis), ["x"])
+                for o in get_args(Order)
             )
+            first.inputs["basis"][...] = basis
+            self._calls.append(_Call(first, second, basis, block.samples.shape[1]))
         served = np.concatenate(order)
         self.count = len(served)
         self.column = np.full(1 + max(int(block.samples.max(initial=0)) for block in blocks), -1)
@@ -68,7 +69,8 @@ class SampleValues:
         """Values (count, 2) and their gradients (count, 2, n_var)."""
         values, gradients = [np.empty((0, 2))], [np.empty((0, 2, len(x)))]
         for call in self._calls:
-            found = call.first.batch(x, call.basis)
+            call.first.inputs["x"][...] = x
+            found = call.first()
             values.append(found["values"].reshape(-1, 2))
             gradients.append(found["gradient"].reshape(-1, 2, len(x)))
         return np.concatenate(values), np.concatenate(gradients)
@@ -81,8 +83,11 @@ class SampleValues:
             n = len(call.basis)
             own = weight[start : start + n * call.served].reshape(n, -1)
             start += n * call.served
-            matter = np.abs(own).max(axis=1) > least
-            if matter.any():
-                hessian = call.second.batch(x, call.basis[matter], own[matter])["hessian"]
-                total += hessian.sum(axis=0)
+            matter = np.flatnonzero(np.abs(own).max(axis=1) > least)
+            if count := len(matter):
+                inputs = call.second.inputs
+                inputs["x"][...] = x
+                inputs["basis"][:count] = call.basis[matter]
+                inputs["weight"][:count] = own[matter]
+                total += call.second(count)["hessian"][:count].sum(axis=0)
         return total

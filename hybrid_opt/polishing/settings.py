@@ -52,8 +52,8 @@ class NearSettings:
     beside_kink: float = 0.03
     kink_window: float = 0.04
     joint_distance: float = 0.05
-    reach_share: float = 0.5
-    reach_stride: float = 0.08
+    reach_share: float = 0.9
+    reach_stride: float = 0.02
     lost: float = 0.04
     force_stride: float = 0.02
     tie_stride: float = 0.06
@@ -73,6 +73,8 @@ class TrustSettings:
         quartered: factor after a step that brought nothing, or no answer.
         doubled: factor after two steps in a row that the box stopped.
         inside: steps shorter than this share of the radius were not stopped by the box.
+        parts: evenly spaced parts of a step that violates something, which are judged in its place,
+            the longest first.
     """
 
     first: float = 1.0
@@ -82,6 +84,7 @@ class TrustSettings:
     quartered: float = 0.25
     doubled: float = 2.0
     inside: float = 0.9
+    parts: int = 3
 
 
 @dataclass(frozen=True)
@@ -97,8 +100,8 @@ class SolveSettings:
             cut off wherever it stands, it ends in an obstacle more often than not.
     """
 
-    solver: SolverName = "ipopt"
-    barrier: float = 1e-3
+    solver: SolverName = "dense"
+    barrier: float = 3e-4
     tolerance: float = 1e-6
     feasible: float = 1e-3
     patience: int = 3
@@ -143,19 +146,22 @@ class PolishSettings:
         rounds: of one point at most; see `hybrid_opt.polishing.point`.
         max_seconds: wall time after which a solve is given up. Generous, because a result that
             depends on it cannot be repeated.
-        margin: kept from every constraint but clearances, in the constraint's own scale.
+        margin: kept from the rims of patches, in the square of the shift over the radius.
+        between: kept from joint limits [rad] and, in the square of |det J| over its least value,
+            from singularities: they are judged at places and hold between them as well.
         clearance: distance kept from obstacles [m]; lets the motion between samples be certified.
         stricter: least rise of a required value that counts as a new demand [m, rad, 1].
         tolerance: improvement of an objective below which a point counts as optimal already.
         near, trust, solve, front: the parts' own.
     """
 
-    points: int = 22
+    points: int = 14
     method: Method = "pascoletti-serafini"
-    max_iterations: int = 15
+    max_iterations: int = 30
     rounds: int = 7
     max_seconds: float = 60.0
     margin: float = 1e-6
+    between: float = 2e-3
     clearance: float = 8e-4
     stricter: float = 1e-4
     tolerance: float = 1e-6
@@ -180,6 +186,6 @@ class PolishSettings:
                 raise SettingsError(
                     f"polish {name} is {value!r}; allowed are whole numbers from {least}"
                 )
-        for name in ("max_seconds", "margin", "clearance", "stricter", "tolerance"):
+        for name in ("max_seconds", "margin", "between", "clearance", "stricter", "tolerance"):
             if not getattr(self, name) > 0.0:
                 raise SettingsError(f"polish {name} is {getattr(self, name)!r}; it must exceed 0")

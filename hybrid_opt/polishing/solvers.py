@@ -17,6 +17,8 @@ class Answer:
         message: its status.
         converged: whether it claims an optimum.
         usable: whether z is finite.
+        multipliers: of the variables' bounds (n_variables,) and of the rows (n_rows,), in CasADi's
+            convention.
         residuals: recomputed here.
         iterations: its own.
     """
@@ -25,5 +27,6 @@ class Answer:
     message: str
     converged: bool
     usable: bool
+    multipliers: tuple[Array, Array]
     residuals: Residuals
     iterations: int

@@ -120,6 +120,24 @@ def test_batch_equals_loop_to_the_bit(make: Make, threads: int) -> None:
             np.testing.assert_array_equal(found[name][k], single[name])
 
 
+def test_a_prepared_batch_equals_a_batch_to_the_bit(make: Make) -> None:
+    rng = np.random.default_rng(1)
+    function = make(random_function(rng, ca.MX))
+    prepared = function.prepared(11, ["vector"])
+    for count in (11, 4, 1, 0, 11):
+        matrices = rng.standard_normal((count, *function.input_shapes[0]))
+        vector = rng.standard_normal(function.input_shapes[1])
+        prepared.inputs["matrix"][:count] = matrices
+        prepared.inputs["vector"][...] = vector
+        found = prepared(count)
+        expected = function.batch(matrices, vector)
+        for name in function.output_names:
+            np.testing.assert_array_equal(found[name][:count], expected[name])
+    assert prepared() is found
+    with pytest.raises(CodegenError, match="room for 11"):
+        prepared(12)
+
+
 def test_empty_batch(make: Make) -> None:
     found = make(small()).batch(np.empty((0, 3)), np.zeros((4, 2)))
     assert {name: array.shape for name, array in found.items()} == {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from hybrid_opt.polishing.constraints.kind import Kind
 from hybrid_opt.polishing.grid import lowest
@@ -23,8 +23,14 @@ class JointLimits(Kind[PlaceRow]):
         return self._below(carry, self.near_settings.joint_distance)
 
     def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
-        """Joints beyond a limit."""
-        return self._below(carry, 0.0)
+        """Joints beyond a limit, or nearer than half of what is kept from it."""
+        return self._below(carry, self.around.settings.between / 2.0)
+
+    def required(
+        self, carry: PlacedCarry, rows: Sequence[PlaceRow], lenient: bool = False
+    ) -> list[float]:
+        """What lets a limit hold between places as well."""
+        return [self.around.settings.between] * len(rows)
 
     def _below(self, carry: PlacedCarry, limit: float) -> Iterable[PlaceRow]:
         for arm, robot in enumerate(self.around.workcell.robots):

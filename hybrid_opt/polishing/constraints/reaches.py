@@ -18,6 +18,8 @@ from symbolic.smooth.reach import Reach
 class Reaches(Kind[PlaceRow]):
     """Rows where |det J| is low: beyond the edge of the reach nothing else is defined."""
 
+    lasting = True
+
     def near(self, carry: PlacedCarry, target: Target) -> Iterable[PlaceRow]:
         """Below a share of the median along the path, every few places."""
         stride = self.around.cell.grid.places(self.near_settings.reach_stride)
@@ -28,15 +30,22 @@ class Reaches(Kind[PlaceRow]):
                 yield PlaceRow(Reach(arm), place)
 
     def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
-        """Below the least value; and where an arm loses the path and after it: at the edge of its
-        reach it is stretched, and so singular."""
+        """Below the least value and half of what is kept beyond it; and where an arm loses the path
+        and after it: at the edge of its reach it is stretched, and so singular."""
+        least = (1.0 + self.around.settings.between / 2.0) ** 0.5
         for arm in (0, 1):
-            for place in lowest(carry.manipulability[:, arm], 1.0):
+            for place in lowest(carry.manipulability[:, arm], least):
                 yield PlaceRow(Reach(arm), place)
         for arm in carry.stranded:
             width = self.around.cell.grid.places(self.near_settings.lost)
             for later in (0, width, 2 * width):
                 yield PlaceRow(Reach(arm), carry.reached + later)
+
+    def required(
+        self, carry: PlacedCarry, rows: Sequence[PlaceRow], lenient: bool = False
+    ) -> list[float]:
+        """What lets the measure hold between places as well."""
+        return [self.around.settings.between] * len(rows)
 
     def demanded(
         self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[PlaceRow], before: list[float]

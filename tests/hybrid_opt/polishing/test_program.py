@@ -63,7 +63,7 @@ def program_of(judge: CandidateEvaluator) -> tuple[SmoothProgram, Array]:
     task, grid = judge.workcell.task, Grid(judge.workcell.task)
     cell = SmoothCell(judge.workcell, polish_functions(judge.compiled), grid)
     x = initial_decision(task)
-    carry = CarryReader(judge, grid).read(x)
+    carry = CarryReader(judge, grid, cell.functions.rows).read(x)
     box, *_ = sorted(cell.functions.rows.separable)
     arms = [k for k in range(carry.clearance.shape[1]) if k not in cell.functions.rows.separable]
     rows: list[Row] = [
@@ -169,7 +169,8 @@ def test_rows_at_places_are_in_the_order_of_the_layout() -> None:
         row.constraint.pair for row in layout.place_rows if isinstance(row.constraint, Separation)
     )
     grid = Grid(evaluator(RACK).workcell.task)
-    carry = CarryReader(evaluator(RACK), grid).read(program.candidate(z))
+    functions = polish_functions(evaluator(RACK).compiled)
+    carry = CarryReader(evaluator(RACK), grid, functions.rows).read(program.candidate(z))
     checked = 0
     for row, value in zip(layout.place_rows, values.tolist(), strict=True):
         kind = row.constraint

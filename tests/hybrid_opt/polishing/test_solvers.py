@@ -130,8 +130,7 @@ def test_an_impossible_program_is_told(solve: Solver) -> None:
     assert answer.residuals.feasibility > 0.5
 
 
-@SOLVERS
-def test_a_solve_is_not_cut_off_where_it_violates_something(solve: Solver) -> None:
+def test_ipopt_is_not_cut_off_where_it_violates_something() -> None:
     """From outside into a thin curved strip, which steps along its tangent leave again."""
     z = ca.SX.sym("z", 2)
     program = Written(
@@ -145,12 +144,26 @@ def test_a_solve_is_not_cut_off_where_it_violates_something(solve: Solver) -> No
         np.array([1e-2]),
     )
     few = PolishSettings(max_iterations=1)
-    cut = solve(program, few)
+    cut = ipopt(program, few)
     assert cut.iterations <= few.solve.patience
     assert cut.residuals.feasibility > few.solve.feasible
-    patient = solve(program, replace(few, max_iterations=3))
+    patient = ipopt(program, replace(few, max_iterations=3))
     assert 3 < patient.iterations < 3 * few.solve.patience
     assert patient.residuals.feasibility <= few.solve.feasible
+
+
+def test_the_dense_method_keeps_what_holds_wherever_it_is_cut_off() -> None:
+    def rows(z: ca.SX) -> ca.SX:
+        return ca.vertcat(1.0 - ca.sumsqr(z), z[1] + 0.5 * z[0] - 3.0)
+
+    program = written(rows, [-1.0, -0.1], [-2.0, 0.7])
+    costs = [float(program.cost @ program.start)]
+    for iterations in (1, 2, 4, 8, 16):
+        answer = dense(program, PolishSettings(max_iterations=iterations))
+        assert answer.iterations <= iterations
+        assert answer.residuals.feasibility == 0.0
+        costs.append(float(program.cost @ answer.z))
+    assert costs[-1] < costs[1] < costs[0]
 
 
 def test_residuals_of_the_optimum_vanish_and_of_others_do_not() -> None:
