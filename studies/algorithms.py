@@ -22,6 +22,7 @@ from hybrid_opt.metaheuristics import Evaluated, analytic_problems
 from hybrid_opt.metaheuristics.analytic_problems import AnalyticProblem
 from studies.algorithm_bands import BAND_POPULATION, BAND_SOURCE, BANDS, Band, Verdict, judge
 from studies.program import add_verbose, carried_out, run_program
+from studies.text_table import number, text_table
 from symbolic.errors import SettingsError
 
 PROGRAM = "python -m studies.algorithms"
@@ -204,20 +205,8 @@ def table(result: AlgorithmTest) -> str:
         f"Mean over {result.seeds} seeds of the final front (limited size) and of all evaluated "
         "points",
         f"Bands: {BAND_SOURCE}",
-        f"{'problem':13}{'evals':>6}{'pop':>5}  {'algorithm':16}{'HV':>7}{'sd':>7}{'band':>7}"
-        f"{'':9}{'IGD':>8}{'sd':>8}{'band':>8} {'':8}{'HV all':>7}{'IGD all':>9}{'us/eval':>9}",
+        text_table([_HEADINGS, *map(_cells, result.rows)], left=(0, 3, 7, 11)),
     ]
-    for row in result.rows:
-        band = _band(row.problem, row.evaluations, row.algorithm, row.population)
-        lines.append(
-            f"{row.problem:13}{row.evaluations:6d}{row.population:5d}  {row.algorithm:16}"
-            f"{row.hypervolume.mean:7.3f}{row.hypervolume.std:7.3f}"
-            f"{f'{band.hypervolume:.3f}' if band else '':>7} {row.hypervolume_verdict or '':8}"
-            f"{row.igd.mean:8.4f}{row.igd.std:8.4f}"
-            f"{f'{band.igd:.4f}' if band else '':>8} {row.igd_verdict or '':8}"
-            f"{row.archive_hypervolume.mean:7.3f}{row.archive_igd.mean:9.4f}"
-            f"{row.overhead_us:9.1f}"
-        )
     for name in dict.fromkeys(row.algorithm for row in result.rows):
         rows = [row for row in result.rows if row.algorithm == name]
         verdicts = [v for row in rows for v in (row.hypervolume_verdict, row.igd_verdict) if v]
@@ -236,6 +225,34 @@ def table(result: AlgorithmTest) -> str:
         for test in result.tests
     ]
     return "\n".join(lines)
+
+
+_HEADINGS = (
+    *("problem", "evals", "pop", "algorithm"),
+    *("HV", "sd", "band", "verdict", "IGD", "sd", "band", "verdict"),
+    *("HV all", "IGD all", "us/eval"),
+)
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    band = _band(row.problem, row.evaluations, row.algorithm, row.population)
+    return (
+        row.problem,
+        str(row.evaluations),
+        str(row.population),
+        row.algorithm,
+        number(row.hypervolume.mean, 3),
+        number(row.hypervolume.std, 3),
+        number(band.hypervolume, 3) if band else "",
+        row.hypervolume_verdict or "",
+        number(row.igd.mean, 4),
+        number(row.igd.std, 4),
+        number(band.igd, 4) if band else "",
+        row.igd_verdict or "",
+        number(row.archive_hypervolume.mean, 3),
+        number(row.archive_igd.mean, 4),
+        number(row.overhead_us, 1),
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

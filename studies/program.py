@@ -105,6 +105,20 @@ def carried_out(
     return wrap
 
 
+def program_of(
+    program: str,
+    parser: Callable[[], argparse.ArgumentParser],
+    run: Callable[[argparse.Namespace], int],
+) -> Main:
+    """The main function of a program that parses its arguments and runs with them."""
+
+    @carried_out(program)
+    def main(arguments: Sequence[str] | None) -> int:
+        return run(parser().parse_args(arguments))
+
+    return main
+
+
 class _Warnings:
     """Shows every warning of this project once, and all others if it is verbose."""
 

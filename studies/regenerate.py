@@ -14,19 +14,12 @@ import numpy as np
 from codegen.build import Build, FunctionReport, build_set
 from codegen.cache import Cache
 from codegen.check import Agreement, compare
-from studies.program import add_verbose, carried_out, run_program
+from studies.program import add_verbose, program_of, run_program
 from studies.text_table import text_table
 
 PROGRAM = "python -m studies.regenerate"
 
 DISAGREES = 1
-
-
-@carried_out(PROGRAM)
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit code: 0, 1 where `--check` fails, 2 on bad input."""
-    options = _parser().parse_args(arguments)
-    return _run(options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -140,6 +133,9 @@ def _row(report: FunctionReport) -> tuple[str, ...]:
         f"{report.compile_seconds:.2f} s (-O{report.level})",
         "yes" if report.from_cache else "no",
     )
+
+
+main = program_of(PROGRAM, _parser, _run)
 
 
 if __name__ == "__main__":

@@ -5,17 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from hybrid_opt.store.export import FORMATS, export
+from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.replay import Replay, replay
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
-from hybrid_opt.timing import TimingModel, timed_trajectory
-from studies.program import add_verbose, carried_out, run_program
-from studies.timing_text import timing_json, timing_text
+from hybrid_opt.timing import timed_trajectory
+from hybrid_opt.timing.document import timing_document
+from studies.program import add_verbose, program_of, run_program
+from studies.text_table import text_table
+from studies.timing_text import timing_text
 from symbolic.errors import SettingsError
 
 PROGRAM = "python -m studies.replay"
@@ -59,13 +61,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-@carried_out(PROGRAM)
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Replay one file; returns the exit code."""
-    options = _parser().parse_args(arguments)
-    return _run(options)
-
-
 def _run(options: argparse.Namespace) -> int:
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
@@ -86,11 +81,11 @@ def _run(options: argparse.Namespace) -> int:
 def _time(
     stored: StoredTrajectory, replayed: Replay, options: argparse.Namespace
 ) -> tuple[dict[str, Any], str]:
-    model = TimingModel(replayed.workcell)
+    model = replayed.cell.timing_model
     if options.use == "force" and options.export and options.force_limit is None:
         raise SettingsError("--use force needs --force-limit")
     timed = timed_trajectory(model, stored.x, options.force_limit, options.force_curve)
-    document, text = timing_json(timed), timing_text(timed)
+    document, text = to_json(timing_document(timed)), timing_text(timed)
     if options.export:
         timing = timed.report.timings[TIMINGS[options.use]]
         stem = Path(options.file).stem
@@ -102,8 +97,8 @@ def _time(
 
 def _replay_json(stored: StoredTrajectory, replayed: Replay) -> dict[str, Any]:
     return {
-        "workcell": replayed.workcell.name,
-        "digest": replayed.workcell.digest,
+        "workcell": replayed.cell.workcell.name,
+        "digest": replayed.cell.workcell.digest,
         "reproduced": replayed.reproduced,
         "start_difference": replayed.start_difference,
         "figures": {
@@ -119,15 +114,22 @@ def _replay_json(stored: StoredTrajectory, replayed: Replay) -> dict[str, Any]:
 
 
 def _replay_text(stored: StoredTrajectory, replayed: Replay) -> str:
-    lines = [f"{replayed.workcell.name}, {len(stored.x)} variables"]
-    lines += [f"  {'':<32}{'stored':>16}{'recomputed':>16}"]
+    rows = [("figure", "stored", "recomputed", "")]
     for figure in replayed.figures:
         recomputed = "-" if figure.recomputed is None else f"{figure.recomputed:.9g}"
-        mark = "" if figure.same else "  DIFFERS"
-        lines.append(f"  {figure.name:<32}{figure.stored:>16.9g}{recomputed:>16}{mark}")
-    lines.append(f"  start postures differ by at most {replayed.start_difference:.2e} rad")
-    lines.append("reproduced" if replayed.reproduced else "NOT reproduced")
-    return "\n".join(lines)
+        mark = "" if figure.same else "DIFFERS"
+        rows.append((figure.name, f"{figure.stored:.9g}", recomputed, mark))
+    return "\n".join(
+        [
+            f"{replayed.cell.workcell.name}, {len(stored.x)} variables",
+            text_table(rows, left=(0, 3)),
+            f"start postures differ by at most {replayed.start_difference:.2e} rad",
+            "reproduced" if replayed.reproduced else "NOT reproduced",
+        ]
+    )
+
+
+main = program_of(PROGRAM, _parser, _run)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,7 +12,8 @@ import numpy as np
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.store.trajectory_file import read_trajectory
-from studies.program import carried_out, run_program
+from studies.program import program_of, run_program
+from studies.text_table import number, text_table
 from symbolic.array import Array
 
 PROGRAM = "python -m studies.robust"
@@ -39,13 +39,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-@carried_out(PROGRAM)
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Report one trajectory's robust forces; returns the exit code."""
-    options = _parser().parse_args(arguments)
-    return _run(options)
-
-
 def _run(options: argparse.Namespace) -> int:
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
@@ -64,9 +57,12 @@ def _run(options: argparse.Namespace) -> int:
     print(f"  peak forces that hold in all cases   {_both(force.peak)} N")
     print(f"  reference forces                     {_both(limit)} N")
     print(f"  they allow {largest:.3f} times the set")
-    print("\n  times the set   peak forces [N]")
-    for factor, peak in zip(factors, price, strict=True):
-        print(f"  {factor:13.2f}   {_both(peak)}")
+    rows = [("times the set", "peak force 1 [N]", "peak force 2 [N]")]
+    rows += [
+        (number(factor, 2), number(peak[0], 2), number(peak[1], 2))
+        for factor, peak in zip(factors, price, strict=True)
+    ]
+    print(f"\n{text_table(rows, left=())}")
     verdict = "all hold" if check.holds else f"{check.failing} FAIL"
     print(
         f"\n  {check.cases} random cases (seed {options.seed}): {verdict}; the hardest needs "
@@ -77,6 +73,9 @@ def _run(options: argparse.Namespace) -> int:
 
 def _both(values: Array) -> str:
     return " / ".join(f"{value:.2f}" for value in values)
+
+
+main = program_of(PROGRAM, _parser, _run)
 
 
 if __name__ == "__main__":

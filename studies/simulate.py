@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,7 +18,7 @@ from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.cell_scene import ArmSettings
 from hybrid_opt.witness.controller import CONTROLS
 from hybrid_opt.witness.scene import SimulationSettings
-from studies.program import carried_out, run_program
+from studies.program import program_of, run_program
 from studies.simulate_arms import simulate_arms
 from studies.simulate_pads import simulate_pads
 from symbolic.array import Array
@@ -90,12 +89,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-@carried_out(PROGRAM)
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Simulate one trajectory; returns the exit code."""
-    return _run(_parser().parse_args(arguments))
-
-
 def _run(options: argparse.Namespace) -> int:
     if options.controller == PADS and (options.film or options.mjcf):
         raise WitnessError("films and MJCF files are of cells with arms; give another --controller")
@@ -141,6 +134,9 @@ def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
     if not timing.ok or timing.carry is None:
         raise WitnessError(f"the trajectory cannot be driven: {timing.reason}")
     return timing.carry
+
+
+main = program_of(PROGRAM, _parser, _run)
 
 
 if __name__ == "__main__":

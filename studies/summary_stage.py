@@ -17,8 +17,6 @@ from hybrid_opt.campaign.layout import (
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.summary import ReplicaFigures
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.static_hold import static_hold
 from hybrid_opt.indicators.attainment import attainment_surfaces
 from hybrid_opt.indicators.selection import Selected, select
 from hybrid_opt.store.files import storing, write_atomically, write_json
@@ -38,8 +36,7 @@ def summary_stage() -> Stage:
 
 def _run(folder: CampaignFolder, progress: Progress) -> None:
     results = read_campaign(folder.root)
-    evaluator = CandidateEvaluator(folder.workcell, folder.settings.objectives)
-    static = static_hold(folder.workcell)
+    evaluator = folder.cell.evaluator
     polished = {
         (replica.algorithm, replica.replica): read_polished(results.root, replica, results.workcell)
         for replica in results.replicas
@@ -69,7 +66,7 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
         _write_points(folder, name, results.objectives, union)
         if len(results.objectives) in (2, 3):
             _write_attainment(folder, name, results)
-    summary = campaign_summary(results, reference, static, entries)
+    summary = campaign_summary(results, reference, folder.cell.static_hold, entries)
     write_json(folder.root / SUMMARY, to_json(summary))
 
 

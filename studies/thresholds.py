@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from hybrid_opt.witness.drive import drive_of
 from hybrid_opt.witness.scene import SimulationSettings
 from hybrid_opt.witness.simulate import Witness
 from studies.cli import Parser
-from studies.program import carried_out, run_program
+from studies.program import program_of, run_program
 from symbolic.array import Array
 from symbolic.workcell.decision import initial_decision
 
@@ -59,12 +59,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--carries", type=int, default=40, help="how many, in turn of all kinds")
     parser.add_argument("--seed", type=int, default=1, help="of the random candidates")
     return parser
-
-
-@carried_out(PROGRAM)
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Simulate and print; returns the exit code."""
-    return _run(_parser().parse_args(arguments))
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -136,6 +130,9 @@ def _pressed(cell: Cell, carry: Carry, friction: float) -> Carry:
         workcell=replace(workcell, contacts=(first, second)),
         normal_force=load["normal_force"],
     )
+
+
+main = program_of(PROGRAM, _parser, _run)
 
 
 if __name__ == "__main__":

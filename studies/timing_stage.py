@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.layout import SELECTED
 from hybrid_opt.store.files import write_json
+from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingModel, timed_trajectory
+from hybrid_opt.timing.document import TimingDocument, timing_document
 from hybrid_opt.work.job import Emit, Job, answer_all
-from studies.timing_text import timing_json
 from symbolic.array import Array
 from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.records import Workcell
@@ -49,7 +49,7 @@ def _run(folder: CampaignFolder, progress: Progress, force_limit: float | None) 
         executor = executor_for(folder.execution)
         documents = answer_all(executor, job, requests, lambda: advance(1))
     for file, document in zip(found, documents, strict=True):
-        write_json(folder.root / TIMING / file, document)
+        write_json(folder.root / TIMING / file, to_json(document))
 
 
 @dataclass(frozen=True)
@@ -76,5 +76,5 @@ def _ready_model(workcell: Workcell) -> TimingModel:
 
 def _document(
     model: TimingModel, request: tuple[Array, float | None], emit: Emit
-) -> dict[str, Any]:
-    return timing_json(timed_trajectory(model, *request))
+) -> TimingDocument:
+    return timing_document(timed_trajectory(model, *request))

@@ -13,6 +13,7 @@ from hybrid_opt.campaign.execution import ExecutionSettings
 from hybrid_opt.campaign.identity import identity, require_equal
 from hybrid_opt.campaign.layout import CONFIGURATION, WORKCELL
 from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import locked, read_json, storing, sync_folder, write_json
 from symbolic.workcell.archive import CellArchive, archive_cell, unpack_cell
@@ -28,15 +29,20 @@ class CampaignFolder:
         root: the folder.
         settings: what is computed.
         execution: how.
-        workcell: as read from the folder's own copy.
+        cell: of the folder's own copy of the workcell, with the settings' objectives.
         archive: the workcell's files.
     """
 
     root: Path
     settings: CampaignSettings
     execution: ExecutionSettings
-    workcell: Workcell
+    cell: Cell
     archive: CellArchive
+
+    @property
+    def workcell(self) -> Workcell:
+        """The cell's description."""
+        return self.cell.workcell
 
 
 @contextmanager
@@ -72,7 +78,7 @@ def open_folder(
         copy = _stored_cell(root, archive)
         if not exists:
             write_json(configuration, identity(settings, root, copy))
-        yield CampaignFolder(root, settings, execution, copy, archive)
+        yield CampaignFolder(root, settings, execution, Cell(copy, settings.objectives), archive)
 
 
 def _check_use(root: Path, exists: bool, resume: bool) -> None:

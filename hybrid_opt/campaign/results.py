@@ -25,6 +25,7 @@ from hybrid_opt.campaign.layout import (
 )
 from hybrid_opt.campaign.replica import front_rows
 from hybrid_opt.campaign.summary import CampaignSummary
+from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import Evaluations
 from hybrid_opt.store.files import read_bytes, read_json, sha256
@@ -72,14 +73,19 @@ class CampaignResults:
     Attributes:
         root: the results folder.
         configuration: what is in its configuration.json.
-        workcell: as read from the folder's copy.
+        cell: of the folder's copy of the workcell, with the study's objectives.
         replicas: of all algorithms, by algorithm and number.
     """
 
     root: Path
     configuration: Configuration
-    workcell: Workcell
+    cell: Cell
     replicas: tuple[Replica, ...]
+
+    @property
+    def workcell(self) -> Workcell:
+        """The cell's description."""
+        return self.cell.workcell
 
     @property
     def algorithms(self) -> tuple[str, ...]:
@@ -117,7 +123,7 @@ def read_campaign(root: str | Path) -> CampaignResults:
         for algorithm in settings.algorithms
         for number in range(settings.replicas)
     )
-    return CampaignResults(root, configuration, workcell, replicas)
+    return CampaignResults(root, configuration, Cell(workcell, settings.objectives), replicas)
 
 
 def read_configuration(root: str | Path) -> Configuration:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.store.trajectory_figures import same_figure, trajectory_figures
 from hybrid_opt.store.trajectory_file import StoredTrajectory
-from symbolic.workcell.records import Workcell
 
 START_TOLERANCE = 1e-6
 """Largest difference of the start postures [rad]."""
@@ -36,12 +35,12 @@ class Replay:
     """A re-evaluated trajectory.
 
     Attributes:
-        workcell: as unpacked from the file.
+        cell: as unpacked from the file.
         figures: every stored figure, compared.
         start_difference: largest difference of the start postures [rad].
     """
 
-    workcell: Workcell
+    cell: Cell
     figures: tuple[FigureComparison, ...]
     start_difference: float
 
@@ -62,15 +61,15 @@ def replay(stored: StoredTrajectory, folder: Path) -> Replay:
     workcell = stored.unpack(folder)
     named = [name.removeprefix("objective_") for name in stored.figures]
     objectives = tuple(name for name in named if name in OBJECTIVES)
-    evaluator = CandidateEvaluator(workcell, objectives or PAPER_OBJECTIVES)
-    carry = evaluator.carry(stored.x)
+    cell = Cell(workcell, objectives or PAPER_OBJECTIVES)
+    carry = cell.carry(stored.x)
     recomputed = trajectory_figures(carry)
     differences = [
         float(np.abs(arm.q[0] - start).max())
         for arm, start in zip(carry.arms, stored.start, strict=True)
     ]
     return Replay(
-        workcell,
+        cell,
         tuple(
             FigureComparison(name, value, recomputed.get(name))
             for name, value in stored.figures.items()

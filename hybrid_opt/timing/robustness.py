@@ -81,11 +81,6 @@ class Margin:
     limit: float
     fails: str
 
-    def __str__(self) -> str:
-        unit = f" {self.unit}" if self.unit else ""
-        end = f"then {self.fails}" if self.fails else "nothing fails up to there"
-        return f"{self.quantity:<28}{self.nominal:9.4f} -> {self.limit:9.4f}{unit}, {end}"
-
 
 def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
     """Forces against payload mass for an unchanged timing."""

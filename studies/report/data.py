@@ -14,7 +14,6 @@ from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
 from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, ReplicaFigures
 from hybrid_opt.carry import Carry
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.selection import balanced, peak_normal_forces
 from hybrid_opt.timing import TimingModel, timed_trajectory
@@ -46,19 +45,18 @@ REACH_SEED = 0
 """Of the postures that the reach is drawn from; no result depends on it."""
 
 
-def gather(root: Path, executor: Executor | None = None) -> ReportData:
-    """Read a results folder and evaluate what is drawn in detail.
+def gather(results: CampaignResults, executor: Executor | None = None) -> ReportData:
+    """Evaluate what is drawn in detail.
 
     Args:
-        root: the results folder.
+        results: of a finished study.
         executor: who does what takes long, None for this process.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
         DualArmError: the workcell's functions cannot be built.
     """
-    results = read_campaign(root)
-    summary = read_summary(root)
+    summary = read_summary(results.root)
     workcell = results.workcell
     maker = _CarryMaker(results)
     geometry = build_geometry(workcell)
@@ -114,8 +112,7 @@ class _CarryMaker:
     """Evaluates trajectories of one campaign in detail."""
 
     def __init__(self, results: CampaignResults) -> None:
-        self.evaluator = CandidateEvaluator(results.workcell, results.objectives)
-        self.model = TimingModel(results.workcell)
+        self.evaluator = results.cell.evaluator
 
     def carry(self, x: Array, label: str) -> DrawnCarry:
         return shown(label, self.evaluator.carry(x))

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from hybrid_opt.cell import Cell
 from hybrid_opt.store.files import write_atomically
-from hybrid_opt.timing import TimingModel
 from hybrid_opt.work.job import Emit, Executor, Job, answer_all
 from hybrid_opt.work.serial import SerialExecutor
 from studies.report.figures import ReportFigure, report_figures
@@ -25,6 +25,7 @@ TABLES = "tables"
 def write_report(
     root: Path,
     data: ReportData,
+    cell: Cell,
     with_paper: bool,
     done: Callable[[], None] = lambda: None,
     executor: Executor | None = None,
@@ -34,6 +35,7 @@ def write_report(
     Args:
         root: the results folder.
         data: from `studies.report.data.gather`.
+        cell: whose functions give the trajectories of whole fronts.
         with_paper: whether figures that the paper states of its rack stand beside ours.
         done: called after every figure and after the page.
         executor: who draws, None for this process.
@@ -58,7 +60,7 @@ def write_report(
             ("tex", table.latex()),
         ):
             write_atomically(root / TABLES / f"{table.name}.{suffix}", text.encode())
-    document = PageData(data, TimingModel(data.workcell)).document()
+    document = PageData(data, cell.timing_model).document()
     page = root / PAGE
     write_atomically(page, render_page(data, document, tables, pictures).encode())
     done()

@@ -61,14 +61,16 @@ def follow_report_options(root: Path, options: argparse.Namespace) -> None:
 
 
 def _write(root: Path, with_paper: bool, progress: Progress, executor: Executor) -> None:
+    from hybrid_opt.campaign.results import read_campaign
     from studies.report.data import gather
     from studies.report.figures import report_figures
     from studies.report.generate import write_report
 
-    data = gather(root, executor)
+    results = read_campaign(root)
+    data = gather(results, executor)
     count = len(list(report_figures(data))) + 1
     with progress.stage("report", count, "pictures") as advance:
-        write_report(root, data, with_paper, lambda: advance(1), executor)
+        write_report(root, data, results.cell, with_paper, lambda: advance(1), executor)
 
 
 def rewrite(root: Path, progress: Progress) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
 from hybrid_opt.campaign.documents import PolishEffort
+from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.campaign.summary import PolishedFigures
 from hybrid_opt.indicators.metrics import non_dominated
 from studies.report.data import gather
@@ -35,7 +36,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def data(study: Path) -> ReportData:
     """What a report of that study shows."""
-    return gather(study)
+    return gather(read_campaign(study))
 
 
 @pytest.fixture(scope="session")

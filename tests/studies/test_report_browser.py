@@ -17,6 +17,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
+from hybrid_opt.cell import Cell
 from studies.report.generate import write_report
 from studies.report.records import ReportData
 from tests.studies.test_report_page import HOSTILE, with_hostile_names
@@ -32,7 +33,9 @@ if not (BROWSER and DRIVER) and not os.environ.get("CI"):
 
 @pytest.fixture(scope="module")
 def report(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_report(tmp_path_factory.mktemp("page"), data, with_paper=False)
+    return write_report(
+        tmp_path_factory.mktemp("page"), data, Cell(data.workcell), with_paper=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +239,9 @@ def test_fits_the_window(
 def test_hostile_names_are_shown_as_text(
     browser: webdriver.Chrome, data: ReportData, tmp_path: Path
 ) -> None:
-    hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False)
+    hostile = write_report(
+        tmp_path, with_hostile_names(data), Cell(data.workcell), with_paper=False
+    )
     logged(browser, "browser")
     opened(browser, hostile)
     assert browser.execute_script("return window.broken") is None

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hybrid_opt.cell import Cell
 from hybrid_opt.timing import TimingModel
 from studies.report.generate import write_report
 from studies.report.page_data import PageData
@@ -35,7 +36,9 @@ def with_hostile_names(data: ReportData) -> ReportData:
 
 @pytest.fixture(scope="module")
 def report(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_report(tmp_path_factory.mktemp("report"), data, with_paper=True)
+    return write_report(
+        tmp_path_factory.mktemp("report"), data, Cell(data.workcell), with_paper=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +93,9 @@ def test_the_policy_allows_exactly_the_pages_scripts(text: str) -> None:
 
 
 def test_hostile_names_stay_text(data: ReportData, tmp_path: Path, text: str) -> None:
-    hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False).read_text("utf-8")
+    hostile = write_report(
+        tmp_path, with_hostile_names(data), Cell(data.workcell), with_paper=False
+    ).read_text("utf-8")
     assert HOSTILE not in hostile
     assert html.escape(HOSTILE) in hostile
     clean, found = Elements(text), Elements(hostile)

@@ -15,6 +15,7 @@ from hybrid_opt.campaign.documents import Configuration, StoredCell, StoredSetti
 from hybrid_opt.campaign.replica import front_rows
 from hybrid_opt.campaign.results import CampaignResults, Replica
 from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures, SelectedEntry
+from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.evaluate.static_hold import StaticHold
 from hybrid_opt.indicators.statistics import rank_test
@@ -126,7 +127,7 @@ def results(entries: dict[str, list[ReplicaFigures]]) -> CampaignResults:
         first_generation="initial",
     )
     configuration = Configuration("", 1, StoredCell("Rack", "", ""), settings, {})
-    return CampaignResults(Path("results"), configuration, load(RACK), ())
+    return CampaignResults(Path("results"), configuration, Cell(load(RACK)), ())
 
 
 VOLUMES = {"nsga2": [0.4, 0.6, 0.5, 0.45, 0.55], "mopso": [0.1, 0.2, 0.15, 0.12, 0.18]}

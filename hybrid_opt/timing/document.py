@@ -1,0 +1,175 @@
+"""What timing says of one trajectory as one record: stored in `timing/*.json`, printed as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from hybrid_opt.store.json_records import Figure, Range, Shape, read_record
+from hybrid_opt.timing.analysis import ForceCurve
+from hybrid_opt.timing.overview import TimedTrajectory
+from hybrid_opt.timing.records import Timing, TimingStatus
+from hybrid_opt.timing.robustness import Margin
+from hybrid_opt.timing.use import joint_use
+from symbolic.array import Array
+
+Count = Annotated[int, Range(0, 10**12)]
+Pair = Annotated[Array, Shape((2,))]
+
+
+@dataclass(frozen=True)
+class StoredUse:
+    """How far a limit is used: the largest value over it, and its `Place`."""
+
+    ratio: Figure
+    constraint: str
+    robot: str
+    joint: str
+    sample: Count
+    parameter: Annotated[float, Range(0.0, 1.0)]
+
+
+@dataclass(frozen=True)
+class StoredTiming:
+    """One `Timing`. What follows `use` is that of its carry, None without one.
+
+    Attributes:
+        status, reason, iterations, slowed, seconds: as there.
+        duration: [s], NaN without a timing.
+        use: by limit.
+        objectives: (2,) largest normal forces over the reference forces.
+        payload_limit: [kg].
+        peak_normal_force, peak_resultant_force: (2,) [N].
+        least_friction_margin: (2,) least share of the friction that is left.
+        peak_pressure_shift: (2,) [m].
+        peak_point_moment_residual, peak_moment_residual: [N m].
+        joint_use: (n joints,) largest use of each joint by limit, both arms in order.
+    """
+
+    status: str
+    reason: str
+    duration: Figure
+    iterations: Count
+    slowed: Figure
+    seconds: Figure
+    use: Mapping[str, StoredUse]
+    objectives: Pair | None = None
+    payload_limit: float | None = None
+    peak_normal_force: Pair | None = None
+    peak_resultant_force: Pair | None = None
+    least_friction_margin: Pair | None = None
+    peak_pressure_shift: Pair | None = None
+    peak_point_moment_residual: float | None = None
+    peak_moment_residual: float | None = None
+    joint_use: Mapping[str, Annotated[Array, Shape((None,))]] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a status that no timing has."""
+        TimingStatus(self.status)
+
+
+@dataclass(frozen=True)
+class StoredLimit:
+    """One limit of a force curve: force [N], duration [s] (NaN without a timing), status."""
+
+    force: float
+    duration: Figure
+    status: str
+
+    def __post_init__(self) -> None:
+        """Refuse a status that no timing has."""
+        TimingStatus(self.status)
+
+
+@dataclass(frozen=True)
+class StoredCurve:
+    """A `ForceCurve`: the forces at rest and without limit [N], and the limits between them."""
+
+    static_force: float
+    unlimited_force: Figure
+    points: tuple[StoredLimit, ...]
+
+
+@dataclass(frozen=True)
+class TimingDocument:
+    """All that timing says of one trajectory, see `TimedTrajectory`.
+
+    Attributes:
+        nominal_duration: at the reference speeds without ramps [s].
+        timings: by name, the search's first.
+        margins: how wrong the cell's description may be.
+        force_curve: duration against force limit, None where it was not asked for.
+    """
+
+    nominal_duration: Figure
+    timings: Mapping[str, StoredTiming]
+    margins: tuple[Margin, ...]
+    force_curve: StoredCurve | None
+
+
+def timing_document(timed: TimedTrajectory) -> TimingDocument:
+    """The record of a timed trajectory."""
+    return TimingDocument(
+        nominal_duration=timed.report.nominal_duration,
+        timings={name: _timing(timing) for name, timing in timed.report.timings.items()},
+        margins=timed.margins,
+        force_curve=None if timed.curve is None else _curve(timed.curve),
+    )
+
+
+def read_timing(path: Path) -> TimingDocument:
+    """Read one file of `timing/` in a results folder.
+
+    Raises:
+        ResultsError: it is missing or damaged.
+    """
+    remedy = "delete stages/timing.json in its folder and continue the study with --resume"
+    return read_record(TimingDocument, path, remedy)
+
+
+def _timing(timing: Timing) -> StoredTiming:
+    use = {
+        limit: StoredUse(excess.ratio, **vars(excess.place)) for limit, excess in timing.use.items()
+    }
+    known = StoredTiming(
+        status=timing.status.value,
+        reason=timing.reason,
+        duration=timing.duration,
+        iterations=timing.iterations,
+        slowed=timing.slowed,
+        seconds=timing.seconds,
+        use=use,
+    )
+    carry = timing.carry
+    if carry is None:
+        return known
+    return replace(
+        known,
+        objectives=carry.force_ratio,
+        payload_limit=carry.payload_limit,
+        peak_normal_force=carry.peak_normal_force,
+        peak_resultant_force=carry.peak_resultant_force,
+        least_friction_margin=carry.friction_margin.min(axis=0),
+        peak_pressure_shift=carry.peak_pressure_shift,
+        peak_point_moment_residual=_largest(carry.point_moment_residual),
+        peak_moment_residual=_largest(carry.moment_residual),
+        joint_use=joint_use(carry, carry.workcell),
+    )
+
+
+def _largest(vectors: Array) -> float:
+    """Largest length of vectors (n, 3)."""
+    return float(np.linalg.norm(vectors, axis=1).max())
+
+
+def _curve(curve: ForceCurve) -> StoredCurve:
+    points = zip(curve.force.tolist(), curve.duration.tolist(), curve.status, strict=True)
+    return StoredCurve(
+        curve.static_force,
+        curve.unlimited_force,
+        tuple(StoredLimit(force, duration, status.value) for force, duration, status in points),
+    )

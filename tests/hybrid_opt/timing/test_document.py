@@ -1,0 +1,72 @@
+"""What timing says of a trajectory survives being stored."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.store.files import write_json
+from hybrid_opt.store.json_records import to_json
+from hybrid_opt.timing import TimedTrajectory, timed_trajectory
+from hybrid_opt.timing.document import read_timing, timing_document
+from tests.hybrid_opt.timing.cells import hand_timing, initial
+
+
+@cache
+def timed() -> TimedTrajectory:
+    # The limit cannot be kept: that timing has no carry.
+    return timed_trajectory(hand_timing(), initial(), force_limit=1.0, curve_points=3)
+
+
+def test_stored_and_read_it_is_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "timing.json"
+    document = to_json(timing_document(timed()))
+    write_json(path, document)
+    assert to_json(read_timing(path)) == document
+
+
+def test_figures_are_those_of_the_timings() -> None:
+    document, report = timing_document(timed()), timed().report
+    fastest, carry = document.timings["fastest"], report.fastest.carry
+    assert carry is not None
+    assert fastest.duration == carry.time[-1] - carry.time[0]
+    assert fastest.peak_normal_force is not None
+    np.testing.assert_array_equal(fastest.peak_normal_force, carry.normal_force.max(axis=0))
+    limited = document.timings["force limited"]
+    assert limited.status == "infeasible at rest"
+    assert limited.peak_normal_force is None
+    assert to_json(limited)["duration"] is None
+    assert document.force_curve is not None
+    assert len(document.force_curve.points) == 3
+    assert document.margins == timed().margins
+
+
+@pytest.mark.parametrize(
+    ("change", "place"),
+    [
+        ({"timings": {"fastest": {}}}, "timings.fastest.status"),
+        ({"margins": None}, "margins"),
+        ({"nominal_duration": "long"}, "nominal_duration"),
+    ],
+)
+def test_damage_is_told_with_its_place(
+    tmp_path: Path, change: dict[str, object], place: str
+) -> None:
+    path = tmp_path / "timing.json"
+    path.write_text(json.dumps(to_json(timing_document(timed())) | change), encoding="utf-8")
+    with pytest.raises(ResultsError, match=f"damaged at {place}"):
+        read_timing(path)
+
+
+def test_an_unknown_status_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "timing.json"
+    document = to_json(timing_document(timed()))
+    document["timings"]["fastest"]["status"] = "fine"
+    path.write_text(json.dumps(document), encoding="utf-8")
+    with pytest.raises(ResultsError, match="'fine'"):
+        read_timing(path)
