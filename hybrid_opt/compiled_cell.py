@@ -68,9 +68,7 @@ class CompiledCell:
         """What a set of functions is made from: the workcell, the symbolic package's sources, the
         libraries that write the expressions (CasADi's version is part of every set's key)."""
         libraries = [f"{library} {version(library)}" for library in ("pin", "scipy")]
-        law = self.workcell.task.time_law
-        cell = (self.workcell.digest, law, source_digest("symbolic"), *libraries)
-        return digest(name, *cell, *details)
+        return digest(name, self.workcell.digest, source_digest("symbolic"), *libraries, *details)
 
     def functions(
         self,

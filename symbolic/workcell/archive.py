@@ -13,13 +13,11 @@ import posixpath
 import re
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-
-import numpy as np
 
 from symbolic import outside
 from symbolic.errors import BundleError, DualArmError, OutsideError, RobotModelError
@@ -62,29 +60,16 @@ def archive_cell(workcell: Workcell) -> CellArchive:
         BundleError: the file on disk no longer describes this workcell, or a reference cannot
             be made relative.
     """
-    return _archive(workcell.source, workcell.digest, _Same(workcell))
-
-
-class _Same:
-    """Lets the archive cache compare workcells by their records."""
-
-    def __init__(self, workcell: Workcell) -> None:
-        self.workcell = workcell
-
-    def __hash__(self) -> int:
-        return hash(self.workcell.digest)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and _equal(self.workcell, other.workcell)
+    return _archive(workcell.source, workcell.digest)
 
 
 @lru_cache(maxsize=4)
-def _archive(source: Path, digest: str, wanted: _Same) -> CellArchive:
+def _archive(source: Path, digest: str) -> CellArchive:
     try:
         current = load(source, decided=wanted.workcell.start_branch)
     except DualArmError as error:
         raise BundleError(f"the workcell cannot be stored: {error}") from error
-    if current.digest != digest or not _equal(current, wanted.workcell):
+    if current.digest != digest:
         raise BundleError(
             f"{source.name} does not describe the workcell in memory (it was changed after "
             "reading); store trajectories of a workcell as its file has it"
@@ -246,17 +231,3 @@ def _check_references(archive: CellArchive, root: Path) -> None:
 
 def _leads_out(path: str) -> bool:
     return path.startswith(("/", "../")) or path == ".."
-
-
-def _equal(first: Any, second: Any) -> bool:
-    """Whether two records hold the same values, where they came from set aside."""
-    if is_dataclass(first) and not isinstance(first, type):
-        return type(first) is type(second) and all(
-            _equal(getattr(first, field.name), getattr(second, field.name))
-            for field in fields(first)
-        )
-    if isinstance(first, tuple):
-        return len(first) == len(second) and all(map(_equal, first, second))
-    if isinstance(first, np.ndarray):
-        return bool(np.array_equal(first, second))
-    return bool(first == second)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from symbolic import outside
@@ -12,6 +13,7 @@ from symbolic.robot.urdf import resolve_mesh, robot_urdf
 from symbolic.robot.xacro_file import description_content
 from symbolic.workcell.branches import with_branches
 from symbolic.workcell.checks import check_all
+from symbolic.workcell.identity import reading_of
 from symbolic.workcell.reader import Problems, Table
 from symbolic.workcell.records import SEARCHED, Body, Mesh, Robot, Workcell
 from symbolic.workcell.redundancy import read_redundant, with_redundancy
@@ -93,11 +95,11 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
         collision=collision,
         start_branch=(robots[0][1], robots[1][1]),
         source=source,
-        digest=identity,
         uncertainty=uncertainty,
     )
     check_all(workcell, problems)
-    return with_redundancy(workcell, redundant, problems)
+    workcell = with_redundancy(workcell, redundant, problems)
+    return replace(workcell, reading=reading_of(workcell, identity)) if identity else workcell
 
 
 def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Body]) -> str:

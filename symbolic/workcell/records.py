@@ -14,6 +14,7 @@ format; `symbolic.workcell.file` reads them from TOML.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
+from symbolic.workcell.identity import Reading, digest_of
 
 TimeLaw = Literal["constant", "ramped", "optimal"]
 Allocation = Literal["paper", "joint"]
@@ -407,8 +409,7 @@ class Workcell:
             -1 for the stated criterion's choice, or `SEARCHED`: all compete, see
             `hybrid_opt.branches`, and until then it is the criterion's choice.
         source: the file it came from.
-        digest: SHA-256 over the file and every file it names (URDF, meshes); identifies the
-            cell in caches and results.
+        reading: what it was like when it was read from `source`.
     """
 
     name: str
@@ -420,5 +421,11 @@ class Workcell:
     collision: CollisionSettings = field(default_factory=CollisionSettings)
     start_branch: tuple[int, int] = (-1, -1)
     source: Path = Path()
-    digest: str = ""
+    reading: Reading | None = None
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
+
+    @cached_property
+    def digest(self) -> str:
+        """Identifies the cell in caches and results: SHA-256 over the file and every file it names
+        (URDF, meshes), and over its values where it was changed in memory; '' without files."""
+        return digest_of(self, self.reading)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -136,9 +135,3 @@ def test_less_force_violates_more_and_costs_more() -> None:
     x[:, -1] = np.linspace(20.0, 45.0, 5)
     found = evaluator().evaluate(x)
     assert (np.diff(found.penalised[:, 0]) < 0.0).all()
-
-
-def test_the_time_law_is_part_of_what_functions_are_kept_by() -> None:
-    cell = replace(hand_cell(), digest="d")
-    drivable = replace(cell, task=replace(cell.task, time_law="optimal"))
-    assert CompiledCell(cell).key("set") != CompiledCell(drivable).key("set")

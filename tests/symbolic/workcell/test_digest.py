@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import trimesh
 
 from symbolic.workcell.file import load
-from symbolic.workcell.records import Mesh
+from symbolic.workcell.records import Mesh, Workcell
 from tests.symbolic.workcell.samples import GOFA, sample_data, write
 
 COLLISION_BOX = '<geometry><box size="0.161 0.093 0.707"/></geometry>'
@@ -82,3 +83,56 @@ def test_swapped_meshes_are_another_cell(tmp_path: Path) -> None:
     (shapes / "stored.stl").rename(shapes / "tool.stl")
     (shapes / "other.stl").rename(shapes / "stored.stl")
     assert load(path).digest != before
+
+
+def changed_cells(cell: Workcell) -> dict[str, Workcell]:
+    """The cell with one value changed in memory."""
+    first, second = cell.robots
+    nearer = replace(first, T_world_base=first.T_world_base + 1e-12)
+    return {
+        "name": replace(cell, name="other"),
+        "time law": replace(cell, task=replace(cell.task, time_law="ramped")),
+        "samples": replace(cell, task=replace(cell.task, samples=cell.task.samples + 1)),
+        "mass": replace(cell, payload=replace(cell.payload, mass=11.0)),
+        "base": replace(cell, robots=(nearer, second)),
+        "order": replace(cell, robots=(second, first)),
+        "environment": replace(cell, environment=cell.environment[:-1]),
+        "tolerance": replace(cell, collision=replace(cell.collision, tolerance=1e-3)),
+    }
+
+
+def test_a_cell_changed_in_memory_is_another_cell(tmp_path: Path) -> None:
+    cell = load(make_cell(tmp_path / "cell"))
+    digests = {name: changed.digest for name, changed in changed_cells(cell).items()}
+    assert all(len(digest) == 64 for digest in digests.values()), digests
+    assert len({cell.digest, *digests.values()}) == 1 + len(digests)
+
+
+def test_the_same_change_is_the_same_cell_anywhere(tmp_path: Path) -> None:
+    path = make_cell(tmp_path / "cell")
+    shutil.copytree(tmp_path / "cell", tmp_path / "elsewhere")
+    here, there = (
+        changed_cells(load(tmp_path / name / path.name)) for name in ("cell", "elsewhere")
+    )
+    assert [cell.digest for cell in here.values()] == [cell.digest for cell in there.values()]
+
+
+def test_a_change_that_is_taken_back_is_none(tmp_path: Path) -> None:
+    cell = load(make_cell(tmp_path / "cell"))
+    changed = replace(cell, task=replace(cell.task, samples=11))
+    assert replace(changed, task=cell.task).digest == cell.digest
+    copied = replace(
+        cell.payload, mass=float(str(cell.payload.mass)), size=cell.payload.size.copy()
+    )
+    assert replace(cell, payload=copied).digest == cell.digest
+
+
+def test_files_that_were_not_read_identify_nothing(tmp_path: Path) -> None:
+    path = make_cell(tmp_path / "cell")
+    cell = load(path)
+    first, second = cell.robots
+    other = replace(first, urdf=path.parent / "other.urdf")
+    assert replace(cell, robots=(other, second)).digest == ""
+    argued = replace(first, xacro_arguments=(("size", "2"),))
+    assert replace(cell, robots=(argued, second)).digest == ""
+    assert replace(cell, reading=None).digest == ""
