@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from codegen.cache import FORMAT, Cache, Entry, digest, source_digest
-from codegen.compiled import CompiledFunction, warn_one_lane
-from codegen.compiler import FLAGS, LANE_FLAGS, Compiler, default_level, find_compiler
-from codegen.errors import CodegenError
+from codegen.cache import FORMAT, Cache, digest, source_digest
+from codegen.compilation import Source, compile_source, load_compiled
+from codegen.compiler import Compiler, default_level, find_compiler
 from codegen.function import NumericFunction, available_cores
 from codegen.interpreted import InterpretedFunction, warn_interpreted
 from codegen.signature import Signature
@@ -116,10 +113,10 @@ def build(
     with ThreadPoolExecutor(jobs or available_cores()) as pool:
         futures = []
         for name, function in functions.items():
-            source = _Source.of(function, lanes)
+            source = Source.of(function, lanes)
             level = (levels or {}).get(name)
             level = default_level(source.own_bytes) if level is None else level
-            futures.append(pool.submit(_compile, source, compiler, cache, level, rebuild))
+            futures.append(pool.submit(compile_source, source, compiler, cache, level, rebuild))
         built = [future.result() for future in futures]
     reports = tuple(
         FunctionReport(
@@ -202,8 +199,8 @@ def load_or_compile(
     if found is not None:
         return next(iter(found.values()))
     signature, text = make()
-    source = _Source(signature, 0, text, len(text), None)
-    function, entry, _ = _compile(source, compiler, cache, 3, rebuild=False)
+    source = Source(signature, 0, text, len(text), None)
+    function, entry, _ = compile_source(source, compiler, cache, 3, rebuild=False)
     cache.write_record(_set_key(key, 1, compiler), {"members": {signature.name: entry.key}})
     return function
 
@@ -221,77 +218,6 @@ def build_set(
     return built
 
 
-@dataclass(frozen=True)
-class _Source:
-    """C to compile, and without lanes if that fails. own_bytes: what CasADi generated of it."""
-
-    signature: Signature
-    operations: int
-    text: str
-    own_bytes: int
-    without_lanes: str | None
-
-    @classmethod
-    def of(cls, function: ca.Function, lanes: int) -> _Source:
-        from codegen.source import c_source, dense, operations
-
-        densified = dense(function)
-        text = c_source(densified)
-        signature, count, own = Signature.of(densified), operations(function), len(text)
-        wide = c_source(densified, lanes)
-        return cls(signature, count, wide, own, None if wide == text else text)
-
-
-def _compile(
-    source: _Source, compiler: Compiler, cache: Cache, level: int, rebuild: bool
-) -> tuple[CompiledFunction, Entry, bool]:
-    signature = source.signature
-    # Names and shapes are part of the C text, except which of two equal layouts they mean.
-    flags = () if source.without_lanes is None else LANE_FLAGS
-    names = str(signature.to_json())
-    key = digest(str(FORMAT), compiler.identity, str(level), *FLAGS, *flags, names, source.text)
-
-    def make(library: Path) -> dict[str, Any]:
-        text = library.parent / f"{signature.name}.c"
-        text.write_text(source.text)
-        start = time.perf_counter()
-        try:
-            compiler.compile(text, library, level, flags)
-        except CodegenError as error:
-            if source.without_lanes is None:
-                raise
-            text.write_text(source.without_lanes)
-            compiler.compile(text, library, level)
-            warn_one_lane(signature.name, str(error))
-        return {
-            "signature": signature.to_json(),
-            "operations": source.operations,
-            "c_bytes": len(source.text),
-            "compile_seconds": time.perf_counter() - start,
-            "level": level,
-        }
-
-    if not rebuild and (hit := _load(key, cache)) is not None:
-        return *hit, True
-    with cache.lock(key):
-        if not rebuild and (hit := _load(key, cache)) is not None:
-            return *hit, True
-        entry = cache.store(key, make)
-    return CompiledFunction(signature, entry.library), entry, False
-
-
-def _load(key: str, cache: Cache) -> tuple[CompiledFunction, Entry] | None:
-    entry = cache.find(key)
-    if entry is None:
-        return None
-    try:
-        signature = Signature.from_json(entry.facts["signature"])
-        return CompiledFunction(signature, entry.library), entry
-    except CodegenError:
-        # Intact but not loadable, such as made against a newer C library: to be made again.
-        return None
-
-
 def _load_set(
     key: str, lanes: int, compiler: Compiler, cache: Cache
 ) -> dict[str, NumericFunction] | None:
@@ -300,7 +226,7 @@ def _load_set(
         return None
     functions: dict[str, NumericFunction] = {}
     for name, member in record["members"].items():
-        hit = _load(member, cache)
+        hit = load_compiled(member, cache)
         if hit is None:
             return None
         functions[name] = hit[0]

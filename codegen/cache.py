@@ -31,6 +31,7 @@ import platformdirs
 from codegen.errors import CodegenError
 from symbolic import outside
 from symbolic.errors import OutsideError
+from symbolic.replacing import replace_file
 
 FORMAT = 1
 """Part of every key; rises when what is stored changes its meaning."""
@@ -153,11 +154,9 @@ class Cache:
     def write_record(self, key: str, facts: Mapping[str, Any]) -> None:
         """Store a record with its checksum, in one step."""
         text = json.dumps({"facts": facts, "sha256": digest(_canonical(facts))}, indent=1)
-        with self._build_folder() as scratch, _writing(self.folder):
-            written = scratch / "record.json"
-            written.write_text(text)
-            written.chmod(0o600)
-            written.replace(self.folder / f"{key}.json")
+        self._make_folder()
+        with _writing(self.folder):
+            replace_file(self.folder / f"{key}.json", text.encode(), 0o600)
 
     @contextmanager
     def lock(self, key: str) -> Iterator[None]:
@@ -185,7 +184,7 @@ class Cache:
             for path in self.folder.iterdir():
                 if path.is_dir() and path.name.startswith("build-"):
                     shutil.rmtree(path, ignore_errors=True)
-                elif path.suffix in {".so", ".json", ".lock"}:
+                elif path.suffix in {".so", ".json", ".lock", ".draft"}:
                     libraries += path.suffix == ".so"
                     path.unlink(missing_ok=True)
         return libraries

@@ -15,7 +15,8 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations, concatenated
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import Evaluations, concatenated
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective
 from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
 from symbolic.array import Array

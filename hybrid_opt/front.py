@@ -9,7 +9,7 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.evaluation import Evaluations
+from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.selection import balanced, peak_normal_forces
 from hybrid_opt.polishing.records import PolishedFront

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from symbolic.array import Array
 
 _LEVEL = 4

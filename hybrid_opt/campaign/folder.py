@@ -15,7 +15,8 @@ from hybrid_opt.campaign.layout import CONFIGURATION, WORKCELL
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.files import locked, read_json, storing, sync_folder, write_json
+from hybrid_opt.store.files import locked, read_json, storing, write_json
+from symbolic.replacing import sync_folder
 from symbolic.workcell.archive import CellArchive, archive_cell, unpack_cell
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell

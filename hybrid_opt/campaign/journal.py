@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.store.files import read_bytes, storing
 
 _MAGIC = b"DACARRY1"

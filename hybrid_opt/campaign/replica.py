@@ -13,7 +13,8 @@ from hybrid_opt.campaign.evaluations_file import EvaluationTable, encode, encode
 from hybrid_opt.campaign.journal import decode_generation, encode_generation
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from hybrid_opt.metaheuristics.problem import Evaluator, disarmed

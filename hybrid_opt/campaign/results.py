@@ -27,7 +27,7 @@ from hybrid_opt.campaign.replica import front_rows
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluation import Evaluations
+from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.store.files import read_bytes, read_json, sha256
 from hybrid_opt.store.json_records import from_json, read_record
 from symbolic.array import Array

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.evaluate.evaluation import Evaluations
+from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.metaheuristics.problem import CarryProblem, ConstraintHandling, Evaluator
 from hybrid_opt.metaheuristics.registry import make
 from hybrid_opt.metaheuristics.run import search

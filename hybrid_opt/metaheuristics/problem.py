@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 from pymoo.core.problem import Problem
 
-from hybrid_opt.evaluate.evaluation import NOT_FINITE, REASONS, Evaluations, concatenated
+from hybrid_opt.evaluate.evaluations import NOT_FINITE, REASONS, Evaluations, concatenated
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 

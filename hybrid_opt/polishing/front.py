@@ -14,7 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost, solve_safely

@@ -8,13 +8,14 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from hybrid_opt.errors import ResultsError
 from symbolic import outside
 from symbolic.errors import OutsideError
+from symbolic.replacing import replace_file
 
 LOCK = ".lock"
 
@@ -44,29 +45,9 @@ def write_atomically(path: Path, content: bytes) -> None:
     Raises:
         ResultsError: it cannot be written.
     """
-    draft = path.with_name(f".{path.name}.draft")
     with storing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with draft.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(draft, path)
-        except OSError:
-            with suppress(OSError):
-                draft.unlink()
-            raise
-        sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make a folder's entries durable."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        replace_file(path, content)
 
 
 def write_json(path: Path, document: Any) -> None:

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +22,7 @@ from hybrid_opt.store.files import storing
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import BundleError, OutsideError
+from symbolic.replacing import replace_file
 from symbolic.workcell.archive import (
     CellArchive,
     archive_cell,
@@ -31,7 +30,7 @@ from symbolic.workcell.archive import (
     archive_to_json,
     unpack_cell,
 )
-from symbolic.workcell.reader import shown, text_problem
+from symbolic.workcell.problems import shown, text_problem
 from symbolic.workcell.records import Workcell
 
 FORMAT = "dual-arm-carry trajectory"
@@ -117,7 +116,9 @@ def write_trajectory(
         text = json.dumps(document, indent=1, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ResultsError(f"the trajectory cannot be stored as JSON: {error}") from error
-    _write(Path(path), text)
+    path = Path(path)
+    with storing(path):
+        replace_file(path, f"{text}\n".encode())
 
 
 def read_trajectory(path: str | Path) -> StoredTrajectory:
@@ -197,18 +198,3 @@ def _figure(name: str, value: Any) -> float:
         if math.isfinite(number):
             return number
     raise ResultsError(f"{name}: found {shown(value)}; expected a finite number")
-
-
-def _write(path: Path, text: str) -> None:
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    with storing(path):
-        try:
-            with draft.open("w", encoding="utf-8") as file:
-                file.write(text + "\n")
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(draft, path)
-        except OSError:
-            with suppress(OSError):
-                draft.unlink()
-            raise

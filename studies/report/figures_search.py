@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS
+from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
 from hybrid_opt.indicators.metrics import best_so_far
 from studies.report.records import ReportData
 from studies.report.style import FULL_WIDTH, new_figure, panel_label, series

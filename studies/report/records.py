@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hybrid_opt import carry
 from hybrid_opt.campaign.summary import CampaignSummary, PolishedFigures, ReplicaFigures
-from hybrid_opt.evaluate.evaluation import Evaluations
+from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.timing import ForceCurve, TimingReport
 from hybrid_opt.timing.robustness import Margin, PayloadSensitivity
 from symbolic.array import Array

@@ -17,7 +17,7 @@ from symbolic.geometry.pieces import Capsule, Hull, Piece, check_piece
 from symbolic.robot.machine import ArmLinks, arm_links, one_machine
 from symbolic.robot.urdf import arm_model, link_frame, resolve_mesh, robot_urdf
 from symbolic.robot.urdf_file import UrdfMesh
-from symbolic.workcell.reader import shown
+from symbolic.workcell.problems import shown
 from symbolic.workcell.records import Box, Mesh, Robot, Shape, Workcell
 
 Group = Literal["robot 1", "robot 2", "payload", "environment"]

@@ -15,7 +15,8 @@ from symbolic.geometry.bodies import BOX, WORLD, Frame
 from symbolic.geometry.motion_bounds import motion_function
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import Piece
-from symbolic.geometry.scene import Scene, clean, world_placements
+from symbolic.geometry.placements import clean, world_placements
+from symbolic.geometry.scene import Scene
 from symbolic.geometry.softness import EXACT, Softness
 from symbolic.physics.rotation import rotation_matrix
 

@@ -23,7 +23,7 @@ from symbolic.array import Array
 from symbolic.geometry.bodies import BOX, WORLD, ArmGeometry, CollisionBody, Frame
 from symbolic.geometry.pairs import CellGeometry, chain_radius
 from symbolic.geometry.pieces import bounding_box, farthest_from_axis, farthest_from_point
-from symbolic.geometry.scene import clean, world_placements
+from symbolic.geometry.placements import clean, world_placements
 from symbolic.physics.rotation import rotation_matrix
 
 

@@ -6,7 +6,6 @@ Behind `symbolic.geometry.clearance`, which states the principle.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -14,31 +13,21 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.geometry.bodies import CollisionBody, Frame
 from symbolic.geometry.covers import chain_cover, close_pairs, slab_cover
+from symbolic.geometry.directions import (
+    Axes,
+    Interval,
+    between_bases,
+    fixed_intervals,
+    slanted_matters,
+)
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.geometry.pieces import Capsule, Piece, SphereChain, axes_with_z, edges, support
+from symbolic.geometry.pieces import Capsule, Piece, SphereChain, support
+from symbolic.geometry.placements import clean, world_placements
 from symbolic.geometry.softness import Softness
 from symbolic.workcell.records import Box, Cylinder, Sphere
 
-Interval = tuple[ca.SX, ca.SX]
-"""Least and largest coordinate along a direction."""
-
-LONG = 0.25
-"""Bodies longer than wide by more than this [m] are also compared along their own axes: across
-the world's axes, a slanted body seems wider by up to that much."""
-
 BOX_NUMBERS = 30
 """Length of `Scene.box_numbers`."""
-
-VAST = 2.0
-"""Obstacles this many times as wide as a body is long (a floor) need no such comparison."""
-
-
-@dataclass(frozen=True)
-class _Axes:
-    """Three orthogonal directions: rows of A (3, 3)."""
-
-    key: str
-    A: ca.SX
 
 
 class Scene:
@@ -55,7 +44,7 @@ class Scene:
         """See `symbolic.geometry.clearance.clearance_expressions`."""
         self.geometry, self.soft = geometry, softness
         self._close = close_pairs(geometry)
-        self._between = _between_bases(geometry)
+        self._between = between_bases(geometry)
         self._placed: dict[Frame, tuple[ca.SX, ca.SX]] = {
             Frame("world"): (ca.SX.eye(3), ca.SX.zeros(3)),
             Frame("box"): (R_box, p_box),
@@ -63,7 +52,7 @@ class Scene:
         for i, (arm, given) in enumerate(zip(geometry.arms, placements, strict=True)):
             for j, placed in enumerate(world_placements(arm.T_world_root, given)):
                 self._placed[Frame("link", i, j)] = placed
-        self._world = _Axes("world", ca.SX.eye(3))
+        self._world = Axes("world", ca.SX.eye(3))
         self._relative: dict[tuple[Frame, str], tuple[ca.SX, ca.SX]] = {}
         self._intervals: dict[tuple[int, str], list[Interval]] = {}
         self._covers: dict[int, tuple[Piece, ...]] = {}
@@ -110,7 +99,7 @@ class Scene:
         rotation, centre = ca.reshape(obstacle[15:24], 3, 3).T, obstacle[24:27]
         half = obstacle[27:]
         # A key of its own, because other symbols may come next.
-        moving = self._interval(i, _Axes(f"obstacle {len(self._intervals)}", A))
+        moving = self._interval(i, Axes(f"obstacle {len(self._intervals)}", A))
         pairs = [(own, (low[k], high[k])) for k, own in enumerate(moving)]
         own = self._own_axes(self.geometry.bodies[i].frame)
         middle, turned = ca.mtimes(own.A, centre), ca.mtimes(own.A, rotation)
@@ -131,14 +120,14 @@ class Scene:
         parts = (A, low, high, rotation, clean(piece.centre), half)
         return np.concatenate([np.ravel(part) for part in parts])
 
-    def _along(self, i: int, j: int, axes: _Axes) -> list[tuple[Interval, Interval]]:
+    def _along(self, i: int, j: int, axes: Axes) -> list[tuple[Interval, Interval]]:
         return list(zip(self._interval(i, axes), self._interval(j, axes), strict=True))
 
     def _gap(self, pairs: Sequence[tuple[Interval, Interval]]) -> ca.SX:
         """Largest separation over directions, given both bodies' intervals."""
         return self.soft.maximum_below(_gaps(pairs))
 
-    def _interval(self, index: int, axes: _Axes) -> list[Interval]:
+    def _interval(self, index: int, axes: Axes) -> list[Interval]:
         """Per direction the extent of a body."""
         key = (index, axes.key)
         if key not in self._intervals:
@@ -177,7 +166,7 @@ class Scene:
             case _:
                 raise AssertionError("a cover has no hulls")
 
-    def _seen(self, frame: Frame, axes: _Axes) -> tuple[ca.SX, ca.SX]:
+    def _seen(self, frame: Frame, axes: Axes) -> tuple[ca.SX, ca.SX]:
         """Rotation and position of a frame in coordinates along the axes."""
         key = (frame, axes.key)
         if key not in self._relative:
@@ -186,8 +175,8 @@ class Scene:
             self._relative[key] = (turned, ca.mtimes(axes.A, p))
         return self._relative[key]
 
-    def _own_axes(self, frame: Frame) -> _Axes:
-        return _Axes(str(frame), self._placed[frame][0].T)
+    def _own_axes(self, frame: Frame) -> Axes:
+        return Axes(str(frame), self._placed[frame][0].T)
 
     def _cover(self, index: int) -> tuple[Piece, ...]:
         if index not in self._covers:
@@ -223,7 +212,7 @@ class Scene:
         origin = self._seen(frame, axes)[1]
         A, offset = self._seen(self.geometry.bodies[j].frame, axes)
         moving = [self._piece_interval(A, offset - origin, piece) for piece in self._cover(j)]
-        still = [_fixed_intervals(piece, np.eye(3)) for piece in self._cover(i)]
+        still = [fixed_intervals(piece, np.eye(3)) for piece in self._cover(i)]
         return self.soft.minimum_below(
             [self._gap(list(zip(own, other, strict=True))) for own in still for other in moving]
         )
@@ -257,21 +246,21 @@ class Scene:
     ) -> list[tuple[Interval, Interval]]:
         """Extents of a moving body and of a fixed piece along the directions that matter."""
         axes = self._axes_of(piece)
-        fixed = _fixed_intervals(piece, np.array(ca.DM(axes.A)))
+        fixed = fixed_intervals(piece, np.array(ca.DM(axes.A)))
         pairs = list(zip(self._interval(index, axes), fixed, strict=True))
-        if body.frame.kind == "box" or _slanted_matters(body, piece):
+        if body.frame.kind == "box" or slanted_matters(body, piece):
             own = self._own_axes(body.frame)
             cover = slab_cover(CollisionBody("", "environment", Frame("world"), (piece,)))[0]
             still = self._piece_interval(own.A, ca.SX.zeros(3), cover)
             pairs += list(zip(self._interval(index, own), still, strict=True))
         return pairs
 
-    def _axes_of(self, piece: Piece) -> _Axes:
+    def _axes_of(self, piece: Piece) -> Axes:
         """A fixed box's own axes; the world's where they agree or the piece is no box."""
         R = clean(piece.rotation)
         if not isinstance(piece.shape, Box) or np.allclose(np.abs(R).max(axis=0), 1.0):
             return self._world
-        return _Axes(f"fixed {R.tolist()}", ca.SX(R.T))
+        return Axes(f"fixed {R.tolist()}", ca.SX(R.T))
 
     def _round_bound(self, index: int, piece: Piece) -> ca.SX:
         """A chain of spheres against a fixed cylinder, capsule or sphere."""
@@ -295,46 +284,3 @@ class Scene:
 def _gaps(pairs: Sequence[tuple[Interval, Interval]]) -> list[ca.SX]:
     """Gaps between two intervals, either one below the other, for all given pairs of them."""
     return [gap for a, b in pairs for gap in (a[0] - b[1], b[0] - a[1])]
-
-
-def world_placements(
-    T_world_root: Array, placements: tuple[ca.SX, ca.SX]
-) -> list[tuple[ca.SX, ca.SX]]:
-    """Rotation and position in the world of each joint frame given in the root."""
-    rotations, positions = placements
-    T = ca.SX(clean(T_world_root))
-    return [
-        (
-            ca.mtimes(T[:3, :3], rotations[:, 3 * j : 3 * j + 3]),
-            ca.mtimes(T[:3, :3], positions[:, j]) + T[:3, 3],
-        )
-        for j in range(positions.shape[1])
-    ]
-
-
-def clean(matrix: Array) -> Array:
-    """Entries within 1e-15 of -1, 0 or 1 made exact, so that expressions simplify."""
-    rounded = np.round(matrix)
-    near = (np.abs(matrix - rounded) < 1e-15) & (np.abs(rounded) <= 1.0)
-    return np.where(near, rounded, matrix)
-
-
-def _slanted_matters(body: CollisionBody, obstacle: Piece) -> bool:
-    """Whether a body is long, and the obstacle no plane for it."""
-    _, width, length = edges(body.pieces)
-    return bool(length - width > LONG and edges((obstacle,))[1] < VAST * length)
-
-
-def _between_bases(geometry: CellGeometry) -> _Axes | None:
-    """Axes whose first points from one robot's base to the other's; None if the world's do."""
-    first, second = (arm.T_world_root[:3, 3] for arm in geometry.arms)
-    along = second - first
-    distance = float(np.linalg.norm(along))
-    if distance < 1e-6 or np.max(np.abs(along)) > 0.99 * distance:
-        return None
-    return _Axes("between", ca.SX(clean(axes_with_z(along / distance)[:, [2, 0, 1]].T)))
-
-
-def _fixed_intervals(piece: Piece, A: Array) -> list[Interval]:
-    high, low = support(piece, A), -support(piece, -A)
-    return [(ca.SX(low[k]), ca.SX(high[k])) for k in range(3)]

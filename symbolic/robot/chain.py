@@ -13,7 +13,7 @@ from symbolic.errors import RobotModelError
 from symbolic.robot.urdf_file import Urdf
 from symbolic.robot.urdf_joint import UrdfJoint
 from symbolic.workcell.patterns import matching
-from symbolic.workcell.reader import suggestion
+from symbolic.workcell.problems import suggestion
 
 Held = tuple[tuple[str, float], ...]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from symbolic import outside
 from symbolic.errors import OutsideError, UrdfError
 from symbolic.robot.urdf_elements import Part, parse_elements
-from symbolic.workcell.reader import Problems
+from symbolic.workcell.problems import Problems
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import pinocchio as pin
 from symbolic.errors import RobotModelError
 from symbolic.robot.chain import Held, chain_joints, held_joints, listed, without_links
 from symbolic.robot.urdf_file import Urdf, read_urdf
-from symbolic.workcell.reader import suggestion
+from symbolic.workcell.problems import suggestion
 from symbolic.workcell.records import Robot
 
 FOLLOWING = 6

@@ -10,14 +10,8 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import OutsideError
-from symbolic.workcell.reader import (
-    Problems,
-    Quantity,
-    checked_number,
-    read_only,
-    shown,
-    suggestion,
-)
+from symbolic.workcell.problems import Problems, shown, suggestion
+from symbolic.workcell.reader import Quantity, checked_number, read_only
 
 MOST_ELEMENTS = 100_000
 MOST_DEPTH = 32

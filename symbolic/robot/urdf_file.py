@@ -27,7 +27,7 @@ from symbolic.robot.urdf_joint import UrdfJoint, origin_element, pose_of, read_j
 from symbolic.robot.urdf_tree import mimic_problem, tree_problem
 from symbolic.robot.xacro_file import Arguments, description_content
 from symbolic.workcell import quantities as quantity
-from symbolic.workcell.reader import Problems, shown
+from symbolic.workcell.problems import Problems, shown
 from symbolic.workcell.records import Box, Cylinder, Sphere
 
 MOST_LINKS = 500

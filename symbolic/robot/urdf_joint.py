@@ -11,7 +11,8 @@ from symbolic.array import Array
 from symbolic.physics.pose import pose_matrix
 from symbolic.robot.urdf_elements import Part
 from symbolic.workcell import quantities as quantity
-from symbolic.workcell.reader import read_only, shown
+from symbolic.workcell.problems import shown
+from symbolic.workcell.reader import read_only
 
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 SMALLEST_AXIS = 1e-6

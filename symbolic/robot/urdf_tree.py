@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from symbolic.workcell.reader import suggestion
+from symbolic.workcell.problems import suggestion
 
 
 def tree_problem(

@@ -24,7 +24,7 @@ from symbolic.errors import BundleError, DualArmError, OutsideError, RobotModelE
 from symbolic.robot.urdf_file import read_urdf
 from symbolic.robot.xacro_file import is_xacro
 from symbolic.workcell.file import load
-from symbolic.workcell.reader import shown
+from symbolic.workcell.problems import shown
 from symbolic.workcell.records import Workcell
 from symbolic.workcell.references import CellCollector, joined, parse_toml, references
 

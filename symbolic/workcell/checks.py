@@ -17,7 +17,7 @@ from symbolic.robot.machine import machine_problem
 from symbolic.robot.urdf import arm_model, link_frame, robot_urdf
 from symbolic.workcell.body_names import PAYLOAD_BODY, body_names
 from symbolic.workcell.patterns import matching
-from symbolic.workcell.reader import Problems, suggestion
+from symbolic.workcell.problems import Problems, suggestion
 from symbolic.workcell.records import Robot, Workcell
 
 PATCH_OVERLAP = 0.9  # [1], how far patches that carry moments together may stand beside one another

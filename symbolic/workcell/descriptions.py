@@ -23,7 +23,8 @@ from symbolic.robot.urdf import (
 from symbolic.robot.urdf_file import Urdf, read_urdf
 from symbolic.robot.xacro_file import Arguments, is_xacro
 from symbolic.workcell import quantities as quantity
-from symbolic.workcell.reader import Table, shown
+from symbolic.workcell.problems import shown
+from symbolic.workcell.reader import Table
 from symbolic.workcell.sections import read_file
 
 

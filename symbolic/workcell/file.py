@@ -14,7 +14,8 @@ from symbolic.robot.xacro_file import description_content
 from symbolic.workcell.branches import with_branches
 from symbolic.workcell.checks import check_all
 from symbolic.workcell.identity import reading_of
-from symbolic.workcell.reader import Problems, Table
+from symbolic.workcell.problems import Problems
+from symbolic.workcell.reader import Table
 from symbolic.workcell.records import SEARCHED, Body, Mesh, Robot, Workcell
 from symbolic.workcell.redundancy import read_redundant, with_redundancy
 from symbolic.workcell.robots import read_robot

@@ -11,7 +11,8 @@ from symbolic.array import Array
 from symbolic.errors import OutsideError
 from symbolic.physics.pose import pose_matrix, transform
 from symbolic.workcell import quantities as quantity
-from symbolic.workcell.reader import Problems, Table, checked_vector, read_only, shown
+from symbolic.workcell.problems import Problems, shown
+from symbolic.workcell.reader import Table, checked_vector, read_only
 from symbolic.workcell.records import (
     Body,
     Box,

@@ -10,7 +10,8 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.workcell import quantities as quantity
-from symbolic.workcell.reader import Table, checked_vector, read_only, shown
+from symbolic.workcell.problems import shown
+from symbolic.workcell.reader import Table, checked_vector, read_only
 from symbolic.workcell.records import (
     Allocation,
     AllowedContact,

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import REASONS
 from studies.inspect import main
 from studies.inspection import Inspection, inspect
 from symbolic.workcell.decision import straight_line

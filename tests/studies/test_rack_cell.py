@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import REASONS
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 

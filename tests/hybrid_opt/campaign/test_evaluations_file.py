@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 
 from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode, encode, encode_front
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluation import REASONS, Evaluations
+from hybrid_opt.evaluate.evaluations import REASONS, Evaluations
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
 
 PATH = Path("evaluations.csv.gz")

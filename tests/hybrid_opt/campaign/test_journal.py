@@ -18,7 +18,7 @@ from hybrid_opt.campaign.journal import (
     encode_generation,
 )
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluation import Evaluations
+from hybrid_opt.evaluate.evaluations import Evaluations
 from tests.hybrid_opt.campaign.fake import verdicts
 
 IDENTITY = bytes(range(32))

@@ -13,7 +13,8 @@ from hybrid_opt.evaluate.certification import (
     certificates,
     configurations,
 )
-from hybrid_opt.evaluate.evaluation import BETWEEN_SAMPLES, REASONS, CandidateEvaluator
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import BETWEEN_SAMPLES, REASONS
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.problem import CarryProblem
 from symbolic.array import Array

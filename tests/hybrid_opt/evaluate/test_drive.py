@@ -12,7 +12,8 @@ from hybrid_opt import metaheuristics
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.drive import Driver
 from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
-from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.problem import CarryProblem

@@ -12,12 +12,8 @@ import numpy as np
 import pytest
 
 from hybrid_opt.collision.judge import FCL_RESOLUTION
-from hybrid_opt.evaluate.evaluation import (
-    FEASIBLE,
-    REASONS,
-    CandidateEvaluator,
-    Evaluations,
-)
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.evaluate.sampled import reached_samples
 from studies.plain.collisions import PlainCollisionChecker
 from studies.plain.verdict import PlainJudge, PlainVerdict

@@ -11,7 +11,8 @@ import pytest
 
 from codegen import compiled as compiled_module
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.kernel import Kernel, load_kernel
 from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
 from symbolic.array import Array

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.evaluate.evaluation import FEASIBLE, NOT_FINITE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluations import FEASIBLE, NOT_FINITE, REASONS, Evaluations
 from hybrid_opt.metaheuristics.problem import WORST_PENALTY, CarryProblem, disarmed
 from symbolic.array import Array
 from symbolic.errors import SettingsError

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from symbolic.array import Array
 from symbolic.geometry.clearance import quaternion
-from symbolic.geometry.scene import clean
+from symbolic.geometry.placements import clean
 from symbolic.geometry.softness import EXACT, Softness
 from symbolic.physics.pose import pose_matrix
 from symbolic.physics.rotation import rotation_matrix

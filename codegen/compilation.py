@@ -1,0 +1,99 @@
+"""One function from its source to a loaded library, by way of the cache."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from codegen.cache import FORMAT, Cache, Entry, digest
+from codegen.compiled import CompiledFunction, warn_one_lane
+from codegen.compiler import FLAGS, LANE_FLAGS, Compiler
+from codegen.errors import CodegenError
+from codegen.signature import Signature
+
+if TYPE_CHECKING:
+    import casadi as ca
+
+
+@dataclass(frozen=True)
+class Source:
+    """C to compile, and without lanes if that fails. own_bytes: what CasADi generated of it."""
+
+    signature: Signature
+    operations: int
+    text: str
+    own_bytes: int
+    without_lanes: str | None
+
+    @classmethod
+    def of(cls, function: ca.Function, lanes: int) -> Source:
+        """The C of a function, with so many evaluations of a batch side by side."""
+        from codegen.source import c_source, dense, operations
+
+        densified = dense(function)
+        text = c_source(densified)
+        signature, count, own = Signature.of(densified), operations(function), len(text)
+        wide = c_source(densified, lanes)
+        return cls(signature, count, wide, own, None if wide == text else text)
+
+
+def compile_source(
+    source: Source, compiler: Compiler, cache: Cache, level: int, rebuild: bool
+) -> tuple[CompiledFunction, Entry, bool]:
+    """The loaded library, its entry, and whether the cache had it already.
+
+    Args:
+        level: of optimisation.
+        rebuild: compile also what is in the cache.
+
+    Raises:
+        CodegenError: it cannot be compiled, cached or loaded.
+    """
+    signature = source.signature
+    # Names and shapes are part of the C text, except which of two equal layouts they mean.
+    flags = () if source.without_lanes is None else LANE_FLAGS
+    names = str(signature.to_json())
+    key = digest(str(FORMAT), compiler.identity, str(level), *FLAGS, *flags, names, source.text)
+
+    def make(library: Path) -> dict[str, Any]:
+        text = library.parent / f"{signature.name}.c"
+        text.write_text(source.text)
+        start = time.perf_counter()
+        try:
+            compiler.compile(text, library, level, flags)
+        except CodegenError as error:
+            if source.without_lanes is None:
+                raise
+            text.write_text(source.without_lanes)
+            compiler.compile(text, library, level)
+            warn_one_lane(signature.name, str(error))
+        return {
+            "signature": signature.to_json(),
+            "operations": source.operations,
+            "c_bytes": len(source.text),
+            "compile_seconds": time.perf_counter() - start,
+            "level": level,
+        }
+
+    if not rebuild and (hit := load_compiled(key, cache)) is not None:
+        return *hit, True
+    with cache.lock(key):
+        if not rebuild and (hit := load_compiled(key, cache)) is not None:
+            return *hit, True
+        entry = cache.store(key, make)
+    return CompiledFunction(signature, entry.library), entry, False
+
+
+def load_compiled(key: str, cache: Cache) -> tuple[CompiledFunction, Entry] | None:
+    """The library kept under a key; None where there is none that can be loaded."""
+    entry = cache.find(key)
+    if entry is None:
+        return None
+    try:
+        signature = Signature.from_json(entry.facts["signature"])
+        return CompiledFunction(signature, entry.library), entry
+    except CodegenError:
+        # Intact but not loadable, such as made against a newer C library: to be made again.
+        return None
