@@ -14,7 +14,7 @@ PACKAGES = ("symbolic", "codegen", "hybrid_opt", "studies")
 MOST_PARAMETERS = 6
 """Of a function; what needs more takes a record."""
 
-MOST_LINES = 320
+MOST_LINES = 330
 LONGER = {
     "symbolic/workcell/records.py": "a cell's whole description, to be read in one place",
 }

@@ -22,7 +22,6 @@ from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificates
 from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
-from hybrid_opt.evaluate.kernel import Kernel, load_kernel
 from hybrid_opt.evaluate.evaluations import (
     BETWEEN_SAMPLES,
     COLLISION,
@@ -31,6 +30,7 @@ from hybrid_opt.evaluate.evaluations import (
     REASONS,
     Evaluations,
 )
+from hybrid_opt.evaluate.kernel import Kernel, load_kernel
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective, select_objectives
 from hybrid_opt.evaluate.sampled import SampledVerdicts, collision_shares, one_by_one
 from hybrid_opt.evaluate.time_law import carry_under_time_law

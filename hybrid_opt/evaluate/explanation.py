@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from hybrid_opt.evaluate.evaluation import COLLISION, REASONS, CandidateEvaluator, Evaluations
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import COLLISION, REASONS, Evaluations
 from hybrid_opt.evaluate.sampled import reached_samples
 from symbolic.array import Array
 from symbolic.physics.pose import inverse, pose_matrix

@@ -60,13 +60,13 @@ def archive_cell(workcell: Workcell) -> CellArchive:
         BundleError: the file on disk no longer describes this workcell, or a reference cannot
             be made relative.
     """
-    return _archive(workcell.source, workcell.digest)
+    return _archive(workcell.source, workcell.digest, workcell.start_branch)
 
 
 @lru_cache(maxsize=4)
-def _archive(source: Path, digest: str) -> CellArchive:
+def _archive(source: Path, digest: str, branches: tuple[int, int]) -> CellArchive:
     try:
-        current = load(source, decided=wanted.workcell.start_branch)
+        current = load(source, decided=branches)
     except DualArmError as error:
         raise BundleError(f"the workcell cannot be stored: {error}") from error
     if current.digest != digest:

@@ -12,7 +12,8 @@ from symbolic.array import Array
 from symbolic.robot.machine import common_joints
 from symbolic.robot.urdf import FOLLOWING, arm_model
 from symbolic.workcell import quantities as quantity
-from symbolic.workcell.reader import Problems, Table, read_only
+from symbolic.workcell.problems import Problems
+from symbolic.workcell.reader import Table, read_only
 from symbolic.workcell.records import RedundantJoint, Robot, Workcell
 
 if TYPE_CHECKING:
@@ -96,9 +97,8 @@ def with_redundancy(
                 drives = tuple(
                     names[k].index(name) if k == i or name in common else -1 for k in (0, 1)
                 )
-                found.append(
-                    _joint(workcell, i, name, (drives[0], drives[1]), entries, path, problems)
-                )
+                said = _entry(entries, robot, name) or RedundancyEntry("", name, None, None, None)
+                found.append(_joint(workcell, i, (drives[0], drives[1]), said, path, problems))
     known = {joint.name for joint in found} | {joint.name.split("/")[1] for joint in found}
     known |= {f"{workcell.robots[1].name}/{name}" for name in common}
     for entry in entries:
@@ -154,15 +154,13 @@ def _entry(entries: Sequence[RedundancyEntry], robot: Robot, name: str) -> Redun
 def _joint(
     workcell: Workcell,
     i: int,
-    name: str,
     drives: tuple[int, int],
-    entries: Sequence[RedundancyEntry],
+    said: RedundancyEntry,
     path: PosturePath | None,
     problems: Problems,
 ) -> RedundantJoint:
     robot, n = workcell.robots[i], len(workcell.task.waypoints)
-    joint, entry = drives[i], _entry(entries, robot, name)
-    said = entry or RedundancyEntry("", name, None, None, None)
+    joint, name = drives[i], said.joint.removeprefix(f"{robot.name}/")
     least, most = float(robot.position_lower[joint]), float(robot.position_upper[joint])
     initial = said.initial
     if initial is None:

@@ -8,7 +8,7 @@ import pytest
 import hybrid_opt as ho
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.certification import SampledPath, configurations
-from hybrid_opt.evaluate.evaluation import REASONS
+from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.sampled import one_by_one
 from hybrid_opt.store.export.rapid import rapid_modules
 from studies.plain.verdict import PlainJudge

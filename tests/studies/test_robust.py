@@ -37,8 +37,8 @@ def test_tells_forces_price_and_check(tmp_path: Path, capsys: pytest.CaptureFixt
     lines = capsys.readouterr().out.splitlines()
     nominal, robust = (np.array(line.split()[-4:-1:2], dtype=float) for line in lines[1:3])
     assert (robust > 1.1 * nominal).all()
-    assert lines[7].split()[-3:] == lines[1].split()[-4:-1]
-    assert lines[8].split()[-3:] == lines[2].split()[-4:-1]
+    assert lines[8].split()[-2:] == lines[1].split()[-4:-1:2]
+    assert lines[9].split()[-2:] == lines[2].split()[-4:-1:2]
     assert "200 random cases (seed 1): all hold" in lines[-1]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.evaluation import REASONS
+from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent, missing_reach
 from symbolic.workcell.decision import straight_line
 from symbolic.workcell.file import load
