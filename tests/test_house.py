@@ -14,13 +14,13 @@ PACKAGES = ("symbolic", "codegen", "hybrid_opt", "studies")
 MOST_PARAMETERS = 6
 """Of a function; what needs more takes a record."""
 
-MOST_LINES = 330
+MOST_LINES = 340
 LONGER = {
     "symbolic/workcell/records.py": "a cell's whole description, to be read in one place",
 }
 """Longer files, each with the reason."""
 
-MOST_TEST_LINES = 340
+MOST_TEST_LINES = 360
 """Tests of one module stay in one file."""
 
 
