@@ -16,7 +16,7 @@ import pinocchio
 from symbolic.array import Array
 from symbolic.expression import Expression
 from symbolic.robot import bridge
-from symbolic.robot.urdf import arm_model, link_frame
+from symbolic.robot.urdf import arm_model, link_frame, turning_joints
 from symbolic.workcell.records import POSE_SIZE, Robot
 
 
@@ -66,7 +66,7 @@ class RobotModel:
     @property
     def turning(self) -> tuple[bool, ...]:
         """Which joints turn; the others slide."""
-        return tuple(str(j.shortname()).startswith("JointModelR") for j in self.model.joints[1:])
+        return turning_joints(self.model)
 
     def with_redundant(self, q: Expression, extended: Expression) -> Expression:
         """Joints (n,) whose redundant ones are where the extended pose says."""

@@ -102,6 +102,11 @@ def arm_model(robot: Robot) -> pin.Model:
     return model
 
 
+def turning_joints(model: pin.Model) -> tuple[bool, ...]:
+    """Which joints of an arm turn, in the order of q; the others slide."""
+    return tuple(str(joint.shortname()).startswith("JointModelR") for joint in model.joints[1:])
+
+
 def structure_problem(model: pin.Model) -> str:
     """Why a model is no serial arm of at least six joints, or an empty string."""
     names = list(model.names)[1:]

@@ -14,7 +14,7 @@ from symbolic.array import Array
 from symbolic.errors import RobotModelError
 from symbolic.physics.pose import inverse, pose_matrix
 from symbolic.robot.machine import machine_problem
-from symbolic.robot.urdf import arm_model, link_frame, robot_urdf
+from symbolic.robot.urdf import arm_model, link_frame, robot_urdf, turning_joints
 from symbolic.workcell.body_names import PAYLOAD_BODY, body_names
 from symbolic.workcell.patterns import matching
 from symbolic.workcell.problems import Problems, suggestion
@@ -222,10 +222,10 @@ def stretched_length(robot: Robot) -> tuple[Array, float]:
     offsets = [model.jointPlacements[joint].translation for joint in range(2, model.njoints)]
     slides = sum(
         max(abs(low), abs(high))
-        for joint, low, high in zip(
-            model.joints[1:], robot.position_lower, robot.position_upper, strict=True
+        for turns, low, high in zip(
+            turning_joints(model), robot.position_lower, robot.position_upper, strict=True
         )
-        if str(joint.shortname()).startswith("JointModelP")
+        if not turns
     )
     stretched = sum(np.linalg.norm(offset) for offset in [*offsets, flange])
     return shoulder[:3], float(stretched + slides)

@@ -10,7 +10,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.robot.machine import common_joints
-from symbolic.robot.urdf import FOLLOWING, arm_model
+from symbolic.robot.urdf import FOLLOWING, arm_model, turning_joints
 from symbolic.workcell import quantities as quantity
 from symbolic.workcell.problems import Problems
 from symbolic.workcell.reader import Table, read_only
@@ -133,9 +133,7 @@ def _choice(
     path = posture_path(robot, workcell.contacts[i], workcell.task, held)
     if not chosen:
         sliding = [
-            k
-            for k, joint in enumerate(model.joints[1:])
-            if str(joint.shortname()).startswith("JointModelP") and k not in held
+            k for k, turns in enumerate(turning_joints(model)) if not turns and k not in held
         ]
         forced = [*held, *sliding][:beyond]
         chosen = tuple(names[k] for k in best_conditioned(path, model.nq, forced))

@@ -9,6 +9,7 @@ import hybrid_opt as ho
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.certification import SampledPath, configurations
 from hybrid_opt.evaluate.evaluations import REASONS
+from hybrid_opt.evaluate.locked import LockedEvaluator
 from hybrid_opt.evaluate.sampled import one_by_one
 from hybrid_opt.store.export.rapid import rapid_modules
 from studies.plain.verdict import PlainJudge
@@ -81,3 +82,19 @@ def test_a_carry_is_timed_and_exported_with_all_joints(cell: Cell) -> None:
         np.testing.assert_allclose(slope, mean, atol=0.02 * np.abs(arm.q_rate).max())
     with pytest.raises(SettingsError, match="7 joints"):
         rapid_modules(carry)
+
+
+def test_locking_is_a_constant_path(cell: Cell) -> None:
+    task = cell.workcell.task
+    locked = LockedEvaluator(cell.evaluator, np.array([0.1, -0.2]))
+    assert locked.n_var == len(locked.lower) == task.n_box
+    x = np.random.default_rng(4).uniform(locked.lower, locked.upper, (20, locked.n_var))
+    whole = np.hstack([x, np.tile([0.1] * 3 + [-0.2] * 3, (20, 1))])
+    found, expected = locked.evaluate(x), cell.evaluate(whole)
+    np.testing.assert_array_equal(found.penalised, expected.penalised)
+    np.testing.assert_array_equal(found.x, x)
+    np.testing.assert_array_equal(
+        locked.certified(found).feasible, cell.evaluator.certified(expected).feasible
+    )
+    with pytest.raises(SettingsError, match="3 positions; needed are 2"):
+        LockedEvaluator(cell.evaluator, np.zeros(3))

@@ -20,6 +20,7 @@ from hybrid_opt.store.trajectory_file import FORMAT as TRAJECTORY_FORMAT
 from hybrid_opt.timing.model import joint_names
 from hybrid_opt.timing.records import Timing
 from symbolic.errors import SettingsError
+from symbolic.robot.urdf import arm_model, turning_joints
 
 JSON_FORMAT = "dual-arm-carry timed trajectory"
 JSON_VERSION = 1
@@ -29,7 +30,8 @@ _JOINT_QUANTITIES = (
     ("q_rate", "velocity", "rad/s"),
     ("q_second", "acceleration", "rad/s^2"),
 )
-"""Of `hybrid_opt.carry.ArmMotion`, with the files' words and units."""
+"""Of `hybrid_opt.carry.ArmMotion`, with the files' words and units, m for rad where a joint
+slides."""
 
 _HEAD = 200
 """Characters at the beginning of a file that tell what it is."""
@@ -91,11 +93,15 @@ def csv_text(carry: Carry) -> str:
     """One row per time step, one column per quantity, named with its unit."""
     robots = [robot.name for robot in carry.workcell.robots]
     names = [joint_names(robot) for robot in carry.workcell.robots]
+    turning = {robot.name: turning_joints(arm_model(robot)) for robot in carry.workcell.robots}
     header = ["time [s]", *(f"box {name}" for name in _POSE)]
     columns = [carry.time[:, None], carry.pose]
     for quantity, word, unit in _JOINT_QUANTITIES:
         for robot, joints in zip(robots, names, strict=True):
-            header += [f"{robot}/{joint} {word} [{unit}]" for joint in joints]
+            own = (unit if turns else unit.replace("rad", "m") for turns in turning[robot])
+            header += [
+                f"{robot}/{joint} {word} [{each}]" for joint, each in zip(joints, own, strict=True)
+            ]
         columns.append(carry.side_by_side(quantity))
     header += [f"{robot} normal force [N]" for robot in robots]
     columns.append(carry.normal_force)
