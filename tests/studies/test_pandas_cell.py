@@ -1,0 +1,52 @@
+"""The cell of two Pandas that ships: redundant elbows between columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.locked import LockedEvaluator
+from studies.redundancy import locks
+from studies.run import main
+from symbolic.workcell.file import load
+from tests.symbolic.workcell.samples import RACK
+
+PANDAS = RACK.with_name("pandas.toml")
+
+
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    return Cell(load(PANDAS))
+
+
+def test_elbows_are_mirrored(cell: Cell) -> None:
+    north, south = cell.workcell.task.redundant
+    assert (north.name, south.name) == ("north/panda_joint3", "south/panda_joint3")
+    np.testing.assert_array_equal(north.initial, -south.initial)
+    np.testing.assert_array_equal(north.lower, -south.upper)
+
+
+@pytest.mark.slow
+def test_the_hand_made_trajectory_is_feasible_and_the_bounds_searchable(cell: Cell) -> None:
+    judged = cell.evaluate(cell.initial)
+    assert judged.feasible.all()
+    share = cell.evaluate(cell.random(1000, np.random.default_rng(1))).feasible.mean()
+    assert 0.02 <= share <= 0.5
+
+
+@pytest.mark.slow
+def test_constant_elbows_are_in_the_way(cell: Cell) -> None:
+    x = cell.initial[None, : cell.workcell.task.n_box]
+    tried = [LockedEvaluator(cell.evaluator, np.array(p)) for p in locks(cell.workcell.task, 16)]
+    assert not any(one.evaluate(x).feasible.all() for one in tried)
+
+
+@pytest.mark.slow
+def test_a_small_study_goes_through(tmp_path: Path) -> None:
+    output = tmp_path / "results"
+    arguments = [str(PANDAS), "--output", str(output), "--replicas", "1", "--evaluations", "120"]
+    assert main([*arguments, "--no-polish", "--no-report", "--jobs", "1", "--quiet"]) == 0
+    assert (output / "summary.json").exists()
