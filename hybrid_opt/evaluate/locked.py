@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import Evaluations
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
