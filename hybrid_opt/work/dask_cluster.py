@@ -7,6 +7,7 @@ its worker died, sends them again; they are the same to the bit, and what came b
 from __future__ import annotations
 
 import itertools
+import logging
 import os
 import pickle
 import queue
@@ -14,7 +15,8 @@ import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,11 +34,17 @@ from hybrid_opt.work.job import (
 )
 from symbolic.errors import SettingsError
 
-CONNECT_SECONDS = 30.0
+CONNECT_SECONDS = 15.0
 """So long the scheduler, and then a first worker, may take to answer."""
+
+LOST_SECONDS = 10.0
+"""After so long without its scheduler the work is given up."""
 
 _TICK = 1.0
 """Longest wait for news [s]."""
+
+_CONNECTED = "running"
+"""What Dask calls a client that has its scheduler."""
 
 _contexts = threading.local()
 
@@ -80,12 +88,26 @@ class DaskExecutor:
             client = connect(self.address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
             raise SettingsError(f"no Dask scheduler answers at {self.address} ({error})") from error
-        with client:
+        with _hushed(), client:
             try:
                 client.wait_for_workers(1, timeout=CONNECT_SECONDS)
             except TimeoutError as error:
                 raise SettingsError(f"the scheduler at {self.address} has no workers") from error
             _Session(self, client, job, ledger).run()
+
+
+@contextmanager
+def _hushed() -> Iterator[None]:
+    """Keep Dask from logging tracebacks of a lost connection, of which an error of ours tells."""
+    loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 @dataclass
@@ -119,6 +141,7 @@ class _Session:
         self._numbers = itertools.count()
         self._deaths: Counter[int] = Counter()
         self._orders: dict[int, _Order] = {}
+        self._connected = time.monotonic()
         # Goes along with every request: shared data would be lost with the worker that holds it,
         # and would draw the requests to one worker, to be blamed for one another's deaths.
         self._pickled = pickle.dumps(job)
@@ -131,8 +154,20 @@ class _Session:
             while self._orders:
                 self._listen()
         finally:
-            self._client.cancel([order.future for order in self._orders.values()])
-            self._client.unsubscribe_topic(self._topic)
+            if self._client.status == _CONNECTED:  # else this would wait for an answer
+                self._client.cancel([order.future for order in self._orders.values()])
+                self._client.unsubscribe_topic(self._topic)
+
+    def _require_scheduler(self) -> None:
+        """Without it no news comes, not even that of a loss."""
+        now = time.monotonic()
+        if self._client.status == _CONNECTED:
+            self._connected = now
+        elif now - self._connected > LOST_SECONDS or self._client.status == "closed":
+            raise WorkerError(
+                f"the scheduler at {self._executor.address} does not answer any more; what was "
+                "computed is kept: continue with --resume"
+            )
 
     def _submit(self, index: int) -> None:
         number = next(self._numbers)
@@ -147,6 +182,7 @@ class _Session:
         future.add_done_callback(lambda done: self._news.put((number, -1, done)))
 
     def _listen(self) -> None:
+        self._require_scheduler()
         before = time.monotonic()
         try:
             number, event, content = self._news.get(timeout=_TICK)

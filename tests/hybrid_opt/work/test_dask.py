@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -114,6 +115,21 @@ def test_a_request_that_kills_its_workers_is_lost(cluster: Any) -> None:
 def test_workers_with_other_software_are_refused(cluster: Any) -> None:
     with pytest.raises(DualArmError, match=r"worker tcp.* has numpy .*, this campaign 1\.0"):
         jobs.run(executor(cluster, {"numpy": "1.0"}), jobs.echo, [1])
+
+
+def test_a_lost_scheduler_is_told(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("hybrid_opt.work.dask_cluster.LOST_SECONDS", 0.5)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as own:
+        end = threading.Timer(3.0, own.close)
+        end.start()
+        with pytest.raises(WorkerError, match=r"scheduler at tcp.* not answer any more; .*--re"):
+            jobs.run(executor(own), jobs.moody, ["hang"])
+        end.join()
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_no_scheduler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
