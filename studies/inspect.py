@@ -17,8 +17,8 @@ from pathlib import Path
 
 from hybrid_opt.carry import Judgement
 from studies.inspection import Branch, Inspection, inspect
+from studies.options import seed, whole
 from studies.program import add_verbose, carried_out, run_program
-from symbolic.errors import SettingsError
 from symbolic.workcell.file import load
 
 _IN_THE_WAY = {
@@ -107,13 +107,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
     parser.add_argument(
         "--candidates",
-        type=int,
+        type=whole(1, 10**7),
         default=1000,
         metavar="N",
         help="random candidates to judge (default: %(default)s)",
     )
     parser.add_argument(
-        "--seed", type=int, default=1, metavar="N", help="of their randomness (default: 1)"
+        "--seed", type=seed, default=1, metavar="N", help="of their randomness (default: 1)"
     )
     parser.add_argument(
         "--output",
@@ -126,8 +126,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
     add_verbose(parser)
     options = parser.parse_args(arguments)
-    if options.seed < 0:
-        raise SettingsError(f"--seed is {options.seed}; allowed are whole numbers from 0")
     output = options.output or Path("inspect") / options.workcell.stem
     found = inspect(
         load(options.workcell),

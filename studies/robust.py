@@ -12,6 +12,7 @@ import numpy as np
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.store.trajectory_file import read_trajectory
+from studies.options import seed, whole
 from studies.program import program_of, run_program
 from studies.text_table import number, text_table
 from symbolic.array import Array
@@ -33,9 +34,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--leader", type=int, choices=(1, 2), default=1, help="the arm that keeps its place"
     )
-    parser.add_argument("--cases", type=int, default=100_000, help="random cases to check")
-    parser.add_argument("--points", type=int, default=9, help="points of the price curve")
-    parser.add_argument("--seed", type=int, default=1, help="of the random cases")
+    parser.add_argument(
+        "--cases", type=whole(1, 10**7), default=100_000, help="random cases to check"
+    )
+    parser.add_argument(
+        "--points", type=whole(2, 1000), default=9, help="points of the price curve"
+    )
+    parser.add_argument("--seed", type=seed, default=1, help="of the random cases")
     return parser
 
 

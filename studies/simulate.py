@@ -18,6 +18,7 @@ from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.cell_scene import ArmSettings
 from hybrid_opt.witness.controller import CONTROLS
 from hybrid_opt.witness.scene import SimulationSettings
+from studies.options import force, number, seed, whole
 from studies.program import program_of, run_program
 from studies.simulate_arms import simulate_arms
 from studies.simulate_pads import simulate_pads
@@ -49,15 +50,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--timing", choices=("closest", "fastest"), default="closest", help="how it is driven"
     )
-    parser.add_argument("--force-limit", type=float, metavar="N", help="fastest below this force")
+    parser.add_argument("--force-limit", type=force, metavar="N", help="fastest below this force")
     parser.add_argument(
         "--leader", type=int, choices=(1, 2), default=1, help="the arm that keeps its place"
     )
-    parser.add_argument("--runs", type=int, default=20, help="random cases of the uncertainty")
-    parser.add_argument("--seed", type=int, default=1, help="of the random cases")
+    parser.add_argument(
+        "--runs", type=whole(0, 10**6), default=20, help="random cases of the uncertainty"
+    )
+    parser.add_argument("--seed", type=seed, default=1, help="of the random cases")
     parser.add_argument(
         "--tracking-error",
-        type=float,
+        type=number(0.0, 1.0),
         default=1e-4,
         metavar="RAD",
         help="amplitude of each joint's error in the random cases, a sinusoid of 0.3 to 1.5 Hz",
@@ -65,18 +68,20 @@ def _parser() -> argparse.ArgumentParser:
     arms = ArmSettings()
     parser.add_argument(
         "--stiffness",
-        type=float,
+        type=number(1e-3, 1e9),
         default=arms.stiffness,
         metavar="1/RAD",
         help="of each joint over its largest torque",
     )
     parser.add_argument(
         "--time-step",
-        type=float,
+        type=number(1e-6, 1.0),
         metavar="S",
         help=f"{arms.time_step:g} with arms, {SimulationSettings().time_step:g} without",
     )
-    parser.add_argument("--contact-time", type=float, default=arms.contact_time, metavar="S")
+    parser.add_argument(
+        "--contact-time", type=number(1e-5, 10.0), default=arms.contact_time, metavar="S"
+    )
     parser.add_argument(
         "--sweep", action="store_true", help="the threshold at half and twice the time step, too"
     )

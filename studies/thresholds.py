@@ -18,6 +18,7 @@ from hybrid_opt.witness.drive import drive_of
 from hybrid_opt.witness.scene import SimulationSettings
 from hybrid_opt.witness.simulate import Witness
 from studies.cli import Parser
+from studies.options import seed, whole
 from studies.program import program_of, run_program
 from symbolic.array import Array
 from symbolic.workcell.decision import initial_decision
@@ -56,8 +57,10 @@ def _parser() -> argparse.ArgumentParser:
         "several timings and frictions.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument("--carries", type=int, default=40, help="how many, in turn of all kinds")
-    parser.add_argument("--seed", type=int, default=1, help="of the random candidates")
+    parser.add_argument(
+        "--carries", type=whole(1, 10**6), default=40, help="how many, in turn of all kinds"
+    )
+    parser.add_argument("--seed", type=seed, default=1, help="of the random candidates")
     return parser
 
 
