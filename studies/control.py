@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ from hybrid_opt.campaign.settings import SIZE_KEYS
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
+from hybrid_opt.store.json_records import to_json
 from studies.cli import Parser
 from studies.program import add_verbose, carried_out, run_program
 from studies.reference_front import ReferenceFront, read_reference_front
@@ -208,7 +210,7 @@ def approaches(root: Path, reference: ReferenceFront) -> list[Approach]:
             float(np.median([metrics.igd(front, reference.objectives) for front in fronts]))
             for fronts in (searched, polished)
         ]
-        closed = 100.0 * (1.0 - gaps[1] / gaps[0])
+        closed = 100.0 * (1.0 - gaps[1] / gaps[0]) if gaps[0] else math.nan
         found.append(Approach(name, gaps[0], gaps[1], igds[0], igds[1], closed))
     return found
 
@@ -288,7 +290,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         progress = Progress(True)
         found = run = controls(options.results, options.evaluations, options.jobs, progress)
         text = as_text(run)
-    print(json.dumps([asdict(entry) for entry in found], indent=1) if options.json else text)
+    print(json.dumps(to_json(found), indent=1) if options.json else text)
     return 0
 
 

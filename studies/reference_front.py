@@ -30,7 +30,9 @@ from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.files import read_bytes, write_atomically
 from hybrid_opt.work.job import Emit, Job, answer_all
 from hybrid_opt.work.processes import local_executor
+from studies.options import seed, whole
 from studies.program import add_verbose, carried_out, run_program
+from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.archive import archive_cell
@@ -143,12 +145,20 @@ def read_reference_front(path: Path) -> ReferenceFront:
         ResultsError: it cannot be read or is damaged.
     """
     try:
-        lines = read_bytes(path).decode("ascii").splitlines()
+        content = read_bytes(path)
+        if content.count(b",") + content.count(b"\n") > outside.MOST_VALUES:
+            raise ValueError(f"it holds more than {outside.MOST_VALUES} values")
+        lines = content.decode("ascii").splitlines()
         digest = lines[1].removeprefix("# workcell: ")
         values = np.array([[float(word) for word in line.split(",")] for line in lines[3:]])
+        if values.ndim != 2 or values.shape[1] < 3:
+            raise ValueError("its lines do not hold two objectives and a decision")
+        if not np.isfinite(values).all():
+            raise ValueError("it holds a number that is not finite")
         objectives, x = values[:, :2].copy(), values[:, 2:].copy()
     except (ValueError, IndexError) as error:
-        raise ResultsError(f"{path}: no reference front ({error}); make it again") from error
+        told = str(error).splitlines()[0][:200]
+        raise ResultsError(f"{path}: no reference front ({told}); make it again") from error
     for array in (objectives, x):
         array.setflags(write=False)
     return ReferenceFront(digest, objectives, x)
@@ -164,10 +174,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("workcell", type=Path, help="the workcell file")
     parser.add_argument("--output", type=Path, required=True, help="the CSV file to write")
-    parser.add_argument("--starts", type=int, default=24, help="random starts")
-    parser.add_argument("--points", type=int, default=60, help="attempts of the final polish")
-    parser.add_argument("--seed", type=int, default=1, help="of the random starts")
-    parser.add_argument("--jobs", type=int, default=0, help="processes, 0 for one per core")
+    parser.add_argument("--starts", type=whole(1, 10**4), default=24, help="random starts")
+    parser.add_argument(
+        "--points", type=whole(0, 10**5), default=60, help="attempts of the final polish"
+    )
+    parser.add_argument("--seed", type=seed, default=1, help="of the random starts")
+    parser.add_argument(
+        "--jobs", type=whole(0, 4096), default=0, help="processes, 0 for one per core"
+    )
     add_verbose(parser)
     options = parser.parse_args(arguments)
     command = (

@@ -46,9 +46,16 @@ _KINDS = (
     (stat.S_ISSOCK, "a socket"),
 )
 _STRING_OR_BRACKET = re.compile(r'"(?:[^"\\]++|\\.)*+"?|[\[{]|[\]}]', re.DOTALL)
+_DECLARED = re.compile(r"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([^"']*)["']""")
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
-_KEY_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
-_LONG_KEY = re.compile(rf"(?<![\w\"'-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{MOST_DEPTH},}}")
+_KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+_KEYS_AND_TEXTS = re.compile(
+    r'''"""(?:[^\\]|\\.)*?"""|'''
+    r"""'''.*?'''|#[^\n]*+|"""
+    rf"{_KEY_PART}(?P<further>(?:[ \t]*+\.[ \t]*+{_KEY_PART})*+)",
+    re.DOTALL,
+)
+_LONG = re.compile(rf"(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{MOST_DEPTH}}}")
 
 
 def resolved(path: Path) -> Path:
@@ -105,6 +112,25 @@ def text(content: bytes) -> str:
         ) from error
 
 
+def xml_text(content: bytes) -> str:
+    """The text of an XML document, without a byte order mark.
+
+    Raises:
+        OutsideError: it is not UTF-8, declares another encoding, or has a document type, whose
+            entities may unfold without end.
+    """
+    document = text(content).removeprefix("\ufeff")
+    declared = _DECLARED.match(document[:1000])
+    if declared and declared[1].lower() not in ("utf-8", "utf8", "us-ascii", "ascii"):
+        raise OutsideError(
+            f"declares the encoding {ascii(declared[1])[:60]}; allowed is UTF-8, save it so and "
+            'declare encoding="utf-8"'
+        )
+    if "<!DOCTYPE" in document:
+        raise OutsideError("has a document type (<!DOCTYPE>); remove it")
+    return document
+
+
 def json_value(content: bytes) -> Any:
     """The value of a JSON document, every number finite and every text printable as UTF-8.
 
@@ -138,7 +164,11 @@ def toml_tables(content: bytes) -> dict[str, Any]:
     found = text(content)
     if found.startswith("\ufeff"):
         raise OutsideError("begins with a byte order mark; save it as UTF-8 without one")
-    if _LONG_KEY.search(found):
+    if any(
+        _LONG.match(found, *match.span("further"))
+        for match in _KEYS_AND_TEXTS.finditer(found)
+        if match["further"]
+    ):
         raise OutsideError(f"a key of more than {MOST_DEPTH} parts; {_TOO_DEEP}")
     try:
         tables = tomllib.loads(found)

@@ -24,6 +24,11 @@ _FIXED = ("evaluation", "generation", "feasible", "reason", "position")
 _REASON = _FIXED.index("reason")
 _LONGEST_LINE = 1_000_000
 
+_ROOM = 2**24
+_BYTES_PER_NUMBER = 2
+"""A file may hold so many numbers, and one more for so many of its bytes: zeros can be packed much
+tighter, but what a search evaluates holds more digits than zeros."""
+
 
 @dataclass(frozen=True)
 class EvaluationTable:
@@ -97,7 +102,8 @@ def decode(content: bytes, path: Path) -> EvaluationTable:
             stored = REASONS[: len(_between(names, "violation_time_"))]
             if names != columns(n_var, objectives, stored):
                 raise ValueError("its columns are not those of this version")
-            values, reason = _rows(file, len(names))
+            most = _ROOM + len(content) // _BYTES_PER_NUMBER
+            values, reason = _rows(file, len(names), most)
         _, generation, feasible, position = values[:, :4].T
         _check(values, generation, feasible, values[:, 4 : 4 + n_var])
     except (OSError, EOFError, zlib.error, ValueError, KeyError, IndexError) as error:
@@ -121,11 +127,11 @@ def _text(line: bytes) -> str:
     return line.decode("ascii").rstrip("\n")
 
 
-def _rows(file: gzip.GzipFile, width: int) -> tuple[Array, NDArray[np.int8]]:
+def _rows(file: gzip.GzipFile, width: int, most: int) -> tuple[Array, NDArray[np.int8]]:
     """Numbers (n, width - 1) and reasons (n,) of all rows.
 
     Row by row, so that no more is held than what is kept, and a small file cannot unfold into a
-    huge one: each row bears its number.
+    huge one: each row bears its number, and there are not more than `most` numbers.
     """
     reasons = {"": FEASIBLE, **{reason: k for k, reason in enumerate(REASONS)}}
     numbers, found = array("d"), array("b")
@@ -135,11 +141,13 @@ def _rows(file: gzip.GzipFile, width: int) -> tuple[Array, NDArray[np.int8]]:
             raise ValueError("candidates are missing or out of order")
         if len(words) != width:
             raise ValueError(f"candidate {words[0]} has {len(words)} columns of {width}")
+        if len(numbers) + width > most:
+            raise ValueError(f"it holds more than {most} numbers, too many for its size")
         found.append(reasons[words.pop(_REASON)])
         numbers.extend(map(float, words))
     return (
-        np.array(numbers, dtype=float).reshape(-1, width - 1),
-        np.array(found, dtype=np.int8),
+        np.frombuffer(numbers, dtype=float).reshape(-1, width - 1),
+        np.frombuffer(found, dtype=np.int8),
     )
 
 

@@ -31,6 +31,13 @@ MOST_CELL_FACES = 200_000
 """Most triangles of one mesh, and of all meshes of a cell together: cutting them takes about 0.1 ms
 each, and collision shapes are simplified shapes."""
 
+MOST_WORDS = 2_000_000
+"""Most words of a mesh that is a text: what reads them keeps them all, 100 bytes each. A mesh of
+`MOST_FACES` with normals and texture has half of them."""
+
+MOST_MARKS = 500_000
+"""Most elements and attributes of a COLLADA mesh."""
+
 MOST_PARTS = 400
 """Most connected components of one mesh: each becomes a convex piece or several."""
 
@@ -183,8 +190,13 @@ def _read(path: Path) -> trimesh.Trimesh:
         content = outside.read_bytes(path, outside.MESH_BYTES)
     except OutsideError as error:
         raise CollisionModelError(f"{path}: the mesh {error}; correct its path") from error
-    if kind == "dae" and b"<!DOCTYPE" in content:  # its entities may unfold without end
-        raise CollisionModelError(f"{path}: has a document type (<!DOCTYPE>); remove it")
+    if kind == "dae":
+        _require_collada(content, path)
+    elif _is_text(kind, content) and _gaps(content) > MOST_WORDS:
+        raise CollisionModelError(
+            f"{path}: enormous mesh, more than {MOST_WORDS} words; simplify it for collision "
+            "checking"
+        )
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
@@ -203,6 +215,31 @@ def _read(path: Path) -> trimesh.Trimesh:
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise CollisionModelError(f"{path}: the mesh has triangles whose corners it does not have")
     return mesh
+
+
+def _require_collada(content: bytes, path: Path) -> None:
+    try:
+        outside.xml_text(content)
+    except OutsideError as error:
+        raise CollisionModelError(f"{path}: the mesh {error}") from error
+    # A meshful of attributes is one element too; its numbers are text in few elements.
+    if content.count(b"<") + content.count(b"=") > MOST_MARKS:
+        raise CollisionModelError(
+            f"{path}: enormous mesh, more than {MOST_MARKS} elements and attributes; simplify it "
+            "for collision checking"
+        )
+
+
+def _is_text(kind: str, content: bytes) -> bool:
+    """Whether a mesh is read word by word; of STL the reader keeps numbers only."""
+    second = content[:1000].split(b"\n", 2)[1:2]
+    return kind in ("obj", "off") or (kind == "ply" and b"binary" not in b"".join(second).lower())
+
+
+def _gaps(content: bytes) -> int:
+    """At least as many as there are gaps between words: letters beyond ASCII may be some."""
+    letters = np.frombuffer(content, np.uint8)
+    return int(np.count_nonzero((letters <= 32) | (letters >= 128)))
 
 
 def _collada_unit(mesh: trimesh.Trimesh) -> float:

@@ -18,6 +18,8 @@ PACKAGE_SCHEME = "package://"
 DEEPEST_PACKAGE = 4
 """How far below a folder of ROS_PACKAGE_PATH a package may lie."""
 
+LONGEST_NAME = 200
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _SKIPPED = ("build", "devel", "install", "log")
 
@@ -35,7 +37,7 @@ def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> 
         package_dirs: the folders that a workcell names.
         description: the file that names the package.
     """
-    if not _NAME.fullmatch(name):
+    if len(name) > LONGEST_NAME or not _NAME.fullmatch(name):
         return None
     for folder in package_dirs:
         if os.path.isdir(folder / name):

@@ -41,7 +41,7 @@ def read_srdf(path: Path) -> tuple[DisabledPair, ...]:
 @lru_cache(maxsize=8)
 def _parse(content: bytes, file: str) -> tuple[DisabledPair, ...]:
     problems = Problems()
-    root = Part(parse_elements(outside.text(content)), "", problems)
+    root = Part(parse_elements(outside.xml_text(content)), "", problems)
     pairs = tuple(
         DisabledPair(part.text("link1"), part.text("link2"), part.raw("reason") or "")
         for part in root.all("disable_collisions")

@@ -8,7 +8,6 @@ its element and attribute; everything else in the file is left alone. Pinocchio 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -27,10 +26,13 @@ from symbolic.robot.urdf_joint import UrdfJoint, origin_element, pose_of, read_j
 from symbolic.robot.urdf_tree import mimic_problem, tree_problem
 from symbolic.robot.xacro_file import Arguments, description_content
 from symbolic.workcell import quantities as quantity
-from symbolic.workcell.problems import Problems, shown
+from symbolic.workcell.problems import Problems
 from symbolic.workcell.records import Box, Cylinder, Sphere
 
 MOST_LINKS = 500
+MOST_MESHES = 2000
+"""Most different mesh files."""
+
 LARGEST_GYRATION = 10.0
 """No inertia is larger than that of its mass at this distance [m]."""
 
@@ -38,7 +40,6 @@ INERTIA_SLACK = 1e-6
 """Published inertias are rounded, and those of small covers often wrong by more than they are: so
 much below zero a principal moment may lie [kg m^2]; a hundredth of it at larger ones."""
 
-_DECLARED = re.compile(r"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([^"']*)["']""")
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -123,24 +124,13 @@ def parse_urdf(content: bytes, file: str) -> Urdf:
     """
     problems = Problems()
     try:
-        root = parse_elements(_decoded(content))
+        root = parse_elements(outside.xml_text(content))
         urdf = _read(Part(root, "", problems), file)
     except OutsideError as error:
         raise UrdfError(file, (str(error),)) from error
     if problems.found:
         raise UrdfError(file, problems.messages())
     return urdf
-
-
-def _decoded(content: bytes) -> str:
-    document = outside.text(content).removeprefix("\ufeff")
-    declared = _DECLARED.match(document[:1000])
-    if declared and declared[1].lower() not in ("utf-8", "utf8", "us-ascii", "ascii"):
-        raise OutsideError(
-            f"declares the encoding {shown(declared[1])}; allowed is UTF-8, save it so and declare "
-            'encoding="utf-8"'
-        )
-    return document
 
 
 def _read(root: Part, file: str) -> Urdf:
@@ -168,7 +158,7 @@ def _read(root: Part, file: str) -> Urdf:
     collisions = {
         name: tuple(map(_collision, link.all("collision"))) for name, link in links.items()
     }
-    return Urdf(
+    urdf = Urdf(
         file=file,
         links=tuple(links),
         joints=MappingProxyType(read),
@@ -176,6 +166,10 @@ def _read(root: Part, file: str) -> Urdf:
         visuals=MappingProxyType({name: _visual_meshes(link) for name, link in links.items()}),
         kinematics=ElementTree.tostring(reduced, encoding="unicode"),
     )
+    meshes = len({*urdf.collision_meshes, *urdf.visual_meshes})
+    if meshes > MOST_MESHES:
+        raise OutsideError(f"names {meshes} mesh files; allowed are {MOST_MESHES}: merge them")
+    return urdf
 
 
 def _inertial(link: Part) -> list[ElementTree.Element]:

@@ -69,7 +69,7 @@ def read_joint(joint: Part, name: str) -> tuple[ElementTree.Element, UrdfJoint]:
     lower = upper = 0.0
     if limit is not None:
         for key in ("effort", "velocity"):
-            limit.number(key, quantity.JOINT_LIMIT)
+            limit.number(key, quantity.JOINT_MOST)
         lower, upper = (limit.number(key, quantity.JOINT_LIMIT, "0") for key in ("lower", "upper"))
     written = {} if limit is None else limit.written("lower", "upper", "effort", "velocity")
     if kind == "continuous":

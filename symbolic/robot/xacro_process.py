@@ -24,8 +24,8 @@ from symbolic.robot.packages import PACKAGE_SCHEME, find_package
 CPU_SECONDS = 5
 """So long an expansion may compute."""
 
-MEMORY_BYTES = 256 * outside.MEBIBYTE
-MEMORY_PER_BYTE = 10
+MEMORY_BYTES = 192 * outside.MEBIBYTE
+MEMORY_PER_BYTE = 6
 """So much memory it may take, and so much more per byte of the file."""
 
 ANSWER_BYTES = 8 * outside.URDF_BYTES

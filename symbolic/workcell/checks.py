@@ -255,4 +255,5 @@ def check_all(workcell: Workcell, problems: Problems) -> None:
         try:
             check(workcell, problems)
         except RobotModelError as error:  # pragma: no cover - the robots section reports it first
-            problems.add("robots", str(error))
+            if problems.clean("robots"):
+                problems.add("robots", str(error))

@@ -27,6 +27,9 @@ from symbolic.workcell.problems import shown
 from symbolic.workcell.reader import Table
 from symbolic.workcell.sections import read_file
 
+MOST_FOLDERS = 100
+"""Most package folders of a robot: every mesh is looked for in each."""
+
 
 @dataclass(frozen=True)
 class Description:
@@ -80,6 +83,9 @@ def _read_folders(table: Table, folder: Path) -> tuple[Path, ...]:
     path = table.at("package_dirs")
     if not isinstance(value, list):
         table.problems.add(path, f"found {shown(value)}; allowed is an array of folders")
+        return ()
+    if len(value) > MOST_FOLDERS:
+        table.problems.add(path, f"found {len(value)} folders; allowed are {MOST_FOLDERS}")
         return ()
     folders = []
     for index, entry in enumerate(value):

@@ -12,6 +12,9 @@ from typing import Any
 MAX_NAME_LENGTH = 80
 
 
+MOST_LETTERS = 2000
+"""So much of a problem is told: it may quote what was found, or list what is allowed."""
+
 MOST_PROBLEMS = 100
 """So many problems of a file are told, the rest is counted."""
 
@@ -34,7 +37,8 @@ class Problems:
         After `MOST_PROBLEMS` they are only counted.
         """
         if len(self.found) < MOST_PROBLEMS:
-            self.found.append((path, text))
+            told = text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS - 4]} ..."
+            self.found.append((path, told))
         else:
             self.uncounted += 1
 

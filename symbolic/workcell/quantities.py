@@ -48,6 +48,7 @@ LOCKED_POSITION = Quantity("rad or m", -4 * math.pi, 4 * math.pi)
 TORQUE = Quantity("N m", 1e-3, 1e5)
 MANIPULABILITY = Quantity("m^3", 1e-9, 10.0)
 JOINT_LIMIT = Quantity("", -1e30, 1e30)
+JOINT_MOST = Quantity("", 0.0, 1e30)
 URDF_ANGLE = Quantity("rad", -2 * _TURN, 2 * _TURN, mistaken=_DEGREES)
 DIRECTION = Quantity("", -1e3, 1e3)
 

@@ -193,7 +193,10 @@ class Table:
         return Table({}, self.at(key), Problems())
 
     def tables(self, key: str, exactly: int | None = None) -> list[Table]:
-        """An array of tables, of any length (and not required) or of exactly that many."""
+        """An array of tables, of any length (and not required) or of exactly that many.
+
+        Of too many the first ones.
+        """
         value = self.raw(key, [] if exactly is None else _REQUIRED)
         if value is None:
             return []
@@ -210,7 +213,7 @@ class Table:
             )
         return [
             Table(entry, f"{self.at(key)}[{index}]", self.problems)
-            for index, entry in enumerate(value)
+            for index, entry in enumerate(value[:exactly])
         ]
 
 

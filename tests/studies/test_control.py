@@ -69,6 +69,9 @@ def test_distance_to_a_reference_front(study: Path) -> None:
     assert found.polished_igd < found.search_igd
     assert found.closed == pytest.approx(100.0 * (1.0 - found.polished_gap / found.search_gap))
     assert "NSGA-II" in control.approaches_text([found])
+    searched = metrics.front_of(np.concatenate([r.front for r in own.replicas[:1]]))
+    own_front = ReferenceFront(own.workcell.digest, searched, np.empty((len(searched), 0)))
+    assert control.approaches(study, own_front)  # the gap to it may be none
     with pytest.raises(ResultsError, match="another workcell"):
         control.approaches(study, ReferenceFront("0" * 64, union, np.empty((len(union), 0))))
 

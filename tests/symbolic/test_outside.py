@@ -175,3 +175,38 @@ def test_toml_comes_in_as_a_plain_reader_has_it() -> None:
     found = outside.toml_tables(content)
     assert found == tomllib.loads(content.decode())
     assert math.isclose(sum(found["x"]), 100.0)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"a = [" + b'".", ' * 1000 + b"]",
+        b"a = [" + b"'.', " * 1000 + b"]",
+        b'a = """' + b"a." * 100 + b'"""',
+        b"a = '''\n" + b"a." * 100 + b"'''",
+        b'a = "\\"' + b"a." * 100 + b'"',
+        b'a = 1 # "' + b"a." * 100 + b"\nb = 2",
+        b"a." * 49 + b"a = 1",
+    ],
+)
+def test_dots_in_texts_are_no_keys(content: bytes) -> None:
+    assert outside.toml_tables(content) == tomllib.loads(content.decode())
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ('<a b="\xe9"/>'.encode("latin-1"), "not UTF-8"),
+        ('<?xml version="1.0" encoding="utf-16"?><a/>'.encode("utf-16"), "not UTF-8"),
+        (b'<?xml version="1.0" encoding="utf-7"?>+ADw-!DOCTYPE a+AD4-<a/>', "'utf-7'; allowed is"),
+        (b"<!DOCTYPE a><a/>", "document type"),
+    ],
+)
+def test_other_xml_is_refused(content: bytes, words: str) -> None:
+    with pytest.raises(OutsideError, match=words):
+        outside.xml_text(content)
+
+
+def test_xml_comes_in_without_its_mark() -> None:
+    document = '<?xml version="1.0" encoding="UTF-8"?><a b="\xe9"/>'
+    assert outside.xml_text(document.encode("utf-8-sig")) == document

@@ -188,8 +188,37 @@ def test_a_header_that_promises_more_than_there_is(tmp_path: Path) -> None:
 def test_entities_are_not_unfolded(tmp_path: Path) -> None:
     path = tmp_path / "m.dae"
     path.write_text('<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><COLLADA>&b;</COLLADA>')
-    with pytest.raises(CollisionModelError, match=r"m\.dae: has a document type"):
+    with pytest.raises(CollisionModelError, match=r"m\.dae: the mesh has a document type"):
         convex_pieces(path, ONES)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-7"])
+def test_entities_are_not_hidden_by_an_encoding(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "m.dae"
+    document = f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE a><COLLADA/>'
+    path.write_bytes(document.encode(encoding))
+    with pytest.raises(CollisionModelError, match=r"the mesh (byte 0 is|declares the enco)"):
+        convex_pieces(path, ONES)
+
+
+@pytest.mark.parametrize(
+    ("name", "begin", "piece"),
+    [
+        ("m.obj", "v 0 0 0\n", "f 1 1 1\n"),
+        ("m.obj", "v 0 0 0\nf ", "1\u00a0"),
+        ("m.off", "OFF\n9 9 0\n", "0 0 0\n"),
+        ("m.ply", "ply\nformat ascii 1.0\ncomment binary\n", "0 0 0\n"),
+        ("m.dae", "<COLLADA>", "<a/>"),
+        ("m.dae", "<COLLADA>", "<a b='' c=''/>"),
+    ],
+)
+def test_a_text_without_end_is_not_read(tmp_path: Path, name: str, begin: str, piece: str) -> None:
+    path = tmp_path / name
+    path.write_text(begin + piece * 1_600_000)
+    start = time.process_time()
+    with pytest.raises(CollisionModelError, match=r"enormous mesh, more than \d+ (words|elements)"):
+        convex_pieces(path, ONES)
+    assert time.process_time() - start < 2.0
 
 
 def test_a_pipe_is_no_mesh(tmp_path: Path) -> None:

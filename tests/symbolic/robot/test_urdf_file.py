@@ -88,6 +88,7 @@ def swap(old: str, new: str, count: int = 1) -> Callable[[str], str]:
     return lambda text: text.replace(old, new, count)
 
 
+MESH = "<visual><geometry><mesh filename='package://a/{}.stl'/></geometry></visual>"
 MASS = '<mass value="8.411"/>'
 INERTIA = 'ixx="0.0486" ixy="0" ixz="0" iyy="0.0378" iyz="-0.0008" izz="0.0394"'
 BOX = '<box size="0.205 0.2 0.03"/>'
@@ -275,6 +276,24 @@ CASES: list[tuple[str, Callable[[str], str], str, str]] = [
         swap("</robot>", "<a>" * 40 + "</a>" * 40 + "</robot>"),
         "nested too deeply",
         "a depth of 32",
+    ),
+    (
+        "attributes",
+        swap("</robot>", "<a " + " ".join(f"a{k}=''" for k in range(500_001)) + "/></robot>"),
+        "has more than 500000 attributes",
+        "",
+    ),
+    (
+        "meshes",
+        swap("</link>", "".join(MESH.format(k) for k in range(2001)) + "</link>"),
+        "names 2001 mesh files; allowed are 2000",
+        "",
+    ),
+    (
+        "speed",
+        swap('velocity="2.094395102393195"', 'velocity="-1"'),
+        "joint 'joint_1'/limit velocity: found -1; allowed is 0",
+        "",
     ),
     ("many", swap("</robot>", "<a/>" * 100_001 + "</robot>"), "has more than 100000 elements", ""),
 ]

@@ -53,6 +53,8 @@ CASES: list[tuple[str, Any, str, str]] = [
     ("payload.size", 0.3, "payload.size", "allowed is an array of 3 numbers"),
     ("task.start", [0.0, 0.0, 0.7], "task.start", "allowed is an array of 6 numbers"),
     ("robots", [], "robots", "found 0 tables; allowed are exactly 2"),
+    ("robots[0].package_dirs", ["."] * 101, "robots[0].package_dirs", "found 101 folders"),
+    ("robots[0].urdf", "package://" + "a" * 9000, "robots[0].urdf", "in no package that is found"),
     ("contacts[+]", {}, "contacts", "found 3 tables; allowed are exactly 2"),
     ("environment", 3, "environment", "allowed is an array of tables, [[environment]]"),
     ("robots[0].tool", 3, "robots[0].tool", "array of tables, [[robots.tool]]"),

@@ -1,0 +1,75 @@
+"""What reading one file takes, in a process of its own: `-m tests.fuzz.reading KIND FILE`."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codegen.cache import Cache
+from hybrid_opt.campaign.documents import FinishedReplica, PolishDocument, StageMark
+from hybrid_opt.campaign.evaluations_file import decode
+from hybrid_opt.campaign.journal import Journal
+from hybrid_opt.campaign.results import read_configuration
+from hybrid_opt.campaign.summary import CampaignSummary
+from hybrid_opt.store.files import read_bytes
+from hybrid_opt.store.json_records import read_record
+from hybrid_opt.store.trajectory_file import read_trajectory
+from studies.reference_front import read_reference_front
+from symbolic.errors import DualArmError
+from symbolic.geometry.meshes import read_mesh
+from symbolic.robot.srdf_file import read_srdf
+from symbolic.robot.urdf_file import read_urdf
+from symbolic.workcell.file import load
+
+READERS: dict[str, Callable[[Path], Any]] = {
+    "workcell": load,
+    "urdf": read_urdf,
+    "xacro": read_urdf,
+    "srdf": read_srdf,
+    "mesh": lambda path: read_mesh(path, np.ones(3)),
+    "trajectory": read_trajectory,
+    "configuration": lambda path: read_configuration(path.parent),
+    "summary": lambda path: read_record(CampaignSummary, path, ""),
+    "replica": lambda path: read_record(FinishedReplica, path, ""),
+    "polish": lambda path: read_record(PolishDocument, path, ""),
+    "stage": lambda path: read_record(StageMark, path, ""),
+    "evaluations": lambda path: decode(read_bytes(path), path),
+    "journal": lambda path: Journal(path, b"\0" * 32),
+    "reference front": read_reference_front,
+    "cache": lambda path: Cache(path.parent).find(path.stem),
+}
+
+
+def main() -> None:
+    """Read the file and tell, as JSON, what it took."""
+    kind, path = sys.argv[1], Path(sys.argv[2])
+    warnings.simplefilter("ignore")
+    # The peak that a process is born with is that of its parent.
+    Path("/proc/self/clear_refs").write_text("5")
+    before = _status("VmRSS")
+    told = ""
+    try:
+        READERS[kind](path)
+    except DualArmError as error:
+        told = str(error)
+    times = os.times()
+    grown = _status("VmHWM") - before
+    print(json.dumps({"grown": grown, "seconds": sum(times[:4]), "told": told[:1000]}))
+
+
+def _status(key: str) -> int:
+    """A size of this process [bytes]."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    (line,) = (line for line in lines if line.startswith(f"{key}:"))
+    return int(line.split()[1]) * 1024
+
+
+if __name__ == "__main__":
+    main()
