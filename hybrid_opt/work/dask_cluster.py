@@ -83,6 +83,7 @@ class DaskExecutor:
             raise SettingsError(
                 'Dask is not installed; install it with: pip install "dual-arm-carry[dask]"'
             ) from error
+        _require_address(self.address)
         connect: Any = distributed.Client  # untyped
         try:
             client = connect(self.address, timeout=CONNECT_SECONDS, set_as_default=False)
@@ -94,6 +95,20 @@ class DaskExecutor:
             except TimeoutError as error:
                 raise SettingsError(f"the scheduler at {self.address} has no workers") from error
             _Session(self, client, job, ledger).run()
+
+
+def _require_address(address: str) -> None:
+    """A client that is given none of these is not made, but waits and complains when it goes."""
+    from distributed.comm import addressing
+
+    host_port: Any = addressing.get_address_host_port  # untyped
+    try:
+        host_port(address)
+    except (ValueError, NotImplementedError) as error:
+        said = str(error) if len(address) < 200 else "it is too long"
+        raise SettingsError(
+            f"{address[:200]!a} is no address of a Dask scheduler ({said}); give tcp://HOST:8786"
+        ) from error
 
 
 @contextmanager

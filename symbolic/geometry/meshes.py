@@ -31,9 +31,9 @@ MOST_CELL_FACES = 200_000
 """Most triangles of one mesh, and of all meshes of a cell together: cutting them takes about 0.1 ms
 each, and collision shapes are simplified shapes."""
 
-MOST_WORDS = 2_000_000
-"""Most words of a mesh that is a text: what reads them keeps them all, 100 bytes each. A mesh of
-`MOST_FACES` with normals and texture has half of them."""
+MOST_WORDS = {"obj": 2_000_000, "off": 2_000_000, "ply": 800_000}
+"""Most words of a mesh that is a text, by format: what reads them keeps them all, with 100 bytes
+each, of PLY 300. A mesh of `MOST_FACES` has fewer."""
 
 MOST_MARKS = 500_000
 """Most elements and attributes of a COLLADA mesh."""
@@ -192,9 +192,9 @@ def _read(path: Path) -> trimesh.Trimesh:
         raise CollisionModelError(f"{path}: the mesh {error}; correct its path") from error
     if kind == "dae":
         _require_collada(content, path)
-    elif _is_text(kind, content) and _gaps(content) > MOST_WORDS:
+    elif _is_text(kind, content) and _gaps(content) > MOST_WORDS[kind]:
         raise CollisionModelError(
-            f"{path}: enormous mesh, more than {MOST_WORDS} words; simplify it for collision "
+            f"{path}: enormous mesh, more than {MOST_WORDS[kind]} words; simplify it for collision "
             "checking"
         )
     try:

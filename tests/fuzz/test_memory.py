@@ -55,8 +55,8 @@ def journal(*payloads: bytes, times: int = 1) -> bytes:
     return b"DACARRY1" + b"\0" * 32 + b"".join(blocks) * times
 
 
-WORDS = MOST_WORDS * 2 - 100
-"""Size of a text of the most words, of one letter each."""
+WORDS = {kind: 2 * most - 100 for kind, most in MOST_WORDS.items()}
+"""Size of a text of the most words, of one letter each, by its format."""
 
 FILES: dict[str, tuple[str, str, Callable[[], bytes]]] = {
     "array": ("workcell", "c.toml", lambda: full(b"a=[", b"[],", b"]", WORKCELL_BYTES)),
@@ -104,9 +104,13 @@ FILES: dict[str, tuple[str, str, Callable[[], bytes]]] = {
             MESH_BYTES,
         ),
     ),
-    "corners": ("mesh", "m.obj", lambda: full(b"v 0 0 0\nf ", b"1 ", b"\n", WORDS)),
+    "corners": ("mesh", "m.obj", lambda: full(b"v 0 0 0\nf ", b"1 ", b"\n", WORDS["obj"])),
     "more corners": ("mesh", "m.obj", lambda: full(b"v 0 0 0\nf ", b"1 ", b"\n", MESH_BYTES)),
-    "vertices": ("mesh", "m.off", lambda: full(b"OFF\n900000 1 0\n", b"0 0 0\n", b"", WORDS)),
+    "vertices": (
+        "mesh",
+        "m.off",
+        lambda: full(b"OFF\n900000 1 0\n", b"0 0 0\n", b"", WORDS["off"]),
+    ),
     "listed vertices": (
         "mesh",
         "m.ply",
@@ -116,7 +120,7 @@ FILES: dict[str, tuple[str, str, Callable[[], bytes]]] = {
             b"end_header\n",
             b"0 0 0\n",
             b"3 0 1 2\n",
-            WORDS,
+            WORDS["ply"],
         ),
     ),
     "collada": ("mesh", "m.dae", lambda: full(COLLADA, b"<a/>", b"</COLLADA>", 1_900_000)),

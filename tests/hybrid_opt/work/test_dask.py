@@ -132,6 +132,18 @@ def test_a_lost_scheduler_is_told(
     assert "Traceback" not in capfd.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "address",
+    ["", "foo://x", "tcp://", "tcp://[::1", ":::", "x" * 3000, "\udcff", "inproc://1/2/3"],
+)
+def test_other_addresses_are_refused(address: str) -> None:
+    nowhere = DaskExecutor(address, machine(), machine)
+    with pytest.raises(SettingsError, match="is no address of a Dask scheduler") as caught:
+        nowhere.run(Job(jobs.context, jobs.echo), jobs.Kept([1]))
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 600
+
+
 def test_no_scheduler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hybrid_opt.work.dask_cluster.CONNECT_SECONDS", 0.5)
     nobody = DaskExecutor("tcp://127.0.0.1:9", machine(), machine)
