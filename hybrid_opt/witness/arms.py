@@ -128,6 +128,7 @@ class _Run:
     ) -> None:
         self._settings, self._workcell = witness.settings, witness.workcell
         self._reference, self._factor = reference, factor
+        self._shares_squeeze = control == "both"
         self._mujoco, self._model = witness.mujoco, witness.model
         self._data = self._mujoco.MjData(self._model)
         self._pads = Pads(self._mujoco, self._model, self._data, self._workcell)
@@ -233,6 +234,9 @@ class _Run:
         data, ticks = self._data, self._ticks
         error = ticks.q[k] - data.qpos[self._q]
         error_rate = ticks.q_rate[k] - data.qvel[self._v]
+        asked = ticks.normal_force[k]
+        # What both squeeze is controlled, not what the box takes of it on one side.
+        felt = asked - (asked - measured).mean() if self._shares_squeeze else measured
         torque = np.empty(len(self._limit))
         linear, angular = self._jacobian[:3], self._jacobian[3:]
         for i, arm in enumerate(self._arms):
@@ -243,9 +247,9 @@ class _Run:
                 error_rate[arm],
                 self._jacobian[:, self._v[arm]],
                 data.site_xmat[site].reshape(3, 3)[:, 2],
-                float(measured[i]),
+                float(felt[i]),
             )
-            command = ArmCommand(ticks.effort[k, arm], float(ticks.normal_force[k, i]))
+            command = ArmCommand(ticks.effort[k, arm], float(asked[i]))
             torque[arm] = self._controllers[i].torque(command, state)
         np.maximum(self._torque_use, np.abs(torque) / self._limit, out=self._torque_use)
         return np.clip(torque, -self._limit, self._limit)

@@ -2,8 +2,9 @@
 
 All feed the planned torques forward. `impedance`: every joint is a spring and a damper about its
 reference. `leader`: so is the leading arm; the other has no stiffness along the normal and an
-integral control of its normal force instead. `both`: both are so, with a weak spring along the
-normal that both share, since nothing else keeps the box in its place between them.
+integral control of its normal force instead. `both`: both are so, with the mean of their force
+errors and a weak spring along the normal each, since nothing else keeps the box in its place
+between them.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class ArmState:
         error, error_rate: (n_joints,) reference less position, and its rate [rad, s].
         jacobian: (6, n_joints) of the pad, linear velocities first, world axes.
         normal: (3,) of the pad, into the box.
-        force: measured normal force [N].
+        force: normal force, as measured or as both arms share it [N].
     """
 
     error: Array

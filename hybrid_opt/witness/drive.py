@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
 from hybrid_opt.witness.scene import PAD_MASS, SimulationSettings, quaternion
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -29,6 +30,7 @@ class Drive:
         quaternion: (n, 4) the same, real part first.
         spin, spin_rate: (n, 3) angular velocity and acceleration in the box frame [rad, s].
         press: (n,) normal force of the other pad [N].
+        tilt: (n, 2, 2) planned moments of both pads about the x and y axes of their frames [N m].
         own: (n,) force that the sliding pad's own mass takes along its normal [N].
     """
 
@@ -42,11 +44,45 @@ class Drive:
     spin: Array
     spin_rate: Array
     press: Array
+    tilt: Array
     own: Array
 
 
+@dataclass(frozen=True, eq=False)
+class PlannedMoments:
+    """Moments that the pads are to exert on the box about their nominal points, world frame.
+
+    Attributes:
+        along: (n, 2, 3) at the carry's samples [N m].
+        at_rest: (2, 3) at rest before it [N m].
+    """
+
+    along: Array
+    at_rest: Array
+
+
+def planned_moments(cell: Cell, carry: Carry) -> PlannedMoments:
+    """The moments of a carry's planned wrenches, for its own friction and centre of mass."""
+    workcell = carry.workcell
+    friction = np.array([contact.friction for contact in workcell.contacts])
+    still = np.zeros_like(carry.pose[:1])
+    resting = replace(carry, pose=carry.pose[:1], rate=still, second_rate=still)
+    along, at_rest = (
+        np.stack([load["wrench_1"][:, 3:], load["wrench_2"][:, 3:]], axis=1)
+        for load in (
+            cell.timing_model.uncertain_load(each, friction, workcell.payload.centre_of_mass)
+            for each in (carry, resting)
+        )
+    )
+    return PlannedMoments(along, at_rest[0])
+
+
 def drive_of(
-    carry: Carry, settings: SimulationSettings, press: Array | None = None, leader: int = 0
+    carry: Carry,
+    settings: SimulationSettings,
+    press: Array | None = None,
+    leader: int = 0,
+    moments: PlannedMoments | None = None,
 ) -> Drive:
     """A carry from rest to rest, with the box at rest before it.
 
@@ -54,6 +90,7 @@ def drive_of(
         press: (n,) force to press with at the carry's samples; the planned normal force of the
             arm that does not lead by default [N].
         leader: index of the arm that keeps its place.
+        moments: what drives pads that tilt; none by default.
 
     Raises:
         SettingsError: the carry does not start and end at rest, or the force does not fit it.
@@ -88,8 +125,22 @@ def drive_of(
         spin=np.einsum("nji,nj->ni", rotation, omega),
         spin_rate=np.einsum("nji,nj->ni", rotation, alpha),
         press=np.interp(clipped, carry.time, force),
+        tilt=_tilt(carry, np.asarray(time), rotation, moments),
         own=PAD_MASS * np.einsum("ni,ni->n", at_pad, normal),
     )
+
+
+def _tilt(carry: Carry, time: Array, rotation: Array, moments: PlannedMoments | None) -> Array:
+    """(steps, 2, 2) moments about the axes in the planes of the pads."""
+    tilt = np.zeros((len(time), 2, 2))
+    if moments is None:
+        return tilt
+    for i, contact in enumerate(carry.workcell.contacts):
+        moment = _interpolated(time, carry.time, moments.along[:, i])
+        moment[time < carry.time[0]] = moments.at_rest[i]
+        axes = rotation @ contact.T_box_pad[:3, :2]
+        tilt[:, i] = np.einsum("nji,nj->ni", axes, moment)
+    return tilt
 
 
 def _pose(carry: Carry, time: Array) -> tuple[Array, Array]:

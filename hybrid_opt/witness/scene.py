@@ -25,6 +25,12 @@ it, and its state is set anew at each step."""
 PAD_MASS = 0.1
 """[kg]; its inertia is fed forward."""
 
+PAD_INERTIA = 5e-4
+"""[kg m^2]; what its turning takes is lost in the planned moments."""
+
+TILT_DAMPING_TIME = 2e-3
+"""Damping of a pad's tilt over its stiffness [s]."""
+
 POINT_RADIUS = 2e-3
 """Of the spheres [m]."""
 
@@ -39,6 +45,9 @@ class SimulationSettings:
             more a threshold depends on the time step.
         points: contact points on the rim of each patch.
         noslip_iterations: of MuJoCo's solver against the creep of frictional contacts.
+        tilt_stiffness: of each pad about the axes in its plane, where it is driven by the planned
+            moments; None for pads that keep their planned orientation, whatever they feel
+            [N m/rad].
         settle: time at rest before the carry begins [s].
         slip: displacement in the plane of a pad that counts as slip [m].
     """
@@ -47,6 +56,7 @@ class SimulationSettings:
     contact_time: float = 0.01
     points: int = 8
     noslip_iterations: int = 30
+    tilt_stiffness: float | None = None
     settle: float = 0.15
     slip: float = 1e-3
 
@@ -58,6 +68,8 @@ class SimulationSettings:
             )
         if self.points < 3 or self.noslip_iterations < 0:
             raise SettingsError("give at least three contact points and no negative iterations")
+        if self.tilt_stiffness is not None and not self.tilt_stiffness > 0.0:
+            raise SettingsError("give a positive stiffness of the pads' tilt, or none")
         if not (self.settle > 0.0 and self.slip > 0.0):
             raise SettingsError("give a positive time to settle and a positive slip")
 
@@ -76,7 +88,7 @@ def scene_text(
     payload, inertia = workcell.payload, workcell.payload.inertia
     about = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     pads = "\n".join(
-        _pad_text(contact, f"pad_{i + 1}", settings.points, slides=i != leader)
+        _pad_text(contact, f"pad_{i + 1}", settings, slides=i != leader)
         for i, contact in enumerate(workcell.contacts)
     )
     return f"""
@@ -127,12 +139,24 @@ def contact_points(contact: Contact, points: int, T_body_pad: Array) -> str:
     )
 
 
-def _pad_text(contact: Contact, name: str, points: int, slides: bool) -> str:
+def tilt_names(pad: str) -> tuple[str, str]:
+    """Names of the joints about a pad's x and y axes."""
+    return f"{pad}_tilt_x", f"{pad}_tilt_y"
+
+
+def _pad_text(contact: Contact, name: str, settings: SimulationSettings, slides: bool) -> str:
     joint = '<joint name="press" type="slide" axis="0 0 1"/>' if slides else ""
+    stiffness = settings.tilt_stiffness
+    if stiffness is not None:
+        joint += "".join(
+            f'<joint name="{tilt}" type="hinge" axis="{axis}" stiffness="{stiffness!r}" '
+            f'damping="{TILT_DAMPING_TIME * stiffness!r}"/>'
+            for tilt, axis in zip(tilt_names(name), ("1 0 0", "0 1 0"), strict=True)
+        )
     return f"""<body name="{name}" gravcomp="1" {placed(contact.T_box_pad)}>
         {joint}
-        <inertial pos="0 0 0" mass="{PAD_MASS!r}" diaginertia="0.001 0.001 0.001"/>
-        {contact_points(contact, points, np.eye(4))}
+        <inertial pos="0 0 0" mass="{PAD_MASS!r}" diaginertia="{mjcf_text([PAD_INERTIA] * 3)}"/>
+        {contact_points(contact, settings.points, np.eye(4))}
       </body>"""
 
 

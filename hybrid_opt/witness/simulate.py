@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.witness.drive import Drive
 from hybrid_opt.witness.outcome import Outcome, Threshold, bisected, mujoco_module
-from hybrid_opt.witness.scene import CARRIAGE_MASS, SimulationSettings, scene_text
+from hybrid_opt.witness.scene import CARRIAGE_MASS, SimulationSettings, scene_text, tilt_names
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
 
@@ -66,6 +66,10 @@ class Witness:
         data = mujoco.MjData(model)
         box = int(model.joint("box").qposadr[0])
         press = int(model.joint("press").dofadr[0])
+        pads = ("pad_1", "pad_2") if settings.tilt_stiffness is not None else ()
+        names = [tilt_names(pad) for pad in pads]
+        joints = [[int(model.joint(name).dofadr[0]) for name in both] for both in names]
+        tilts = np.array(joints, int).reshape(-1, 2)
         data.qpos[:3], data.qpos[3:7] = drive.position[0], drive.quaternion[0]
         data.qpos[box : box + 3], data.qpos[box + 3 : box + 7] = data.qpos[:3], data.qpos[3:7]
         force = factor * drive.press + drive.own
@@ -78,6 +82,7 @@ class Witness:
             data.qfrc_applied[:3] = CARRIAGE_MASS * drive.acceleration[k]
             data.qfrc_applied[3:6] = CARRIAGE_MASS * drive.spin_rate[k]
             data.qfrc_applied[press] = force[k]
+            data.qfrc_applied[tilts] = drive.tilt[k, : len(tilts)]
             mujoco.mj_step(model, data)
             if k % every or drive.time[k] < drive.time[0] + settings.settle / 2.0:
                 continue
