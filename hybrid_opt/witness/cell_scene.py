@@ -13,12 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio
 
+from hybrid_opt.errors import WitnessError
 from hybrid_opt.witness.scene import contact_points, mjcf_text, placed, solver_options
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import Frame, arm_geometry, collision_bodies
 from symbolic.geometry.pieces import Capsule, Hull, Piece
 from symbolic.physics.contact_forces import GRAVITY
+from symbolic.robot.machine import common_joints
 from symbolic.robot.urdf import arm_model
 from symbolic.workcell.records import Box, Cylinder, Sphere, Workcell
 
@@ -99,7 +101,13 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
     """The MJCF document.
 
     Joints are named `joint_ROBOT_NUMBER`, sites of the pads `pad_1` and `pad_2`, the box `box`.
+
+    Raises:
+        WitnessError: one joint moves both arms.
     """
+    common = common_joints(workcell.robots)
+    if common:
+        raise WitnessError(f"joint {common[0]!r} moves both arms; hold it (locked_joints)")
     meshes: list[str] = []
     shown: dict[Frame, list[str]] = {}
     for body in collision_bodies(workcell):
@@ -144,9 +152,10 @@ def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, l
     inner = f"""<site name="pad_{i + 1}" {placed(T_joint_pad)} size="0.005"/>
       {contact_points(contact, settings.points, T_joint_pad)}"""
     for j in reversed(range(len(geometry.axes))):
+        kind = "hinge" if geometry.turning[j] else "slide"
         T = geometry.origins[j] if j else geometry.T_world_root @ geometry.origins[0]
         inner = f"""<body name="{_name("link", i, j)}" {placed(T)}>
-      <joint name="{_name("joint", i, j)}" type="hinge" axis="{mjcf_text(geometry.axes[j])}"
+      <joint name="{_name("joint", i, j)}" type="{kind}" axis="{mjcf_text(geometry.axes[j])}"
         armature="{float(armature[j])!r}"/>
       {_inertial(model.inertias[j + 1])}
       {"".join(shown.get(Frame("link", i, j), []))}

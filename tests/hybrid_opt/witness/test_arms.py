@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ pytest.importorskip("mujoco")
 import mujoco
 
 from hybrid_opt.cell import Cell
+from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.cases import nominal_case
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.solve import time_path
@@ -32,6 +34,7 @@ from studies.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Workcell
+from tests.redundant_cells import machine_on_lift, rack_on_rail
 from tests.symbolic.cells import hand_cell, rack_cell, start_posture
 
 WEIGHT = 98.1
@@ -213,6 +216,15 @@ def test_a_carrys_references_are_the_planners_torques() -> None:
         carry_reference(cell, carry, np.ones(3))
     with pytest.raises(SettingsError, match="start and end at rest"):
         carry_reference(cell, replace(carry, rate=np.ones_like(carry.rate)))
+
+
+def test_joints_that_slide_do_so_and_a_joint_of_both_arms_is_refused(tmp_path: Path) -> None:
+    witness = CellWitness(rack_on_rail(tmp_path, 0.1))
+    kinds = [int(witness.model.joint(name).type[0]) for name in joint_names(witness.workcell)]
+    slides, turns = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    assert kinds == [slides] + 12 * [turns]
+    with pytest.raises(WitnessError, match="moves both arms"):
+        CellWitness(machine_on_lift(tmp_path, 0.2, free=True))
 
 
 def test_misuse_is_told() -> None:

@@ -14,7 +14,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.cases import nominal_case
 from hybrid_opt.witness.cases import witness_of_case, workcell_of_case
-from hybrid_opt.witness.drive import drive_of
+from hybrid_opt.witness.drive import PlannedMoments, drive_of
 from hybrid_opt.witness.scene import SimulationSettings
 from hybrid_opt.witness.simulate import Witness
 from symbolic.array import Array
@@ -41,6 +41,26 @@ def threshold(carry: Carry, steps: int = 5, leader: int = 0) -> float:
 def test_a_box_at_rest_slips_below_the_least_force(friction: float) -> None:
     """N = m g / (2 mu), within 0.5 %."""
     assert threshold(planned(STILL, friction=friction)) == pytest.approx(1.0, abs=0.005)
+
+
+def test_pads_that_tilt_hold_as_well_and_follow_their_moments() -> None:
+    """Pads that only springs keep upright need no more force; moments that oppose one another move
+    both centres of pressure, not the box."""
+    carry = planned(STILL)
+    settings = SimulationSettings(tilt_stiffness=300.0)
+    witness = Witness(carry.workcell, settings)
+    assert witness.threshold(drive_of(carry, settings), 0.95, 1.05, 4).factor == pytest.approx(
+        1.0, abs=0.005
+    )
+    turned = []
+    for moment in (0.0, 0.5, 1.0):
+        # About the box's z axis: the pressure moves to one side of both pads.
+        at_rest = np.array([[0.0, 0.0, moment], [0.0, 0.0, -moment]])
+        moments = PlannedMoments(np.tile(at_rest, (len(carry), 1, 1)), at_rest)
+        outcome = witness.simulate(drive_of(carry, settings, moments=moments), 1.5)
+        assert outcome.holds
+        turned.append(outcome.turn.max())
+    assert max(turned) < 1e-3
 
 
 @pytest.mark.parametrize("leader", [0, 1])
@@ -125,6 +145,8 @@ def test_misuse_is_told() -> None:
         witness.threshold(drive, 1.5, 2.0, 1)
     with pytest.raises(SettingsError, match="two time steps"):
         SimulationSettings(time_step=0.01)
+    with pytest.raises(SettingsError, match="stiffness of the pads"):
+        SimulationSettings(tilt_stiffness=0.0)
     with pytest.raises(SettingsError, match="start and end at rest"):
         drive_of(replace(carry, rate=np.ones((len(carry), 6))), witness.settings)
     with pytest.raises(SettingsError, match="samples"):
