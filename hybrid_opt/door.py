@@ -13,7 +13,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
-from hybrid_opt.polishing.front import FrontPolisher
+from hybrid_opt.polishing.polisher import polisher_for
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
@@ -66,7 +66,7 @@ def polish(
     Raises:
         SettingsError: the cell's objectives are not both peak forces.
     """
-    polisher = FrontPolisher(cell.evaluator, settings or PolishSettings(), cell.polish_functions)
+    polisher = polisher_for(cell.evaluator, settings or PolishSettings(), cell.polish_functions)
     done = polisher.polish(front.x, rng)
     title = f"{front.title}, polished"
     return Front(cell, title, done.x, done.objectives, front.evaluations, done)

@@ -31,6 +31,7 @@ from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.attempt import Lost, use_one_thread
 from hybrid_opt.polishing.front import FrontPolisher
+from hybrid_opt.polishing.polisher import polisher_for
 from hybrid_opt.polishing.records import (
     PolishedFront,
     PolishOutcome,
@@ -70,7 +71,7 @@ class PolisherSource:
         return self.cell.make(self._polisher)
 
     def _polisher(self, workcell: Workcell) -> FrontPolisher:
-        return FrontPolisher(CandidateEvaluator(workcell, self.objectives), self.settings)
+        return polisher_for(CandidateEvaluator(workcell, self.objectives), self.settings)
 
 
 @dataclass(frozen=True)

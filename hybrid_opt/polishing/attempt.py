@@ -7,21 +7,14 @@ who gave it the work (`hybrid_opt.work`); they put down the attempt as `Lost` an
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import casadi
 
-from hybrid_opt.polishing.point import Solution, SolveTask
-
-
-class Solver(Protocol):
-    """What solves."""
-
-    def solve(self, task: SolveTask) -> Solution:
-        """See `hybrid_opt.polishing.point.PolishSolver`."""
+from hybrid_opt.polishing.point import Solution
 
 
 @dataclass(frozen=True)
@@ -31,10 +24,10 @@ class Lost:
     reason: str
 
 
-def solve_safely(solver: Solver, task: SolveTask) -> Solution | Lost:
+def solve_safely(solve: Callable[[], Solution]) -> Solution | Lost:
     """The solution, or what was raised instead."""
     try:
-        return solver.solve(task)
+        return solve()
     except Exception as error:
         return Lost(f"{type(error).__name__}: {error}".splitlines()[0])
 

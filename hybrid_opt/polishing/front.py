@@ -11,22 +11,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.polishing.archive import GrowingFront
-from hybrid_opt.polishing.attempt import Lost, solve_safely
+from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.plan import Attempt, aimed, points, widest_gap
 from hybrid_opt.polishing.point import PolishSolver, Solution, SolveTask
-from hybrid_opt.polishing.records import (
-    PolishedFront,
-    PolishOutcome,
-    Status,
-)
+from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
+from hybrid_opt.polishing.run import PolishRun
 from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -34,8 +31,6 @@ from symbolic.workcell.decision import initial_decision
 
 TIMED_EVALUATIONS = 32
 """Candidates whose evaluation is timed, to express the polish in their unit."""
-
-NO_SOLUTION = Solution(np.empty(0))
 
 
 class FrontPolisher:
@@ -85,7 +80,7 @@ class FrontPolisher:
         found = self.evaluator.certified(self.evaluator.evaluate(x))
         feasible = np.flatnonzero(found.feasible)
         archive = GrowingFront(x[feasible], found.objectives[feasible], feasible.tolist())
-        run = _Run(self, archive, list(recorded), emit)
+        run = self._run(archive, list(recorded), emit)
         if len(feasible) and self.settings.points:
             run.all(rng)
         rows = archive.rows() if len(feasible) else []
@@ -101,6 +96,15 @@ class FrontPolisher:
             evaluation_seconds=unit,
         )
 
+    def _run(
+        self,
+        archive: GrowingFront,
+        recorded: list[PolishOutcome | Lost],
+        emit: Callable[[PolishOutcome], None],
+    ) -> PolishRun[Any]:
+        """A polish of one front, about to begin."""
+        return ForceRun(self, archive, recorded, emit)
+
     def _evaluation_seconds(self, x: Array) -> float:
         """Time of one candidate evaluation; the initial trajectory's for an empty front."""
         sample = x if len(x) else initial_decision(self.evaluator.workcell.task)[None]
@@ -110,18 +114,8 @@ class FrontPolisher:
         return (time.perf_counter() - begin) / len(batch)
 
 
-def polish_front(
-    evaluator: CandidateEvaluator,
-    front_x: Array,
-    settings: PolishSettings,
-    rng: np.random.Generator,
-) -> PolishedFront:
-    """Polish one front; see `FrontPolisher`."""
-    return FrontPolisher(evaluator, settings).polish(front_x, rng)
-
-
-class _Run:
-    """One polish in progress."""
+class ForceRun(PolishRun[Attempt]):
+    """The polish of the paper's two objectives."""
 
     def __init__(
         self,
@@ -130,12 +124,13 @@ class _Run:
         recorded: list[PolishOutcome | Lost],
         emit: Callable[[PolishOutcome], None],
     ) -> None:
-        self._evaluator, self._settings = polisher.evaluator, polisher.settings
+        super().__init__(polisher.evaluator, polisher.settings, archive, recorded, emit)
         self._solver = polisher.solver
-        self._archive, self._recorded, self._emit = archive, recorded, emit
         self._tried: set[tuple[int | None, bytes]] = set()
         self._stalls = 0
-        self.outcomes: list[PolishOutcome] = []
+
+    def _solution(self, attempt: Attempt) -> Solution:
+        return self._solver.solve(SolveTask(attempt.x, attempt.target, attempt.radius))
 
     def all(self, rng: np.random.Generator) -> None:
         """The front's points first; then ends, middle and gaps in turns, while attempts last."""
@@ -169,73 +164,12 @@ class _Run:
         feasible = self._evaluator.evaluate(half).feasible[0]
         return [replace(attempt, x=half) if feasible else attempt]
 
-    def _left(self) -> int:
-        return self._settings.points - len(self.outcomes)
 
-    def _do(self, attempts: list[Attempt]) -> None:
-        """Solve, judge and take in attempts; those on record are not solved again."""
-        for attempt in attempts[: max(0, self._left())]:
-            known = self._recorded.pop(0) if self._recorded else None
-            if isinstance(known, PolishOutcome):
-                self._take(attempt, known)
-                continue
-            begin = time.perf_counter()
-            task = SolveTask(attempt.x, attempt.target, attempt.radius)
-            outcome = self._judged(attempt, known or solve_safely(self._solver, task), begin)
-            self._take(attempt, outcome)
-            if known is None:
-                self._emit(outcome)
-
-    def _take(self, attempt: Attempt, outcome: PolishOutcome) -> None:
-        self.outcomes.append(outcome)
-        if outcome.status != "accepted":
-            return
-        if attempt.aim == "point":
-            self._archive.replace(attempt.parent, outcome.x, outcome.objectives)
-        else:
-            self._archive.add(outcome.x, outcome.objectives)
-
-    def _judged(self, attempt: Attempt, answer: Solution | Lost, begin: float) -> PolishOutcome:
-        status, reason, objectives = self._verdict(attempt, answer)
-        told = answer if isinstance(answer, Solution) else NO_SOLUTION
-        return PolishOutcome(
-            aim=attempt.aim,
-            parent=attempt.parent,
-            status=status,
-            reason=reason,
-            x=told.x if status == "accepted" else attempt.x,
-            start=attempt.start,
-            objectives=objectives,
-            residuals=told.residuals,
-            iterations=told.iterations,
-            rounds=told.rounds,
-            rows=told.rows,
-            seconds=time.perf_counter() - begin,
-        )
-
-    def _verdict(self, attempt: Attempt, answer: Solution | Lost) -> tuple[Status, str, Array]:
-        if isinstance(answer, Lost):
-            return "failed", answer.reason, attempt.start
-        if not answer.usable:
-            return "failed", answer.message, attempt.start
-        if np.array_equal(answer.x, attempt.x):
-            return self._not_improved(answer, attempt)
-        found = self._evaluator.certified(self._evaluator.evaluate(answer.x))
-        reason = int(found.reason[0])
-        if reason != FEASIBLE:
-            return "rejected", REASONS[reason], attempt.start
-        objectives = found.objectives[0]
-        gain = attempt.start - objectives
-        if attempt.aim == "point":
-            if gain.min() < -self._settings.tolerance:
-                return "rejected", "an objective became worse", attempt.start
-            if gain.max() <= self._settings.tolerance:
-                return self._not_improved(answer, attempt)
-        elif self._archive.dominates(objectives):
-            return "rejected", "dominated", attempt.start
-        return "accepted", "", objectives
-
-    def _not_improved(self, answer: Solution, attempt: Attempt) -> tuple[Status, str, Array]:
-        if answer.converged or answer.residuals.stationarity <= self._settings.front.optimal:
-            return "optimal", "not improved", attempt.start
-        return "failed", f"not improved: {answer.message}", attempt.start
+def polish_front(
+    evaluator: CandidateEvaluator,
+    front_x: Array,
+    settings: PolishSettings,
+    rng: np.random.Generator,
+) -> PolishedFront:
+    """Polish one front; see `FrontPolisher`."""
+    return FrontPolisher(evaluator, settings).polish(front_x, rng)

@@ -12,9 +12,9 @@ import casadi as ca
 from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.polishing.drivable.functions import DrivenFunctions, driven_functions_of
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
-from symbolic.errors import SettingsError
 from symbolic.smooth.closure import closure_functions
 from symbolic.smooth.joint_limit import JointLimit
 from symbolic.smooth.keys import Block, ClosureKey, Order, Quantity, RowKey, SampleKey
@@ -106,31 +106,29 @@ class PolishFunctions:
         samples: forces and pressure, see `symbolic.smooth.samples`.
         closures: inverse kinematics of both arms, see `symbolic.smooth.closure`.
         rows: constraints at places of the path.
+        driven: limits along a driven path, only under the time law 'optimal'.
     """
 
     samples: Mapping[SampleKey, NumericFunction]
     closures: Mapping[ClosureKey, NumericFunction]
     rows: RowFunctions = field(repr=False)
+    driven: DrivenFunctions | None = None
 
 
 def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     """Load or build the functions of a workcell's smooth problem.
 
     Raises:
-        SettingsError: the time law is 'optimal', which is no smooth function of the path.
         DualArmError: the cell's model cannot be built, or its functions not be compiled.
     """
-    if compiled.workcell.task.time_law == "optimal":
-        raise SettingsError(
-            "the polish does not know the time law 'optimal'; search without it (--no-polish), or "
-            "polish under 'constant' or 'ramped'"
-        )
+    driven = compiled.workcell.task.time_law == "optimal"
 
     @cache
     def make() -> dict[str, ca.Function]:
         model = compiled.model
         place, functions = Place(model), dict[str, ca.Function]()
-        for quantity in QUANTITIES:
+        # What is driven has limits at the stages of its timing, not at samples.
+        for quantity in () if driven else QUANTITIES:
             functions |= _named(sample_functions(model.workcell, quantity))
         for arm in ARMS:
             functions |= _named(closure_functions(model, arm))
@@ -158,6 +156,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
         samples={key: built[key.name] for key in sample_keys if key.name in built},
         closures={key: built[key.name] for key in closure_keys},
         rows=RowFunctions(compiled.model, {key: built[key.name] for key in row_keys}, built[GAPS]),
+        driven=driven_functions_of(compiled) if driven else None,
     )
 
 

@@ -72,7 +72,7 @@ class SmoothCell:
     """What all smooth programs of a cell share.
 
     Attributes:
-        task, functions, grid: the cell's.
+        workcell, task, functions, grid: the cell's.
         unit: the scaled decision vector.
         free: rows and columns of the variables among the extended waypoints.
         blocks: how samples are divided among functions.
@@ -80,7 +80,8 @@ class SmoothCell:
     """
 
     def __init__(self, workcell: Workcell, functions: PolishFunctions, grid: Grid) -> None:
-        self.task, self.functions, self.grid = workcell.task, functions, grid
+        self.workcell, self.task = workcell, workcell.task
+        self.functions, self.grid = functions, grid
         self.unit = UnitBox.of(workcell.task)
         self.blocks = sample_blocks(workcell.task)
         self.coefficients = branch_coefficients(workcell)
@@ -95,6 +96,21 @@ class SmoothCell:
         points[self.free] = x[: self.task.n_path]
         turns = points[1:, 3:POSE_SIZE] - points[:-1, 3:POSE_SIZE]
         return extended_waypoints(self.task, x) if np.abs(turns).max() > np.pi else points
+
+
+def place_values(cell: SmoothCell, rows: tuple[PlaceRow, ...], carry: PlacedCarry) -> PlaceValues:
+    """What evaluates rows at places, with the joints of a carry to start from."""
+    grid = cell.grid
+    at = np.array(sorted({row.place for row in rows}), dtype=np.intp)
+    index = {place: k for k, place in enumerate(at.tolist())}
+    places = Places(
+        grid.basis[at],
+        grid.rate_basis[at],
+        cell.free,
+        (carry.q[0][at], carry.q[1][at]),
+    )
+    local = tuple(PlaceRow(row.constraint, index[row.place]) for row in rows)
+    return PlaceValues(local, places, cell.functions.closures, cell.functions.rows)
 
 
 class SmoothProgram:
@@ -127,7 +143,7 @@ class SmoothProgram:
         self._forces = SampleValues("force", cell.blocks, cell.functions.samples, ruled)
         pressed = {row.sample for row in layout.pressure_rows}
         self._patches = SampleValues("pressure", cell.blocks, cell.functions.samples, pressed)
-        self._places = self._place_values(carry)
+        self._places = place_values(cell, layout.place_rows, carry)
         self._index_rows()
 
         phi = (carry.peak - target.anchor) / target.span + SLACK
@@ -148,20 +164,6 @@ class SmoothProgram:
         ]
         self._fixed = self._fixed_part()
         self._known = b""
-
-    def _place_values(self, carry: PlacedCarry) -> PlaceValues:
-        grid, rows = self._cell.grid, self.layout.place_rows
-        at = np.array(sorted({row.place for row in rows}), dtype=np.intp)
-        index = {place: k for k, place in enumerate(at.tolist())}
-        places = Places(
-            grid.basis[at],
-            grid.rate_basis[at],
-            self._cell.free,
-            (carry.q[0][at], carry.q[1][at]),
-        )
-        local = tuple(PlaceRow(row.constraint, index[row.place]) for row in rows)
-        functions = self._cell.functions
-        return PlaceValues(local, places, functions.closures, functions.rows)
 
     def _index_rows(self) -> None:
         """Rows as arrays: what each takes of the values at samples, and its scale."""

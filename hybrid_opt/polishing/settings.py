@@ -135,6 +135,43 @@ class FrontSettings:
 
 
 @dataclass(frozen=True)
+class DrivableSettings:
+    """The polish under the time law 'optimal', see `hybrid_opt.polishing.drivable`.
+
+    Attributes:
+        first_radius: of the box of trust, in halves of the ranges of the waypoints.
+        rounds: steps of one point at most.
+        least_radius: of the box of trust, below which a point is left.
+        stationary: residual of stationarity and of complementarity at which a point counts as
+            optimal.
+        feasible: the same of feasibility; what is asked of distances moves with the path.
+        noise: relative change of a timing that counts as none: what the timing rounds off.
+        newton: steps shorter than this keep the program's squared speeds, longer ones take those
+            of the new timing.
+        row_rounds: times that rows are added to one quadratic program.
+        row_tolerance: predicted excess of a limit that adds its row.
+        negligible: scaled multipliers below this count as none.
+        steadiness: curvature by the path of the program that finds multipliers.
+        corrections: of a step by how geometric rows bend along it, at most.
+        bend: of a scaled geometric row that is left uncorrected.
+    """
+
+    first_radius: float = 0.3
+    rounds: int = 40
+    least_radius: float = 1e-5
+    stationary: float = 1e-4
+    feasible: float = 5e-3
+    noise: float = 5e-4
+    newton: float = 0.05
+    row_rounds: int = 3
+    row_tolerance: float = 1e-6
+    negligible: float = 1e-8
+    steadiness: float = 1.0
+    corrections: int = 3
+    bend: float = 0.01
+
+
+@dataclass(frozen=True)
 class PolishSettings:
     """What decides the results of a polish.
 
@@ -152,7 +189,7 @@ class PolishSettings:
         clearance: distance kept from obstacles [m]; lets the motion between samples be certified.
         stricter: least rise of a required value that counts as a new demand [m, rad, 1].
         tolerance: improvement of an objective below which a point counts as optimal already.
-        near, trust, solve, front: the parts' own.
+        near, trust, solve, front, drivable: the parts' own.
     """
 
     points: int = 14
@@ -169,6 +206,7 @@ class PolishSettings:
     trust: TrustSettings = field(default_factory=TrustSettings)
     solve: SolveSettings = field(default_factory=SolveSettings)
     front: FrontSettings = field(default_factory=FrontSettings)
+    drivable: DrivableSettings = field(default_factory=DrivableSettings)
 
     def __post_init__(self) -> None:
         """Check every value.

@@ -24,15 +24,17 @@ from symbolic.smooth.reach import Reach
 class ActiveSet:
     """Chooses rows for candidates of one evaluator.
 
-    A new kind of constraint is a class beside `kind.Kind`'s others and a line here.
+    A new kind of constraint is a class beside `kind.Kind`'s others and a line here. Carries
+    under the time law 'optimal' have no rows at samples: `hybrid_opt.polishing.drivable` has their
+    forces.
     """
 
     def __init__(self, around: Surroundings) -> None:
         self.forces = Forces(around)
         self._movable = around.movable
-        self._kinds: dict[type, Kind[Any]] = {
-            ForceRow: self.forces,
-            PressureRow: Pressure(around),
+        sampled: dict[type, Kind[Any]] = {ForceRow: self.forces, PressureRow: Pressure(around)}
+        driven = around.workcell.task.time_law == "optimal"
+        self._kinds: dict[type, Kind[Any]] = ({} if driven else sampled) | {
             Clearance: Clearances(around),
             Separation: Separations(around),
             Passing: Passings(around),

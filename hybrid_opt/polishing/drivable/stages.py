@@ -1,0 +1,202 @@
+"""Limits at both ends of every stage of a path, by its waypoints and squared speeds.
+
+A stage is a piece of the path with constant u''. Its two ends are two points, so that n stages
+have 2 n points, both of one stage in a row. What is limited at a point depends on the waypoints,
+which are linear in pose and derivatives, and on the squared speeds at both ends of the stage:
+u'' = (w_end - w_begin) n / 2, u'^2 = w.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_opt.polishing.drivable.functions import DrivenFunctions
+from symbolic.array import Array
+from symbolic.physics.contact_forces import normal_force_branches
+from symbolic.physics.path import path_basis
+from symbolic.smooth.driven import driven_layout
+from symbolic.smooth.keys import ClosureKey
+from symbolic.workcell.decision import waypoints_of
+from symbolic.workcell.records import Workcell
+
+LOCAL = 20
+"""What a point depends on: box pose and both derivatives (6 each), u'' and u'^2."""
+
+
+@dataclass(frozen=True)
+class RowKinds:
+    """Inequalities of one point, mix . quantities <= bound, as (k, ...) arrays.
+
+    Attributes:
+        mix: (k, quantities) coefficients.
+        is_force: (k,) whether the bound is the force limit; it is 1 otherwise.
+    """
+
+    mix: Array
+    is_force: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, workcell: Workcell) -> RowKinds:
+        """Those of a workcell: both signs where a quantity has one, all branches of the forces."""
+        layout = driven_layout(workcell)
+        eye = np.eye(layout.size)
+        forces = np.zeros((2, 5, layout.size))
+        friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
+        for column, split in ((0, (1.0, 0.0)), (1, (0.0, 1.0))):
+            branches = np.array(normal_force_branches(*split, friction)).reshape(-1)
+            forces[:, :, layout.block("force").start + column] = branches
+        forces[0, :, layout.block("force").start] += 1.0  # N_1 = N_2 + F_n
+        blocks = [
+            eye[layout.block("speed")],
+            eye[layout.block("acceleration")],
+            -eye[layout.block("acceleration")],
+            eye[layout.block("cone")],
+            eye[layout.block("torque")],
+            -eye[layout.block("torque")],
+            eye[layout.block("pressure")],
+            forces.reshape(-1, layout.size),
+        ]
+        mix = np.concatenate(blocks)
+        return cls(mix, np.arange(len(mix)) >= len(mix) - forces.shape[0] * forces.shape[1])
+
+
+class StageGrid:
+    """What all paths of a workcell share.
+
+    Attributes:
+        workcell: the cell.
+        stages: pieces of constant u''.
+        sample: (points,) grid point of each point.
+        carry_over: (points, 18, n_path) from the free waypoints to pose and both derivatives.
+        kinds: the inequalities of a point.
+    """
+
+    def __init__(self, workcell: Workcell, stages: int) -> None:
+        self.workcell, self.stages = workcell, stages
+        task = workcell.task
+        basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, stages + 1))
+        self.sample = (np.arange(stages)[:, None] + np.array([0, 1])).reshape(-1)
+        self._bases = (basis.position, basis.first, basis.second)
+        free = list(task.free_indices)
+        parts = [np.kron(b[self.sample][:, free], np.eye(6)) for b in self._bases]
+        n_points, n_path = len(self.sample), 6 * len(free)
+        self.carry_over = np.stack(
+            [part.reshape(n_points, 6, n_path) for part in parts], axis=1
+        ).reshape(n_points, 18, n_path)
+        self.kinds = RowKinds.of(workcell)
+        self.layout = driven_layout(workcell)
+
+    def path(self, x: Array) -> tuple[Array, Array, Array]:
+        """Pose and both derivatives (stages + 1, 6) of a decision vector."""
+        waypoints = waypoints_of(self.workcell.task, x)
+        first, second, third = (np.ascontiguousarray(b @ waypoints) for b in self._bases)
+        return first, second, third
+
+
+@dataclass(frozen=True)
+class StageValues:
+    """The limited quantities of one driven path with their derivatives.
+
+    Attributes:
+        grid: what the path shares with others.
+        value: (points, quantities).
+        slope: (points, quantities, LOCAL) by what a point depends on, the joints following.
+    """
+
+    grid: StageGrid
+    value: Array
+    slope: Array
+    _inputs: tuple[Array, ...]
+    _full: Array
+    _follow: tuple[Array, Array]
+    _pull: tuple[Array, Array]
+    _functions: DrivenFunctions
+
+    @classmethod
+    def at(
+        cls,
+        grid: StageGrid,
+        functions: DrivenFunctions,
+        x: Array,
+        squared: Array,
+        near: tuple[Array, Array],
+    ) -> StageValues:
+        """Evaluate.
+
+        Args:
+            x: (n_var,) decision vector.
+            squared: (stages + 1,) u'^2 at the grid points.
+            near: joints of both arms (stages + 1, n) near those that hold the box.
+        """
+        path, s = grid.path(x), grid.sample
+        held = [
+            functions.closures[ClosureKey(arm, "first")].batch(path[0], near[arm]) for arm in (0, 1)
+        ]
+        a = np.repeat(np.diff(squared) * grid.stages / 2.0, 2)
+        inputs = (*(part[s] for part in path), *(found["q"][s] for found in held), a, squared[s])
+        out = functions.first.batch(*inputs)
+        full = out["slope"]
+        follow = tuple(found["follow"][s] for found in held)
+        slope = np.concatenate([full[:, :, :18], full[:, :, -2:]], axis=2)
+        start = 18
+        for along in follow:
+            n = along.shape[2]
+            slope[:, :, :6] += full[:, :, start : start + n] @ np.swapaxes(along, 1, 2)
+            start += n
+        pull = tuple(found["pull"][s] for found in held)
+        return cls(
+            grid,
+            out["value"],
+            slope,
+            inputs,
+            full,
+            (follow[0], follow[1]),
+            (pull[0], pull[1]),
+            functions,
+        )
+
+    def rows(self) -> Array:
+        """(points, kinds) mix . quantities of every inequality."""
+        return self.value @ self.grid.kinds.mix.T
+
+    def curvature(self, weight: Array) -> tuple[NDArray[np.intp], Array]:
+        """Second derivatives of weight . value.
+
+        Args:
+            weight: (points, quantities).
+
+        Returns:
+            The points (m,) with any weight, and (m, LOCAL, LOCAL) of each.
+        """
+        at = np.flatnonzero(np.abs(weight).max(axis=1) > 0.0)
+        n, variables = len(at), self.grid.layout.variables
+        spread = np.zeros((n, LOCAL, variables))
+        spread[:, np.arange(18), np.arange(18)] = 1.0
+        spread[:, [18, 19], [variables - 2, variables - 1]] = 1.0
+        start = 18
+        for along in self._follow:
+            stop = start + along.shape[2]
+            spread[:, :6, start:stop] = along[at]
+            start = stop
+        repeated = [np.repeat(values[at], LOCAL, axis=0) for values in self._inputs]
+        change = self._functions.second.batch(
+            *repeated, np.repeat(weight[at], LOCAL, axis=0), spread.reshape(-1, variables)
+        )["change"].reshape(n, LOCAL, variables)
+        total = change @ np.swapaxes(spread, 1, 2)
+        # How the joints' own curvature along the path adds to it, see `symbolic.smooth.closure`.
+        slope = np.einsum("pk,pkv->pv", weight[at], self._full[at])
+        start = 18
+        for arm, along in enumerate(self._follow):
+            n_joints = along.shape[2]
+            by_joints = slope[:, start : start + n_joints]
+            nu = np.matmul(self._pull[arm][at], by_joints[:, :, None])[:, :, 0]
+            closed = self._functions.closures[ClosureKey(arm, "second")].batch(
+                self._inputs[0][at], self._inputs[3 + arm][at], nu
+            )["hessian"]
+            follow = np.concatenate([np.tile(np.eye(6), (n, 1, 1)), along[at]], axis=2)
+            total[:, :6, :6] += follow @ closed @ np.swapaxes(follow, 1, 2)
+            start += n_joints
+        return at, (total + np.swapaxes(total, 1, 2)) / 2.0

@@ -1,0 +1,144 @@
+"""What every polish of a front does with its attempts: solve, judge, take in, report."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator
+from hybrid_opt.polishing.archive import GrowingFront
+from hybrid_opt.polishing.attempt import Lost, solve_safely
+from hybrid_opt.polishing.point import Solution
+from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
+from hybrid_opt.polishing.settings import PolishSettings
+from symbolic.array import Array
+
+NO_SOLUTION = Solution(np.empty(0))
+
+
+class Attempted(Protocol):
+    """What every attempt has; see `hybrid_opt.polishing.plan.Attempt`."""
+
+    @property
+    def aim(self) -> Aim:
+        """What it looks for."""
+
+    @property
+    def parent(self) -> int:
+        """Row of the given front, or -1."""
+
+    @property
+    def x(self) -> Array:
+        """(n_var,) decision vector to start from."""
+
+    @property
+    def start(self) -> Array:
+        """(2,) objectives there."""
+
+
+AnyAttempt = TypeVar("AnyAttempt", bound=Attempted)
+
+
+class PolishRun(ABC, Generic[AnyAttempt]):
+    """One polish in progress: attempts are solved, judged and taken in, one after the other."""
+
+    def __init__(
+        self,
+        evaluator: CandidateEvaluator,
+        settings: PolishSettings,
+        archive: GrowingFront,
+        recorded: list[PolishOutcome | Lost],
+        emit: Callable[[PolishOutcome], None],
+    ) -> None:
+        self._evaluator, self._settings = evaluator, settings
+        self._archive, self._recorded, self._emit = archive, recorded, emit
+        self.outcomes: list[PolishOutcome] = []
+
+    @abstractmethod
+    def all(self, rng: np.random.Generator) -> None:
+        """Every attempt."""
+
+    @abstractmethod
+    def _solution(self, attempt: AnyAttempt) -> Solution:
+        """What the solver makes of an attempt."""
+
+    def _left(self) -> int:
+        return self._settings.points - len(self.outcomes)
+
+    def _do(self, attempts: list[AnyAttempt]) -> None:
+        """Solve, judge and take in attempts; those on record are not solved again."""
+        for attempt in attempts[: max(0, self._left())]:
+            known = self._recorded.pop(0) if self._recorded else None
+            if isinstance(known, PolishOutcome):
+                self._take(attempt, known)
+                continue
+            begin = time.perf_counter()
+            answer = known or solve_safely(partial(self._solution, attempt))
+            outcome = self._judged(attempt, answer, begin)
+            self._take(attempt, outcome)
+            if known is None:
+                self._emit(outcome)
+
+    def _take(self, attempt: AnyAttempt, outcome: PolishOutcome) -> None:
+        self.outcomes.append(outcome)
+        if outcome.status != "accepted":
+            return
+        if attempt.aim == "point":
+            self._archive.replace(attempt.parent, outcome.x, outcome.objectives)
+        else:
+            self._archive.add(outcome.x, outcome.objectives)
+
+    def _judged(self, attempt: AnyAttempt, answer: Solution | Lost, begin: float) -> PolishOutcome:
+        status, reason, objectives = self._verdict(attempt, answer)
+        told = answer if isinstance(answer, Solution) else NO_SOLUTION
+        return PolishOutcome(
+            aim=attempt.aim,
+            parent=attempt.parent,
+            status=status,
+            reason=reason,
+            x=told.x if status == "accepted" else attempt.x,
+            start=attempt.start,
+            objectives=objectives,
+            residuals=told.residuals,
+            iterations=told.iterations,
+            rounds=told.rounds,
+            rows=told.rows,
+            seconds=time.perf_counter() - begin,
+        )
+
+    def _verdict(self, attempt: AnyAttempt, answer: Solution | Lost) -> tuple[Status, str, Array]:
+        if isinstance(answer, Lost):
+            return "failed", answer.reason, attempt.start
+        if not answer.usable:
+            return "failed", answer.message, attempt.start
+        if np.array_equal(answer.x, attempt.x):
+            return self._not_improved(answer, attempt)
+        found = self._evaluator.certified(self._evaluator.evaluate(answer.x))
+        reason = int(found.reason[0])
+        if reason != FEASIBLE:
+            return "rejected", REASONS[reason], attempt.start
+        return self._worth(attempt, answer, found.objectives[0])
+
+    def _worth(
+        self, attempt: AnyAttempt, answer: Solution, objectives: Array
+    ) -> tuple[Status, str, Array]:
+        """Whether a feasible answer is taken in."""
+        gain = attempt.start - objectives
+        if attempt.aim == "point":
+            if gain.min() < -self._settings.tolerance:
+                return "rejected", "an objective became worse", attempt.start
+            if gain.max() <= self._settings.tolerance:
+                return self._not_improved(answer, attempt)
+        elif self._archive.dominates(objectives):
+            return "rejected", "dominated", attempt.start
+        return "accepted", "", objectives
+
+    def _not_improved(self, answer: Solution, attempt: AnyAttempt) -> tuple[Status, str, Array]:
+        if answer.converged or answer.residuals.stationarity <= self._settings.front.optimal:
+            return "optimal", "not improved", attempt.start
+        return "failed", f"not improved: {answer.message}", attempt.start

@@ -1,0 +1,136 @@
+"""What the polish of drivable carries asks at a point of a driven path, with exact derivatives.
+
+Path and timing are variables together: at a point of the path every limited quantity follows from
+the box pose, its first and second derivative along the path, the joints that hold the box there,
+u'' and u'^2. Joints are differentiated as in `symbolic.smooth.closure`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from symbolic.cell_model import CellModel
+from symbolic.physics.path_limits import (
+    PATH_OUTPUTS,
+    limit_layout,
+    ratio_functions,
+    sample_limits_function,
+)
+from symbolic.workcell.records import Workcell
+
+DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
+"""Names of the functions."""
+
+TANGENT_FLOOR = 1e-9
+"""Keeps the tangential force's magnitude smooth at zero [N]."""
+
+
+@dataclass(frozen=True)
+class DrivenLayout:
+    """Where the quantities at a driven point lie in their vector; `joints` counts both arms'.
+
+    Blocks, in order:
+    speed (joints + 2): squared speeds over their squared limits: joints, payload, its turning.
+    acceleration (joints): of the joints over their limits, signed.
+    cone (2): squared length of the payload's acceleration and angular acceleration, likewise.
+    force (2): normal component and tangential magnitude of the required force [N].
+    torque (joints): over their limits, signed.
+    pressure (2): shifts of the centres of pressure over their patches' radii.
+    """
+
+    joints: int
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Numbers per block."""
+        j = self.joints
+        return {
+            "speed": j + 2,
+            "acceleration": j,
+            "cone": 2,
+            "force": 2,
+            "torque": j,
+            "pressure": 2,
+        }
+
+    def block(self, name: str) -> slice:
+        """Place of a block."""
+        sizes = self.sizes
+        start = sum(list(sizes.values())[: list(sizes).index(name)])
+        return slice(start, start + sizes[name])
+
+    @property
+    def size(self) -> int:
+        """Quantities at a point."""
+        return sum(self.sizes.values())
+
+    @property
+    def variables(self) -> int:
+        """Box pose and both derivatives, the joints, u'' and u'^2."""
+        return 18 + self.joints + 2
+
+
+def driven_layout(workcell: Workcell) -> DrivenLayout:
+    """The layout for a workcell's arms."""
+    return DrivenLayout(limit_layout(workcell).joints)
+
+
+def driven_functions(model: CellModel) -> dict[str, ca.Function]:
+    """Limited quantities at a driven point, with y = (pose, first, second, q_1, q_2, a, w), a = u''
+    and w = u'^2:
+
+    driven_first: y's parts -> value (size,), slope (size, variables).
+    driven_second: y's parts, weight (size,), direction (variables,) -> change (variables,): the
+        Hessian of weight . value times the direction.
+    """
+    layout = driven_layout(model.workcell)
+    names = [*PATH_OUTPUTS, "a", "w"]
+    sizes = [6, 6, 6, *[len(start) for start in model.start], 1, 1]
+    inputs = [ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)]
+    value, y = _value(model, inputs), ca.vertcat(*inputs)
+    assert value.shape == (layout.size, 1)
+    first = ca.cse([value, ca.densify(ca.jacobian(value, y).T)])
+    weight, direction = ca.SX.sym("weight", layout.size), ca.SX.sym("direction", layout.variables)
+    gradient = ca.gradient(ca.dot(weight, value), y)
+    second = ca.cse([ca.densify(ca.jtimes(gradient, y, direction))])
+    return {
+        DRIVEN_FIRST: ca.Function(DRIVEN_FIRST, inputs, first, names, ["value", "slope"]),
+        DRIVEN_SECOND: ca.Function(
+            DRIVEN_SECOND,
+            [*inputs, weight, direction],
+            second,
+            [*names, "weight", "direction"],
+            ["change"],
+        ),
+    }
+
+
+def _value(model: CellModel, inputs: list[ca.SX]) -> ca.SX:
+    """The quantities of `DrivenLayout`."""
+    workcell = model.workcell
+    limits, joints = limit_layout(workcell), limit_layout(workcell).joints
+    *path, a, w = inputs
+    row = sample_limits_function(model)(*path)
+    at = limits.offsets
+    block = {name: row[at[name] : at[name] + size] for name, size in limits.sizes.items()}
+    cones = [block["cone"][6 * k : 6 * k + 6] for k in (0, 1)]
+    payload = workcell.payload
+    reach = (
+        payload.acceleration_max / payload.velocity_max,
+        payload.angular_acceleration_max / payload.angular_velocity_max,
+    )
+    # Not the lengths' squares: a length has no slope where the box does not move.
+    speeds = [ca.sumsqr(cones[k][:3] * reach[k]) for k in (0, 1)]
+    force = block["force"][:3] * a + block["force"][3:6] * w + block["force"][6:]
+    ratios = ratio_functions(workcell)[0](row[at["force"] :], a, w)
+    return ca.vertcat(
+        block["speed"][:joints] ** 2 * w,
+        *[speed * w for speed in speeds],
+        block["acceleration"][:joints] * a + block["acceleration"][joints:] * w,
+        *[ca.sumsqr(cone[:3] * a + cone[3:] * w) for cone in cones],
+        force[2],
+        ca.sqrt(force[0] ** 2 + force[1] ** 2 + TANGENT_FLOOR**2),
+        ratios,
+    )

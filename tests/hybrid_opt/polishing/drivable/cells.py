@@ -1,0 +1,56 @@
+"""The rack under the time law 'optimal', its evaluator and polisher built once per test process."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.polishing.drivable.front import DrivablePolisher
+from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
+from hybrid_opt.polishing.settings import PolishSettings
+from symbolic.array import Array
+from symbolic.workcell.decision import initial_decision
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
+from tests.symbolic.workcell.samples import RACK
+
+
+@cache
+def drivable_rack() -> Workcell:
+    """Timed as robots drive it."""
+    cell = load(RACK)
+    still = cell.payload.mass * 9.81 / 2.0
+    task = replace(cell.task, time_law="optimal", force_limit=(1.001 * still, 117.68))
+    return replace(cell, task=task)
+
+
+@cache
+def evaluator() -> CandidateEvaluator:
+    """Of the drivable rack."""
+    cell = drivable_rack()
+    return CandidateEvaluator(cell, DRIVABLE_OBJECTIVES, compiled=CompiledCell(cell))
+
+
+@cache
+def functions() -> PolishFunctions:
+    """Of the drivable rack."""
+    return polish_functions(evaluator().compiled)
+
+
+@cache
+def polisher(points: int = 3) -> DrivablePolisher:
+    """Of the drivable rack."""
+    return DrivablePolisher(evaluator(), PolishSettings(points=points), functions())
+
+
+def start(force: float, seed: int = 0) -> Array:
+    """(n_var,) the hand-made path, moved a little, with a force limit [N]."""
+    x = initial_decision(drivable_rack().task)
+    x[:-1] += 0.004 * np.random.default_rng(seed).normal(size=len(x) - 1)
+    x[-1] = force
+    return np.clip(x, drivable_rack().task.lower, drivable_rack().task.upper)

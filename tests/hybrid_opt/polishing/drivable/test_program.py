@@ -1,0 +1,139 @@
+"""The joint program's values against the compiled timing, its derivatives against differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hybrid_opt.polishing.drivable.program import Iterate, JointProgram, Multipliers
+from hybrid_opt.polishing.drivable.stages import StageGrid, StageValues
+from hybrid_opt.polishing.drivable.timed import Goal
+from hybrid_opt.polishing.grid import Grid
+from hybrid_opt.polishing.layout import PlaceRow
+from hybrid_opt.polishing.placed_carry import CarryReader
+from hybrid_opt.polishing.program import SmoothCell, place_values
+from symbolic.array import Array
+from symbolic.smooth.reach import Reach
+from symbolic.workcell.decision import initial_decision
+from tests.hybrid_opt.polishing.drivable.cells import (
+    drivable_rack,
+    evaluator,
+    functions,
+    polisher,
+    start,
+)
+
+FORCE = 52.0
+ROWS = (PlaceRow(Reach(0), 150), PlaceRow(Reach(1), 250))
+
+
+class Programs:
+    """Programs about points near one timed path."""
+
+    def __init__(self, x: Array, duration: float | None = None) -> None:
+        task = drivable_rack().task
+        grid = Grid(task)
+        self.cell = SmoothCell(drivable_rack(), functions(), grid)
+        self.half = self.cell.unit.half[:-1]
+        self.x, self.duration = x, duration
+        self.timed = polisher().drivable.judge.timed(x[:-1], Goal("duration", FORCE))
+        self.carry = CarryReader(evaluator(), grid).read(x)
+        self.stages = StageGrid(drivable_rack(), 100)
+
+    def at(self, d: Array | None = None) -> JointProgram:
+        """The program after a step d of the scaled variables from the path."""
+        x, squared = self.x.copy(), self.timed.squared.copy()
+        if d is not None:
+            n = len(self.half)
+            x[:n] += self.half * d[:n]
+            squared[1:-1] *= 1.0 + d[n:-1]
+        driven = functions().driven
+        assert driven is not None
+        values = StageValues.at(self.stages, driven, x, squared, self.timed.joints)
+        places = (ROWS, place_values(self.cell, ROWS, self.carry), np.array([0.01, 0.01]))
+        iterate = Iterate(x, squared, FORCE, self.duration)
+        return JointProgram(self.stages, iterate, values, self.half, places)
+
+
+def direction(program: JointProgram, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    d = np.concatenate(
+        [0.1 * rng.normal(size=program.n_path), rng.normal(size=program.n_speeds), [0.0]]
+    )
+    return np.asarray(d)
+
+
+def test_the_compiled_timing_satisfies_the_program() -> None:
+    programs = Programs(start(FORCE))
+    program = programs.at()
+    assert program.total == pytest.approx(programs.timed.duration, rel=1e-12)
+    assert program.rows.max() < 2e-3
+    # Time-optimal: some limit is used fully in nearly every stage.
+    by_stage = program.rows.max(axis=1).reshape(-1, 2).max(axis=1)
+    assert np.mean(by_stage > -0.01) > 0.9
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_rows_have_exact_slopes(seed: int) -> None:
+    programs = Programs(start(FORCE, seed))
+    program = programs.at()
+    d, h = direction(program, seed), 1e-6
+    difference = (programs.at(h * d).rows - programs.at(-h * d).rows) / (2.0 * h)
+    foretold = program.predicted(d) - program.rows
+    assert np.abs(difference - foretold).max() < 1e-6 * np.abs(foretold).max()
+    chosen = program.near()
+    linear, scales = program.linear(chosen)
+    rows = (linear.A * scales[:, None]) @ d
+    m = int(chosen.sum())
+    np.testing.assert_allclose(rows[:m], foretold[chosen], atol=1e-12 * np.abs(foretold).max())
+    geometry = (programs.at(h * d).geometry - programs.at(-h * d).geometry) / (2.0 * h)
+    np.testing.assert_allclose(rows[m:], geometry, rtol=1e-5, atol=1e-8)
+
+
+def test_slopes_exist_where_the_box_does_not_turn() -> None:
+    x = initial_decision(drivable_rack().task)
+    x[-1] = FORCE
+    program = Programs(x).at()
+    linear, _ = program.linear(program.near())
+    assert np.isfinite(linear.A).all()
+
+
+@pytest.mark.parametrize("duration", [None, 3.0])
+def test_the_lagrangian_has_exact_curvature(duration: float | None) -> None:
+    programs = Programs(start(FORCE), duration)
+    program = programs.at()
+    chosen = program.near()
+    rng = np.random.default_rng(3)
+    timing = np.where(chosen, rng.random(chosen.shape), 0.0)
+    weights = rng.random(len(ROWS))
+    multipliers = Multipliers(timing, dict(zip(ROWS, weights.tolist(), strict=True)), 0.7)
+    d, h, n = direction(program, 5), 1e-6, program.n_path
+
+    def gradient(sign: float) -> Array:
+        moved = programs.at(sign * h * d)
+        linear, scales = moved.linear(chosen)
+        A = linear.A * scales[:, None]
+        share = 1.0 if duration is None else 0.7
+        total = np.zeros(program.n)
+        total[n:-1] = share * moved.cost * moved.total / program.total
+        total += A[: int(chosen.sum())].T @ timing[chosen]
+        total += A[int(chosen.sum()) :][: len(ROWS)].T @ weights
+        # Slopes by omega there are slopes by w times another w.
+        total[n:-1] /= 1.0 + sign * h * d[n:-1]
+        return total
+
+    difference = (gradient(1.0) - gradient(-1.0)) / (2.0 * h)
+    curvature = program.curvature(multipliers)
+    np.testing.assert_allclose(curvature, curvature.T, atol=1e-9 * np.abs(curvature).max())
+    found = curvature @ d
+    assert np.abs(difference[:-1] - found[:-1]).max() < 1e-5 * np.abs(found).max()
+
+
+def test_geometry_after_a_step_is_what_its_slopes_do_not_foretell() -> None:
+    programs = Programs(start(FORCE))
+    program = programs.at()
+    d = direction(program, 1)
+    after = programs.at(d).geometry
+    linear, _ = program.linear(program.near())
+    foretold = program.geometry + linear.A[-len(ROWS) :] @ d
+    np.testing.assert_allclose(program.geometry_after(d), after - foretold, atol=1e-8)
