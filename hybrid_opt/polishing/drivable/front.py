@@ -168,7 +168,11 @@ class DriveRun(PolishRun[DriveAttempt]):
 
     def _widest_gap(self) -> float | None:
         """A force limit in the middle of the largest gap between neighbours; None without any."""
-        rows, span = self._archive.rows(), self._archive.span()
+        # What is not polished yet fills no gap: it is to be improved.
+        rows = [k for k in self._archive.rows() if self._archive.polished[k]]
+        if len(rows) < 2:
+            rows = self._archive.rows()
+        span = self._archive.span()
         values = np.array([self._archive.objectives[k] for k in rows]) / span
         areas = np.abs(np.prod(np.diff(values, axis=0), axis=1))
         for gap in np.argsort(-areas, kind="stable").tolist():

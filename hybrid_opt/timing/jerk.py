@@ -1,0 +1,221 @@
+"""Timings of a path whose accelerations do not jump: limits on jerk, rest without acceleration.
+
+The fastest timing without jerk limits switches accelerations in no time, and starts at rest with
+an acceleration. Here the path is warped first, u = rho(s) with rho' and rho'' zero at both ends:
+driven at any speed s' > 0 it starts and ends at rest without acceleration. With v = s'^2, and ' for
+d/ds on v and rho,
+
+    u'^2  = rho'^2 v
+    u''   = rho'' v + rho' v' / 2
+    q'''  = sqrt(v) [(q_uuu rho'^3 + 3 q_uu rho' rho'' + q_u rho''') v
+                     + (q_uu rho'^2 + q_u rho'') 3/2 v' + q_u rho' v'' / 2],
+
+so that with v a cubic spline all but the jerk, and what is not convex anyway, is linear or convex
+in its coefficients. A jerk within J is |[...]| <= J / sqrt(v), whose right side is convex: its
+tangent at the last v lies below it, so every program allows less than the limits do, and the last
+v is among what it allows (the convex-concave procedure). The answer is judged between the points at
+which limits are imposed, and slowed down where it exceeds one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from scipy.interpolate import BSpline, CubicSpline
+
+from hybrid_opt.timing.jerk_program import Point, convex_step
+from hybrid_opt.timing.model import PathMotion, TimingModel
+from hybrid_opt.timing.path_check import path_failure
+from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.solve import LEAST_SPEED, time_path
+from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_use, worst
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+
+PIECES = 60
+"""Of the spline of squared speeds."""
+
+POINTS = 4
+"""Per piece, at which limits are imposed."""
+
+FINER = 10
+"""Points per imposed one at which the answer is judged."""
+
+MAX_ROUNDS = 40
+SETTLED = 1e-4
+"""Relative change of the duration at which rounds end."""
+
+FIRST_USE = 0.5
+"""Largest use of a limit by the slow start that the rounds begin with."""
+
+
+@dataclass(frozen=True)
+class JerkLimits:
+    """Largest jerks.
+
+    Attributes:
+        joints: (all joints,) both arms' in order [rad/s^3].
+        payload: of the box's frame [m/s^3].
+    """
+
+    joints: Array
+    payload: float
+
+    def __post_init__(self) -> None:
+        """Check them.
+
+        Raises:
+            SettingsError: a limit is not positive.
+        """
+        if not (np.all(np.asarray(self.joints) > 0.0) and self.payload > 0.0):
+            raise SettingsError("jerk limits: give positive ones [rad/s^3, m/s^3]")
+
+
+@dataclass(frozen=True)
+class JerkTiming:
+    """A timing within jerk limits, and what they cost.
+
+    Attributes:
+        timing: without `grid_speed`: its u'' is not constant on stages.
+        jerk_use: largest joint jerk and payload jerk over their limits.
+        without: duration of the fastest timing without jerk limits [s].
+        rounds: programs solved.
+    """
+
+    timing: Timing
+    jerk_use: tuple[float, float]
+    without: float
+    rounds: int = 0
+
+    @property
+    def cost(self) -> float:
+        """Share of the duration that the jerk limits add."""
+        return self.timing.duration / self.without - 1.0
+
+
+def time_with_jerk(
+    model: TimingModel, x: Array, limits: TimingLimits, jerk: JerkLimits
+) -> JerkTiming:
+    """A fast timing from rest to rest within all limits, whose accelerations do not jump.
+
+    Args:
+        x: (n_var,) decision vector.
+
+    Raises:
+        SettingsError: x does not fit the workcell.
+    """
+    motion = model.path_motion(x)
+    fastest = time_path(model, x, limits, motion)
+    if path_failure(model, motion) is not None or not fastest.ok:
+        return JerkTiming(fastest, (np.nan, np.nan), fastest.duration)
+    problem = _Problem(model, motion, limits, jerk)
+    coefficients, rounds = problem.solve()
+    return replace(problem.judged(coefficients), without=fastest.duration, rounds=rounds)
+
+
+class _Problem:
+    """One path with one set of limits."""
+
+    def __init__(
+        self, model: TimingModel, motion: PathMotion, limits: TimingLimits, jerk: JerkLimits
+    ) -> None:
+        self._model, self._limits, self._jerk = model, limits, jerk
+        inner = np.linspace(0.0, 1.0, PIECES + 1)
+        self._knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
+        self._geometry = _Geometry(motion)
+        self._coarse = self._points(np.linspace(0.0, 1.0, PIECES * POINTS + 1))
+        self._fine = self._points(np.linspace(0.0, 1.0, PIECES * POINTS * FINER + 1))
+
+    def _points(self, s: Array) -> Point:
+        """Basis of the spline and geometry at some places s."""
+        n = len(self._knots) - 4
+        splines = BSpline(self._knots, np.eye(n), 3)
+        basis = [splines(s), splines.derivative(1)(s), splines.derivative(2)(s)]
+        warp = (
+            30.0 * (s * (1.0 - s)) ** 2,
+            60.0 * s * (1.0 - s) * (1.0 - 2.0 * s),
+            60.0 * (1.0 - 6.0 * s + 6.0 * s**2),
+        )
+        u = np.clip(s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 0.0, 1.0)
+        motion, q_third, box_third = self._geometry.at(u)
+        return Point.of(s, basis, warp, motion, (q_third, box_third))
+
+    def solve(self) -> tuple[Array, int]:
+        """Coefficients of the squared speeds, and the rounds it took."""
+        c = np.ones(len(self._knots) - 4)
+        c *= self._slow(c)
+        duration = self._coarse.duration(c)
+        for rounds in range(1, MAX_ROUNDS + 1):
+            found = convex_step(self._model, self._coarse, c, self._limits, self._jerk)
+            if found is None:
+                return c, rounds
+            c, before = found, duration
+            duration = self._coarse.duration(c)
+            if abs(duration / before - 1.0) < SETTLED:
+                break
+        return c, rounds
+
+    def _slow(self, c: Array) -> float:
+        """Factor on the squared speeds at which everything is used little, as at rest."""
+        factor = 1.0
+        rest = max(self._uses(0.0 * c))
+        allowed = rest + FIRST_USE * (1.0 - rest)
+        while max(self._uses(factor * c)) > allowed:
+            factor *= 0.5
+        return factor
+
+    def _uses(self, c: Array) -> tuple[float, float, float]:
+        """Largest use of the timing's limits, joint jerk and payload jerk at the coarse points."""
+        return self._judge(self._coarse, c)[1:]
+
+    def _judge(self, at: Point, c: Array) -> tuple[Timing, float, float, float]:
+        speed, acceleration = at.speed(c), at.acceleration(c)
+        carry = self._model.carry(at.motion, at.time(c), speed, acceleration)
+        use = limit_use(carry, self._model.workcell, self._limits, self._model.joint_names)
+        joint, box = at.jerk(c)
+        joint_use = float((np.abs(joint) / self._jerk.joints).max())
+        box_use = float(np.linalg.norm(box, axis=1).max() / self._jerk.payload)
+        excess = worst(use)
+        reason = f"{carry.duration:.3f} s; most used: {excess.place}"
+        timing = Timing(TimingStatus.OK, reason, excess.place, carry, use)
+        return timing, excess.ratio, joint_use, box_use
+
+    def judged(self, c: Array) -> JerkTiming:
+        """The timing on the finer grid, slowed down where it exceeds a limit."""
+        factor = 1.0
+        timing, *uses = self._judge(self._fine, c)
+        if max(uses) > 1.0 + RECOMPUTED_TOLERANCE:
+            low, high = 0.0, 1.0
+            for _ in range(14):
+                factor = 0.5 * (low + high)
+                exceeded = max(self._judge(self._fine, factor**2 * c)[1:]) > 1.0
+                low, high = (low, factor) if exceeded else (factor, high)
+            factor = low
+            timing, *uses = self._judge(self._fine, factor**2 * c)
+        status = TimingStatus.OK if factor >= LEAST_SPEED else TimingStatus.NOT_CONVERGED
+        place = timing.place
+        if max(uses[1:]) > uses[0]:
+            joint = uses[1] >= uses[2]
+            place = Place("joint jerk" if joint else "payload jerk", "", "", 0, 0.0)
+        timing = replace(timing, status=status, place=place, slowed=factor)
+        return JerkTiming(timing, (uses[1], uses[2]), np.nan)
+
+
+class _Geometry:
+    """A path's geometry between its samples, with third derivatives."""
+
+    def __init__(self, motion: PathMotion) -> None:
+        u = motion.parameter
+        self._x = motion.x
+        self._splines = {
+            f.name: CubicSpline(u, getattr(motion, f.name))
+            for f in fields(motion)
+            if f.name not in ("x", "parameter")
+        }
+
+    def at(self, u: Array) -> tuple[PathMotion, Array, Array]:
+        """The geometry at places u (n,), and third derivatives of joints and box position by u."""
+        values = {name: spline(u) for name, spline in self._splines.items()}
+        third = [self._splines[name].derivative()(u) for name in ("q_second", "pose_second")]
+        return PathMotion(x=self._x, parameter=u, **values), third[0], third[1][:, :3]
