@@ -101,7 +101,9 @@ class Driver:
             violation[row, DRIVE_CONSTRAINTS.index(name)] = excess
             position[row] = timing.place.parameter
         force = np.array([timing.peak_force for timing in timings]).reshape(-1, 2)
-        time, speed, acceleration = (np.array(part) for part in zip(*driven, strict=True))
+        # An axis of three that no candidates leave empty, too.
+        parts = np.array(driven).reshape(len(x), 3, len(u))
+        time, speed, acceleration = np.swapaxes(parts, 0, 1)
         return Drive(time, speed, acceleration, force, violation, position)
 
 

@@ -9,6 +9,7 @@ from hybrid_opt.timing.analysis import (
     force_limited_timing,
     judge_timing,
 )
+from hybrid_opt.timing.jerk import JerkLimits, JerkTiming, time_with_jerk
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.overview import (
     TimedTrajectory,
@@ -30,6 +31,8 @@ from hybrid_opt.timing.solve import time_path
 __all__ = [
     "Excess",
     "ForceCurve",
+    "JerkLimits",
+    "JerkTiming",
     "JudgedTiming",
     "PathTimer",
     "PathTiming",
@@ -48,5 +51,6 @@ __all__ = [
     "judge_timing",
     "report_timing",
     "time_path",
+    "time_with_jerk",
     "timed_trajectory",
 ]

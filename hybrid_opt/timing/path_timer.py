@@ -126,7 +126,7 @@ class PathTimer:
         shapes = zip(self._limits.input_names, self._limits.input_shapes, strict=True)
         samples = [paths[name].reshape(-1, *shape) for name, shape in shapes]
         rows = self._limits.batch(*samples, threads=self._threads)["limits"]
-        return paths | {"limits": rows.reshape(len(x), 2 * self.stages + 1, -1)}
+        return paths | {"limits": rows.reshape(len(x), 2 * self.stages + 1, rows.shape[-1])}
 
     def time(self, x: Array, limits: TimingLimits) -> PathTiming:
         """The fastest timing from rest to rest of one path.

@@ -12,7 +12,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.drivable.front import DrivablePolisher
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.file import load
@@ -43,9 +43,10 @@ def functions() -> PolishFunctions:
 
 
 @cache
-def polisher(points: int = 3) -> DrivablePolisher:
+def polisher(rounds: int = 40) -> DrivablePolisher:
     """Of the drivable rack."""
-    return DrivablePolisher(evaluator(), PolishSettings(points=points), functions())
+    settings = PolishSettings(points=3, drivable=DrivableSettings(rounds=rounds))
+    return DrivablePolisher(evaluator(), settings, functions())
 
 
 def start(force: float, seed: int = 0) -> Array:

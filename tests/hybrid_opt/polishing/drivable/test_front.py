@@ -25,6 +25,9 @@ from tests.hybrid_opt.polishing.drivable.cells import (
 
 BOUND = np.full(2, 1.1)
 
+ROUNDS = 8
+"""Of each point: enough to get better."""
+
 
 def starts() -> Array:
     return np.array([start(51.0), start(55.0, seed=1)])
@@ -32,7 +35,7 @@ def starts() -> Array:
 
 @cache
 def polished() -> PolishedFront:
-    return polisher().polish(starts(), np.random.default_rng(0))
+    return polisher(ROUNDS).polish(starts(), np.random.default_rng(0))
 
 
 def test_the_front_dominates_more_than_before() -> None:
@@ -47,13 +50,13 @@ def test_the_front_dominates_more_than_before() -> None:
 def test_a_polish_goes_on_where_it_was_interrupted() -> None:
     written = [outcome_to_json(outcome) for outcome in polished().outcomes[:2]]
     recorded = [outcome_from_json(values) for values in written]
-    again = polisher().polish(starts(), np.random.default_rng(0), recorded=recorded)
+    again = polisher(ROUNDS).polish(starts(), np.random.default_rng(0), recorded=recorded)
     np.testing.assert_array_equal(again.x, polished().x)
     np.testing.assert_array_equal(again.objectives, polished().objectives)
 
 
 def test_an_empty_front_stays_empty() -> None:
-    assert len(polisher().polish(np.empty((0, 19)), np.random.default_rng(0)).x) == 0
+    assert len(polisher(ROUNDS).polish(np.empty((0, 19)), np.random.default_rng(0)).x) == 0
 
 
 def test_the_time_law_chooses_the_polish() -> None:
