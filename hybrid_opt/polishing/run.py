@@ -10,7 +10,8 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost, solve_safely
 from hybrid_opt.polishing.point import Solution

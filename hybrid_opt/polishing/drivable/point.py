@@ -63,7 +63,7 @@ class DrivableSolver:
         self._cell = SmoothCell(evaluator.workcell, functions, grid)
         self._task, self._settings, self._driven = task, settings, settings.drivable
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
-        self._reader = CarryReader(evaluator, grid)
+        self._reader = CarryReader(evaluator, grid, functions.rows)
         self._proposer = Proposer(
             self._cell, functions.driven, self._active, driver.timer.stages, settings.drivable
         )

@@ -37,7 +37,7 @@ class Programs:
         self.half = self.cell.unit.half[:-1]
         self.x, self.duration = x, duration
         self.timed = polisher().drivable.judge.timed(x[:-1], Goal("duration", FORCE))
-        self.carry = CarryReader(evaluator(), grid).read(x)
+        self.carry = CarryReader(evaluator(), grid, functions().rows).read(x)
         self.stages = StageGrid(drivable_rack(), 100)
 
     def at(self, d: Array | None = None) -> JointProgram:
