@@ -1,8 +1,9 @@
 """The library. `import hybrid_opt as ho` and work with a cell; docs/library.md shows how.
 
 `Cell` is the only resource. `search` and `polish` make a `Front`, a front gives a `Carry`,
-`time_path` makes a `Timing` of it, and `export` writes that for robots. Rooms, in the order of the
-data: evaluate, collision, metaheuristics, indicators, polishing, timing, robust, store; work and
+`time_path` makes a `Timing` of it, `plan_job` plans the whole job around that, and `export` writes
+it for robots. Rooms, in the order of the data: evaluate, collision, metaheuristics, indicators,
+polishing, timing, robust, job, store; work and
 campaign carry out whole studies; display is how objects look in a notebook.
 
 Names are imported when they are first used, so that `import hybrid_opt` takes no time.
@@ -20,25 +21,35 @@ if TYPE_CHECKING:
     from hybrid_opt.door import polish, save, search, time_every_way, time_path
     from hybrid_opt.evaluate.objectives import Objective
     from hybrid_opt.front import Front
+    from hybrid_opt.job.plan import plan_job
+    from hybrid_opt.job.records import Job
+    from hybrid_opt.job.squeeze import SqueezeSettings
     from hybrid_opt.metaheuristics.carries import SearchSettings
     from hybrid_opt.polishing.settings import PolishSettings
     from hybrid_opt.store.export.formats import export
+    from hybrid_opt.store.export.options import BundleOptions
+    from hybrid_opt.store.export.origin import Origin
     from hybrid_opt.timing.records import Timing, TimingLimits
     from symbolic.errors import DualArmError
     from symbolic.workcell.records import Workcell
 
 __all__ = [
+    "BundleOptions",
     "Carry",
     "Cell",
     "DualArmError",
     "Front",
+    "Job",
     "Objective",
+    "Origin",
     "PolishSettings",
     "SearchSettings",
+    "SqueezeSettings",
     "Timing",
     "TimingLimits",
     "Workcell",
     "export",
+    "plan_job",
     "polish",
     "save",
     "search",
@@ -48,17 +59,22 @@ __all__ = [
 ]
 
 _HOMES = {
+    "BundleOptions": "hybrid_opt.store.export.options",
     "Carry": "hybrid_opt.carry",
     "Cell": "hybrid_opt.cell",
     "DualArmError": "symbolic.errors",
     "Front": "hybrid_opt.front",
+    "Job": "hybrid_opt.job.records",
     "Objective": "hybrid_opt.evaluate.objectives",
+    "Origin": "hybrid_opt.store.export.origin",
     "PolishSettings": "hybrid_opt.polishing.settings",
+    "SqueezeSettings": "hybrid_opt.job.squeeze",
     "SearchSettings": "hybrid_opt.metaheuristics.carries",
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",
     "Workcell": "symbolic.workcell.records",
     "export": "hybrid_opt.store.export.formats",
+    "plan_job": "hybrid_opt.job.plan",
     "polish": "hybrid_opt.door",
     "save": "hybrid_opt.door",
     "search": "hybrid_opt.door",

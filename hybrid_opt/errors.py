@@ -21,3 +21,7 @@ class WorkerError(DualArmError):
 
 class WitnessError(DualArmError):
     """The simulator is missing, or cannot answer what it was asked."""
+
+
+class JobError(DualArmError):
+    """The box cannot be gripped, lifted, set down or let go as the workcell asks."""

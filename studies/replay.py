@@ -9,7 +9,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from hybrid_opt.store.export import FORMATS, export
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.replay import Replay, replay
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
@@ -18,11 +17,8 @@ from hybrid_opt.timing.document import timing_document
 from studies.program import add_verbose, program_of, run_program
 from studies.text_table import text_table
 from studies.timing_text import timing_text
-from symbolic.errors import SettingsError
 
 PROGRAM = "python -m studies.replay"
-
-TIMINGS = {"closest": "closest to reference", "fastest": "fastest", "force": "force limited"}
 
 EXIT_DIFFERENT = 1
 
@@ -30,8 +26,9 @@ EXIT_DIFFERENT = 1
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
-        description="Re-evaluate a stored trajectory from its file alone and compare its figures; "
-        "time it for real robots and export it. Exit code 1 where a figure differs.",
+        description="Re-evaluate a stored trajectory from its file alone and compare its figures, "
+        "and time it for real robots (studies.export writes it for them). Exit code 1 where a "
+        "figure differs.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("file", metavar="FILE", help="a trajectory file")
@@ -50,12 +47,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="POINTS",
         help="durations at this many force limits",
     )
-    parser.add_argument("--export", choices=list(FORMATS), help="write the timed trajectory")
-    parser.add_argument(
-        "--use", choices=list(TIMINGS), default="closest", help="which timing to export"
-    )
-    parser.add_argument("--step", type=float, metavar="S", help="time step of the export [s]")
-    parser.add_argument("--output", default=".", metavar="DIR", help="folder of the export")
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
     add_verbose(parser)
     return parser
@@ -67,7 +58,7 @@ def _run(options: argparse.Namespace) -> int:
         replayed = replay(stored, Path(folder))
         document: dict[str, Any] = _replay_json(stored, replayed)
         text = [_replay_text(stored, replayed)]
-        asked = (options.force_limit, options.force_curve, options.export)
+        asked = (options.force_limit, options.force_curve)
         if options.timing or any(option is not None for option in asked):
             document["timing"], timing = _time(stored, replayed, options)
             text += ["", timing]
@@ -82,17 +73,8 @@ def _time(
     stored: StoredTrajectory, replayed: Replay, options: argparse.Namespace
 ) -> tuple[dict[str, Any], str]:
     model = replayed.cell.timing_model
-    if options.use == "force" and options.export and options.force_limit is None:
-        raise SettingsError("--use force needs --force-limit")
     timed = timed_trajectory(model, stored.x, options.force_limit, options.force_curve)
-    document, text = to_json(timing_document(timed)), timing_text(timed)
-    if options.export:
-        timing = timed.report.timings[TIMINGS[options.use]]
-        stem = Path(options.file).stem
-        paths = export(timing, options.export, options.output, stem, options.step)
-        document["exported"] = [str(path) for path in paths]
-        text += "\n\nExported " + ", ".join(str(path) for path in paths)
-    return document, text
+    return to_json(timing_document(timed)), timing_text(timed)
 
 
 def _replay_json(stored: StoredTrajectory, replayed: Replay) -> dict[str, Any]:

@@ -148,6 +148,20 @@ class TimingModel:
             carry.pose, carry.rate, carry.second_rate, friction, centre_of_mass
         )
 
+    def arm_motion(self, arm: int, q: Array, pose: Array, first: Array) -> dict[str, Array]:
+        """`symbolic.physics.path_motion.ARM_OUTPUTS` of one arm (0 or 1) on a straight line.
+
+        Args:
+            q: (n, joints) that hold a box at the poses, redundant ones standing still [rad].
+            pose: (n, 6) of that box [m, rad].
+            first: (n, 6) its derivative by the path parameter; the second one is zero.
+        """
+        still = np.zeros((len(q), self.workcell.task.extended_size))
+        motion = [still.copy() for _ in (pose, first)]
+        for extended, values in zip(motion, (pose, first), strict=True):
+            extended[:, :6] = values  # the redundant joints are in q already
+        return self._functions[f"arm_{arm + 1}"].batch(np.ascontiguousarray(q), *motion, still)
+
     def wrench_torque(self, q: Array, pose: Array) -> Array:
         """(n, all joints, 6) from contact wrenches to joint torques, at joints (n, all joints) and
         box poses (n, 6)."""

@@ -1,10 +1,12 @@
-"""Export a timing for robots, and store a carry with its whole cell in one file."""
+"""Plan a whole job, export it for robots, and store a carry with its whole cell in one file."""
 
 import hybrid_opt as ho
 
 cell = ho.Cell.load("studies/workcells/rack.toml")
 carry = cell.carry(cell.initial)
 timing = ho.time_path(cell, carry, ho.TimingLimits(reference_speed=True))
+job = ho.plan_job(timing)
+print(job)
 for form in ("csv", "json", "ros2", "rapid"):
-    print(*ho.export(timing, form, "out"))
+    print(*ho.export(job, form, "out"))
 ho.save(carry, "out/carry.json", {"by": "hand"})

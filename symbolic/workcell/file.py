@@ -13,6 +13,7 @@ from symbolic.robot.urdf import resolve_mesh, robot_urdf
 from symbolic.robot.xacro_file import description_content
 from symbolic.workcell.branches import with_branches
 from symbolic.workcell.checks import check_all
+from symbolic.workcell.handling import read_handling
 from symbolic.workcell.identity import reading_of
 from symbolic.workcell.problems import Problems
 from symbolic.workcell.reader import Table
@@ -77,6 +78,7 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     environment = tuple(read_body(entry, folder) for entry in table.tables("environment"))
     collision = read_collision(table.table("collision", {}))
     uncertainty = read_uncertainty(table.table("uncertainty", {}))
+    handling = read_handling(table.table("handling", {}))
     table.close()
     if len(robots) != 2 or len(contacts) != 2:
         return None
@@ -97,6 +99,7 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
         start_branch=(robots[0][1], robots[1][1]),
         source=source,
         uncertainty=uncertainty,
+        handling=handling,
     )
     check_all(workcell, problems)
     workcell = with_redundancy(workcell, redundant, problems)

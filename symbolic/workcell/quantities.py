@@ -57,3 +57,7 @@ FORCE = Quantity("N", 20.0, 1e5, mistaken=(("kgf", STANDARD_GRAVITY),))
 DURATION = Quantity("s", 1e-3, 60.0, mistaken=(("ms", 1e-3),))
 DEPARTURE = Quantity("m", 1e-6, 1.0, mistaken=_MILLIMETRES)
 TOLERANCE = Quantity("m", 0.0, 0.1, mistaken=_MILLIMETRES)
+
+STAND_OFF = Quantity("m", 1e-3, 0.5, mistaken=_MILLIMETRES)
+LIFT = Quantity("m", 0.0, 0.5, mistaken=_MILLIMETRES)
+FORCE_RATE = Quantity("N/s", 1.0, 1e4)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
+from symbolic.workcell.handling import Handling
 from symbolic.workcell.identity import Reading, digest_of
 
 TimeLaw = Literal["constant", "ramped", "optimal"]
@@ -404,7 +405,7 @@ class Workcell:
     Attributes:
         name: title for reports.
         robots: the two arms; robot i holds contact i.
-        payload, contacts, task, environment, collision, uncertainty: see their records.
+        payload, contacts, task, environment, collision, uncertainty, handling: see their records.
         start_branch: (2,) per robot the index of the start branch among the ranked branches,
             -1 for the stated criterion's choice, or `SEARCHED`: all compete, see
             `hybrid_opt.branches`, and until then it is the criterion's choice.
@@ -423,6 +424,7 @@ class Workcell:
     source: Path = Path()
     reading: Reading | None = None
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    handling: Handling = field(default_factory=Handling)
 
     @cached_property
     def digest(self) -> str:

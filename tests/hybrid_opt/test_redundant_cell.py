@@ -11,7 +11,7 @@ from hybrid_opt.evaluate.certification import SampledPath, configurations
 from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.locked import LockedEvaluator
 from hybrid_opt.evaluate.sampled import one_by_one
-from hybrid_opt.store.export.rapid import rapid_modules
+from hybrid_opt.store.export.makers import require_axes
 from studies.plain.verdict import PlainJudge
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -81,7 +81,7 @@ def test_a_carry_is_timed_and_exported_with_all_joints(cell: Cell) -> None:
         slope = np.diff(arm.q, axis=0)[moving] / steps[moving, None]
         np.testing.assert_allclose(slope, mean, atol=0.02 * np.abs(arm.q_rate).max())
     with pytest.raises(SettingsError, match="7 joints"):
-        rapid_modules(carry)
+        require_axes(cell.workcell, "RAPID")
 
 
 def test_locking_is_a_constant_path(cell: Cell) -> None:

@@ -92,23 +92,18 @@ def test_unknown_figures_and_other_postures_are_differences(
     assert "NOT reproduced" in capsys.readouterr().out
 
 
-def test_timing_report_and_exports(
-    stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    arguments = [str(stored), "--force-limit", "60", "--force-curve", "3", "--output", str(out)]
-    assert main([*arguments, "--export", "csv"]) == 0
+def test_timing_report(stored: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [str(stored), "--force-limit", "60", "--force-curve", "3"]
+    assert main(arguments) == 0
     text = capsys.readouterr().out
     for part in ("closest to reference", "force limited", "Margins", "Duration against force"):
         assert part in text
-    assert main([*arguments, "--export", "rapid", "--use", "force", "--json"]) == 0
+    assert main([*arguments, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     limited = document["timing"]["timings"]["force limited"]
     assert limited["status"] == "ok"
     assert max(limited["peak_normal_force"]) <= 60.0 * 1.005
     assert len(document["timing"]["force_curve"]["points"]) == 3
-    names = sorted(path.name for path in out.iterdir())
-    assert names == ["t.csv", "t_T_ROB1.mod", "t_T_ROB2.mod"]
 
 
 @pytest.mark.parametrize(
@@ -117,9 +112,6 @@ def test_timing_report_and_exports(
         (["--force-limit", "-1"], "positive force"),
         (["--force-limit", "0"], "positive force"),
         (["--force-curve", "1"], "at least 2"),
-        (["--export", "csv", "--step", "0"], "time step"),
-        (["--export", "csv", "--use", "force"], "--force-limit"),
-        (["--export", "csv", "--use", "force", "--force-limit", "1"], "no timing to export"),
     ],
 )
 def test_bad_options_are_told(

@@ -1,6 +1,7 @@
-"""Export of timed carries: CSV, JSON, ROS 2 and RAPID. docs/export.md describes the files."""
+"""Whole jobs as bundles: CSV, JSON, ROS 2, RAPID, URScript, MCAP. docs/export.md describes them."""
 
-from hybrid_opt.store.export.formats import DEFAULT_STEP, FORMATS, export
-from hybrid_opt.store.export.samples import sample_timing
+from hybrid_opt.store.export.formats import FORMATS, export
+from hybrid_opt.store.export.options import BundleOptions
+from hybrid_opt.store.export.origin import Origin
 
-__all__ = ["DEFAULT_STEP", "FORMATS", "export", "sample_timing"]
+__all__ = ["FORMATS", "BundleOptions", "Origin", "export"]

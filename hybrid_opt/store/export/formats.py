@@ -1,193 +1,84 @@
-"""The export formats by name."""
+"""The forms of bundles by name, and the one function that writes them."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import yaml
-
-from hybrid_opt.carry import Carry
-from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.export.rapid import rapid_modules
-from hybrid_opt.store.export.samples import sample_timing
-from hybrid_opt.store.trajectory_file import FORMAT as TRAJECTORY_FORMAT
-from hybrid_opt.timing.model import joint_names
+from hybrid_opt.job.plan import plan_job
+from hybrid_opt.job.records import Job
+from hybrid_opt.job.sampling import SampledJob, sample_job
+from hybrid_opt.store.export.bundle import Contents, write_bundle
+from hybrid_opt.store.export.manifest import manifest
+from hybrid_opt.store.export.mcap_file import mcap_files
+from hybrid_opt.store.export.options import BundleOptions
+from hybrid_opt.store.export.origin import Origin
+from hybrid_opt.store.export.rapid import rapid_files
+from hybrid_opt.store.export.ros2 import ros2_files
+from hybrid_opt.store.export.tables import csv_text, json_text
+from hybrid_opt.store.export.urscript import urscript_files
 from hybrid_opt.timing.records import Timing
 from symbolic.errors import SettingsError
-from symbolic.robot.urdf import arm_model, turning_joints
 
-JSON_FORMAT = "dual-arm-carry timed trajectory"
-JSON_VERSION = 1
-_POSE = ("x [m]", "y [m]", "z [m]", "roll [rad]", "pitch [rad]", "yaw [rad]")
-_JOINT_QUANTITIES = (
-    ("q", "position", "rad"),
-    ("q_rate", "velocity", "rad/s"),
-    ("q_second", "acceleration", "rad/s^2"),
-)
-"""Of `hybrid_opt.carry.ArmMotion`, with the files' words and units, m for rad where a joint
-slides."""
 
-_HEAD = 200
-"""Characters at the beginning of a file that tell what it is."""
+@dataclass(frozen=True)
+class Form:
+    """One form of bundles.
+
+    Attributes:
+        files: from a sampled job to file contents by path.
+        step: time step where none is given [s].
+    """
+
+    files: Callable[[SampledJob, BundleOptions], Contents]
+    step: float
+
+
+FORMATS: Mapping[str, Form] = {
+    "csv": Form(lambda sampled, options: {"job.csv": csv_text(sampled)}, 0.008),
+    "json": Form(lambda sampled, options: {"job.json": json_text(sampled)}, 0.008),
+    "ros2": Form(ros2_files, 0.02),
+    "rapid": Form(rapid_files, 0.1),
+    "urscript": Form(urscript_files, 0.008),
+    "mcap": Form(mcap_files, 0.02),
+}
+"""Every form by its name."""
 
 
 def export(
-    timing: Timing,
+    job: Job | Timing,
     form: str,
     folder: str | Path,
-    stem: str = "trajectory",
-    step: float | None = None,
+    *,
+    origin: Origin | None = None,
+    options: BundleOptions | None = None,
 ) -> tuple[Path, ...]:
-    """Write a timing in one of `FORMATS` into a folder, which is made where missing.
+    """Write a whole job as one bundle, FOLDER/NAME/FORM, with a manifest.
 
     Args:
-        timing: one that robots can drive.
-        form: name of the format.
-        stem: beginning of the file names.
-        step: time between samples [s], None for the format's own in `DEFAULT_STEP`.
+        job: as `plan_job` makes it, or a timing that robots can drive, for the job around it with
+            default forces.
+        form: name of one of `FORMATS`.
+        folder: what the bundle's own folder is made in.
+        origin: where the carry comes from, for the name; by default the workcell's name.
+        options: None for the defaults.
 
     Returns:
-        The files written.
+        The files written, the manifest first.
 
     Raises:
-        SettingsError: the format is unknown, the step out of range, or the timing fails.
-        ResultsError: a file cannot be written, or another file of this project is in its place.
+        SettingsError: the form is unknown, the step out of range, the timing failed, or the form is
+            not for these arms.
+        JobError: the job cannot be done.
+        ResultsError: the bundle cannot be written, or something else is in its place.
     """
     if form not in FORMATS:
         raise SettingsError(f"unknown format {form!r}; known are {', '.join(FORMATS)}")
-    carry = sample_timing(timing, DEFAULT_STEP[form] if step is None else step)
-    folder = Path(folder)
-    contents = {folder / f"{stem}{end}": text for end, text in FORMATS[form](carry).items()}
-    for path in contents:
-        _refuse_to_replace_a_trajectory(path)
-    for path, text in contents.items():
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, encoding="utf-8", newline="")
-        except OSError as error:
-            raise ResultsError(f"{path}: cannot be written ({error.strerror})") from error
-    return tuple(contents)
-
-
-def _refuse_to_replace_a_trajectory(path: Path) -> None:
-    """A stored trajectory is the only copy of a result; an export can be made again."""
-    try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            begin = file.read(_HEAD)
-    except OSError:
-        return
-    if f'"{TRAJECTORY_FORMAT}"' in begin:
-        raise ResultsError(
-            f"{path} is a stored trajectory, which an export would replace; choose another "
-            "folder or file name"
-        )
-
-
-def csv_text(carry: Carry) -> str:
-    """One row per time step, one column per quantity, named with its unit."""
-    robots = [robot.name for robot in carry.workcell.robots]
-    names = [joint_names(robot) for robot in carry.workcell.robots]
-    turning = {robot.name: turning_joints(arm_model(robot)) for robot in carry.workcell.robots}
-    header = ["time [s]", *(f"box {name}" for name in _POSE)]
-    columns = [carry.time[:, None], carry.pose]
-    for quantity, word, unit in _JOINT_QUANTITIES:
-        for robot, joints in zip(robots, names, strict=True):
-            own = (unit if turns else unit.replace("rad", "m") for turns in turning[robot])
-            header += [
-                f"{robot}/{joint} {word} [{each}]" for joint, each in zip(joints, own, strict=True)
-            ]
-        columns.append(carry.side_by_side(quantity))
-    header += [f"{robot} normal force [N]" for robot in robots]
-    columns.append(carry.normal_force)
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(header)
-    for row in np.concatenate(columns, axis=1).tolist():
-        writer.writerow([repr(value) for value in row])
-    return file.getvalue()
-
-
-def json_text(carry: Carry) -> str:
-    """Everything in one object, numbers in full precision."""
-    document = {
-        "format": JSON_FORMAT,
-        "version": JSON_VERSION,
-        "workcell": carry.workcell.name,
-        "time": carry.time.tolist(),
-        "box": {"pose": carry.pose.tolist()},
-        "robots": [
-            {
-                "name": robot.name,
-                "joints": list(joint_names(robot)),
-                **{word: getattr(arm, name).tolist() for name, word, _ in _JOINT_QUANTITIES},
-                "normal_force": carry.normal_force[:, i].tolist(),
-            }
-            for i, (robot, arm) in enumerate(zip(carry.workcell.robots, carry.arms, strict=True))
-        ],
-    }
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
-
-
-def joint_trajectory(carry: Carry, arm: int) -> dict[str, Any]:
-    """One arm as a ROS 2 trajectory_msgs/msg/JointTrajectory."""
-    motion = carry.arms[arm]
-    points = [
-        {
-            "positions": motion.q[k].tolist(),
-            "velocities": motion.q_rate[k].tolist(),
-            "accelerations": motion.q_second[k].tolist(),
-            "effort": [],
-            "time_from_start": _duration(float(time)),
-        }
-        for k, time in enumerate(carry.time)
-    ]
-    return {
-        "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
-        "joint_names": list(joint_names(carry.workcell.robots[arm])),
-        "points": points,
-    }
-
-
-def _duration(seconds: float) -> dict[str, int]:
-    """A builtin_interfaces/msg/Duration."""
-    nanoseconds = round(seconds * 1e9)
-    return {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
-
-
-def _csv(carry: Carry) -> dict[str, str]:
-    return {".csv": csv_text(carry)}
-
-
-def _json(carry: Carry) -> dict[str, str]:
-    return {".json": json_text(carry)}
-
-
-def _ros2(carry: Carry) -> dict[str, str]:
-    return {
-        f"_arm{arm + 1}.yaml": yaml.safe_dump(
-            joint_trajectory(carry, arm), sort_keys=False, default_flow_style=None
-        )
-        for arm in range(len(carry.arms))
-    }
-
-
-def _rapid(carry: Carry) -> dict[str, str]:
-    return {f"_T_ROB{arm + 1}.mod": text for arm, text in enumerate(rapid_modules(carry))}
-
-
-FORMATS: Mapping[str, Callable[[Carry], dict[str, str]]] = {
-    "csv": _csv,
-    "json": _json,
-    "ros2": _ros2,
-    "rapid": _rapid,
-}
-"""From a sampled trajectory to file contents by the ending of their names."""
-
-DEFAULT_STEP = {"csv": 0.01, "json": 0.01, "ros2": 0.02, "rapid": 0.1}
-"""Time step [s] of each format where none is given."""
+    options, origin = options or BundleOptions(), origin or Origin()
+    whole = job if isinstance(job, Job) else plan_job(job)
+    found = FORMATS[form]
+    sampled = sample_job(whole, found.step if options.step is None else options.step)
+    contents = found.files(sampled, options)
+    document = manifest(sampled, form, origin, options)
+    return write_bundle(Path(folder) / document["name"] / form, contents, document)

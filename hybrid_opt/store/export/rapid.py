@@ -1,16 +1,23 @@
-"""Two synchronised RAPID tasks (ABB MultiMove) that drive a trajectory. docs/export.md has limits.
+"""Two synchronised RAPID tasks (ABB MultiMove) that drive a job. docs/export.md has limits.
 
 Syntax after ABB's technical reference manual for RAPID instructions (MoveAbsJ, SyncMoveOn,
-SyncMoveOff) and the MultiMove application manual: every move between SyncMoveOn and SyncMoveOff
-carries an ID, the same in both tasks, ascending.
+SyncMoveOff, GripLoad) and the MultiMove application manual: every move between SyncMoveOn and
+SyncMoveOff carries an ID, the same in both tasks, ascending.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Iterator
 
-from hybrid_opt.carry import Carry
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybrid_opt.job.sampling import SampledJob
+from hybrid_opt.store.export.makers import ABB, require_axes, require_maker
+from hybrid_opt.store.export.options import BundleOptions
+from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.physics.pose import inverse
 
 TASKS = ("T_ROB1", "T_ROB2")
 MAX_MOVES = 2000
@@ -19,68 +26,175 @@ MAX_MOVES = 2000
 LEAST_MOVE_TIME = 0.02
 """Shortest time of one move [s]: below it a controller cannot plan ahead."""
 
-AXES = 6
-"""Robot axes of a jointtarget."""
-
-APPROACH_SPEED = "v50"
 ZONE = "z1"
+START_TOLERANCE = 1.0
+"""How far an arm may be from the first position [degrees]; farther, the program stops."""
+
+UNKNOWN_TOOL_MASS = 0.1
+"""[kg] where the workcell gives no `tool_load`; RAPID wants more than none."""
+
+FORCE_EVERY = 5
+"""Moves between two force references."""
+
+REFERENCES = 100
+"""Entries of the table of force references."""
+
 _LINE_LENGTH = 60
 
 
-def rapid_modules(carry: Carry) -> tuple[str, str]:
+def rapid_files(sampled: SampledJob, options: BundleOptions) -> dict[str, str | bytes]:
     """The modules of both tasks.
 
     Raises:
-        SettingsError: an arm has more than six joints, the time step is too short or the
-            trajectory too long for RAPID.
+        SettingsError: an arm is not ABB's or has more than six joints, or the time step is too
+            short or the job too long.
     """
-    for robot, arm in zip(carry.workcell.robots, carry.arms, strict=True):
-        if arm.q.shape[1] != AXES:
-            raise SettingsError(
-                f"robot {robot.name!r} has {arm.q.shape[1]} joints; RAPID's jointtarget holds "
-                f"{AXES} robot axes, choose another format"
-            )
-    moves = len(carry.time) - 1
-    step = float(carry.time[1])
+    require_maker(sampled.job.workcell, ABB, "RAPID", options.any_arm)
+    require_axes(sampled.job.workcell, "RAPID")
+    moves = len(sampled.time) - 1
+    step = float(np.diff(sampled.time).min())
     if step < LEAST_MOVE_TIME or moves > MAX_MOVES:
         raise SettingsError(
             f"{moves} moves of {step:g} s are too many or too short for RAPID; choose a time "
             f"step of at least {LEAST_MOVE_TIME:g} s that gives at most {MAX_MOVES} moves"
         )
-    return _module(carry, 0), _module(carry, 1)
-
-
-def _module(carry: Carry, arm: int) -> str:
-    degrees = np.rad2deg(carry.arms[arm].q)
-    lines = [
-        f"MODULE Carry{arm + 1}",
-        f"  ! {_comment(carry.workcell.name)}",
-        f"  ! Robot {_comment(carry.workcell.robots[arm].name)} in task {TASKS[arm]}",
-        f"  ! {len(carry.time)} positions, {float(carry.time[-1]):.3f} s",
-        f'  PERS tasks carryTasks{{2}} := [["{TASKS[0]}"],["{TASKS[1]}"]];',
-        "  VAR syncident carryStart;",
-        "  VAR syncident carryEnd;",
-        "",
-        "  PROC Carry()",
-        f"    MoveAbsJ {_target(degrees[0])} \\NoEOffs, {APPROACH_SPEED}, fine, tool0;",
-        "    SyncMoveOn carryStart, carryTasks;",
-    ]
-    for k in range(1, len(degrees)):
-        time = float(carry.time[k] - carry.time[k - 1])
-        zone = ZONE if k < len(degrees) - 1 else "fine"
-        lines.append(
-            f"    MoveAbsJ {_target(degrees[k])} \\ID:={10 * k} \\NoEOffs, "
-            f"v1000 \\T:={time:.6f}, {zone}, tool0;"
-        )
-    lines += ["    SyncMoveOff carryEnd;", "  ENDPROC", "ENDMODULE", ""]
     # RAPID files have Windows line ends.
-    return "\r\n".join(lines)
+    return {
+        f"{TASKS[arm]}/Carry{arm + 1}.mod": "\r\n".join(_module(sampled, arm)) + "\r\n"
+        for arm in (0, 1)
+    }
 
 
-def _target(degrees: np.ndarray) -> str:
+def _module(sampled: SampledJob, arm: int) -> Iterator[str]:
+    job, robot = sampled.job, sampled.job.workcell.robots[arm]
+    degrees = np.rad2deg(sampled.arm(arm, sampled.q))
+    yield f"MODULE Carry{arm + 1}"
+    yield f"  ! {_comment(job.workcell.name)}"
+    yield f"  ! Robot {_comment(robot.name)} in task {TASKS[arm]}"
+    yield f"  ! {len(degrees)} positions, {float(sampled.time[-1]):.3f} s"
+    yield "  ! Positions alone do not squeeze: CarryForce has to make this arm press."
+    yield f'  PERS tasks carryTasks{{2}} := [["{TASKS[0]}"],["{TASKS[1]}"]];'
+    yield f"  PERS tooldata carryPad := {_tool_data(sampled, arm)};"
+    yield f"  PERS loaddata carryHalfBox := {_load_data(sampled, arm)};"
+    yield "  ! Set to TRUE when CarryForce does what it says."
+    yield "  PERS bool carryForceReady := FALSE;"
+    yield from _force_references(sampled, arm)
+    yield "  VAR syncident carryStart;"
+    yield "  VAR syncident carryEnd;"
+    yield f"  CONST jointtarget carryFirst := {_target(degrees[0])};"
+    yield ""
+    yield from _main(sampled)
+    yield from _start_check()
+    yield from _force_hook(sampled, arm)
+    for index, phase in enumerate(job.phases):
+        yield f"  PROC Carry_{phase.name}()"
+        yield f"    ! {phase.duration:.3f} s"
+        span = sampled.span(index)
+        for k in range(span.start + 1, span.stop):
+            zone = ZONE if k < span.stop - 1 else "fine"
+            time = float(sampled.time[k] - sampled.time[k - 1])
+            if k % FORCE_EVERY == 0 or k == span.stop - 1:
+                yield f"    CarryForce {sampled.normal_force[k, arm]:.3f};"
+            yield (
+                f"    MoveAbsJ {_target(degrees[k])} \\ID:={10 * k} \\NoEOffs, "
+                f"v1000 \\T:={time:.6f}, {zone}, carryPad;"
+            )
+        yield "  ENDPROC"
+        yield ""
+    yield "ENDMODULE"
+
+
+def _main(sampled: SampledJob) -> Iterator[str]:
+    yield "  PROC Carry()"
+    yield "    CarryCheckStart;"
+    yield "    SyncMoveOn carryStart, carryTasks;"
+    for phase in sampled.job.phases:
+        yield f"    Carry_{phase.name};"
+        if phase.name == "press":
+            yield "    GripLoad carryHalfBox;"
+        if phase.name == "release":
+            yield "    GripLoad load0;"
+    yield "    SyncMoveOff carryEnd;"
+    yield "  ENDPROC"
+    yield ""
+
+
+def _start_check() -> Iterator[str]:
+    """No move to the first position: the way there is not checked for collisions."""
+    yield "  PROC CarryCheckStart()"
+    yield "    VAR jointtarget here;"
+    yield "    here := CJointT();"
+    for axis in range(1, 7):
+        joint = f"robax.rax_{axis}"
+        yield f"    IF Abs(here.{joint} - carryFirst.{joint}) > {START_TOLERANCE:g} THEN"
+        yield '      TPWrite "Carry: jog the robot to carryFirst, pads away from the box.";'
+        yield "      Stop;"
+        yield "    ENDIF"
+    yield "  ENDPROC"
+    yield ""
+
+
+def _force_hook(sampled: SampledJob, arm: int) -> Iterator[str]:
+    leads = arm == sampled.job.squeeze.leader
+    yield "  PROC CarryForce(num newton)"
+    if leads:
+        yield "    ! This arm keeps its place; the other one presses. Nothing to do here."
+    else:
+        yield "    ! Here the force controller gets its reference, along z of carryPad,"
+        yield "    ! e.g. that of the Force Control option, or a value for an EGM stream."
+        yield "    IF carryForceReady = FALSE THEN"
+        yield '      TPWrite "Carry: CarryForce is not connected; nothing would squeeze.";'
+        yield "      Stop;"
+        yield "    ENDIF"
+    yield "  ENDPROC"
+    yield ""
+
+
+def _force_references(sampled: SampledJob, arm: int) -> Iterator[str]:
+    """Normal forces at even times, for force controllers that take a table."""
+    time = np.linspace(0.0, float(sampled.time[-1]), REFERENCES)
+    force = np.interp(time, sampled.time, sampled.normal_force[:, arm])
+    for name, values in (("carryForceTime", time), ("carryForceNewton", force)):
+        listed = ",".join(f"{value:.3f}" for value in values)
+        yield f"  PERS num {name}{{{REFERENCES}}} := [{listed}];"
+
+
+def _tool_data(sampled: SampledJob, arm: int) -> str:
+    """A tooldata: the pad's frame on the flange, and the tool's load where it is known."""
+    robot = sampled.job.workcell.robots[arm]
+    frame = _frame(robot.T_flange_pad)
+    if robot.tool_load is None:
+        middle = 500.0 * robot.T_flange_pad[:3, 3]
+        return f"[TRUE,{frame},{_load(UNKNOWN_TOOL_MASS, middle, np.zeros(3))}]"
+    load = robot.tool_load
+    return f"[TRUE,{frame},{_load(load.mass, 1e3 * load.centre_of_mass, np.diag(load.inertia))}]"
+
+
+def _load_data(sampled: SampledJob, arm: int) -> str:
+    """A loaddata: half of the box about its centre of mass, in the pad's frame."""
+    payload, contact = sampled.job.workcell.payload, sampled.job.workcell.contacts[arm]
+    centre = inverse(contact.T_box_pad) @ np.append(payload.centre_of_mass, 1.0)
+    return _load(payload.mass / 2.0, 1e3 * centre[:3], np.zeros(3))
+
+
+def _load(mass: float, centre: Array, inertia: Array) -> str:
+    """A loaddata from a mass [kg], a centre of mass (3,) [mm] and moments (3,) [kg m^2]."""
+    return f"[{mass:.4f},{_numbers(centre)},[1,0,0,0],{_numbers(inertia)[1:-1]}]"
+
+
+def _frame(pose: Array) -> str:
+    """A RAPID pose: position [mm] and quaternion, real part first."""
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return f"[{_numbers(1e3 * pose[:3, 3])},{_numbers(np.array([w, x, y, z]))}]"
+
+
+def _target(degrees: Array) -> str:
     """A jointtarget without external axes."""
-    robot = ",".join(f"{value:.6f}" for value in degrees)
-    return f"[[{robot}],[9E9,9E9,9E9,9E9,9E9,9E9]]"
+    return f"[{_numbers(degrees)},[9E9,9E9,9E9,9E9,9E9,9E9]]"
+
+
+def _numbers(values: Array) -> str:
+    return f"[{','.join(f'{value:.6f}' for value in values)}]"
 
 
 def _comment(text: str) -> str:

@@ -168,4 +168,10 @@ def cells(draw: st.DrawFn) -> dict[str, Any]:
             "centre_of_mass": draw(vectors(0, 0.1, 3)),
             "disturbance": draw(vectors(0, 5.0, 3)),
         }
+    if draw(st.booleans()):
+        data["handling"] = {
+            "stand_off": draw(numbers(0.001, 0.5)),
+            "pressing_rate": draw(numbers(1.0, 1e4)),
+            "lift_height": draw(numbers(0.0, 0.5)),
+        }
     return data

@@ -87,6 +87,13 @@ def assert_same_uncertainty(cell: Workcell, data: dict[str, Any]) -> None:
     np.testing.assert_array_equal(uncertainty.disturbance, data.get("disturbance", none))
 
 
+def assert_same_handling(cell: Workcell, data: dict[str, Any]) -> None:
+    usual = {"stand_off": 0.05, "pressing_speed": 0.05, "pressing_rate": 100.0}
+    usual |= {"lifting_speed": 0.1}
+    nothing = {"lift_height": None, "set_down_height": None}
+    assert vars(cell.handling) == usual | nothing | data
+
+
 def assert_same_task(cell: Workcell, data: dict[str, Any]) -> None:
     task = cell.task
     bounds = [(data["start"], data["start"])]
@@ -126,6 +133,7 @@ def test_written_cells_are_read_back(data: dict[str, Any]) -> None:
         cell = load(write(Path(folder), data))
     assert_same_cell(cell, data)
     assert_same_uncertainty(cell, data.get("uncertainty", {}))
+    assert_same_handling(cell, data.get("handling", {}))
 
 
 @given(st.integers(0, 2), st.sampled_from([-1, 1]), numbers(-6, 6))

@@ -1,7 +1,8 @@
 """A parser for the part of RAPID that motion modules use, after ABB's reference manual.
 
-It knows nothing of the exporter: it reads tokens, declarations, procedures and calls with
-optional arguments (`\\Name` and `\\Name:=value`), and returns them as plain records.
+It knows nothing of the exporter: it reads tokens, declarations, procedures with parameters,
+conditions, assignments and calls with optional arguments (`\\Name` and `\\Name:=value`), and
+returns them as plain records.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ Value = float | str | list["Value"]
 _TOKEN = re.compile(
     r"(?P<space>[ \t\r\n]+)|(?P<comment>![^\n]*)|(?P<text>\"(?:[^\"\n]|\"\")*\")"
     r"|(?P<number>[-+]?\d+(?:\.\d+)?(?:E[-+]?\d+)?)|(?P<word>[A-Za-z][A-Za-z0-9_]*)"
-    r"|(?P<mark>:=|[\[\]{},;\\()])"
+    r"|(?P<mark>:=|<>|<=|>=|[\[\]{},;\\().<>=+*/-])"
 )
-_RESERVED = {"MODULE", "ENDMODULE", "PROC", "ENDPROC", "VAR", "PERS", "CONST"}
+_RESERVED = {"MODULE", "ENDMODULE", "PROC", "ENDPROC", "VAR", "PERS", "CONST", "IF", "ENDIF"}
 MAX_NAME = 32
 
 
@@ -40,6 +41,7 @@ class Module:
     name: str
     declarations: list[tuple[str, str, str, Value | None]] = field(default_factory=list)
     procedures: dict[str, list[Call]] = field(default_factory=dict)
+    parameters: dict[str, list[tuple[str, str]]] = field(default_factory=dict)
 
 
 class _Parser:
@@ -56,8 +58,9 @@ class _Parser:
             position = match.end()
         self.at = 0
 
-    def peek(self) -> str:
-        return self.tokens[self.at][1] if self.at < len(self.tokens) else ""
+    def peek(self, ahead: int = 0) -> str:
+        place = self.at + ahead
+        return self.tokens[place][1] if place < len(self.tokens) else ""
 
     def take(self, expected: str = "") -> str:
         found = self.peek()
@@ -92,6 +95,20 @@ class _Parser:
             return found
         raise RapidError(f"{found!r} is no value")
 
+    def expression(self, end: str) -> str:
+        """Tokens up to one that ends an expression, whose brackets have to fit."""
+        found, open_brackets = [], 0
+        while self.peek() != end:
+            token = self.take()
+            open_brackets += (token == "(") - (token == ")")
+            if token in (";", ":=") or token in _RESERVED or open_brackets < 0:
+                raise RapidError(f"{token!r} in an expression")
+            found.append(token)
+        if open_brackets or not found:
+            raise RapidError(f"expected an expression before {end!r}")
+        self.take(end)
+        return " ".join(found)
+
     def call(self) -> Call:
         call = Call(self.name())
         while self.peek() != ";":
@@ -111,28 +128,53 @@ class _Parser:
         self.take(":=")
         return self.value()
 
+    def statements(self, end: str) -> list[Call]:
+        """Statements up to a closing word; what a condition holds follows it."""
+        calls = []
+        while self.peek() != end:
+            if self.peek() == "IF":
+                self.take()
+                calls.append(Call("IF", [self.expression("THEN")]))
+                calls += self.statements("ENDIF")
+            elif self.peek(1) == ":=":
+                target = self.name()
+                self.take(":=")
+                calls.append(Call(":=", [target, self.expression(";")]))
+            else:
+                calls.append(self.call())
+        self.take(end)
+        return calls
+
+    def declared(self) -> tuple[str, str, str, Value | None]:
+        storage, kind, name = self.take(), self.name(), self.name()
+        if self.peek() == "{":
+            self.take()
+            size = self.value()
+            self.take("}")
+            value: Value | None = self._assigned()
+            if not isinstance(value, list) or len(value) != size:
+                raise RapidError(f"{name} has not {size} entries")
+        else:
+            value = self._assigned() if self.peek() == ":=" else None
+        self.take(";")
+        return storage, kind, name, value
+
     def module(self) -> Module:
         self.take("MODULE")
         module = Module(self.name())
         while self.peek() in ("VAR", "PERS", "CONST"):
-            storage, kind, name = self.take(), self.name(), self.name()
-            if self.peek() == "{":
-                self.take()
-                self.value()
-                self.take("}")
-            value = self._assigned() if self.peek() == ":=" else None
-            self.take(";")
-            module.declarations.append((storage, kind, name, value))
+            module.declarations.append(self.declared())
         while self.peek() == "PROC":
             self.take()
             name = self.name()
             self.take("(")
+            module.parameters[name] = []
+            while self.peek() != ")":
+                module.parameters[name].append((self.name(), self.name()))
             self.take(")")
-            calls = []
-            while self.peek() != "ENDPROC":
-                calls.append(self.call())
-            self.take("ENDPROC")
-            module.procedures[name] = calls
+            while self.peek() == "VAR":
+                self.declared()
+            module.procedures[name] = self.statements("ENDPROC")
         self.take("ENDMODULE")
         if self.peek():
             raise RapidError(f"{self.peek()!r} after the module")

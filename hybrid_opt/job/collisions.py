@@ -1,0 +1,181 @@
+"""Collisions of a whole job: pads that are not at the box, and a box that stands on something.
+
+Contact rules. A body of an arm's last link that lies behind the plane of its pad may touch the box:
+at the grasp, and wherever the pad is moved away from it along the contact normal, that plane
+separates both. Every other body of an arm has to stay clear of the box, also those that a grasp
+keeps apart. The box may touch the bodies that it stands on until it is lifted off, and sink into
+them by no more than `RESTING_TOLERANCE`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
+from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
+from hybrid_opt.compiled_cell import CompiledCell
+from symbolic.array import Array
+from symbolic.geometry.bodies import PAYLOAD, CollisionBody
+from symbolic.geometry.ignored import ignored_pairs
+from symbolic.geometry.pairs import ActivePair, CellGeometry, ExcludedPair, build_geometry
+from symbolic.geometry.pieces import support
+from symbolic.workcell.records import AllowedContact, Waypoint, Workcell
+
+if TYPE_CHECKING:
+    import casadi as ca
+
+    from symbolic.cell_model import CellModel
+
+LARGEST_DROP = 0.3
+"""How far below the carry's ends something to stand on is looked for [m]."""
+
+MOST_STEPS = 300
+BEHIND_PAD = "behind the pad: the contact plane keeps them apart"
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a box stands.
+
+    Attributes:
+        pose: (6,) of the box [m, rad].
+        height: how far below the carry's end it is [m].
+        bodies: names of what it stands on, empty where nothing is beneath.
+    """
+
+    pose: Array
+    height: float
+    bodies: tuple[str, ...]
+
+
+class JobCollisions:
+    """The collision model of one workcell's jobs. Not to be shared between threads.
+
+    Attributes:
+        geometry: bodies and pairs; beside those of the carry, both arms' against the box.
+    """
+
+    def __init__(self, compiled: CompiledCell) -> None:
+        """Load or build the compiled bounds.
+
+        Raises:
+            DualArmError: the model cannot be built.
+        """
+        self._workcell = compiled.workcell
+        self.geometry = job_geometry(compiled.workcell)
+
+        def make(model: CellModel) -> Mapping[str, ca.Function]:
+            # Not imported at the top: a warm start needs no CasADi.
+            from symbolic.geometry.clearance import screening_functions
+
+            placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
+            return screening_functions(self.geometry, placements)
+
+        self._functions = compiled.functions("job", make, lanes=0)
+
+    def standing(self, pose: Array, height: float | None) -> Standing:
+        """Where the box stands below a pose (6,).
+
+        Args:
+            height: how far below [m]; None to lower it until it touches something, and not at all
+                where nothing is found within `LARGEST_DROP`.
+        """
+        judge = Judge(self.geometry, RESTING_TOLERANCE)
+        payload = self.geometry.index(PAYLOAD)
+        below = self._fixed_bodies(payload)
+
+        def gaps(drop: float) -> Array:
+            lowered = _lowered(pose, drop)
+            still = np.zeros((1, 6))
+            placed = self._functions["piece_poses"].batch(lowered[None], still, still)
+            judge.set_placements(placed["quaternions"], placed["positions"])
+            return np.array([judge.separation(0, payload, body) for body in below])
+
+        found = 0.0 if height is None else height
+        if height is None and below:
+            for _ in range(MOST_STEPS):
+                gap = float(gaps(found).min())
+                found += gap
+                if gap <= FCL_RESOLUTION or found > LARGEST_DROP:
+                    break
+            found = 0.0 if found > LARGEST_DROP else found
+        touched = gaps(found) <= RESTING_TOLERANCE if below else np.zeros(0, dtype=bool)
+        names = [self.geometry.bodies[body].name for body in np.array(below)[touched].tolist()]
+        return Standing(_lowered(pose, found), found, tuple(names))
+
+    def checker(self, places: Sequence[Standing]) -> CollisionChecker:
+        """What judges a job whose box stands at these places before and after the carry."""
+        task = self._workcell.task
+        poses = tuple(Waypoint(place.pose, place.pose) for place in places)
+        contacts = tuple(
+            AllowedContact(body, place.height + RESTING_TOLERANCE)
+            for place in places
+            for body in place.bodies
+        )
+        task = replace(
+            task,
+            waypoints=(*task.waypoints, *poses),
+            allowed_contacts=(*task.allowed_contacts, *contacts),
+        )
+        cell = replace(self._workcell, task=task)
+        return CollisionChecker(replace(self.geometry, workcell=cell), self._functions)
+
+    def _fixed_bodies(self, payload: int) -> list[int]:
+        """Bodies that stand still and that the box must not run into."""
+        found = []
+        for pair in self.geometry.active:
+            if payload in (pair.first, pair.second):
+                other = pair.first + pair.second - payload
+                if self.geometry.bodies[other].frame.kind == "world":
+                    found.append(other)
+        return found
+
+
+def job_geometry(workcell: Workcell) -> CellGeometry:
+    """Bodies and pairs of a cell whose box is not always held; see the module's contact rules.
+
+    Raises:
+        CollisionModelError: a shape is unusable, or an ignored pair names no body.
+    """
+    geometry = build_geometry(workcell)
+    bodies, payload = geometry.bodies, geometry.index(PAYLOAD)
+    ignored = ignored_pairs(workcell, bodies)
+    active, excluded = list(geometry.active), []
+    for pair in geometry.excluded:
+        other = bodies[pair.first + pair.second - payload] if payload in _both(pair) else None
+        if (
+            other is None
+            or not other.group.startswith("robot")
+            or frozenset((other.name, PAYLOAD)) in ignored
+        ):
+            excluded.append(pair)
+        elif _behind_pad(other, geometry):
+            excluded.append(replace(pair, reason=BEHIND_PAD))
+        else:
+            active.append(ActivePair(pair.first, pair.second))
+    return replace(geometry, active=tuple(active), excluded=tuple(excluded))
+
+
+def _both(pair: ExcludedPair) -> tuple[int, int]:
+    return pair.first, pair.second
+
+
+def _behind_pad(body: CollisionBody, geometry: CellGeometry) -> bool:
+    """Whether a body moves with its arm's pad and lies behind its plane."""
+    arm = body.frame.robot
+    if arm < 0 or body.frame.joint != len(geometry.arms[arm].axes) - 1:
+        return False
+    T_joint_pad = geometry.arms[arm].T_joint_box @ geometry.workcell.contacts[arm].T_box_pad
+    normal, origin = T_joint_pad[:3, 2], T_joint_pad[:3, 3]
+    ahead = max(float(support(piece, normal[None])[0]) for piece in body.pieces)
+    return bool(ahead - normal @ origin <= RESTING_TOLERANCE)
+
+
+def _lowered(pose: Array, drop: float) -> Array:
+    lowered = np.array(pose, dtype=float)
+    lowered[2] -= drop
+    return lowered

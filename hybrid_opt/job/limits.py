@@ -1,0 +1,46 @@
+"""How far each phase of a job uses the limits of arms, box and contacts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybrid_opt.job.records import Force, Motion, contact_effort
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
+
+EXCESS = 1.005
+"""Use of a limit beyond which a job is refused."""
+
+_FORCE_FLOOR = 1e-9
+
+
+def phase_use(workcell: Workcell, motion: Motion, force: Force) -> dict[str, float]:
+    """Largest value over its limit by constraint, of what every phase has.
+
+    Torques are those of arms and commanded contact wrenches together. Friction and pressure are
+    judged where forces are planned (`hybrid_opt.timing`): pressing harder only helps them.
+    """
+
+    def joints(name: str) -> Array:
+        return np.concatenate([getattr(robot, name) for robot in workcell.robots])
+
+    lower, upper = joints("position_lower"), joints("position_upper")
+    effort = motion.own_torque + contact_effort(motion, force.wrench)
+    payload = workcell.payload
+    return {
+        "joint position": _most(np.abs(2.0 * motion.q - lower - upper) / (upper - lower)),
+        "joint velocity": _most(np.abs(motion.q_rate) / joints("velocity_max")),
+        "joint acceleration": _most(np.abs(motion.q_second) / joints("acceleration_max")),
+        "joint torque": _most(np.abs(effort) / joints("torque_max")),
+        "payload velocity": _most(_length(motion.rate) / payload.velocity_max),
+        "payload acceleration": _most(_length(motion.second_rate) / payload.acceleration_max),
+        "least normal force": _most(force.least / np.maximum(force.normal, _FORCE_FLOOR)),
+    }
+
+
+def _most(ratio: Array) -> float:
+    return float(ratio.max())
+
+
+def _length(rate: Array) -> Array:
+    return np.asarray(np.linalg.norm(rate[:, :3], axis=1))

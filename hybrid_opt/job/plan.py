@@ -1,0 +1,275 @@
+"""Planning a whole job around the timing of a carry. docs/job.md explains the phases.
+
+Pads approach along the contact normals, press while the box stands, take over its weight with the
+press, lift it off, carry it, set it down, let go, and retreat. Every phase but the carry follows a
+smooth profile from rest to rest (`hybrid_opt.job.profile`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from codegen.function import NumericFunction
+from hybrid_opt.carry import Carry, joints_of
+from hybrid_opt.collision.certify import Certificate, certify
+from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.errors import JobError
+from hybrid_opt.evaluate.certification import SampledPath, certificates
+from hybrid_opt.job.carry_motion import carry_motion
+from hybrid_opt.job.collisions import JobCollisions, Standing
+from hybrid_opt.job.forces import held, pressing, without_force
+from hybrid_opt.job.limits import EXCESS, phase_use
+from hybrid_opt.job.profile import rise
+from hybrid_opt.job.records import Force, Job, Motion, Phase
+from hybrid_opt.job.smooth import WIDTH, rests_at_ends, smoothed
+from hybrid_opt.job.squeeze import SqueezeSettings, chosen_squeeze
+from hybrid_opt.job.straight import (
+    SAMPLES,
+    Straight,
+    followed,
+    lift_line,
+    pad_line,
+    standing_still,
+    timed,
+)
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.records import Timing
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.robot.arm import REACH_TOLERANCE
+from symbolic.workcell.decision import extended_waypoints
+from symbolic.workcell.handling import Handling
+from symbolic.workcell.records import Workcell
+
+PATH_SAMPLES = 201
+"""Of the carry's joints, from which Newton's method reaches every place between."""
+
+FIRST_POINTS = 11
+"""Grid that the proof of a straight motion starts from."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A phase before its forces are known; `line` is None for the carry."""
+
+    name: str
+    motion: Motion
+    line: Straight | None = None
+
+
+class JobModel:
+    """Plans the jobs of one workcell. Not to be shared between threads.
+
+    Attributes:
+        workcell: the cell.
+        timing: its timing model.
+    """
+
+    def __init__(self, cell: Workcell | CompiledCell, timing: TimingModel | None = None) -> None:
+        """Load or build the compiled functions.
+
+        Args:
+            cell: the cell; compiled, where others share its functions.
+            timing: its timing model, where there is one.
+
+        Raises:
+            DualArmError: the model cannot be built.
+        """
+        compiled = CompiledCell.of(cell)
+        self.workcell = compiled.workcell
+        self.timing = TimingModel(compiled) if timing is None else timing
+        self._posture: NumericFunction = compiled.evaluators["posture"]
+        self._collisions = JobCollisions(compiled)
+
+    def plan(
+        self,
+        timing: Timing,
+        squeeze: SqueezeSettings | None = None,
+        smoothing: float = WIDTH,
+        handling: Handling | None = None,
+    ) -> Job:
+        """The whole job around a timed carry.
+
+        Args:
+            timing: of a carry of this workcell, one that robots can drive.
+            squeeze: how hard to press; None for the defaults.
+            smoothing: half the width of the window over which a timing whose acceleration jumps is
+                averaged [s]; zero leaves it as it is.
+            handling: in place of the workcell's own.
+
+        Raises:
+            SettingsError: the timing failed, or the squeeze is not possible.
+            JobError: an arm does not reach a place, something collides, or a limit is exceeded.
+        """
+        carry = timing.carry
+        if carry is None or not timing.ok:
+            raise SettingsError(
+                f"there is no timing to export ({timing.status}: {timing.reason}); export one "
+                "that robots can drive"
+            )
+        if smoothing > 0.0 and not rests_at_ends(timing):
+            timing = smoothed(self.timing, timing, smoothing)
+            carry = timing.carry
+        assert carry is not None, "a smoothed timing has a carry"
+        chosen = chosen_squeeze(self.workcell, squeeze or SqueezeSettings())
+        handling = handling or self.workcell.handling
+        places = (
+            self._collisions.standing(carry.pose[0], handling.lift_height),
+            self._collisions.standing(carry.pose[-1], handling.set_down_height),
+        )
+        before, after = self._handling(carry, places, handling)
+        loaded = [*before[1:], _Part("carry", carry_motion(self.timing, carry)), *after[:-1]]
+        forces = held(self.timing, chosen, [part.motion for part in loaded])
+        checker = self._collisions.checker(places)
+        free = [self._free(checker, part.line, part.motion) for part in (before[0], after[-1])]
+        press, release = (
+            (name, *_pressed(motion, force, end, handling.pressing_rate))
+            for name, motion, force, end in (
+                ("press", loaded[0].motion, forces[0], 0),
+                ("release", loaded[-1].motion, forces[-1], -1),
+            )
+        )
+        planned = [
+            (before[0].name, before[0].motion, without_force(before[0].motion), free[0]),
+            (*press, free[0]),
+            *(
+                (part.name, part.motion, force, self._proof(checker, part, carry))
+                for part, force in zip(loaded, forces, strict=True)
+            ),
+            (*release, free[1]),
+            (after[-1].name, after[-1].motion, without_force(after[-1].motion), free[1]),
+        ]
+        job = Job(
+            self.workcell,
+            timing,
+            tuple(self._phases(planned, timing)),
+            chosen,
+            (places[0].bodies, places[1].bodies),
+            self.timing.joint_names,
+        )
+        refuse_excess(job)
+        return job
+
+    def _handling(
+        self, carry: Carry, places: tuple[Standing, Standing], handling: Handling
+    ) -> tuple[list[_Part], list[_Part]]:
+        """What moves before the carry, in order, and after it."""
+        cell, speed = self.workcell, handling.pressing_speed
+        before: list[_Part] = []
+        after: list[_Part] = []
+        q = carry.q[0]
+        if places[0].height > 0.0:
+            line = lift_line("lift", places[0].pose, carry.pose[0], handling.lifting_speed)
+            before.append(self._part(line, q, at_end=True))
+            q = before[0].motion.q[0]
+        ways = (handling.stand_off, 0.0)
+        line = pad_line(cell, "approach", places[0].pose, ways, speed)
+        before.insert(0, self._part(line, q, at_end=True))
+        q = carry.q[-1]
+        if places[1].height > 0.0:
+            line = lift_line("set_down", carry.pose[-1], places[1].pose, handling.lifting_speed)
+            after.append(self._part(line, q, at_end=False))
+            q = after[0].motion.q[-1]
+        line = pad_line(cell, "retreat", places[1].pose, ways[::-1], speed)
+        after.append(self._part(line, q, at_end=False))
+        return before, after
+
+    def _part(self, line: Straight, known: Array, at_end: bool) -> _Part:
+        q = followed(self.workcell, self._posture, line, known, at_end)
+        return _Part(line.name, timed(self.timing, line, q), line)
+
+    def _proof(self, checker: CollisionChecker, part: _Part, carry: Carry) -> Certificate:
+        if part.line is not None:
+            return self._free(checker, part.line, part.motion)
+        u = np.linspace(0.0, 1.0, PATH_SAMPLES)
+        q = np.column_stack([np.interp(u, carry.parameter, column) for column in carry.q.T])
+        task = self.workcell.task
+        path = SampledPath(task, extended_waypoints(task, carry.x), *joints_of(self.workcell, q))
+        return certificates(checker, self._posture, [path])[0]
+
+    def _free(
+        self, checker: CollisionChecker, line: Straight | None, motion: Motion
+    ) -> Certificate:
+        """The continuous verdict on a straight motion."""
+        assert line is not None, "what moves beside the carry moves on a line"
+        share = rise(1.0, SAMPLES).value
+
+        def at(u: Array) -> tuple[Array, Array, Array]:
+            box, *targets = line.at(u)
+            guess = np.column_stack([np.interp(u, share, column) for column in motion.q.T])
+            guesses = [np.ascontiguousarray(own) for own in joints_of(self.workcell, guess)]
+            placed = []
+            for arm, poses in enumerate(targets, start=1):
+                found = self._posture.batch(poses, *guesses)
+                lost = np.ravel(found[f"residual_{arm}"]) > REACH_TOLERANCE
+                placed.append(np.where(lost[:, None], np.nan, found[f"q_{arm}"]))
+            return box, placed[0], placed[1]
+
+        return certify(checker, at, np.linspace(0.0, 1.0, FIRST_POINTS))
+
+    def _phases(
+        self, planned: Sequence[tuple[str, Motion, Force, Certificate]], timing: Timing
+    ) -> Iterator[Phase]:
+        begin = 0.0
+        for name, motion, force, proof in planned:
+            use = phase_use(self.workcell, motion, force)
+            if name == "carry":
+                # The box's turning and the contacts, which no other phase uses more.
+                use = {key: excess.ratio for key, excess in timing.use.items()} | use
+            yield Phase(name, begin, motion, force, proof, use)
+            begin += motion.duration
+
+
+def _pressed(motion: Motion, hold: Force, end: int, rate: float) -> tuple[Motion, Force]:
+    """The forces of one end of a phase (0 or -1), put on or taken off while all stand still."""
+    duration, force = pressing(hold, end, rate)
+    return standing_still(motion, end, duration), force
+
+
+def refuse_excess(job: Job) -> None:
+    """Raise where a phase collides or exceeds a limit."""
+    for phase in job.phases:
+        title = phase.name.replace("_", " ")
+        if not phase.certificate.is_free:
+            raise JobError(
+                f"{title}: {phase.certificate!r}; change stand_off, lift_height or "
+                "set_down_height under [handling], or choose another carry"
+            )
+        name, ratio = max(phase.use.items(), key=lambda item: item[1])
+        if ratio > EXCESS:
+            raise JobError(
+                f"{title}: uses {100.0 * ratio:.1f} % of the limit on {name}; press less "
+                "(squeeze), or choose a slower timing"
+            )
+
+
+class _Identity:
+    """Lets a cache compare workcells by what they are, not by what they say."""
+
+    def __init__(self, workcell: Workcell) -> None:
+        self.workcell = workcell
+
+    def __hash__(self) -> int:
+        return id(self.workcell)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Identity) and self.workcell is other.workcell
+
+
+@lru_cache(maxsize=2)
+def _model(identity: _Identity) -> JobModel:
+    return JobModel(identity.workcell)
+
+
+def plan_job(
+    timing: Timing, squeeze: SqueezeSettings | None = None, smoothing: float = WIDTH
+) -> Job:
+    """The whole job around a timed carry, see `JobModel.plan`."""
+    if timing.carry is None:
+        raise SettingsError(f"there is no timing to export ({timing.status}: {timing.reason})")
+    return _model(_Identity(timing.carry.workcell)).plan(timing, squeeze, smoothing)

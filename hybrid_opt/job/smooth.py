@@ -1,0 +1,145 @@
+"""A timing without jumps of the acceleration, from one that has them.
+
+Time-optimal timings switch accelerations in no time, and begin and end with one. No controller
+follows that. Here the path parameter as a function of time, u(t), is averaged over a short window
+with a smooth kernel: box and arms stay on the very same path, begin and end at rest also in their
+accelerations, and the jerk is bounded by the jumps over the width. What then exceeds a limit, since
+speeds are passed a little earlier or later, is mended by slowing down uniformly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.errors import JobError
+from hybrid_opt.timing.model import PathMotion, TimingModel
+from hybrid_opt.timing.records import Timing, TimingLimits
+from hybrid_opt.timing.use import limit_use, worst
+from symbolic.array import Array
+
+WIDTH = 0.05
+"""Half the width of the window [s]."""
+
+STEP = 5e-4
+"""Of the averaging [s]."""
+
+EVERY = 4
+"""Steps of the averaging between two samples of the carry."""
+
+RESTS = 1e-3
+"""Share of an acceleration limit below which a joint counts as at rest."""
+
+_BISECTIONS = 12
+_SLOWEST = 0.5
+
+
+def rests_at_ends(timing: Timing) -> bool:
+    """Whether all joints begin and end without acceleration."""
+    return acceleration_at_ends(timing) <= RESTS
+
+
+def acceleration_at_ends(timing: Timing) -> float:
+    """Largest acceleration of a joint at either end, over its limit."""
+    carry = timing.carry
+    assert carry is not None, "a timing that is to be driven has a carry"
+    limit = np.concatenate([robot.acceleration_max for robot in carry.workcell.robots])
+    return float((np.abs(carry.side_by_side("q_second")[[0, -1]]) / limit).max())
+
+
+def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing:
+    """The timing averaged over a window, within the limits that it was found for.
+
+    Args:
+        model: of the timing's workcell.
+        timing: one that robots can drive, with its speeds on the grid.
+        width: half the width of the window [s].
+
+    Raises:
+        JobError: the limits do not hold even at half the speed.
+    """
+    carry, speed = timing.carry, timing.grid_speed
+    assert carry is not None, "a timing that is to be driven has a carry"
+    assert speed is not None, "a timing that was found has its speeds"
+    u, rate, second = _averaged(speed, width)
+    motion = _between(model.path_motion(carry.x), u)
+    limits = _limits_of(timing, carry)
+
+    def driven(factor: float) -> Carry:
+        time = np.asarray(EVERY * STEP / factor * np.arange(len(u)))
+        return model.carry(motion, time, factor * rate, factor**2 * second)
+
+    def within(factor: float) -> bool:
+        use = limit_use(driven(factor), model.workcell, limits, model.joint_names)
+        return worst(use).ratio <= 1.0
+
+    fast, slow = 1.0, _SLOWEST
+    if within(fast):
+        slow = fast
+    elif not within(slow):
+        raise JobError(
+            "the carry's timing cannot be smoothed within its limits; choose a slower timing"
+        )
+    else:
+        for _ in range(_BISECTIONS):
+            middle = (slow + fast) / 2.0
+            slow, fast = (middle, fast) if within(middle) else (slow, middle)
+    found = driven(slow)
+    use = limit_use(found, model.workcell, limits, model.joint_names)
+    place = worst(use).place
+    reason = f"{found.duration:.3f} s without jumps of the acceleration; most used: {place}"
+    slowed = timing.slowed * slow
+    return replace(
+        timing, reason=reason, place=place, carry=found, use=use, grid_speed=None, slowed=slowed
+    )
+
+
+def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
+    """u, u' and u'' of the averaged timing at every `EVERY`th step."""
+    stages = len(grid_speed) - 1
+    grid = np.linspace(0.0, 1.0, stages + 1)
+    steps = 2.0 * np.diff(grid) / (grid_speed[:-1] + grid_speed[1:])
+    begins = np.concatenate([[0.0], np.cumsum(steps)])
+    reach = int(np.ceil(width / STEP))
+    count = int(np.ceil(begins[-1] / STEP)) + 1
+    # At rest before and after, for as long as the window reaches beyond what is kept.
+    time = STEP * np.arange(-2 * reach, count + 2 * reach)
+    stage = np.clip(np.searchsorted(begins, time, side="right") - 1, 0, stages - 1)
+    into = np.clip(time, 0.0, begins[-1]) - begins[stage]
+    change = np.diff(grid_speed) / steps
+    speed = np.where(
+        (time > 0.0) & (time < begins[-1]), grid_speed[stage] + change[stage] * into, 0.0
+    )
+    place = grid[stage] + (grid_speed[stage] + change[stage] * into / 2.0) * into
+    s = np.linspace(-1.0, 1.0, 2 * reach + 1)
+    kernel = (1.0 - s**2) ** 3
+    slope = -6.0 * s * (1.0 - s**2) ** 2 / (reach * STEP)
+    total = kernel.sum()
+    u = np.convolve(np.clip(place, 0.0, 1.0), kernel / total, mode="valid")
+    rate = np.convolve(speed, kernel / total, mode="valid")
+    second = np.convolve(speed, slope / total, mode="valid")
+    keep = np.arange(0, len(u) + EVERY - 1, EVERY).clip(max=len(u) - 1)
+    return np.clip(u[keep], 0.0, 1.0), np.maximum(rate[keep], 0.0), second[keep]
+
+
+def _between(motion: PathMotion, u: Array) -> PathMotion:
+    """The geometry of a path between its samples, which are dense."""
+    values = {
+        field.name: CubicSpline(motion.parameter, getattr(motion, field.name))(u)
+        for field in fields(motion)
+        if field.name not in ("x", "parameter")
+    }
+    return PathMotion(x=motion.x, parameter=u, **values)
+
+
+def _limits_of(timing: Timing, carry: Carry) -> TimingLimits:
+    """The limits that a timing was found for, as its use of them tells."""
+    force = timing.use.get("normal force")
+    return TimingLimits(
+        force=None if force is None else float(carry.normal_force.max()) / force.ratio,
+        torque="joint torque" in timing.use,
+        reference_speed="path speed" in timing.use,
+    )

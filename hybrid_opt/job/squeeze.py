@@ -1,0 +1,148 @@
+"""How hard to press, over time: normal forces to command, at least what holds the box, smooth.
+
+With N_1 - N_2 fixed by the motion, the force of one arm decides both: the leading arm keeps its
+place and feels what follows, the other is force-controlled (`hybrid_opt.robust`). What is commanded
+beyond the plan presses both pads against one another and moves nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+
+from hybrid_opt.robust.force import BoxMotion, robust_model
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.workcell.records import Uncertainty, Workcell
+
+FACTOR = 1.3
+"""Commanded over planned force where nothing says how uncertain the cell is."""
+
+LARGEST_FACTOR = 10.0
+SMOOTHING = 0.1
+"""Half the width of the time window over which commanded forces are smoothed [s]."""
+
+STEP = 1e-3
+"""Time step of the smoothing [s]."""
+
+
+@dataclass(frozen=True)
+class SqueezeSettings:
+    """How hard to press.
+
+    Attributes:
+        factor: commanded over planned squeeze; None for the robust force of the workcell's
+            uncertainty, and `FACTOR` where it has none.
+        leader: index of the arm that keeps its place.
+        smoothing: half the width of the time window of the smoothing [s].
+    """
+
+    factor: float | None = None
+    leader: int = 0
+    smoothing: float = SMOOTHING
+
+    def __post_init__(self) -> None:
+        if self.factor is not None and not 1.0 <= self.factor <= LARGEST_FACTOR:
+            raise SettingsError(
+                f"squeeze {self.factor:g}: allowed is 1 to {LARGEST_FACTOR:g} times the planned "
+                "force"
+            )
+        if self.leader not in (0, 1):
+            raise SettingsError(f"leader {self.leader}: give 0 or 1, the index of an arm")
+        if not 2.0 * STEP <= self.smoothing <= 10.0:
+            raise SettingsError(
+                f"smoothing over {self.smoothing:g} s: allowed is {2.0 * STEP:g} to 10 s"
+            )
+
+
+@dataclass(frozen=True)
+class Squeeze:
+    """How the commanded forces came about.
+
+    Attributes:
+        leader: index of the arm that keeps its place; the other is force-controlled.
+        factor: commanded over planned squeeze, None where the forces are robust ones.
+        uncertainty: the set that the forces hold for, None where a factor was taken.
+        smoothing: half the width of the time window of the smoothing [s].
+    """
+
+    leader: int
+    factor: float | None
+    uncertainty: Uncertainty | None
+    smoothing: float
+
+    def __str__(self) -> str:
+        if self.factor is None:
+            return "robust forces of the cell's [uncertainty]"
+        return f"{self.factor:g} times the planned squeeze"
+
+
+def chosen_squeeze(workcell: Workcell, settings: SqueezeSettings) -> Squeeze:
+    """What the settings mean for a workcell."""
+    factor, uncertainty = settings.factor, None
+    if factor is None and is_uncertain(workcell.uncertainty):
+        uncertainty = workcell.uncertainty
+    elif factor is None:
+        factor = FACTOR
+    return Squeeze(settings.leader, factor, uncertainty, settings.smoothing)
+
+
+def is_uncertain(uncertainty: Uncertainty) -> bool:
+    """Whether anything may be different from what the workcell says."""
+    ranges = (uncertainty.friction, uncertainty.mass, uncertainty.pad_position)
+    return bool(any(ranges) or uncertainty.centre_of_mass.any() or uncertainty.disturbance.any())
+
+
+def extra_force(
+    workcell: Workcell, squeeze: Squeeze, time: Array, motion: BoxMotion, least: Array
+) -> Array:
+    """(n,) what both robots press with beyond the planned normal forces [N].
+
+    Smooth where the planned forces are; with it neither robot ever presses less than the plan or
+    the robust force asks for.
+
+    Args:
+        time: (n,) of the samples, not decreasing [s].
+        motion: of the box at the samples.
+        least: (n, 2) planned normal forces [N].
+
+    Raises:
+        SettingsError: the uncertainty leaves no friction or patch.
+    """
+    follower = least[:, 1 - squeeze.leader]
+    if squeeze.uncertainty is not None:
+        commanded, _ = robust_model(workcell).hold(motion, squeeze.uncertainty, squeeze.leader)
+        needed = np.maximum(commanded, follower)
+    else:
+        assert squeeze.factor is not None, "a squeeze has a factor or a set"
+        needed = follower + (squeeze.factor - 1.0) * least.mean(axis=1)
+    return smooth_above(time, needed, squeeze.smoothing) - follower
+
+
+def smooth_above(time: Array, values: Array, width: float) -> Array:
+    """A smooth curve that is nowhere below the given one, level at both ends.
+
+    The largest value within a window, averaged over the same window by a smooth kernel: where the
+    kernel reaches, every windowed maximum covers the point in its middle.
+
+    Args:
+        time: (n,) not decreasing [s].
+        values: (n,) linear between the times.
+        width: half the width of the window [s].
+    """
+    count = max(2, int(np.ceil((time[-1] - time[0]) / STEP)) + 1)
+    grid = np.linspace(time[0], time[-1], count)
+    step = grid[1] - grid[0]
+    reach = int(np.ceil(width / step))
+    # Between grid points nothing may be missed: each takes the largest of the steps beside it.
+    cell = np.clip(np.searchsorted(grid, time, side="right") - 1, 0, count - 2)
+    highest = np.interp(grid, time, values)
+    np.maximum.at(highest, cell, values)
+    np.maximum.at(highest, cell + 1, values)
+    highest = maximum_filter1d(highest, 2 * reach + 1, mode="reflect")
+    kernel = (1.0 - np.linspace(-1.0, 1.0, 2 * reach + 1) ** 2) ** 3
+    padded = np.pad(highest, reach, mode="symmetric")
+    smooth = np.convolve(padded, kernel / kernel.sum(), mode="valid")
+    return np.asarray(np.interp(time, grid, smooth))

@@ -1,0 +1,220 @@
+"""Straight motions of box and pads: approach and retreat, lift and set-down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from codegen.function import NumericFunction
+from hybrid_opt.carry import joints_of
+from hybrid_opt.errors import JobError
+from hybrid_opt.job.profile import PEAK_RATE, at_even_steps, rise
+from hybrid_opt.job.records import Motion
+from hybrid_opt.timing.model import TimingModel
+from symbolic.array import Array
+from symbolic.physics.pose import rotation_from_rpy
+from symbolic.robot.arm import REACH_TOLERANCE
+from symbolic.workcell.records import Workcell
+
+SAMPLES = 401
+"""Samples of a phase."""
+
+TICK = 0.008
+"""Phases last a whole number of these [s], so that controllers of 125, 250, 500 and 1000 Hz meet
+their ends."""
+
+
+@dataclass(frozen=True)
+class Straight:
+    """A translation of the box, of both pads, or of all.
+
+    Attributes:
+        name: of the phase.
+        box: (2, 6) box poses at beginning and end.
+        held: (2, 2, 6) by arm the box poses that its pad holds at beginning and end; where they
+            are not those of the box the pad is away from it.
+        speed: largest [m/s].
+    """
+
+    name: str
+    box: Array
+    held: Array
+    speed: float
+
+    @property
+    def length(self) -> float:
+        """Of the longest way [m]."""
+        ways = np.concatenate([self.box[None], self.held])
+        return float(np.linalg.norm((ways[:, 1] - ways[:, 0])[:, :3], axis=1).max())
+
+    def at(self, share: Array) -> tuple[Array, Array, Array]:
+        """Poses (n, 6) at shares (n,) of the way: box, and those that either pad holds."""
+        ways = np.concatenate([self.box[None], self.held])
+        poses = ways[:, None, 0] + share[:, None] * (ways[:, 1] - ways[:, 0])[:, None]
+        return poses[0], poses[1], poses[2]
+
+
+def lift_line(name: str, begin: Array, end: Array, speed: float) -> Straight:
+    """The held box from a pose (6,) to another of the same orientation."""
+    box = np.array([begin, end])
+    return Straight(name, box, np.array([box, box]), speed)
+
+
+def pad_line(
+    workcell: Workcell, name: str, box: Array, ways: tuple[float, float], speed: float
+) -> Straight:
+    """Both pads along their normals, the box standing still.
+
+    Args:
+        box: (6,) its pose.
+        ways: distances of the pads from the box at beginning and end [m].
+        speed: largest [m/s].
+    """
+    rotation = rotation_from_rpy(box[3:])
+    held = np.tile(box, (2, 2, 1))
+    for arm, contact in enumerate(workcell.contacts):
+        for end, distance in enumerate(ways):
+            held[arm, end, :3] -= distance * (rotation @ contact.T_box_pad[:3, 2])
+    return Straight(name, np.tile(box, (2, 1)), held, speed)
+
+
+def followed(
+    workcell: Workcell, posture: NumericFunction, line: Straight, known: Array, at_end: bool
+) -> Array:
+    """(SAMPLES, joints) both arms' joints along a line, by Newton's method from a known end.
+
+    Samples are at the places that the profile of `rise` passes at even times. Redundant joints
+    stay where they are at the known end.
+
+    Args:
+        posture: compiled `symbolic.robot.arm.posture_function`.
+        known: (joints,) at the end of the line where `at_end`, else at its beginning [rad].
+
+    Raises:
+        JobError: an arm does not reach a place within its joint range.
+    """
+    share = rise(1.0, SAMPLES).value[:: -1 if at_end else 1]
+    _, *targets = line.at(share)
+    q = np.empty((SAMPLES, len(known)))
+    first, last = len(workcell.robots[0].torque_max), known
+    for k in range(SAMPLES):
+        last = _step(posture, (targets[0][k], targets[1][k]), (last[:first], last[first:]))
+        if not np.isfinite(last).all():
+            raise JobError(_unreached(line, share[k], "does not reach"))
+        q[k] = last
+    lower, upper = (
+        np.concatenate([getattr(robot, name) for robot in workcell.robots])
+        for name in ("position_lower", "position_upper")
+    )
+    outside = ((q < lower) | (q > upper)).any(axis=1)
+    if outside.any():
+        raise JobError(_unreached(line, share[int(np.argmax(outside))], "leaves its joints' range"))
+    return q[:: -1 if at_end else 1]
+
+
+def _unreached(line: Straight, share: float, what: str) -> str:
+    return (
+        f"{line.name.replace('_', ' ')}: an arm {what} {1e3 * share * line.length:.0f} mm from its "
+        f"beginning; change stand_off, lift_height or set_down_height under [handling]"
+    )
+
+
+def _step(
+    posture: NumericFunction, poses: tuple[Array, Array], guesses: tuple[Array, Array]
+) -> Array:
+    """Both arms' joints that hold boxes at poses of their own; NaN where one does not arrive."""
+    found = []
+    for arm in (0, 1):
+        solved = posture.batch(poses[arm][None], guesses[0][None], guesses[1][None])
+        reached = float(np.ravel(solved[f"residual_{arm + 1}"])[0]) <= REACH_TOLERANCE
+        q = solved[f"q_{arm + 1}"][0]
+        found.append(q if reached else np.full_like(q, np.nan))
+    return np.concatenate(found)
+
+
+def timed(model: TimingModel, line: Straight, q: Array) -> Motion:
+    """The motion along a line from rest to rest, as fast as its speed and the limits allow.
+
+    Args:
+        q: (SAMPLES, joints) as from `followed` [rad].
+    """
+    unit = rise(1.0, SAMPLES)
+    box, *targets = line.at(unit.value)
+    own = joints_of(model.workcell, q)
+    arms = []
+    for arm, poses in enumerate(targets):
+        first = np.tile(line.held[arm, 1] - line.held[arm, 0], (SAMPLES, 1))
+        arms.append(model.arm_motion(arm, own[arm], poses, first))
+
+    def both(name: str) -> Array:
+        return np.concatenate([arm[name].reshape(SAMPLES, -1) for arm in arms], axis=1)
+
+    v, w, a = unit.rate[:, None], unit.rate[:, None] ** 2, unit.second[:, None]
+    way = line.box[1] - line.box[0]
+    q_rate = both("q_first") * v
+    q_second = both("q_second") * w + both("q_first") * a
+    rate, second_rate = v * way, a * way
+    limits = _Limits.of(model.workcell)
+    duration = max(
+        PEAK_RATE * line.length / line.speed,
+        float((np.abs(q_rate) / limits.joint_velocity).max()),
+        float((np.abs(q_second) / limits.joint_acceleration).max()) ** 0.5,
+        float(np.linalg.norm(rate[:, :3], axis=1).max()) / limits.velocity,
+        (float(np.linalg.norm(second_rate[:, :3], axis=1).max()) / limits.acceleration) ** 0.5,
+    )
+    T = max(at_even_steps(duration, TICK), TICK)
+    moving = both("torque_by_acceleration") * a + both("torque_by_speed") * w
+    return Motion(
+        first=own[0].shape[1],
+        time=T * unit.time,
+        pose=box,
+        rate=rate / T,
+        second_rate=second_rate / T**2,
+        q=q,
+        q_rate=q_rate / T,
+        q_second=q_second / T**2,
+        own_torque=moving / T**2 + both("torque_at_rest"),
+        wrench_torque=both("wrench_torque").reshape(SAMPLES, -1, 6),
+    )
+
+
+def standing_still(motion: Motion, sample: int, duration: float) -> Motion:
+    """What a motion is at one sample, held for a duration [s]."""
+    k = sample % len(motion.time)
+
+    def still(values: Array) -> Array:
+        return np.zeros((SAMPLES, *values.shape[1:]))
+
+    def same(values: Array) -> Array:
+        return np.repeat(values[k][None], SAMPLES, axis=0)
+
+    return Motion(
+        first=motion.first,
+        time=np.linspace(0.0, duration, SAMPLES),
+        pose=same(motion.pose),
+        rate=still(motion.rate),
+        second_rate=still(motion.second_rate),
+        q=same(motion.q),
+        q_rate=still(motion.q_rate),
+        q_second=still(motion.q_second),
+        own_torque=same(motion.own_torque),
+        wrench_torque=same(motion.wrench_torque),
+    )
+
+
+@dataclass(frozen=True)
+class _Limits:
+    joint_velocity: Array
+    joint_acceleration: Array
+    velocity: float
+    acceleration: float
+
+    @classmethod
+    def of(cls, workcell: Workcell) -> _Limits:
+        joints = [
+            np.concatenate([getattr(robot, name) for robot in workcell.robots])
+            for name in ("velocity_max", "acceleration_max")
+        ]
+        payload = workcell.payload
+        return cls(joints[0], joints[1], payload.velocity_max, payload.acceleration_max)

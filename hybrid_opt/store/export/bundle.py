@@ -1,0 +1,117 @@
+"""Bundles in folders of their own: written whole or not at all, nobody else's files touched."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.store.files import read_bytes, read_json, sha256, storing
+from symbolic.replacing import replace_file, sync_folder
+
+MANIFEST = "manifest.json"
+FORMAT = "dual-arm-carry bundle"
+VERSION = 1
+
+Contents = Mapping[str, str | bytes]
+"""File contents by path within the bundle."""
+
+
+def write_bundle(folder: Path, contents: Contents, manifest: Mapping[str, Any]) -> tuple[Path, ...]:
+    """Write a bundle, or replace an older one of the same folder, in one step.
+
+    Everything is written beside the folder first, so that a full disk leaves what was there.
+
+    Args:
+        folder: of the bundle alone.
+        contents: its files.
+        manifest: JSON values; the files' digests are added.
+
+    Returns:
+        The files written, the manifest first.
+
+    Raises:
+        ResultsError: it cannot be written, or the folder holds something else.
+    """
+    _require_own(folder)
+    data = {
+        name: text.encode() if isinstance(text, str) else text for name, text in contents.items()
+    }
+    document = {"format": FORMAT, "version": VERSION, **manifest}
+    document["files"] = {name: sha256(content) for name, content in data.items()}
+    text = json.dumps(document, indent=1, allow_nan=False) + "\n"
+    draft = folder.with_name(f".{folder.name}.{os.getpid()}")
+    old = folder.with_name(f".{folder.name}.old")
+    with storing(folder):
+        try:
+            for name, content in ((MANIFEST, text.encode()), *data.items()):
+                _write(draft / name, content)
+            if folder.exists():
+                shutil.rmtree(old, ignore_errors=True)
+                os.rename(folder, old)
+            os.rename(draft, folder)
+        except OSError:
+            if old.exists() and not folder.exists():
+                os.rename(old, folder)
+            with suppress(OSError):
+                shutil.rmtree(draft)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
+        sync_folder(folder.parent)
+    return tuple(folder / name for name in (MANIFEST, *data))
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a bundle.
+
+    Raises:
+        ResultsError: there is none, or it is damaged.
+    """
+    path = folder / MANIFEST
+    document = read_json(path)
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise ResultsError(f"{path}: no manifest of a bundle")
+    if document.get("version") != VERSION:
+        raise ResultsError(f"{path}: version {document.get('version')!r}; known is {VERSION}")
+    files = document.get("files")
+    if not isinstance(files, dict) or not all(isinstance(f, str) for f in files.values()):
+        raise ResultsError(f"{path}: damaged (files: expected digests by name)")
+    return document
+
+
+def _require_own(folder: Path) -> None:
+    """Refuse to replace a folder that is not a bundle as it was written.
+
+    Raises:
+        ResultsError: with the first file that is someone else's.
+    """
+    if not os.path.lexists(folder):
+        return
+    remedy = "it stays as it is: move it away, or choose another --output"
+    if folder.is_symlink() or not folder.is_dir():
+        raise ResultsError(f"{folder} is in the way of a bundle; {remedy}")
+    found = sorted(path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    if not found:
+        return
+    try:
+        files = read_manifest(folder)["files"]
+    except ResultsError as error:
+        raise ResultsError(f"{found[0]} is in the way of a bundle ({error}); {remedy}") from error
+    for path in found:
+        name = path.relative_to(folder).as_posix()
+        if name == MANIFEST:
+            continue
+        if name not in files or path.is_symlink():
+            raise ResultsError(f"{path} is no file of this bundle; {remedy}")
+        if sha256(read_bytes(path)) != files[name]:
+            raise ResultsError(f"{path} was changed since it was written; {remedy}")
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(path, content)

@@ -1,0 +1,197 @@
+"""Both arms of a cell as one URDF with mock hardware for ros2_control.
+
+Links and joints of a robot bear its prefix; the arms of one machine share its description and need
+none. Joints that the workcell holds are fixed where it holds them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybrid_opt.job.records import robot_prefix
+from symbolic.array import Array
+from symbolic.geometry.pieces import Capsule
+from symbolic.physics.pose import pose_matrix
+from symbolic.robot.chain import held_joints
+from symbolic.robot.machine import one_machine
+from symbolic.robot.urdf import moving_joints, robot_urdf
+from symbolic.robot.urdf_file import Urdf, UrdfMesh
+from symbolic.workcell.records import Body, Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
+
+WORLD = "world"
+PLUGIN = "mock_components/GenericSystem"
+COMMANDS = ("position", "effort")
+STATES = ("position", "velocity", "effort")
+
+
+def prefixes(workcell: Workcell) -> tuple[str, str]:
+    """What stands before the names of each robot's links and joints."""
+    if one_machine(workcell.robots):
+        return "", ""
+    first, second = (robot_prefix(robot.name) for robot in workcell.robots)
+    return (first, second) if first != second else (f"a_{first}", f"b_{second}")
+
+
+def description(workcell: Workcell, q: Array) -> str:
+    """The cell's URDF.
+
+    Args:
+        q: (joints,) where the mock hardware's joints begin, both arms side by side [rad].
+    """
+    root = ElementTree.Element("robot", {"name": "cell"})
+    ElementTree.SubElement(root, "link", {"name": WORLD})
+    shared = one_machine(workcell.robots)
+    joints: list[str] = []
+    moving_of_both = {name for robot in workcell.robots for name in _moving(robot)}
+    for arm, (robot, prefix) in enumerate(zip(workcell.robots, prefixes(workcell), strict=True)):
+        joints += [f"{prefix}{name}" for name in _moving(robot)]
+        if not (shared and arm == 1):
+            moving = moving_of_both if shared else set(_moving(robot))
+            _add_robot(root, robot, prefix, moving)
+        _add_tool(root, robot, prefix, arm)
+    for body in workcell.environment:
+        _add_fixed(root, WORLD, f"environment_{robot_prefix(body.name)}".rstrip("_"), (body,))
+    _add_hardware(root, joints, q)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _moving(robot: Robot) -> tuple[str, ...]:
+    return moving_joints(robot_urdf(robot), robot.chain_root, robot.flange, robot.locked_joints)
+
+
+def _add_robot(root: ElementTree.Element, robot: Robot, prefix: str, moving: set[str]) -> None:
+    urdf = robot_urdf(robot)
+    held = dict(held_joints(urdf, sorted(moving), robot.locked_joints))
+    children = {joint.child for joint in urdf.joints.values()}
+    base = next(link for link in urdf.links if link not in children)
+    _joint(root, f"{prefix}mount", WORLD, f"{prefix}{base}", robot.T_world_base)
+    for element in ElementTree.fromstring(urdf.kinematics):
+        name = element.attrib["name"]
+        element.set("name", f"{prefix}{name}")
+        if element.tag == "link":
+            _add_shapes(element, urdf, name)
+        else:
+            for end in ("parent", "child"):
+                found = element.find(end)
+                assert found is not None, "a checked joint has both ends"
+                found.set("link", f"{prefix}{found.attrib['link']}")
+            if name in held:
+                _hold(element, held[name])
+        root.append(element)
+
+
+def _hold(joint: ElementTree.Element, position: float) -> None:
+    """Make a joint a fixed one at a position [rad or m]."""
+    origin, axis = joint.find("origin"), joint.find("axis")
+    xyz, rpy = (
+        _numbers("0 0 0" if origin is None else origin.get(key, "0 0 0")) for key in ("xyz", "rpy")
+    )
+    direction = np.array([1.0, 0.0, 0.0] if axis is None else _numbers(axis.attrib["xyz"]))
+    direction = direction / np.linalg.norm(direction)
+    moved = np.eye(4)
+    if joint.attrib["type"] == "revolute":
+        moved[:3, :3] = Rotation.from_rotvec(position * direction).as_matrix()
+    elif joint.attrib["type"] == "prismatic":
+        moved[:3, 3] = position * direction
+    for child in list(joint):
+        if child.tag not in ("parent", "child"):
+            joint.remove(child)
+    joint.set("type", "fixed")
+    _origin(joint, pose_matrix(xyz, rpy) @ moved)
+
+
+def _add_tool(root: ElementTree.Element, robot: Robot, prefix: str, arm: int) -> None:
+    name = prefix or f"arm_{arm + 1}_"
+    flange = f"{prefix}{robot.flange}"
+    _add_fixed(root, flange, f"{name}tool_of_cell", robot.tool)
+    _joint(root, f"{name}contact_pad_fixed", flange, f"{name}contact_pad", robot.T_flange_pad)
+    ElementTree.SubElement(root, "link", {"name": f"{name}contact_pad"})
+
+
+def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequence[Body]) -> None:
+    """Bodies at their poses on a link, as a link of their own."""
+    _joint(root, f"{name}_fixed", parent, name, np.eye(4))
+    link = ElementTree.SubElement(root, "link", {"name": name})
+    for body in bodies:
+        _shapes(link, body.shape, body.pose)
+
+
+def _add_shapes(link: ElementTree.Element, urdf: Urdf, name: str) -> None:
+    for collision in urdf.collisions.get(name, ()):
+        _shapes(link, collision.shape, collision.pose)
+
+
+def _shapes(link: ElementTree.Element, shape: Shape | Capsule | UrdfMesh, pose: Array) -> None:
+    """A shape as visual and as collision geometry; capsules, which URDF lacks, in their parts."""
+    if isinstance(shape, Capsule):
+        _shapes(link, Cylinder(shape.radius, shape.length), pose)
+        for side in (-0.5, 0.5):
+            end = pose.copy()
+            end[:3, 3] += side * shape.length * pose[:3, 2]
+            _shapes(link, Sphere(shape.radius), end)
+        return
+    for kind in ("visual", "collision"):
+        element = ElementTree.SubElement(link, kind)
+        _origin(element, pose)
+        geometry = ElementTree.SubElement(element, "geometry")
+        match shape:
+            case Box():
+                ElementTree.SubElement(geometry, "box", {"size": _text(shape.size)})
+            case Cylinder():
+                size = {"radius": repr(shape.radius), "length": repr(shape.length)}
+                ElementTree.SubElement(geometry, "cylinder", size)
+            case Sphere():
+                ElementTree.SubElement(geometry, "sphere", {"radius": repr(shape.radius)})
+            case Mesh() | UrdfMesh():
+                address = shape.address if isinstance(shape, UrdfMesh) else f"file://{shape.path}"
+                mesh = {"filename": address, "scale": _text(shape.scale)}
+                ElementTree.SubElement(geometry, "mesh", mesh)
+
+
+def _add_hardware(root: ElementTree.Element, joints: Sequence[str], q: Array) -> None:
+    control = ElementTree.SubElement(root, "ros2_control", {"name": "mock_cell", "type": "system"})
+    hardware = ElementTree.SubElement(control, "hardware")
+    ElementTree.SubElement(hardware, "plugin").text = PLUGIN
+    for name, position in zip(joints, q.tolist(), strict=True):
+        joint = ElementTree.SubElement(control, "joint", {"name": name})
+        for command in COMMANDS:
+            ElementTree.SubElement(joint, "command_interface", {"name": command})
+        for state in STATES:
+            interface = ElementTree.SubElement(joint, "state_interface", {"name": state})
+            if state == "position":
+                value = ElementTree.SubElement(interface, "param", {"name": "initial_value"})
+                value.text = repr(position)
+
+
+def _joint(root: ElementTree.Element, name: str, parent: str, child: str, pose: Array) -> None:
+    joint = ElementTree.SubElement(root, "joint", {"name": name, "type": "fixed"})
+    _origin(joint, pose)
+    ElementTree.SubElement(joint, "parent", {"link": parent})
+    ElementTree.SubElement(joint, "child", {"link": child})
+
+
+def _origin(element: ElementTree.Element, pose: Array) -> None:
+    origin = {"xyz": _text(pose[:3, 3]), "rpy": _text(_rpy(pose[:3, :3]))}
+    ElementTree.SubElement(element, "origin", origin)
+
+
+def _rpy(rotation: Array) -> Array:
+    """Roll, pitch, yaw (3,) [rad] of a rotation (3, 3); no roll at a pitch of a quarter turn."""
+    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
+    if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-9:
+        return np.array([0.0, pitch, np.arctan2(-rotation[0, 1], rotation[1, 1])])
+    roll = np.arctan2(rotation[2, 1], rotation[2, 2])
+    return np.array([roll, pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(part) for part in text.split()]
+
+
+def _text(values: Array) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(values))

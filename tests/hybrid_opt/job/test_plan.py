@@ -1,0 +1,216 @@
+"""A job is continuous, at rest between its phases, within limits, and free of collisions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from hybrid_opt.errors import JobError
+from hybrid_opt.job.records import PHASES, Job, Phase
+from hybrid_opt.job.sampling import sample_job
+from hybrid_opt.job.squeeze import SqueezeSettings
+from hybrid_opt.timing import TimingLimits, time_path
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.physics.pose import pose_matrix
+from symbolic.robot.model import gravity_in_root
+from symbolic.robot.urdf import arm_model, link_frame
+from symbolic.workcell.handling import Handling
+from tests.hybrid_opt.job.jobs import rack, rack_job, rack_jobs, rack_timing
+
+
+def pads(q: Array) -> list[Array]:
+    """Poses (4, 4) of both pads in the world, by Pinocchio alone."""
+    found = []
+    for arm, robot in enumerate(rack().workcell.robots):
+        model = arm_model(robot)
+        data = model.createData()
+        pin.framesForwardKinematics(model, data, q[6 * arm : 6 * arm + 6])
+        flange = data.oMf[link_frame(model, robot.flange)].homogeneous
+        found.append(robot.T_world_base @ flange @ robot.T_flange_pad)
+    return found
+
+
+def gap(phase: Phase, sample: int, arm: int) -> float:
+    """Distance of a pad from its place on the box, along its normal, other errors being small."""
+    contact = rack().workcell.contacts[arm]
+    pose = phase.motion.pose[sample]
+    target = pose_matrix(pose[:3], pose[3:]) @ contact.T_box_pad
+    pad = pads(phase.motion.q[sample])[arm]
+    np.testing.assert_allclose(pad[:3, :3], target[:3, :3], atol=1e-6)
+    away = target[:3, 3] - pad[:3, 3]
+    distance = float(away @ target[:3, 2])
+    np.testing.assert_allclose(away, distance * target[:3, 2], atol=2e-6)
+    return distance
+
+
+def test_every_phase_is_there_and_follows_the_one_before() -> None:
+    job = rack_job()
+    assert tuple(phase.name for phase in job.phases) == PHASES
+    end = 0.0
+    for phase in job.phases:
+        assert phase.begin == pytest.approx(end)
+        assert phase.motion.time[0] == 0.0
+        assert phase.duration / 0.008 == pytest.approx(round(phase.duration / 0.008), abs=1e-6)
+        end = phase.begin + phase.duration
+    assert job.duration == pytest.approx(end)
+    for one, other in zip(job.phases[:-1], job.phases[1:], strict=True):
+        np.testing.assert_allclose(one.motion.q[-1], other.motion.q[0], atol=1e-6)
+        np.testing.assert_allclose(one.motion.pose[-1], other.motion.pose[0], atol=1e-9)
+        np.testing.assert_allclose(one.force.normal[-1], other.force.normal[0], atol=1e-9)
+        np.testing.assert_allclose(one.effort[-1], other.effort[0], atol=1e-3)
+
+
+def test_phases_begin_and_end_at_rest() -> None:
+    for phase in rack_job().phases:
+        motion = phase.motion
+        np.testing.assert_allclose(motion.q_rate[[0, -1]], 0.0, atol=1e-9)
+        np.testing.assert_allclose(motion.rate[[0, -1]], 0.0, atol=1e-9)
+        np.testing.assert_allclose(motion.q_second[[0, -1]], 0.0, atol=1e-9)
+        np.testing.assert_allclose(motion.second_rate[[0, -1]], 0.0, atol=1e-9)
+
+
+def test_pads_come_from_the_stand_off_and_go_back_there() -> None:
+    job = rack_job()
+    for name, ends in (("approach", (0.05, 0.0)), ("press", (0.0, 0.0)), ("retreat", (0.0, 0.05))):
+        for arm in (0, 1):
+            for sample, expected in zip((0, -1), ends, strict=True):
+                assert gap(job.phase(name), sample, arm) == pytest.approx(expected, abs=2e-6)
+    rates = np.diff(job.phase("approach").motion.time)
+    assert rates.min() > 0.0
+    for name in ("lift", "set_down"):
+        for sample in (0, 200, -1):
+            assert gap(job.phase(name), sample, 0) == pytest.approx(0.0, abs=2e-6)
+
+
+def test_the_box_is_lifted_from_where_it_stands() -> None:
+    job = rack_job()
+    assert job.stands_on == (("middle board",), ("liner, top board",))
+    half = rack().workcell.payload.size[2] / 2.0
+    assert job.phase("press").motion.pose[0, 2] - half == pytest.approx(0.60, abs=2e-5)
+    assert job.phase("release").motion.pose[0, 2] - half == pytest.approx(1.012, abs=2e-5)
+    for name in ("approach", "press", "release", "retreat"):
+        assert np.ptp(job.phase(name).motion.pose, axis=0).max() == 0.0
+
+
+def test_forces_rise_and_fall_no_faster_than_asked() -> None:
+    job = rack_job()
+    for name in ("press", "release"):
+        phase = job.phase(name)
+        rate = np.gradient(phase.force.normal, phase.motion.time, axis=0)
+        assert 80.0 < abs(rate).max() <= 100.5
+    np.testing.assert_array_equal(job.phase("approach").force.normal, 0.0)
+    np.testing.assert_array_equal(job.phase("retreat").force.normal, 0.0)
+
+
+def test_commanded_wrenches_carry_the_box() -> None:
+    """Newton and Euler about the box's centre, from the wrenches alone."""
+    cell = rack().workcell
+    phase = rack_job().phase("lift")
+    for k in (0, 100, 200, 300):
+        pose = phase.motion.pose[k]
+        T = pose_matrix(pose[:3], pose[3:])
+        force = phase.force.wrench[k, :, :3].sum(axis=0)
+        needed = cell.payload.mass * (phase.motion.second_rate[k, :3] + [0.0, 0.0, 9.81])
+        np.testing.assert_allclose(force, needed, atol=1e-6)
+        moment = np.zeros(3)
+        for arm, contact in enumerate(cell.contacts):
+            lever = T[:3, :3] @ contact.T_box_pad[:3, 3]
+            wrench = phase.force.wrench[k, arm]
+            moment += wrench[3:] + np.cross(lever, wrench[:3])
+            inward = T[:3, :3] @ contact.T_box_pad[:3, 2]
+            assert wrench[:3] @ inward == pytest.approx(phase.force.normal[k, arm], abs=1e-6)
+        np.testing.assert_allclose(moment, 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["approach", "press", "lift", "carry", "set_down"])
+def test_efforts_are_those_of_newton_and_euler(name: str) -> None:
+    phase = rack_job().phase(name)
+    k = 150
+    for arm, robot in enumerate(rack().workcell.robots):
+        model = arm_model(robot)
+        model.gravity.linear = gravity_in_root(robot.T_world_base)
+        data = model.createData()
+        columns = slice(6 * arm, 6 * arm + 6)
+        motion = phase.motion
+        q, rate, second = (v[k, columns] for v in (motion.q, motion.q_rate, motion.q_second))
+        torque = np.array(pin.rnea(model, data, q, rate, second))
+        # The wrench at the contact point, taken to the last joint's axes by statics.
+        pin.computeJointJacobians(model, data, q)
+        pin.updateFramePlacements(model, data)
+        frame = link_frame(model, robot.flange)
+        J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        R = robot.T_world_base[:3, :3].T
+        contact = rack().workcell.contacts[arm]
+        T = pose_matrix(motion.pose[k, :3], motion.pose[k, 3:])
+        flange = robot.T_world_base @ data.oMf[frame].homogeneous
+        lever = (T @ contact.T_box_pad)[:3, 3] - flange[:3, 3]
+        force, moment = phase.force.wrench[k, arm, :3], phase.force.wrench[k, arm, 3:]
+        at_flange = np.concatenate([R @ force, R @ (moment + np.cross(lever, force))])
+        np.testing.assert_allclose(phase.effort[k, columns], torque + J.T @ at_flange, atol=1e-6)
+
+
+def test_no_limit_is_exceeded_on_a_grid_ten_times_as_fine() -> None:
+    """From the positions alone: differences of a grid ten times as fine as a bundle's."""
+    cell = rack().workcell
+    sampled = sample_job(rack_job(), 0.002)
+    for index, phase in enumerate(rack_job().phases):
+        span = sampled.span(index)
+        q, step = sampled.q[span], float(np.diff(sampled.time[span])[0])
+        rate = np.diff(q, axis=0) / step
+        second = np.diff(rate, axis=0) / step
+        for values, name in ((rate, "velocity_max"), (second, "acceleration_max")):
+            limit = np.concatenate([getattr(robot, name) for robot in cell.robots])
+            assert (np.abs(values) / limit).max() <= 1.005, (phase.name, name)
+        torque = np.concatenate([robot.torque_max for robot in cell.robots])
+        assert (np.abs(sampled.effort[span]) / torque).max() <= 1.005
+        third = np.diff(second, axis=0) / step
+        assert np.abs(third).max() < 500.0, phase.name
+
+
+def test_every_phase_is_certified() -> None:
+    for phase in rack_job().phases:
+        assert phase.certificate.is_free, phase.name
+
+
+def changed(**handling: float) -> Job:
+    """The rack's job with another handling."""
+    return rack_jobs().plan(rack_timing(), handling=Handling(**handling))
+
+
+@pytest.mark.parametrize(
+    ("handling", "message"),
+    [
+        ({"set_down_height": 0.02}, "set down: .*payload and liner"),
+        ({"lift_height": 0.03}, "middle board"),
+        ({"stand_off": 1.2}, "approach"),
+        ({"lift_height": 0.5}, "lift"),
+    ],
+)
+def test_what_cannot_be_done_is_told(handling: dict[str, float], message: str) -> None:
+    with pytest.raises(JobError, match=message):
+        changed(**handling)
+
+
+def test_without_a_height_nothing_is_lifted() -> None:
+    job = changed(lift_height=0.0, set_down_height=0.0)
+    assert [phase.name for phase in job.phases] == [
+        "approach",
+        "press",
+        "carry",
+        "release",
+        "retreat",
+    ]
+    assert job.stands_on == ((), ())
+
+
+def test_what_presses_too_hard_is_refused() -> None:
+    with pytest.raises(JobError, match="joint torque"):
+        rack_jobs().plan(rack_timing(), SqueezeSettings(factor=8.0))
+
+
+def test_a_failed_timing_has_no_job() -> None:
+    failed = time_path(rack().timing_model, rack().initial, TimingLimits(force=30.0))
+    with pytest.raises(SettingsError, match="no timing to export"):
+        rack_jobs().plan(failed)

@@ -1,0 +1,183 @@
+"""Bundles keep to their own folders: nobody's files are lost, whatever is in the way."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.job.squeeze import SqueezeSettings
+from hybrid_opt.store.export import FORMATS, BundleOptions, Origin, export
+from hybrid_opt.store.export.bundle import read_manifest, write_bundle
+from hybrid_opt.store.files import sha256
+from hybrid_opt.timing import TimingLimits, time_path
+from symbolic.errors import SettingsError
+from tests.hybrid_opt.job.jobs import rack, rack_job, rack_jobs, rack_timing
+
+FILES: dict[str, str | bytes] = {"a.txt": "one", "sub/b.bin": b"two"}
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_a_bundle_is_replaced_as_a_whole(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "bundle"
+    paths = write_bundle(folder, FILES, {"form": "x"})
+    assert [path.relative_to(folder).as_posix() for path in paths] == [
+        "manifest.json",
+        "a.txt",
+        "sub/b.bin",
+    ]
+    assert read_manifest(folder)["files"]["a.txt"] == sha256(b"one")
+    write_bundle(folder, {"c.txt": "three"}, {"form": "x"})
+    assert set(tree(folder)) == {"manifest.json", "c.txt"}
+    assert [path.name for path in folder.parent.iterdir()] == ["bundle"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("notes.txt", "mine", "no file of this bundle"),
+        ("a.txt", "edited", "was changed"),
+        ("manifest.json", "{}", "in the way"),
+        ("manifest.json", "{", "in the way"),
+    ],
+)
+def test_foreign_and_edited_files_stay(
+    tmp_path: Path, name: str, content: str, message: str
+) -> None:
+    folder = tmp_path / "bundle"
+    write_bundle(folder, FILES, {})
+    (folder / name).write_text(content)
+    before = tree(tmp_path)
+    with pytest.raises(ResultsError, match=message):
+        write_bundle(folder, FILES, {})
+    assert tree(tmp_path) == before
+
+
+def test_a_file_or_link_in_the_way_stays(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    for name in ("file", "link"):
+        with pytest.raises(ResultsError, match="in the way"):
+            write_bundle(tmp_path / name, FILES, {})
+    with pytest.raises(ResultsError, match="cannot be written"):
+        write_bundle(tmp_path / "file" / "bundle", FILES, {})
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS])
+def test_what_cannot_be_written_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    folder = tmp_path / "bundle"
+    write_bundle(folder, FILES, {})
+    before = tree(tmp_path)
+    count = 0
+
+    def fsync(handle: int) -> None:
+        nonlocal count
+        count += 1
+        if count == 2:
+            raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with pytest.raises(ResultsError, match=str(folder)):
+        write_bundle(folder, {"other.txt": "new"}, {})
+    assert tree(tmp_path) == before
+
+
+def test_an_interrupted_exchange_leaves_the_old_bundle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "bundle"
+    write_bundle(folder, FILES, {})
+    before = tree(tmp_path)
+    rename, count = os.rename, 0
+
+    def second_fails(source: Path, target: Path) -> None:
+        nonlocal count
+        count += 1
+        if count == 2:
+            raise OSError(errno.EIO, "input/output error")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", second_fails)
+    with pytest.raises(ResultsError):
+        write_bundle(folder, {"other.txt": "new"}, {})
+    assert tree(tmp_path) == before
+
+
+def test_different_carries_never_touch_one_another(tmp_path: Path) -> None:
+    origin = Origin("rack", "nsga2", 3, 12)
+    first = export(rack_job(), "csv", tmp_path, origin=origin)
+    pressed = rack_jobs().plan(rack_timing(), SqueezeSettings(factor=1.5))
+    fast = time_path(rack().timing_model, rack().initial, TimingLimits(force=60.0))
+    before = tree(tmp_path)
+    folders = {first[0].parent}
+    for job in (pressed, rack_jobs().plan(fast)):
+        folders.add(export(job, "csv", tmp_path, origin=origin)[0].parent)
+    assert len(folders) == 3
+    assert all(folder.parent.name.startswith("rack-nsga2-r03-p0012-") for folder in folders)
+    assert {name: tree(tmp_path)[name] for name in before} == before
+    again = export(rack_job(), "csv", tmp_path, origin=origin)
+    assert again == first
+    assert {name: tree(tmp_path)[name] for name in before} == before
+
+
+def test_names_are_names_of_files() -> None:
+    for study in ("a/../b", "..", "räck  x", "x" * 500, "\0"):
+        name = Origin(study, "nsga2-polished").name(rack_job())
+        assert set(name) <= set("abcdefghijklmnopqrstuvwxyz0123456789-")
+        assert len(name) < 120
+    selected = Path("results/rack/selected/mopso-polished/07.json")
+    provenance = {"algorithm": "mopso", "replica": 7, "row": 41}
+    name = Origin.of_file(selected, b"", provenance).name(rack_job())
+    assert name.startswith("rack-mopso-polished-r07-p0041-")
+    assert (
+        Origin.of_file(Path("my carry.json"), b"", {"replica": "x"})
+        .name(rack_job())
+        .startswith("my-carry-")
+    )
+
+
+def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
+    paths = export(rack_job(), "csv", tmp_path, origin=Origin("rack", "nsga2", 0, 5))
+    document = json.loads(paths[0].read_text())
+    assert document["files"]["job.csv"] == sha256(paths[1].read_bytes())
+    assert [phase["name"] for phase in document["phases"]] == [p.name for p in rack_job().phases]
+    assert all(phase["free_of_collisions"] for phase in document["phases"])
+    worst = max(value for phase in document["phases"] for value in phase["limits"].values())
+    assert worst <= 1.005
+    assert document["squeeze"]["factor"] == 1.3
+    assert document["units"]["force"] == "N"
+    assert document["how_to_run"]
+    assert any("tool_load" in warning for warning in document["warnings"])
+    assert not any("acceleration" in warning for warning in document["warnings"])
+    rough = rack_jobs().plan(rack_timing(), smoothing=0.0)
+    warnings = json.loads(export(rough, "csv", tmp_path)[0].read_text())["warnings"]
+    assert any("acceleration" in warning for warning in warnings)
+    assert [each["delay"] for each in document["start_skew"]] == [0.001, 0.002, 0.005, 0.01, 0.02]
+
+
+def test_a_timing_is_exported_with_its_job(tmp_path: Path) -> None:
+    paths = export(rack_timing(), "json", tmp_path)
+    assert json.loads(paths[1].read_text())["phases"][0]["name"] == "approach"
+    with pytest.raises(SettingsError, match="unknown format"):
+        export(rack_job(), "xml", tmp_path)
+    with pytest.raises(SettingsError, match="no timing to export"):
+        export(replace(rack_timing(), carry=None), "csv", tmp_path)
+    with pytest.raises(SettingsError, match="time step"):
+        export(rack_job(), "csv", tmp_path, options=BundleOptions(step=-1.0))
+    assert set(FORMATS) == {"csv", "json", "ros2", "rapid", "urscript", "mcap"}

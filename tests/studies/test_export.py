@@ -1,0 +1,68 @@
+"""The program writes the bundle of a stored trajectory, and says what is in the way."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import hybrid_opt as ho
+from studies.export import main
+from tests.hybrid_opt.job.jobs import rack
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trajectory where a results folder of a study has it."""
+    path = tmp_path_factory.mktemp("r") / "rack" / "selected" / "nsga2" / "02.json"
+    path.parent.mkdir(parents=True)
+    provenance = {"algorithm": "nsga2", "replica": 2, "row": 17}
+    ho.save(rack().carry(rack().initial), path, provenance)
+    return path
+
+
+def test_a_bundle_is_written(
+    stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(stored), "--form", "csv", "--output", str(tmp_path)]
+    assert main(arguments) == 0
+    text = capsys.readouterr().out
+    for part in ("approach", "set down", "Position control", "The second arm late", "warning"):
+        assert part in text
+    (folder,) = tmp_path.iterdir()
+    assert folder.name.startswith("rack-nsga2-r02-p0017-")
+    manifest = json.loads((folder / "csv" / "manifest.json").read_text())
+    assert manifest["trajectory"]["file"] == "02.json"
+    assert manifest["trajectory"]["replica"] == 2
+    assert main([*arguments, "--squeeze", "1.6", "--force-limit", "60"]) == 0
+    assert len(list(tmp_path.iterdir())) == 2
+    (folder / "csv" / "mine.txt").write_text("mine")
+    assert main(arguments) == 2
+    assert "mine.txt" in capsys.readouterr().err
+    assert (folder / "csv" / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--form", "csv", "--step", "0"], "time step"),
+        (["--form", "csv", "--use", "force"], "--force-limit"),
+        (["--form", "csv", "--force-limit", "1"], "no timing to export"),
+        (["--form", "csv", "--squeeze", "0.5"], "allowed is 1 to 10"),
+        (["--form", "csv", "--stiffness", "0"], "stiffness"),
+        (["--form", "urscript"], "--any-arm"),
+    ],
+)
+def test_what_is_wrong_is_told_in_one_line(
+    stored: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    assert main([str(stored), "--output", str(tmp_path), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
