@@ -20,7 +20,7 @@ from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
-from hybrid_opt.polishing.plan import Attempt, aimed, points, widest_gap
+from hybrid_opt.polishing.plan import Attempt, PlanState, aimed, points, widest_gap
 from hybrid_opt.polishing.point import PolishSolver, Solution, SolveTask
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.run import PolishRun
@@ -127,10 +127,11 @@ class ForceRun(PolishRun[Attempt]):
         super().__init__(polisher.evaluator, polisher.settings, archive, recorded, emit)
         self._solver = polisher.solver
         self._tried: set[tuple[int | None, bytes]] = set()
-        self._stalls = 0
+        self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
 
     def _solution(self, attempt: Attempt) -> Solution:
-        return self._solver.solve(SolveTask(attempt.x, attempt.target, attempt.radius))
+        task = SolveTask(attempt.x, attempt.target, attempt.radius, attempt.wide)
+        return self._solver.solve(task)
 
     def all(self, rng: np.random.Generator) -> None:
         """The front's points first; then ends, middle and gaps in turns, while attempts last."""
@@ -138,20 +139,20 @@ class ForceRun(PolishRun[Attempt]):
         while self._left() > 0:
             for _ in range(self._settings.front.turns_per_gap):
                 self._turn((0, 1), rng)
-                if self._stalls < self._settings.front.middle_stalls:
+                if self._stalls[None] < self._settings.front.middle_stalls:
                     self._turn((None,), rng)
             self._do(self._gap())
 
     def _turn(self, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
-        """An attempt at each of some aims."""
+        """An attempt at each of some aims, and whether it came further."""
         for objective in objectives:
-            before = self._archive.best(objective)[1]
-            attempt = aimed(self._archive, objective, self._tried, self._settings, rng)
+            before, stalls = self._archive.best(objective)[1], self._stalls[objective]
+            search = PlanState(objective, stalls > 0, self._tried)
+            attempt = aimed(self._archive, search, self._settings, rng)
             self._tried.add((objective, attempt.x.tobytes()))
             self._do([attempt])
             further = self._archive.best(objective)[1] < before - self._settings.front.progress
-            if objective is None:
-                self._stalls = 0 if further else self._stalls + 1
+            self._stalls[objective] = 0 if further else stalls + 1
 
     def _gap(self) -> list[Attempt]:
         """An attempt in the widest gap that was not tried, none where all are narrow."""

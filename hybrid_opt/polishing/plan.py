@@ -28,7 +28,7 @@ class Attempt:
     Attributes:
         aim, parent, start: as in `hybrid_opt.polishing.records.PolishOutcome`.
         x: (n_var,) decision vector to start from.
-        target, radius: see `hybrid_opt.polishing.point.SolveTask`.
+        target, radius, wide: see `hybrid_opt.polishing.point.SolveTask`.
     """
 
     aim: Aim
@@ -37,6 +37,7 @@ class Attempt:
     start: Array
     target: Target
     radius: float
+    wide: bool = False
 
 
 def points(archive: GrowingFront, settings: PolishSettings) -> list[Attempt]:
@@ -64,26 +65,38 @@ def points(archive: GrowingFront, settings: PolishSettings) -> list[Attempt]:
     return attempts
 
 
+@dataclass(frozen=True)
+class PlanState:
+    """How far attempts at one aim have come.
+
+    Attributes:
+        objective: whose end of the front; None for its balanced middle.
+        stalled: whether the last attempt came no further.
+        tried: all attempts so far, as objective and bytes of the start.
+    """
+
+    objective: int | None
+    stalled: bool
+    tried: Collection[tuple[int | None, bytes]]
+
+
 def aimed(
     archive: GrowingFront,
-    objective: int | None,
-    tried: Collection[tuple[int | None, bytes]],
+    state: PlanState,
     settings: PolishSettings,
     rng: np.random.Generator,
 ) -> Attempt:
     """An attempt at an end of the front or at its balanced middle.
 
-    It goes on from the best point. Where that was tried already, it starts from any other point of
-    the front: ends lie in several basins, and another start may lead into a better one.
-
-    Args:
-        objective: whose end; None for the middle.
-        tried: earlier attempts, as their objective and their start's bytes.
+    It goes on from the best point. Where the last attempt came no further from there, it starts
+    from any other point, those that are dominated by now included, and looks farther: ends lie
+    in several basins, and another start may lead into a better one.
     """
-    rows, radius = archive.rows(), settings.trust.first
-    k = archive.best(objective)[0]
-    fresh = [row for row in rows if (objective, archive.x[row].tobytes()) not in tried]
-    if k not in fresh and fresh:
+    objective, stalled, tried = state.objective, state.stalled, state.tried
+    radius, k = settings.trust.first, archive.best(objective)[0]
+    fresh = [row for row, x in enumerate(archive.x) if (objective, x.tobytes()) not in tried]
+    wide = stalled or k not in fresh
+    if wide and fresh:
         k = fresh[int(rng.integers(len(fresh)))]
     elif not fresh:
         radius = settings.front.small_radius
@@ -91,7 +104,7 @@ def aimed(
     if objective is None:
         return Attempt("balance", -1, archive.x[k], start, balance(start, span), radius)
     target = extreme(start, span, objective)
-    return Attempt("extreme", -1, archive.x[k], start, target, radius)
+    return Attempt("extreme", -1, archive.x[k], start, target, radius, wide)
 
 
 def widest_gap(

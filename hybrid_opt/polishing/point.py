@@ -10,7 +10,7 @@ than the start. One that ends inside the box at an optimum ends the polish.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -40,11 +40,13 @@ class SolveTask:
         x: (n_var,) feasible decision vector to start from.
         target: what to aim at.
         radius: of the first box of trust, in halves of the decision variables' ranges.
+        wide: whether to look farther than the nearest optimum, with `SolveSettings.wide_barrier`.
     """
 
     x: Array
     target: Target
     radius: float = TrustSettings().first
+    wide: bool = False
 
 
 @dataclass
@@ -96,6 +98,8 @@ class PolishSolver:
         grid = Grid(evaluator.workcell.task)
         self._cell = SmoothCell(evaluator.workcell, functions, grid)
         self._settings = settings
+        wide = replace(settings.solve, barrier=settings.solve.wide_barrier)
+        self._wide = replace(settings, solve=wide)
         self._solve = {"ipopt": ipopt, "dense": dense}[settings.solve.solver]
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
         self._reader = CarryReader(evaluator, grid, functions.rows)
@@ -107,13 +111,13 @@ class PolishSolver:
             _Best(x, self._reader.read(x)),
             TrustRegion(self._settings.trust, task.radius),
         )
-        solution = Solution(x)
+        solution, settings = Solution(x), self._wide if task.wide else self._settings
         while solution.rounds < self._settings.rounds and not region.is_spent:
             required = self._required(best, task.target, lenient=solution.rounds == 0)
             program = SmoothProgram(
                 self._cell, required, task.target, best.carry, best.x, region.radius
             )
-            answer = self._solve(program, self._settings)
+            answer = self._solve(program, settings)
             solution.add(answer)
             if not answer.usable:
                 region.lost()

@@ -1,4 +1,4 @@
-"""Everything that decides what a polish finds, with what was measured. docs/polish.md has how.
+"""Everything that decides what a polish finds. docs/polish.md has what was measured with others.
 
 Widths along the path are in its parameter (the whole path is 1), distances in metres, steps in
 halves of the decision variables' ranges: none of them changes its meaning with the samples.
@@ -94,6 +94,8 @@ class SolveSettings:
     Attributes:
         solver: IPOPT, or the dense interior-point method of `hybrid_opt.polishing.interior`.
         barrier: at the start. A search's point is near the solution but has no multipliers.
+        wide_barrier: at the start of solves that look for other basins: it leads to the middle of
+            what is feasible first.
         tolerance: of the optimality conditions, in the program's scaled rows and variables.
         feasible: violation of a scaled row at which an iterate counts as feasible.
         patience: times the wanted number of iterations that a solve may take to become feasible:
@@ -102,6 +104,7 @@ class SolveSettings:
 
     solver: SolverName = "dense"
     barrier: float = 3e-4
+    wide_barrier: float = 3e-2
     tolerance: float = 1e-6
     feasible: float = 1e-3
     patience: int = 3
@@ -128,7 +131,7 @@ class FrontSettings:
     own_share: float = 1.0 / 6.0
     turns_per_gap: int = 3
     progress: float = 2e-5
-    middle_stalls: int = 2
+    middle_stalls: int = 1
     small_radius: float = 0.1
     least_gap: float = 0.02
     optimal: float = 1e-3
@@ -192,7 +195,7 @@ class PolishSettings:
         near, trust, solve, front, drivable: the parts' own.
     """
 
-    points: int = 14
+    points: int = 16
     method: Method = "pascoletti-serafini"
     max_iterations: int = 30
     rounds: int = 7
