@@ -26,7 +26,7 @@ from hybrid_opt.job.forces import held, pressing, without_force
 from hybrid_opt.job.limits import EXCESS, phase_use
 from hybrid_opt.job.profile import rise
 from hybrid_opt.job.records import Force, Job, Motion, Phase
-from hybrid_opt.job.smooth import WIDTH, rests_at_ends, smoothed
+from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, smoothed
 from hybrid_opt.job.squeeze import SqueezeSettings, chosen_squeeze
 from hybrid_opt.job.straight import (
     SAMPLES,
@@ -112,6 +112,8 @@ class JobModel:
                 f"there is no timing to export ({timing.status}: {timing.reason}); export one "
                 "that robots can drive"
             )
+        if not 0.0 <= smoothing <= WIDEST:
+            raise SettingsError(f"smoothing over {smoothing:g} s: allowed is 0 to {WIDEST:g} s")
         if smoothing > 0.0 and not rests_at_ends(timing):
             timing = smoothed(self.timing, timing, smoothing)
             carry = timing.carry

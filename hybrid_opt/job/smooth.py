@@ -24,6 +24,9 @@ from symbolic.array import Array
 WIDTH = 0.05
 """Half the width of the window [s]."""
 
+WIDEST = 1.0
+"""Largest width that may be asked for [s]."""
+
 STEP = 5e-4
 """Of the averaging [s]."""
 

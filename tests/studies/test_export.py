@@ -51,6 +51,8 @@ def test_a_bundle_is_written(
         (["--form", "csv", "--force-limit", "1"], "no timing to export"),
         (["--form", "csv", "--squeeze", "0.5"], "allowed is 1 to 10"),
         (["--form", "csv", "--stiffness", "0"], "stiffness"),
+        (["--form", "csv", "--smoothing", "-1"], "smoothing"),
+        (["--form", "csv", "--smoothing", "nan"], "smoothing"),
         (["--form", "urscript"], "--any-arm"),
     ],
 )
