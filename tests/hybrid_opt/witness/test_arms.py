@@ -169,6 +169,16 @@ def test_force_control_takes_what_a_wrong_reference_adds() -> None:
     assert 0.0 < excess["both"] < 0.5 * excess["impedance"]
 
 
+def test_what_pushes_the_box_along_the_normal_moves_it_by_the_weak_springs_alone() -> None:
+    """3 N against two springs of 2 N/mm, however long both arms control their forces."""
+    cell = hand_cell()
+    witness = CellWitness(cell, disturbance=(0.0, 0.3, 0.0))
+    outcome = witness.simulate(standing(cell, 1.5 * LEAST, 2.0), "both")
+    assert outcome.holds
+    moved = outcome.box_position[-1, 1] - outcome.box_position[0, 1]
+    assert moved == pytest.approx(-0.3 * 10.0 / (2.0 * witness.settings.drift_stiffness), rel=0.2)
+
+
 def test_the_simulated_case_differs_from_what_the_arms_were_told() -> None:
     cell = hand_cell()
     reference = standing(cell, 1.1 * LEAST)
