@@ -1,9 +1,9 @@
 """The library. `import hybrid_opt as ho` and work with a cell; docs/library.md shows how.
 
 `Cell` is the only resource. `search` and `polish` make a `Front`, a front gives a `Carry`,
-`time_path` makes a `Timing` of it, `plan_job` plans the whole job around that, and `export` writes
-it for robots. Rooms, in the order of the data: evaluate, collision, metaheuristics, indicators,
-polishing, timing, robust, job, store; work and
+`time_path` makes a `Timing` of it, `recommend` says which to run, `plan_job` plans the whole job
+around that, and `export` writes it for robots. Rooms, in the order of the data: evaluate,
+collision, metaheuristics, indicators, polishing, timing, robust, recommending, job, store; work and
 campaign carry out whole studies; display is how objects look in a notebook.
 
 Names are imported when they are first used, so that `import hybrid_opt` takes no time.
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from hybrid_opt.job.squeeze import SqueezeSettings
     from hybrid_opt.metaheuristics.carries import SearchSettings
     from hybrid_opt.polishing.settings import PolishSettings
+    from hybrid_opt.recommending.recommendation import Recommendation, recommend
+    from hybrid_opt.recommending.wish import Wish
     from hybrid_opt.store.export.formats import export
     from hybrid_opt.store.export.options import BundleOptions
     from hybrid_opt.store.export.origin import Origin
@@ -43,14 +45,17 @@ __all__ = [
     "Objective",
     "Origin",
     "PolishSettings",
+    "Recommendation",
     "SearchSettings",
     "SqueezeSettings",
     "Timing",
     "TimingLimits",
+    "Wish",
     "Workcell",
     "export",
     "plan_job",
     "polish",
+    "recommend",
     "save",
     "search",
     "search_branches",
@@ -69,13 +74,16 @@ _HOMES = {
     "Origin": "hybrid_opt.store.export.origin",
     "PolishSettings": "hybrid_opt.polishing.settings",
     "SqueezeSettings": "hybrid_opt.job.squeeze",
+    "Recommendation": "hybrid_opt.recommending.recommendation",
     "SearchSettings": "hybrid_opt.metaheuristics.carries",
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",
+    "Wish": "hybrid_opt.recommending.wish",
     "Workcell": "symbolic.workcell.records",
     "export": "hybrid_opt.store.export.formats",
     "plan_job": "hybrid_opt.job.plan",
     "polish": "hybrid_opt.door",
+    "recommend": "hybrid_opt.recommending.recommendation",
     "save": "hybrid_opt.door",
     "search": "hybrid_opt.door",
     "search_branches": "hybrid_opt.branches",

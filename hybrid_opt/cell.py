@@ -9,6 +9,7 @@ import html
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,11 +18,13 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations, concatenated
-from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, PAPER_OBJECTIVES, Objective
 from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
+from symbolic.workcell.archive import archive_cell, unpack_cell
 from symbolic.workcell.decision import initial_decision
+from symbolic.workcell.drivable import drivable_archive
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
 
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from hybrid_opt.collision.certify import Certificate
     from hybrid_opt.polishing.functions import PolishFunctions
     from hybrid_opt.timing.model import TimingModel
+    from hybrid_opt.timing.path_timer import PathTimer
 
 _CHUNK = 500
 """Candidates evaluated at once; every sample of each is held in memory."""
@@ -63,6 +67,7 @@ class Cell:
         self.compiled = CompiledCell(workcell)
         self.threads = threads
         self._objectives = tuple(objectives)
+        self._folder: TemporaryDirectory[str] | None = None
 
     @classmethod
     def load(
@@ -87,6 +92,21 @@ class Cell:
         decided = load(self.workcell.source, decided=branches)
         return Cell(decided, self._objectives, self.threads)
 
+    def drivable(self) -> Cell:
+        """The same cell with carries as robots drive them: under the time law 'optimal', searched
+        for duration and peak force (docs/timing.md).
+
+        Its workcell file lies in a temporary folder that lasts as long as the cell.
+
+        Raises:
+            BundleError: the workcell file cannot be changed, or was since it was read.
+        """
+        folder = TemporaryDirectory()
+        workcell = unpack_cell(drivable_archive(archive_cell(self.workcell)), Path(folder.name))
+        cell = Cell(workcell, DRIVABLE_OBJECTIVES, self.threads)
+        cell._folder = folder
+        return cell
+
     @cached_property
     def evaluator(self) -> CandidateEvaluator:
         """What judges candidates.
@@ -105,6 +125,13 @@ class Cell:
         from hybrid_opt.timing.model import TimingModel
 
         return TimingModel(self.compiled)
+
+    @cached_property
+    def path_timer(self) -> PathTimer:
+        """What times many paths, in compiled code."""
+        from hybrid_opt.timing.path_timer import PathTimer
+
+        return PathTimer(self.compiled, threads=self.threads)
 
     @cached_property
     def polish_functions(self) -> PolishFunctions:

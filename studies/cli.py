@@ -15,6 +15,7 @@ from hybrid_opt.campaign.settings import FirstGeneration
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.metaheuristics.problem import ConstraintHandling
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.recommending.wish import Wish
 from symbolic.errors import SettingsError
 
 _DEFAULT = CampaignSettings()
@@ -119,11 +120,13 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         f"with --quick {QUICK_POLISH_POINTS})",
     )
     after.add_argument(
-        "--force-limit",
-        type=_force,
-        metavar="N",
-        help="also find the fastest timing with both normal forces below N newtons (default: none)",
+        "--drivable",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also search for carries as robots drive them, of least duration and force, and "
+        "recommend one (default: yes)",
     )
+    add_wishes(after)
     after.add_argument(
         "--report",
         action=argparse.BooleanOptionalAction,
@@ -159,6 +162,30 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         "--quiet", action="store_true", help="no progress on standard error (default: shown)"
     )
     return parser
+
+
+def add_wishes(parser: argparse._ActionsContainer) -> None:
+    """Add what may be asked of the recommended carry; `wish` reads it."""
+    parser.add_argument(
+        "--duration",
+        type=_positive,
+        metavar="S",
+        help="recommend the least force of the carries of at most S seconds (default: the knee)",
+    )
+    parser.add_argument(
+        "--force-limit",
+        type=_positive,
+        metavar="N",
+        help="recommend the shortest carry with both normal forces below N newtons; a study also "
+        "times every selected trajectory with that limit (default: the knee)",
+    )
+    parser.add_argument(
+        "--payload",
+        type=_positive,
+        metavar="KG",
+        help="recommend the shortest carry on whose motion the robots would bear a box of KG "
+        "kilograms (default: the knee)",
+    )
 
 
 def campaign_settings(options: argparse.Namespace) -> CampaignSettings:
@@ -201,6 +228,15 @@ def polish_settings(options: argparse.Namespace) -> PolishSettings | None:
     return PolishSettings(points=points)
 
 
+def wish(options: argparse.Namespace) -> Wish:
+    """What the options ask of the recommended carry.
+
+    Raises:
+        SettingsError: more than one of them is given.
+    """
+    return Wish(options.duration, options.force_limit, options.payload)
+
+
 def execution_settings(options: argparse.Namespace, output: Path) -> ExecutionSettings:
     """How the options want the work done.
 
@@ -235,11 +271,11 @@ def _population(text: str) -> tuple[str, int]:
     return name, int(size)
 
 
-def _force(text: str) -> float:
+def _positive(text: str) -> float:
     try:
-        force = float(text)
+        value = float(text)
     except ValueError:
-        force = math.nan
-    if not 0.0 < force < math.inf:
-        raise argparse.ArgumentTypeError(f"found {text!r}; allowed is a positive force in newtons")
-    return force
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"found {text!r}; allowed is a positive number")
+    return value

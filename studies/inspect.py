@@ -2,8 +2,9 @@
 
 Prints the cell's facts, the postures at the start, the static bound, the verdicts on the
 hand-made trajectory and on the straight line, the feasibility of random candidates by
-constraint, with the pairs, joints and robots that are in the way most, and the number of collision
-pairs (--pairs lists them with the reasons for those left out); draws the cell and both arms' reach.
+constraint, with the pairs, joints and robots that are in the way most, the bounds that a short
+polish ends on, and the number of collision pairs (--pairs lists them with the reasons for those
+left out); draws the cell and both arms' reach.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from hybrid_opt.carry import Judgement
-from studies.inspection import Branch, Inspection, inspect
+from studies.inspection import Branch, Inspection, Optimum, inspect
 from studies.options import seed, whole
 from studies.program import add_verbose, carried_out, run_program
 from symbolic.workcell.file import load
@@ -62,6 +63,8 @@ def as_text(found: Inspection, pairs: bool = False) -> str:
         f"  {name.replace('_', ' ')}: {count} ({100.0 * count / found.candidates:.1f} %)"
         for name, count in found.infeasible_by_reason.items()
     ]
+    if found.optimum is not None:
+        lines += ["", *_optimum_lines(found.optimum)]
     for heading, title in _IN_THE_WAY.items():
         counts = list(found.in_the_way[heading].items())[:MOST_TOLD]
         if counts:
@@ -81,6 +84,18 @@ def as_text(found: Inspection, pairs: bool = False) -> str:
 
 def _why(found: Inspection, name: str) -> list[str]:
     return [f"  {found.explained[name]}"] if name in found.explained else []
+
+
+def _optimum_lines(optimum: Optimum) -> list[str]:
+    if optimum.problem:
+        return [f"Bounds at the optimum: not known: {optimum.problem}"]
+    head = f"Bounds at the optimum ({optimum.solutions} points of a short polish)"
+    if not optimum.binding:
+        return [f"{head}: none binds"]
+    return [
+        f"{head}: these bind, wider ones may allow better carries",
+        *(f"  {bound}: {bound.solutions} of {optimum.solutions}" for bound in optimum.binding),
+    ]
 
 
 def _branch_text(branch: Branch) -> str:
@@ -121,6 +136,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="DIR",
         help="folder for the pictures (default: inspect/NAME of the workcell file)",
     )
+    parser.add_argument(
+        "--polish",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="polish the hand-made trajectory shortly, to see which bounds bind (default: yes)",
+    )
     parser.add_argument("--no-pictures", action="store_true", help="draw nothing")
     parser.add_argument("--pairs", action="store_true", help="list every pair of bodies")
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
@@ -132,6 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.candidates,
         options.seed,
         None if options.no_pictures else output,
+        options.polish,
     )
     print(json.dumps(asdict(found), indent=2) if options.json else as_text(found, options.pairs))
     return 0

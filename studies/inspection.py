@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+import hybrid_opt as ho
 from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.explanation import explain, frequent
+from hybrid_opt.front import Front
+from hybrid_opt.indicators.bounds import BindingBound, binding_bounds
 from studies.report.data import shown
 from studies.report.figures_cell import environment, reachable_regions
 from studies.report.reach import reach_map
@@ -23,6 +26,10 @@ from symbolic.workcell.records import Workcell
 
 EXPLAINED = 200
 """Most infeasible candidates that are looked at closer."""
+
+POLISH_ATTEMPTS = 10
+"""Solves of the short polish: the trajectory itself, then ends, middle and gaps of what it
+becomes."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +45,21 @@ class Branch:
     manipulability: float
     least_manipulability: float
     chosen: bool
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """What a short polish of the hand-made trajectory leads to.
+
+    Attributes:
+        solutions: of the polished front.
+        binding: the bounds that they lie on.
+        problem: why there is no polish, '' where there is one.
+    """
+
+    solutions: int
+    binding: tuple[BindingBound, ...]
+    problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -59,6 +81,7 @@ class Inspection:
         infeasible_by_reason: of them, by the constraint violated first.
         explained_candidates: infeasible ones of them that were looked at closer.
         in_the_way: of these, how often each pair of bodies, joint and robot is in the way first.
+        optimum: a short polish, None where none was asked for.
         active_pairs: pairs of bodies that are checked.
         excluded_pairs: pairs that are not, and why.
         files: pictures written.
@@ -79,12 +102,19 @@ class Inspection:
     infeasible_by_reason: dict[str, int]
     explained_candidates: int
     in_the_way: dict[str, dict[str, int]]
+    optimum: Optimum | None
     active_pairs: tuple[tuple[str, str], ...]
     excluded_pairs: tuple[tuple[str, str, str], ...]
     files: tuple[str, ...]
 
 
-def inspect(workcell: Workcell, candidates: int, seed: int, output: Path | None) -> Inspection:
+def inspect(
+    workcell: Workcell,
+    candidates: int,
+    seed: int,
+    output: Path | None,
+    polish: bool = False,
+) -> Inspection:
     """Look at a workcell.
 
     Args:
@@ -92,6 +122,7 @@ def inspect(workcell: Workcell, candidates: int, seed: int, output: Path | None)
         candidates: random ones to judge, at least 1.
         seed: of their randomness.
         output: folder for the pictures, None to draw none.
+        polish: whether to polish the hand-made trajectory shortly, to see which bounds bind.
 
     Raises:
         SettingsError: no candidates.
@@ -126,6 +157,7 @@ def inspect(workcell: Workcell, candidates: int, seed: int, output: Path | None)
         infeasible_by_reason=found.infeasible_by_reason,
         explained_candidates=len(failed),
         in_the_way=frequent(explain(cell.evaluator, failed)),
+        optimum=_optimum(cell) if polish else None,
         active_pairs=geometry.pair_names,
         excluded_pairs=tuple(
             (names[p.first], names[p.second], p.reason) for p in geometry.excluded
@@ -141,6 +173,23 @@ def _explained(cell: Cell, candidates: dict[str, Array]) -> dict[str, str]:
         for explanation in explain(cell.evaluator, cell.evaluate(x)):
             found[name] = str(explanation)
     return found
+
+
+def _optimum(cell: Cell) -> Optimum:
+    """A short polish of the hand-made trajectory, and the bounds that bind where it ends."""
+    verdicts = cell.evaluate(cell.initial)
+    if not verdicts.feasible.all():
+        return Optimum(0, (), "the hand-made trajectory, its start, is infeasible")
+    try:
+        front = ho.polish(
+            cell,
+            Front.of_search(cell, "hand-made", verdicts),
+            rng=np.random.default_rng(0),
+            settings=ho.PolishSettings(points=POLISH_ATTEMPTS),
+        )
+    except SettingsError as error:
+        return Optimum(0, (), str(error))
+    return Optimum(len(front), binding_bounds(cell.workcell.task, front.x))
 
 
 def _branches(cell: Cell, model: CellModel, arm: int) -> tuple[Branch, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from hybrid_opt.campaign import (
@@ -18,17 +18,23 @@ from hybrid_opt.campaign import (
     search_stage,
 )
 from hybrid_opt.campaign.branch_choice import decided_cell, store_branches
+from hybrid_opt.campaign.experiment_stage import drivable_stage
+from hybrid_opt.campaign.layout import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.recommending.wish import Wish
 from hybrid_opt.work.processes import warm_up
 from studies.cli import (
     campaign_parser,
     campaign_settings,
     execution_settings,
     polish_settings,
+    wish,
 )
 from studies.program import add_verbose, carry_out, run_program
+from studies.recommendation_stage import recommendation_stage
+from studies.recommendation_text import recommendation_text
 from studies.report.stage import add_report_options, follow_report_options, report_stage
 from studies.summary_stage import summary_stage
 from studies.terminal_summary import terminal_summary
@@ -52,13 +58,17 @@ class StudySettings:
 
     Attributes:
         polish: how fronts are polished, None for not at all.
-        force_limit: normal force [N] of an additional timing, None for none.
+        drivable: whether carries are also searched for as robots drive them.
+        drivable_polish: how their fronts are polished, None for not at all.
+        wish: what is asked of the recommended one of them.
         report: whether figures, tables and the page are written.
         with_paper: whether the figures stand beside those that the paper states.
     """
 
     polish: PolishSettings | None = None
-    force_limit: float | None = None
+    drivable: bool = True
+    drivable_polish: PolishSettings | None = None
+    wish: Wish = field(default_factory=Wish)
     report: bool = True
     with_paper: bool = False
 
@@ -68,7 +78,11 @@ def stages(study: StudySettings) -> tuple[Stage, ...]:
     every = [search_stage()]
     if study.polish is not None:
         every.append(polish_stage(study.polish))
-    every += [summary_stage(), timing_stage(study.force_limit)]
+    if study.drivable:
+        inner = [] if study.drivable_polish is None else [polish_stage(study.drivable_polish)]
+        every.append(drivable_stage([search_stage(), *inner, summary_stage()]))
+        every.append(recommendation_stage(study.wish))
+    every += [summary_stage(), timing_stage(study.wish.force)]
     if study.report:
         every.append(report_stage(study.with_paper))
     return tuple(every)
@@ -97,7 +111,23 @@ def run_study(
     with open_folder(settings, execution, cell) as folder:
         told = store_branches(folder.root, competition)
         run_stages(folder, stages(study), progress)
-        return told + terminal_summary(read_summary(folder.root), study.with_paper)
+        return told + study_text(folder.root, study.with_paper)
+
+
+def study_text(root: Path, with_paper: bool) -> str:
+    """The figures of a finished study for a terminal, the carry to run first.
+
+    Raises:
+        ResultsError: the folder is not complete or damaged.
+    """
+    summary = read_summary(root)
+    found = summary.recommendation
+    words = (
+        "" if found is None else recommendation_text(found, summary.robots, str(root)).terminal()
+    )
+    beside = (root / DRIVABLE / SUMMARY).exists()
+    drivable = read_summary(root / DRIVABLE) if beside else None
+    return terminal_summary(summary, with_paper, words, drivable)
 
 
 def main(
@@ -131,7 +161,11 @@ def main(
         if execution.executor == "processes":
             warm_up(*WORKERS_LOAD)
         study = StudySettings(
-            polish_settings(options), options.force_limit, options.report, bool(workcell)
+            polish=polish_settings(options),
+            drivable=options.drivable,
+            wish=wish(options),
+            report=options.report,
+            with_paper=bool(workcell),
         )
         print(run_study(cell, settings, execution, Progress(not options.quiet), study))
         print(f"\nResults: {execution.output}")

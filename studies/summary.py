@@ -15,6 +15,7 @@ from hybrid_opt.campaign.polish_stage import PolishedReplica
 from hybrid_opt.campaign.results import CampaignResults, Replica
 from hybrid_opt.campaign.summary import (
     AlgorithmFigures,
+    Bounds,
     CampaignSummary,
     FrontFigures,
     PolishedFigures,
@@ -23,14 +24,17 @@ from hybrid_opt.campaign.summary import (
     SelectedEntry,
     StaticForces,
     Statistics,
+    StoredBound,
     StoredFront,
     StoredTest,
 )
 from hybrid_opt.evaluate.static_hold import StaticHold
 from hybrid_opt.indicators import metrics
+from hybrid_opt.indicators.bounds import binding_bounds
 from hybrid_opt.indicators.selection import Selected
 from hybrid_opt.indicators.statistics import corrected, rank_test, summarise
 from symbolic.array import Array
+from symbolic.workcell.records import Workcell
 
 FIGURES = (
     "feasible",
@@ -144,7 +148,7 @@ def campaign_summary(
     static: StaticHold,
     entries: Mapping[str, Sequence[ReplicaFigures]],
 ) -> CampaignSummary:
-    """The whole summary.
+    """The figures of the search and of the polish.
 
     Args:
         results: the campaign.
@@ -156,6 +160,7 @@ def campaign_summary(
     corner = metrics.reference_point(len(results.objectives))
     return CampaignSummary(
         workcell=configuration.workcell,
+        robots=tuple(robot.name for robot in results.workcell.robots),
         settings=configuration.settings,
         environment=configuration.environment,
         objectives=results.objectives,
@@ -177,6 +182,12 @@ def campaign_summary(
         },
         tests=_tests(entries),
     )
+
+
+def bounds_of(workcell: Workcell, x: Array) -> Bounds:
+    """What the bounds do to the solutions (k, n_var) of the best fronts."""
+    found = binding_bounds(workcell.task, x)
+    return Bounds(len(x), tuple(StoredBound(**vars(bound)) for bound in found))
 
 
 def _statistics(rows: Sequence[FrontFigures], names: Sequence[str]) -> dict[str, Statistics]:

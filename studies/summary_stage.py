@@ -6,9 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage
 from hybrid_opt.campaign.layout import (
     FRONTS,
+    HAND_MADE,
+    SELECTED,
     SUMMARY,
     polished_selected_file,
     reference_front_file,
@@ -21,8 +25,16 @@ from hybrid_opt.indicators.attainment import attainment_surfaces
 from hybrid_opt.indicators.selection import Selected, select
 from hybrid_opt.store.files import storing, write_atomically, write_json
 from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
-from studies.summary import campaign_summary, polished_figures, reference_front, replica_figures
+from studies.recommendation_stage import read_recommendation
+from studies.summary import (
+    bounds_of,
+    campaign_summary,
+    polished_figures,
+    reference_front,
+    replica_figures,
+)
 from symbolic.array import Array
 
 PERCENTILES = (25.0, 50.0, 75.0, 100.0)
@@ -66,8 +78,31 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
         _write_points(folder, name, results.objectives, union)
         if len(results.objectives) in (2, 3):
             _write_attainment(folder, name, results)
-    summary = campaign_summary(results, reference, folder.cell.static_hold, entries)
+    best = [
+        replica.front_x if front is None else front.x
+        for replica in results.replicas
+        for front in [polished[replica.algorithm, replica.replica]]
+    ]
+    _store_hand_made(folder)
+    summary = replace(
+        campaign_summary(results, reference, folder.cell.static_hold, entries),
+        bounds=bounds_of(folder.workcell, np.concatenate(best)),
+        recommendation=read_recommendation(folder.root),
+    )
     write_json(folder.root / SUMMARY, to_json(summary))
+
+
+def _store_hand_made(folder: CampaignFolder) -> None:
+    """Write the workcell file's own trajectory, feasible or not, beside the selected ones."""
+    carry = folder.cell.carry(folder.cell.initial)
+    path = folder.root / SELECTED / HAND_MADE
+    with storing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    provenance = {"source": "the workcell file's initial trajectory"}
+    # An infeasible one may be without some of its figures.
+    figures = trajectory_figures(carry).items()
+    known = {name: value for name, value in figures if np.isfinite(value)}
+    write_trajectory(path, folder.workcell, carry.x, known, provenance)
 
 
 def _store_selected(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, StoredTest
+from hybrid_opt.campaign.recommended import ForceTable
+from hybrid_opt.campaign.summary import AlgorithmFigures, Bounds, CampaignSummary, StoredTest
 from studies.text_table import number, text_table
 
 TITLES = {
@@ -53,15 +55,23 @@ def title(algorithm: str) -> str:
     return TITLES.get(algorithm, algorithm)
 
 
-def terminal_summary(summary: CampaignSummary, with_paper: bool) -> str:
+def terminal_summary(
+    summary: CampaignSummary,
+    with_paper: bool,
+    recommendation: str = "",
+    drivable: CampaignSummary | None = None,
+) -> str:
     """The figures of a summary.json as text.
 
     Args:
         summary: as from `hybrid_opt.campaign.results.read_summary`.
         with_paper: whether to print what the paper states, which is of its rack cell.
+        recommendation: the words about the carry to run, which come first.
+        drivable: figures of the drivable experiment beside this one.
     """
     settings = summary.settings
     parts = [
+        recommendation,
         f"{summary.workcell.name}: {settings.replicas} replicas of "
         f"{settings.evaluations} evaluations, seed {settings.seed}",
         _table_1(summary.algorithms),
@@ -70,10 +80,71 @@ def terminal_summary(summary: CampaignSummary, with_paper: bool) -> str:
         _over_replicas(summary.algorithms),
         _polish(summary.algorithms),
         _tests(summary.tests),
+        bounds_sentence(summary.bounds),
     ]
+    if summary.recommendation is not None:
+        parts.append(_durations(summary.recommendation.durations))
+    if drivable is not None:
+        parts += [
+            f"The drivable experiment\n{_drivable(drivable)}",
+            bounds_sentence(drivable.bounds),
+        ]
     if with_paper:
         parts.append(_paper(summary.algorithms))
     return "\n\n".join(part for part in parts if part)
+
+
+def bounds_sentence(bounds: Bounds) -> str:
+    """Which bounds of the variables the best fronts lie on, and what follows from that."""
+    if not bounds.solutions:
+        return ""
+    head = f"Bounds of the variables at the {bounds.solutions} members of the best fronts"
+    if not bounds.binding:
+        return f"{head}: none binds"
+    listed = "\n".join(
+        f"  {bound.side} bound of {bound.variable} ({bound.value:g}): {bound.solutions}"
+        for bound in bounds.binding
+    )
+    return f"{head}; these bind, wider ones may allow better carries\n{listed}"
+
+
+def _durations(table: ForceTable) -> str:
+    """How long all fronts take at the same forces."""
+    rows = [["duration [s] at", *(f"{force:.2f} N" for force in table.forces)]]
+    for row in table.rows:
+        cells = [
+            _spread_of(*values) for values in zip(row.median, row.least, row.largest, strict=True)
+        ]
+        rows.append([row.label, *cells])
+    note = "Every path timed anew at the force; of fronts the fastest member, median [least, most]."
+    return f"Time against force\n{text_table(rows)}\n{note}"
+
+
+def _spread_of(median: float, least: float, largest: float) -> str:
+    if not math.isfinite(median):
+        return number(None, 3)
+    if least == largest:
+        return number(median, 3)
+    return f"{number(median, 3)} [{number(least, 3)}, {number(largest, 3)}]"
+
+
+def _drivable(summary: CampaignSummary) -> str:
+    """Hypervolume in duration and force, searched and polished, over the replicas."""
+    rows = [["median", "feasible %", "front", "HV", "HV polished", "better in", "seconds"]]
+    for name, entry in summary.algorithms.items():
+        found, after = entry.statistics, entry.polished
+        rows.append(
+            [
+                title(name),
+                number(found["feasible_share"].median, 1, 100.0),
+                number(found["non_dominated"].median, 0),
+                number(found["hypervolume"].median, 5),
+                number(None if after is None else after.statistics["hypervolume"].median, 5),
+                "-" if after is None else f"{after.replicas_improved} of {len(entry.replicas)}",
+                number(found["seconds"].median, 2),
+            ]
+        )
+    return text_table(rows)
 
 
 def _table_1(algorithms: Mapping[str, AlgorithmFigures]) -> str:
@@ -108,7 +179,9 @@ def _reasons(algorithms: Mapping[str, AlgorithmFigures]) -> str:
 
 
 def _table_2(summary: CampaignSummary) -> str:
-    heading = ["N", "least 1", "least 2", "peak 1", "peak 2", "above static %", "payload kg"]
+    left, right = summary.robots
+    of_robots = [f"least, {left}", f"least, {right}", f"peak, {left}", f"peak, {right}"]
+    heading = ["N", *of_robots, "above static %", "payload kg"]
     rows = [heading]
     static = summary.static_hold
     still = [number(force, 2) for force in static.normal_force]
@@ -129,7 +202,7 @@ def _table_2(summary: CampaignSummary) -> str:
         )
     rows.append(["held still", *still, *still, "0.00", number(static.payload_limit, 2)])
     return (
-        "Table 2. Normal forces of robots 1 and 2 along the selected trajectories (least mean "
+        "Table 2. Normal forces along the selected trajectories (least mean "
         f"peak\nforce of the replica with the largest hypervolume)\n{text_table(rows)}"
     )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
 from hybrid_opt.campaign.cell_source import PackedCell
@@ -20,9 +19,6 @@ from symbolic.workcell.records import Workcell
 
 TIMING = "timing"
 """Folder of the timings in a results folder, laid out as that of the selected trajectories."""
-
-INITIAL = "initial.json"
-"""The hand-made trajectory's timings in that folder."""
 
 
 def timing_stage(force_limit: float | None = None) -> Stage:
@@ -41,8 +37,7 @@ def timing_stage(force_limit: float | None = None) -> Stage:
 def _run(folder: CampaignFolder, progress: Progress, force_limit: float | None) -> None:
     selected = folder.root / SELECTED
     files = sorted(path.relative_to(selected) for path in selected.rglob("*.json"))
-    found = {Path(INITIAL): initial_decision(folder.workcell.task)}
-    found |= {file: read_trajectory(selected / file).x for file in files}
+    found = {file: read_trajectory(selected / file).x for file in files}
     job = Job(TimingModelSource(PackedCell.of(folder.archive)), _document)
     requests = [(x, force_limit) for x in found.values()]
     with progress.stage(TIMING, len(requests), "trajectories") as advance:

@@ -13,6 +13,9 @@ from symbolic.array import Array
 
 Count = Annotated[int, Range(0, 10**12)]
 Seconds = Annotated[float, Range(0.0, 1e12)]
+Pair = Annotated[Array, Shape((2,))]
+"""One number per robot."""
+
 StageStatus = Literal["running", "done", "outdated"]
 
 

@@ -20,10 +20,12 @@ class Progress:
 
     Attributes:
         shown: False to show nothing.
+        of: what the stages belong to, in front of their titles.
     """
 
-    def __init__(self, shown: bool = True) -> None:
+    def __init__(self, shown: bool = True, of: str = "") -> None:
         self.shown = shown
+        self.of = of
 
     @contextmanager
     def stage(self, title: str, total: int, unit: str, done: int = 0) -> Iterator[Advance]:
@@ -38,7 +40,7 @@ class Progress:
         bar = tqdm(
             total=total,
             initial=done,
-            desc=title,
+            desc=f"{self.of} {title}".strip(),
             unit=f" {unit}",
             file=sys.stderr,
             mininterval=0.2 if sys.stderr.isatty() else _QUIET_SECONDS,

@@ -6,12 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from hybrid_opt.campaign.documents import Count, PolishEffort, Seconds, StoredCell, StoredSettings
+from hybrid_opt.campaign.documents import (
+    Count,
+    Pair,
+    PolishEffort,
+    Seconds,
+    StoredCell,
+    StoredSettings,
+)
+from hybrid_opt.campaign.recommended import StoredRecommendation
 from hybrid_opt.store.json_records import Figure, Range, Shape
 from symbolic.array import Array
-
-Pair = Annotated[Array, Shape((2,))]
-"""One number per robot."""
 
 Share = Annotated[float, Range(0.0, 1.0)]
 
@@ -176,10 +181,47 @@ class StoredFront:
 
 
 @dataclass(frozen=True)
+class StoredBound:
+    """A bound of the decision variables that solutions lie on, see `hybrid_opt.indicators.bounds`.
+
+    Attributes:
+        variable, side, value: which bound [m, rad].
+        solutions: how many lie on it.
+    """
+
+    variable: str
+    side: Literal["lower", "upper"]
+    value: float
+    solutions: Count
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the bounds of the decision variables do to the best fronts of all replicas.
+
+    Attributes:
+        solutions: members of these fronts, polished where they were.
+        binding: the bounds that some of them lie on.
+    """
+
+    solutions: Count
+    binding: tuple[StoredBound, ...]
+
+
+NO_BOUNDS = Bounds(0, ())
+
+
+@dataclass(frozen=True)
 class CampaignSummary:
-    """summary.json."""
+    """summary.json.
+
+    Attributes:
+        robots: their names, in the order of all pairs.
+        recommendation: the carry to run, None where the study has none.
+    """
 
     workcell: StoredCell
+    robots: tuple[str, ...]
     settings: StoredSettings
     environment: Mapping[str, str]
     objectives: tuple[str, ...]
@@ -188,9 +230,13 @@ class CampaignSummary:
     reference_front: StoredFront
     algorithms: Mapping[str, AlgorithmFigures]
     tests: tuple[StoredTest, ...]
+    bounds: Bounds = NO_BOUNDS
+    recommendation: StoredRecommendation | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not belong together."""
+        if len(self.robots) != 2:
+            raise ValueError("does not name two robots")
         if list(self.algorithms) != list(self.settings.algorithms):
             raise ValueError("its algorithms are not those of its settings")
         for name, entry in self.algorithms.items():

@@ -72,7 +72,7 @@ def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
 
 def _duration(outputs: Outputs, workcell: Workcell) -> Array:
     """Duration over twice the time that the initial trajectory's polygon takes."""
-    duration = outputs["time"][:, -1] / (2.0 * _polygon_time(workcell))
+    duration = outputs["time"][:, -1] / duration_unit(workcell)
     return np.asarray(duration, dtype=float)
 
 
@@ -127,6 +127,11 @@ def _time_average(values: Array, time: Array) -> Array:
     """Trapezoidal average over time; values and time (n, samples)."""
     integral = np.trapezoid(values, time, axis=1)
     return np.asarray(integral / (time[:, -1] - time[:, 0]), dtype=float)
+
+
+def duration_unit(workcell: Workcell) -> float:
+    """The time [s] that the objective `duration` counts as one."""
+    return 2.0 * _polygon_time(workcell)
 
 
 def _polygon_time(workcell: Workcell) -> float:

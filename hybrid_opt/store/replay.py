@@ -59,7 +59,8 @@ def replay(stored: StoredTrajectory, folder: Path) -> Replay:
         DualArmError: the stored workcell is not valid, or its model cannot be built.
     """
     workcell = stored.unpack(folder)
-    named = [name.removeprefix("objective_") for name in stored.figures]
+    prefix = "objective_"
+    named = [name.removeprefix(prefix) for name in stored.figures if name.startswith(prefix)]
     objectives = tuple(name for name in named if name in OBJECTIVES)
     cell = Cell(workcell, objectives or PAPER_OBJECTIVES)
     carry = cell.carry(stored.x)

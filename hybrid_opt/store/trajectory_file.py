@@ -39,6 +39,9 @@ MAX_FILE_BYTES = 256 * outside.MEBIBYTE
 LARGEST_DECISION = 100.0
 """Largest value of a decision vector and of a start posture [m, rad]: no cell has larger ones."""
 
+LARGEST_FORCE = 1e5
+"""Largest last value of a decision vector, which may be a force limit [N]."""
+
 MOST_NUMBERS = 10_000
 _KEYS = {"format", "version", "decision", "start", "figures", "provenance", "cell"}
 
@@ -102,7 +105,7 @@ def write_trajectory(
     x = np.asarray(x, dtype=float)
     if x.shape != (workcell.task.n_var,) or not np.isfinite(x).all():
         raise ResultsError(f"decision vector: expected {workcell.task.n_var} finite numbers")
-    outputs = CompiledCell(workcell).evaluators["candidate"](x)
+    outputs = CompiledCell(workcell).evaluators["candidate"](x, *_standing_still(workcell))
     document = {
         "format": FORMAT,
         "version": VERSION,
@@ -119,6 +122,15 @@ def write_trajectory(
     path = Path(path)
     with storing(path):
         replace_file(path, f"{text}\n".encode())
+
+
+def _standing_still(workcell: Workcell) -> tuple[Array, ...]:
+    """What a candidate takes besides x: under 'optimal' a timing, which the start
+    postures do not depend on."""
+    if workcell.task.time_law != "optimal":
+        return ()
+    still = np.zeros(workcell.task.samples)
+    return np.linspace(0.0, 1.0, workcell.task.samples), still, still
 
 
 def read_trajectory(path: str | Path) -> StoredTrajectory:
@@ -170,10 +182,12 @@ def _vector(value: Any, name: str) -> Array:
     if len(value) > MOST_NUMBERS:
         raise ResultsError(f"{name}: {len(value)} numbers; allowed are {MOST_NUMBERS}")
     numbers = np.array([_figure(f"{name}[{k}]", entry) for k, entry in enumerate(value)])
-    for k in np.flatnonzero(np.abs(numbers) > LARGEST_DECISION):
+    most = np.full(len(numbers), LARGEST_DECISION)
+    if name == "decision":
+        most[-1:] = LARGEST_FORCE
+    for k in np.flatnonzero(np.abs(numbers) > most):
         raise ResultsError(
-            f"{name}[{k}]: found {numbers[k]:g}; allowed is {-LARGEST_DECISION:g} to "
-            f"{LARGEST_DECISION:g}"
+            f"{name}[{k}]: found {numbers[k]:g}; allowed is {-most[k]:g} to {most[k]:g}"
         )
     return numbers
 

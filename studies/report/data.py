@@ -20,6 +20,7 @@ from hybrid_opt.timing import TimingModel, timed_trajectory
 from hybrid_opt.timing.robustness import payload_sensitivity
 from hybrid_opt.work.job import Emit, Executor, Job, answer_all
 from hybrid_opt.work.serial import SerialExecutor
+from studies.report.data_drivable import gather_drivable
 from studies.report.reach import reach_map
 from studies.report.records import (
     AlgorithmRuns,
@@ -66,17 +67,30 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     slow += [partial(_timing, carry.label, carry.x) for carry in carries]
     job = Job(TimingModelSource(PackedCell.of(archive_cell(workcell))), _called)
     reach, *timings = answer_all(executor or SerialExecutor(), job, slow)
+    archive = archive_cell(workcell)
     return ReportData(
+        root=results.root,
         workcell=workcell,
+        archive=archive,
         geometry=geometry,
         summary=summary,
-        objective_titles=tuple(OBJECTIVES[name].title for name in results.objectives),
+        objectives=results.objectives,
+        objective_titles=_titles(results),
         static=_static(results, summary),
         algorithms=algorithms,
         initial=carries[0],
         timings=tuple(timings),
         reach=reach,
+        drivable=gather_drivable(results.root, results.objectives, summary),
     )
+
+
+def _titles(results: CampaignResults) -> tuple[str, ...]:
+    """The objectives' titles, with the robots' names for their numbers."""
+    titles = [OBJECTIVES[name].title for name in results.objectives]
+    for i, robot in enumerate(results.workcell.robots):
+        titles = [title.replace(f"robot {i + 1}", robot.name) for title in titles]
+    return tuple(titles)
 
 
 def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:

@@ -141,8 +141,9 @@ def _carry_figures(data: ReportData) -> Iterator[ReportFigure]:
     if data.timings:
         yield ReportFigure(
             "duration_against_force",
-            "Shortest drivable duration for every limit on the normal forces; friction, joint and "
-            "payload limits hold throughout.",
+            "Drivable durations against the limit on the normal forces: single paths timed anew "
+            "at every limit, and the members of the drivable fronts. All other limits hold "
+            "throughout.",
             lambda: figures_carry.duration_against_force(data),
         )
 

@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
-from studies.report.records import DrawnCarry, ReportData
+from studies.report.page_views import drive_look, limits
+from studies.report.records import DrawnCarry, DrivableReport, ReportData
 from studies.report.style import (
     FULL_WIDTH,
-    INITIAL,
+    HAND_MADE,
     LineStyle,
     new_figure,
     panel_label,
@@ -28,7 +29,10 @@ STATIC_COLOUR = "#b00020"
 def styled(data: ReportData) -> tuple[tuple[DrawnCarry, LineStyle], ...]:
     """The hand-made trajectory and each algorithm's best one, with their looks."""
     best = [(a.best, series(a.index)) for a in data.algorithms]
-    return ((data.initial, INITIAL), *((carry, look) for carry, look in best if carry is not None))
+    return (
+        (data.initial, HAND_MADE),
+        *((carry, look) for carry, look in best if carry is not None),
+    )
 
 
 def normal_forces(data: ReportData) -> Figure:
@@ -223,33 +227,81 @@ def _note_limits(axes: Axes, data: ReportData, i: int) -> None:
 
 
 def duration_against_force(data: ReportData) -> Figure:
-    """Fastest drivable duration for each limit on the normal forces."""
-    figure = new_figure(FULL_WIDTH, 0.46 * FULL_WIDTH)
+    """Durations for each limit on the normal forces: of single paths, and of the drivable fronts
+    where there are any."""
+    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     axes = figure.subplots()
     looks: Sequence[LineStyle] = [look for _, look in styled(data)]
+    curves = []
     for selection, look in zip(data.timings, looks, strict=True):
         known = np.isfinite(selection.curve.duration)
+        curves.append(np.stack([selection.curve.force, selection.curve.duration], axis=1)[known])
         axes.plot(
-            selection.curve.force[known],
-            selection.curve.duration[known],
+            *curves[-1].T,
             color=look.colour,
             linestyle=look.line,
-            marker=look.marker,
+            marker="" if data.drivable else look.marker,
             markersize=3.5,
-            label=selection.label,
+            label=_curve_label(data, selection.label),
         )
-        axes.axvline(
-            selection.curve.static_force,
-            color=look.colour,
-            linewidth=0.7,
-            linestyle=look.line,
-            label=f"{selection.label}: largest force at rest",
-        )
+    if data.drivable is not None:
+        curves += _draw_fronts(axes, data.drivable)
+    _draw_still(axes, data)
+    _look_at(axes, np.concatenate(curves))
     axes.set_xlabel("limit on the normal forces [N]")
-    axes.set_ylabel("shortest duration [s]")
-    axes.set_yscale("log")
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}")
-    axes.tick_params(axis="y", which="minor", labelsize=6)
+    axes.set_ylabel("duration [s]")
     axes.legend(loc="upper right")
     return figure
+
+
+def _curve_label(data: ReportData, label: str) -> str:
+    """A curve's label beside fronts: a selected path is that of least force."""
+    if data.drivable is None or label == data.initial.label:
+        return label
+    return f"{label}: least-force path"
+
+
+def _draw_fronts(axes: Axes, drivable: DrivableReport) -> list[Array]:
+    """Members of the drivable fronts, and the carry to run; returns their points."""
+    polished = any(entry.front.polished for entry in drivable.fronts)
+    found = []
+    for entry in drivable.fronts:
+        look = series(entry.index)
+        opened = polished and not entry.front.polished
+        axes.plot(
+            entry.force,
+            entry.duration,
+            look.marker,
+            markersize=4.0,
+            markerfacecolor="none" if opened else look.colour,
+            markeredgecolor=look.colour if opened else "black",
+            markeredgewidth=0.6,
+            label=entry.front.label,
+        )
+        found.append(np.stack([entry.force, entry.duration], axis=1))
+    return found
+
+
+def _draw_still(axes: Axes, data: ReportData) -> None:
+    """The carry to run, and the force that holds the payload still."""
+    choice = data.summary.recommendation
+    if choice is not None:
+        axes.plot(
+            choice.force_limit,
+            choice.duration,
+            "*",
+            color=STATIC_COLOUR,
+            markersize=11.0,
+            label="recommended",
+        )
+    still = max(data.summary.static_hold.normal_force)
+    axes.axvline(still, color=STATIC_COLOUR, linewidth=0.8, linestyle=(0, (2, 2)), label="at rest")
+
+
+def _look_at(axes: Axes, points: Array) -> None:
+    """Limits of the axes around what a reader chooses between."""
+    if len(points) == 0:
+        return
+    (low, high), (least, most) = limits(drive_look(points, np.zeros((0, 2))))
+    axes.set_xlim(low, high)
+    axes.set_ylim(least, most)

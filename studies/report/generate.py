@@ -35,7 +35,7 @@ def write_report(
     Args:
         root: the results folder.
         data: from `studies.report.data.gather`.
-        cell: whose functions give the trajectories of whole fronts.
+        cell: of the first experiment; its functions give the trajectories of whole fronts.
         with_paper: whether figures that the paper states of its rack stand beside ours.
         done: called after every figure and after the page.
         executor: who draws, None for this process.
@@ -60,7 +60,7 @@ def write_report(
             ("tex", table.latex()),
         ):
             write_atomically(root / TABLES / f"{table.name}.{suffix}", text.encode())
-    document = PageData(data, cell.timing_model).document()
+    document = PageData(data, cell).document()
     page = root / PAGE
     write_atomically(page, render_page(data, document, tables, pictures).encode())
     done()

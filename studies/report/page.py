@@ -18,6 +18,7 @@ from typing import Any
 from hybrid_opt.display.scene import embedded_json, scene_js, three_js
 from hybrid_opt.store.json_records import to_json
 from studies.errors import ReportError
+from studies.recommendation_text import recommendation_text
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
 
@@ -49,6 +50,7 @@ def render_page(
         policy=_policy(scripts),
         title=html.escape(data.workcell.name),
         lead=html.escape(_lead(data)),
+        recommendation=_recommendation(data),
         facts=_facts(data),
         style=(texts / "page.css").read_text("utf-8"),
         tables="".join(table.html() for table in tables),
@@ -98,6 +100,30 @@ def _lead(data: ReportData) -> str:
         f"{len(task.free_indices)} of them free. {names}: {settings.replicas} replicas of "
         f"{settings.evaluations} evaluations each, seed {settings.seed}."
     )
+
+
+def _recommendation(data: ReportData) -> str:
+    """The words that the terminal opens with, too."""
+    found = data.summary.recommendation
+    if found is None:
+        return ""
+    words = recommendation_text(found, data.summary.robots, str(data.root))
+    facts = "".join(
+        f"<dt>{html.escape(heading)}</dt><dd>{_monospaced(heading, text)}</dd>"
+        for heading, text in words.facts
+    )
+    warnings = "".join(
+        f"<p class='warning'>Warning: {html.escape(text)}</p>" for text in words.warnings
+    )
+    return (
+        f"<section class='recommendation'><h2>{html.escape(words.headline)}</h2>"
+        f"<dl>{facts}</dl>{warnings}</section>"
+    )
+
+
+def _monospaced(heading: str, text: str) -> str:
+    escaped = html.escape(text)
+    return f"<code>{escaped}</code>" if heading in ("file", "export") else escaped
 
 
 def _facts(data: ReportData) -> str:

@@ -1,158 +1,229 @@
-"""What the page's scripts need: trajectories, shapes and fronts as compact JSON values."""
+"""What the page's scripts need: trajectories, pictures of fronts and shapes as JSON values."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from hybrid_opt import carry
+import hybrid_opt as ho
 from hybrid_opt.display.scene import packed, scene_data
-from hybrid_opt.timing import TimingModel
-from studies.report.records import AlgorithmRuns, DrawnCarry, Front, ReportData
-from studies.report.style import series
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from studies.report.page_carries import PageCarries, Shown
+from studies.report.page_views import FrontView, drive_look
+from studies.report.records import AlgorithmRuns, DrawnCarry, DrivableReport, Front, ReportData
+from studies.report.style import HAND_MADE, LineStyle, series
 from symbolic.array import Array
-
-MAX_SAMPLES = 60
-"""Samples of a trajectory on the page; its force peaks are kept besides."""
+from symbolic.workcell.archive import CellArchive, archive_to_json
 
 MAX_CLOUD = 1500
 """Feasible candidates per algorithm in the background of the fronts."""
 
-MAX_FRONT = 150
+MAX_FRONT = 100
 """Trajectories of one front on the page, spread evenly over it."""
 
-SYMBOLS = {"o": "circle", "^": "triangle-up", "D": "diamond", "v": "triangle-down", "P": "cross"}
+CURVE_MEMBERS = 6
+"""Points of a path's time against force that can be clicked."""
+
+MAX_CELL_BYTES = 2_000_000
+"""A cell whose files are larger is not put into the page, so that nothing can be saved from it."""
+
+SYMBOLS = {
+    "o": "circle",
+    "^": "triangle-up",
+    "D": "diamond",
+    "v": "triangle-down",
+    "P": "cross",
+    "s": "square",
+}
 """Plotly's names of Matplotlib's markers."""
+
+RECOMMENDED = "Recommended"
+CHOICE = {"colour": "#b00020", "symbol": "star", "size": 17}
 
 
 class PageData:
-    """Collects the trajectories that the page shows."""
+    """Collects what the page shows."""
 
-    def __init__(self, data: ReportData, model: TimingModel) -> None:
-        self._data = data
-        self._model = model
-        self._limit = np.concatenate([robot.torque_max for robot in data.workcell.robots])
+    def __init__(self, data: ReportData, cell: ho.Cell) -> None:
+        """Collect what a page shows.
+
+        Args:
+            data: of the report.
+            cell: of the first experiment, with its objectives.
+        """
+        self._data, self._cell = data, cell
         self._trajectories: list[dict[str, Any]] = []
+        self._lists: list[dict[str, Any]] = []
+        self._cells: list[CellArchive] = []
 
     def document(self) -> dict[str, Any]:
         """The page's data as JSON values."""
         data = self._data
-        picked = [self._add_carry(carry) for carry in data.carries]
-        lists = [{"label": "Selected", "members": picked}]
-        groups, clouds, shown = [], [], []
-        for algorithm in data.solved:
-            look = series(algorithm.index)
-            run = algorithm.shown
-            cloud = _thinned(run.evaluations.objectives[run.evaluations.feasible], MAX_CLOUD)
-            clouds.append(
-                {
-                    "label": f"{algorithm.title}: feasible",
-                    "points": packed(cloud[:, :2], np.float32),
-                    "colour": look.colour,
-                    "symbol": SYMBOLS[look.marker],
-                }
-            )
-            for label, front, symbol in _fronts(algorithm, SYMBOLS[look.marker]):
-                members = self._add_front(label, front)
-                shown.append(front.objectives[:, :2])
-                groups.append(
-                    {"label": label, "members": members, "colour": look.colour, "symbol": symbol}
-                )
-                lists.append({"label": label, "members": members})
+        views = []
+        first = 0
+        if data.drivable is not None:
+            views.append(self._drive_view(data.drivable))
+            first = views[0]["groups"][0]["members"][0] if views[0]["groups"] else 0
+        if data.objectives != DRIVABLE_OBJECTIVES:
+            view, picked = self._search_view()
+            views.append(view)
+            first = first if data.drivable is not None else picked
+        contacts = data.workcell.contacts
         rest = data.static[:2]
         known_rest = bool(np.isfinite(rest).all()) and len(rest) == 2
-        contacts = data.workcell.contacts
-        force = data.static[:2] * data.workcell.task.reference_force[: len(rest)]
+        force = rest * data.workcell.task.reference_force[: len(rest)]
         return {
-            "objectiveTitles": list(data.objective_titles),
             "robots": [robot.name for robot in data.workcell.robots],
             "joints": [len(robot.torque_max) for robot in data.workcell.robots],
             "patchRadius": min(contact.patch_radius for contact in contacts),
-            "rest": rest.tolist() if known_rest else None,
             "restForce": float(force.max()) if known_rest else None,
-            "ranges": _ranges(shown, rest if known_rest else None),
-            "first": picked[-1] if len(picked) == 1 else picked[1],
+            "first": first,
             "trajectories": self._trajectories,
-            "groups": groups,
-            "clouds": clouds,
-            "lists": lists,
+            "views": views,
+            "lists": self._lists,
+            "cells": [_cell_json(archive) for archive in self._cells],
             **scene_data(data.geometry, data.carries[-1].timed),
         }
 
-    def _add_carry(self, carry: DrawnCarry) -> int:
-        label = carry.label if carry.feasible else f"{carry.label} (infeasible)"
-        return self._add(label, carry.timed, carry.objectives)
+    def _carries(self, cell: ho.Cell, archive: CellArchive) -> PageCarries:
+        self._cells.append(archive)
+        return PageCarries(cell, len(self._cells) - 1, self._trajectories)
 
-    def _add_front(self, label: str, front: Front) -> list[int]:
-        rows = np.unique(np.linspace(0, len(front) - 1, min(len(front), MAX_FRONT)).astype(int))
-        return [
-            self._add(
-                f"{label}, point {row + 1}",
-                self._model.search_carry(front.x[row]),
-                front.objectives[row],
-            )
-            for row in rows.tolist()
-        ]
-
-    def _add(self, label: str, timed: carry.Carry, objectives: Array) -> int:
-        self._trajectories.append(
-            {
-                "label": label,
-                "objectives": [float(value) for value in objectives],
-                "peaks": [round(float(value), 4) for value in timed.peak_normal_force],
-                "duration": round(timed.duration, 5),
-                "payloadLimit": round(timed.payload_limit, 4),
-                "torqueUse": [
-                    round(float(value), 3)
-                    for value in 100.0 * np.abs(timed.contact_torque).max(axis=0) / self._limit
-                ],
-                "data": packed(_samples(timed), np.float32),
-            }
+    def _drive_view(self, drivable: DrivableReport) -> dict[str, Any]:
+        """Time against force of hand-made path, the other experiment's optimum and the fronts."""
+        cell = ho.Cell(drivable.workcell, DRIVABLE_OBJECTIVES)
+        carries = self._carries(cell, drivable.archive)
+        view = FrontView(
+            "Time against force", "largest normal force [N]", "duration [s]", clouds=[]
         )
-        return len(self._trajectories) - 1
+        always: list[Array] = []
+        if drivable.recommended is not None:
+            found = self._data.summary.recommendation
+            source = "" if found is None else found.source
+            shown = Shown(f"{RECOMMENDED} ({source})", drivable.recommended, source)
+            member = carries.add(shown)
+            always.append(np.array([carries.point(member)]))
+            view.add(RECOMMENDED, [member], always[0], CHOICE)
+            self._lists.append({"label": RECOMMENDED, "members": [member]})
+        self._curves(view, carries, drivable)
+        for entry in drivable.fronts:
+            look = series(entry.index)
+            front, open_symbol = entry.front, not entry.front.polished
+            members = [
+                carries.add(Shown(front.source, front.x[row], front.source))
+                for row in _spread(len(front.x), MAX_FRONT)
+            ]
+            points = np.array([carries.point(member) for member in members])
+            polished = any(other.front.polished for other in drivable.fronts)
+            view.add(front.label, members, points, _look(look, polished and open_symbol))
+            self._lists.append({"label": front.source, "members": members})
+            if len(entry.cloud):
+                view.clouds.append(_cloud(front.label, entry.cloud, look))
+        drawn = [np.column_stack([g["x"], g["y"]]) for g in (*view.groups, *view.lines)]
+        chosen = np.concatenate([*always, np.zeros((0, 2))])
+        return view.document(drive_look(np.concatenate([*drawn, np.zeros((0, 2))]), chosen))
+
+    def _curves(self, view: FrontView, carries: PageCarries, drivable: DrivableReport) -> None:
+        """Hand-made and selected paths at every force, some of the points to be clicked."""
+        task = drivable.workcell.task
+        looks = [HAND_MADE, *(series(a.index) for a in self._data.algorithms if a.best is not None)]
+        drawn = zip(self._data.carries, self._data.timings, looks, strict=True)
+        for carry, timed, look in drawn:
+            known = np.isfinite(timed.curve.duration)
+            force, duration = timed.curve.force[known], timed.curve.duration[known]
+            label = carry.label if carry is self._data.initial else f"{carry.label}: least force"
+            view.lines.append(
+                {
+                    "label": label,
+                    "x": force.tolist(),
+                    "y": duration.tolist(),
+                    "colour": look.colour,
+                    "dash": "dot" if look is HAND_MADE else "dash",
+                }
+            )
+            low, high = task.force_limit
+            members = [
+                carries.add(Shown(label, np.append(carry.x[: task.n_path], limit), label))
+                for limit in force[_spread(len(force), CURVE_MEMBERS)]
+                if low <= limit <= high
+            ]
+            points = np.array([carries.point(member) for member in members])
+            style = {"colour": look.colour, "symbol": SYMBOLS[look.marker], "size": 7}
+            view.add(f"{label}, timed", members, points, style)
+            self._lists.append({"label": f"{label}, timed", "members": members})
+
+    def _search_view(self) -> tuple[dict[str, Any], int]:
+        """The fronts of the first experiment; also the trajectory to begin with."""
+        data = self._data
+        carries = self._carries(self._cell, data.archive)
+        titles = [*data.objective_titles, "", ""]
+        view = FrontView("The search's objectives", f"{titles[0]} [-]", f"{titles[1]} [-]")
+        picked = [carries.add(_of(carry)) for carry in data.carries]
+        self._lists.append({"label": "Hand-made and selected", "members": picked})
+        selected = np.array([carry.objectives for carry in data.carries])
+        searched = [selected[1:] if len(picked) > 1 else selected]
+        two = len(data.objectives) >= 2
+        for algorithm in data.solved:
+            look, run = series(algorithm.index), algorithm.shown
+            cloud = run.evaluations.objectives[run.evaluations.feasible]
+            if two:
+                view.clouds.append(_cloud(algorithm.title, cloud[:, :2], look))
+            for label, front, opened in _fronts(algorithm):
+                rows = _spread(len(front), MAX_FRONT)
+                source = f"{label}, replica {run.replica}"
+                members = [carries.add(Shown(source, front.x[row], source)) for row in rows]
+                self._lists.append({"label": source, "members": members})
+                if two:
+                    view.add(label, members, front.objectives[rows][:, :2], _look(look, opened))
+            searched.append(run.front.objectives)
+        rest = data.static[:2]
+        if len(rest) == 2 and np.isfinite(rest).all():
+            view.star = (float(rest[0]), float(rest[1]), "level payload at rest")
+            searched.append(rest[None])
+        first = np.concatenate([points[:, :2] for points in searched])
+        document = view.document(first if two else np.zeros((0, 2)))
+        return document, picked[-1] if len(picked) == 1 else picked[1]
 
 
-def _fronts(algorithm: AlgorithmRuns, symbol: str) -> list[tuple[str, Front, str]]:
+def _of(carry: DrawnCarry) -> Shown:
+    return Shown(carry.label, carry.x, carry.label)
+
+
+def _look(look: LineStyle, opened: bool) -> dict[str, Any]:
+    symbol = SYMBOLS[look.marker]
+    return {"colour": look.colour, "symbol": f"{symbol}-open" if opened else symbol, "size": 9}
+
+
+def _cloud(label: str, points: Array, look: LineStyle) -> dict[str, Any]:
+    rows = _spread(len(points), MAX_CLOUD)
+    return {
+        "label": f"{label}: feasible",
+        "points": packed(points[rows], np.float32),
+        "colour": look.colour,
+        "symbol": SYMBOLS[look.marker],
+    }
+
+
+def _fronts(algorithm: AlgorithmRuns) -> list[tuple[str, Front, bool]]:
+    """Label, front, and whether its points are open: those of a search beside a polish."""
     run = algorithm.shown
-    found = [(f"{algorithm.title}: search", run.front, symbol)]
-    if run.hybrid is not None and len(run.hybrid):
-        found[0] = (f"{algorithm.title}: search", run.front, f"{symbol}-open")
-        found.append((f"{algorithm.title}: polished", run.hybrid, symbol))
-    return found
-
-
-def _samples(timed: carry.Carry) -> Array:
-    """(k, 11 + all joints) time, pose, joints, normal forces, pressure shifts at some samples."""
-    n = len(timed.time)
-    peaks = [
-        *timed.normal_force.argmax(axis=0),
-        *timed.normal_force.argmin(axis=0),
-        *timed.pressure_shift.argmax(axis=0),
+    if run.hybrid is None or not len(run.hybrid):
+        return [(algorithm.title, run.front, False)]
+    return [
+        (algorithm.title, run.front, True),
+        (f"{algorithm.title}, polished", run.hybrid, False),
     ]
-    even = np.linspace(0, n - 1, min(n, MAX_SAMPLES)).round().astype(int)
-    rows = np.unique(np.concatenate([even, peaks]))
-    columns = [timed.time[:, None], timed.pose, timed.q, timed.normal_force, timed.pressure_shift]
-    table = np.concatenate(columns, axis=1)[rows]
-    table[:, 0] -= timed.time[0]
-    return np.asarray(table)
 
 
-def _ranges(fronts: list[Array], rest: Array | None) -> list[list[float]]:
-    """Limits of both axes around the fronts and the payload at rest."""
-    points = [front for front in fronts if len(front)]
-    if rest is not None:
-        points.append(rest[None])
-    if not points:
-        return [[0.0, 1.0], [0.0, 1.0]]
-    every = np.concatenate(points)
-    low, high = every.min(axis=0), every.max(axis=0)
-    room = np.maximum(0.06 * (high - low), 1e-4)
-    limits: list[list[float]] = np.stack([low - room, high + room], axis=1).tolist()
-    return limits
+def _spread(count: int, most: int) -> Sequence[int]:
+    """At most so many of `count` rows, both ends among them."""
+    rows = np.linspace(0, count - 1, min(count, most)).round().astype(int)
+    return [int(row) for row in np.unique(rows)]
 
 
-def _thinned(points: Array, count: int) -> Array:
-    if len(points) <= count:
-        return points
-    return np.asarray(points[np.linspace(0, len(points) - 1, count).astype(int)])
+def _cell_json(archive: CellArchive) -> dict[str, Any] | None:
+    if sum(map(len, archive.files.values())) > MAX_CELL_BYTES:
+        return None
+    return archive_to_json(archive)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
@@ -12,8 +13,10 @@ from hybrid_opt.campaign.summary import CampaignSummary, PolishedFigures, Replic
 from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.timing import ForceCurve, TimingReport
 from hybrid_opt.timing.robustness import Margin, PayloadSensitivity
+from studies.drivable import ReplicaFront
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
+from symbolic.workcell.archive import CellArchive
 from symbolic.workcell.records import Workcell
 
 
@@ -121,13 +124,53 @@ class TimedSelection:
 
 
 @dataclass(frozen=True)
+class DrivableFront:
+    """One algorithm's front of the drivable experiment.
+
+    Attributes:
+        index: of the algorithm, which decides its look.
+        front: of the replica with the largest hypervolume, as searched or as polished.
+        force, duration: (k,) limits on the normal forces [N] and durations [s] of its members.
+        cloud: (n, 2) force [N] and duration [s] of feasible candidates, empty for a polished one.
+    """
+
+    index: int
+    front: ReplicaFront
+    force: Array
+    duration: Array
+    cloud: Array
+
+
+@dataclass(frozen=True)
+class DrivableReport:
+    """What a report shows of the drivable experiment.
+
+    Attributes:
+        workcell: the cell under the time law 'optimal'.
+        archive: its files.
+        summary: of that experiment.
+        fronts: searched and polished.
+        recommended: decision vector of the carry to run, None without one.
+    """
+
+    workcell: Workcell
+    archive: CellArchive
+    summary: CampaignSummary
+    fronts: tuple[DrivableFront, ...]
+    recommended: Array | None
+
+
+@dataclass(frozen=True)
 class ReportData:
     """Everything that a report shows.
 
     Attributes:
+        root: the results folder.
         workcell: the cell.
+        archive: its files.
         geometry: its collision bodies and pairs.
         summary: the content of summary.json.
+        objectives: names of what the search minimised.
         objective_titles: for axes.
         static: (n_obj,) the objectives of the level payload at rest, NaN where an objective has
             no such value.
@@ -135,17 +178,22 @@ class ReportData:
         initial: the hand-made trajectory.
         timings: of the hand-made and the selected trajectories, in the order of `carries`.
         reach: where the arms reach.
+        drivable: the drivable experiment, None without one.
     """
 
+    root: Path
     workcell: Workcell
+    archive: CellArchive
     geometry: CellGeometry
     summary: CampaignSummary
+    objectives: tuple[str, ...]
     objective_titles: tuple[str, ...]
     static: Array
     algorithms: tuple[AlgorithmRuns, ...]
     initial: DrawnCarry
     timings: tuple[TimedSelection, ...]
     reach: ReachMap
+    drivable: DrivableReport | None = None
 
     @property
     def solved(self) -> tuple[AlgorithmRuns, ...]:

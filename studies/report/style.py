@@ -60,7 +60,7 @@ class LineStyle:
     hatch: str
 
 
-INITIAL = LineStyle("#555555", ":", "s", "....")
+HAND_MADE = LineStyle("#555555", ":", "s", "....")
 """Of the hand-made trajectory."""
 
 SERIES = (

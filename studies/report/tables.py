@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from hybrid_opt.campaign.recommended import ForceTable
 from hybrid_opt.campaign.summary import FrontFigures
 from hybrid_opt.indicators.statistics import summarise
 from studies.report.records import AlgorithmRuns, DrawnCarry, ReportData
@@ -20,6 +22,9 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
         with_paper: whether figures that the paper states of its own rack stand beside ours.
     """
     tables = [quality(data, with_paper), selected(data, with_paper)]
+    if data.summary.recommendation is not None:
+        tables.append(time_against_force(data.summary.recommendation.durations))
+    tables.append(bounds(data))
     if data.summary.tests:
         tables.append(rank_tests(data))
     if data.timings:
@@ -155,6 +160,55 @@ def rank_tests(data: ReportData) -> Table:
         ("pair", "figure", "A12", "effect", "p", "p (Holm)"),
         rows,
         "Exact Mann-Whitney tests. A12: chance that the first of the pair has the larger figure.",
+    )
+
+
+def time_against_force(table: ForceTable) -> Table:
+    """How long paths and fronts take at the same forces."""
+    rows = []
+    for row in table.rows:
+        cells = [
+            number(median, 3)
+            if least == largest or not math.isfinite(median)
+            else f"{number(median, 3)} [{number(least, 3)}, {number(largest, 3)}]"
+            for median, least, largest in zip(row.median, row.least, row.largest, strict=True)
+        ]
+        rows.append((row.label, *cells))
+    return Table(
+        "time_against_force",
+        "Time against force: shortest drivable durations [s].",
+        ("path or front", *(f"{force:.2f} N" for force in table.forces)),
+        tuple(rows),
+        "Every path timed anew at the force. Of fronts the fastest member: median over the "
+        "replicas [least, most].",
+    )
+
+
+def bounds(data: ReportData) -> Table:
+    """The bounds of the variables that the best fronts lie on."""
+    experiments = [("search", data.summary.bounds)]
+    if data.drivable is not None and data.objectives != data.drivable.summary.objectives:
+        experiments.append(("drivable", data.drivable.summary.bounds))
+    rows = []
+    for name, found in experiments:
+        if not found.binding:
+            rows.append((name, "none", NOTHING, f"0 of {found.solutions}"))
+        rows += [
+            (
+                name,
+                f"{bound.side}, {bound.variable}",
+                f"{bound.value:g}",
+                f"{bound.solutions} of {found.solutions}",
+            )
+            for bound in found.binding
+        ]
+    return Table(
+        "bounds",
+        "Bounds of the variables that members of the best fronts lie on.",
+        ("experiment", "bound", "value [m, rad]", "members"),
+        tuple(rows),
+        "All replicas, polished fronts where there are any. A bound that many lie on may have "
+        "decided them: wider ones might allow better carries.",
     )
 
 

@@ -17,6 +17,9 @@ from symbolic.array import Array
 from symbolic.workcell.records import POSE_SIZE as POSE_SIZE
 from symbolic.workcell.records import Task
 
+COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Of a pose [m, rad]."""
+
 
 def waypoints_of(task: Task, x: Array) -> Array:
     """All waypoints (n_waypoints, 6) of a decision vector (n_var,), angles unwrapped."""
@@ -68,3 +71,11 @@ def straight_line(task: Task) -> Array:
     numbers = np.arange(len(task.waypoints))
     line = [np.interp(numbers, fixed, poses[fixed, k]) for k in range(POSE_SIZE)]
     return decision_of(task, _beside_initial(task, np.column_stack(line)))
+
+
+def variable_names(task: Task) -> tuple[str, ...]:
+    """What the decision variables (n_var,) are; waypoints count from 1, the start is none."""
+    names = [*COMPONENTS, *(joint.name for joint in task.redundant)]
+    rows, columns = task.free_entries
+    found = [f"waypoint {row}, {names[column]}" for row, column in zip(rows, columns, strict=True)]
+    return tuple(found + ["force limit"] * (task.n_var - task.n_path))

@@ -10,6 +10,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.workcell import quantities as quantity
+from symbolic.workcell.decision import COMPONENTS
 from symbolic.workcell.problems import shown
 from symbolic.workcell.reader import Table, checked_vector, read_only
 from symbolic.workcell.records import (
@@ -25,7 +26,6 @@ from symbolic.workcell.records import (
 MIN_SAMPLES = 5
 MAX_SAMPLES = 2_000
 MAX_WAYPOINTS = 100
-COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
 TIME_LAWS = ("constant", "ramped", "optimal")
 ALLOCATIONS = ("paper", "joint")
 

@@ -32,7 +32,7 @@ SMALL = (
     *("--evaluations", "60", "--replicas", "2", "--polish-points", "1", "--seed", "3"),
     *("--population", "nsga2=20", "--population", "mopso=20", "--jobs", "2"),
 )
-STAGES = ("search", "polish", "summary", "timing", "report")
+STAGES = ("search", "polish", "drivable", "recommendation", "summary", "timing", "report")
 BEGINNING = "beginning"
 """Before the first stage: the cell is read and its functions are compiled or loaded."""
 

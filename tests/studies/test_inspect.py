@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,8 +13,10 @@ from PIL import Image
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
-from studies.inspect import main
-from studies.inspection import Inspection, inspect
+from hybrid_opt.indicators.bounds import BindingBound
+from studies import inspection
+from studies.inspect import as_text, main
+from studies.inspection import Inspection, Optimum, inspect
 from symbolic.workcell.decision import straight_line
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
@@ -108,8 +111,24 @@ def test_the_straight_line_is_straight(transfer: Workcell) -> None:
             assert min(gaps) == pytest.approx(0.0, abs=1e-12)
 
 
+def test_tells_which_bounds_bind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inspection, "POLISH_ATTEMPTS", 1)
+    found = inspect(load(RACK), 10, 1, None, polish=True)
+    assert found.optimum is not None
+    assert found.optimum.solutions >= 1
+    assert found.optimum.problem == ""
+    text = as_text(found)
+    assert "points of a short polish)" in text
+    bound = BindingBound("waypoint 2, yaw", "upper", 0.4, 3)
+    tight = as_text(replace(found, optimum=Optimum(5, (bound,))))
+    assert "upper bound of waypoint 2, yaw, 0.4: 3 of 5" in tight
+    assert "none binds" in as_text(replace(found, optimum=Optimum(5, ())))
+    lost = as_text(replace(found, optimum=Optimum(0, (), "its start is infeasible")))
+    assert "not known: its start is infeasible" in lost
+
+
 def test_prints_text_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = [str(TRANSFER), "--candidates", "100", "--no-pictures"]
+    arguments = [str(TRANSFER), "--candidates", "100", "--no-pictures", "--no-polish"]
     assert main(arguments) == 0
     text = capsys.readouterr().out
     assert "Transfer over a wall" in text

@@ -18,6 +18,8 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from hybrid_opt.cell import Cell
+from hybrid_opt.store.replay import replay
+from hybrid_opt.store.trajectory_file import read_trajectory
 from studies.report.generate import write_report
 from studies.report.records import ReportData
 from tests.studies.test_report_page import HOSTILE, with_hostile_names
@@ -121,9 +123,14 @@ def test_is_usable_soon(browser: webdriver.Chrome, report: Path) -> None:
 
 def test_a_click_on_a_point_selects_its_trajectory(browser: webdriver.Chrome, report: Path) -> None:
     opened(browser, report)
-    group = browser.execute_script("return report.data.groups[0].members")
+    front = browser.execute_script(
+        "return report.data.views[0].groups.findIndex((g) => g.label === 'NSGA-II')"
+    )
+    group = browser.execute_script(
+        "return report.data.views[0].groups[arguments[0]].members", front
+    )
     trace = browser.execute_script(
-        "return document.getElementById('front-plot').data.findIndex((t) => t.customdata)"
+        "return document.getElementById('front-plot').data.findIndex((t) => t.name === 'NSGA-II')"
     )
     wanted = group[-1]
     assert state(browser)["selected"] != wanted
@@ -136,7 +143,9 @@ def test_a_click_on_a_point_selects_its_trajectory(browser: webdriver.Chrome, re
     ActionChains(browser).move_to_element(target).pause(0.2).click().perform()
     until(browser, lambda: state(browser)["selected"] in group)
     chosen = state(browser)["selected"]
-    carry = browser.execute_script("return report.data.trajectories[arguments[0]]", chosen)
+    carry = browser.execute_script(
+        "return report.data.trajectories[arguments[0]].motions[0]", chosen
+    )
     shown = browser.find_element(By.ID, "figures-of-choice").text
     assert f"{carry['peaks'][0]:.2f} N" in shown
     assert f"{carry['duration']:.2f} s" in shown
@@ -158,6 +167,46 @@ def test_the_list_selects_too(browser: webdriver.Chrome, report: Path) -> None:
     assert state(browser)["selected"] == 0
 
 
+def test_every_point_can_be_saved_as_a_trajectory_file(
+    browser: webdriver.Chrome, report: Path, tmp_path: Path
+) -> None:
+    """What the browser saves is read, unpacked and reproduced."""
+    opened(browser, report)
+    views = browser.execute_script("return report.data.views.map((v) => v.groups[0].members[0])")
+    assert len(views) == 2
+    for number in views:
+        text = browser.execute_script(
+            "return report.fileOf(report.data.trajectories[arguments[0]])", number
+        )
+        file = tmp_path / f"{number}.json"
+        file.write_text(text, "utf-8")
+        (tmp_path / str(number)).mkdir()
+        assert replay(read_trajectory(file), tmp_path / str(number)).reproduced
+    assert browser.find_element(By.ID, "save").is_enabled()
+
+
+def test_pictures_and_timings_can_be_switched(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    first, second = browser.find_elements(By.CSS_SELECTOR, "#views button[data-view]")
+    title = "return document.getElementById('front-plot').layout.xaxis.title.text"
+    assert "force" in browser.execute_script(title)
+    second.click()
+    assert second.get_attribute("aria-pressed") == "true"
+    assert first.get_attribute("aria-pressed") == "false"
+    assert "north" in browser.execute_script(title)
+    ranges = "return document.getElementById('front-plot').layout.xaxis.range"
+    near = browser.execute_script(ranges)
+    browser.find_element(By.ID, "whole").click()
+    whole = browser.execute_script(ranges)
+    assert whole[1] - whole[0] >= near[1] - near[0]
+    browser.execute_script("report.select(report.data.views[1].groups[0].members[0])")
+    moments = []
+    for option in browser.find_elements(By.CSS_SELECTOR, "#motion option"):
+        option.click()
+        moments.append(browser.find_element(By.ID, "figures-of-choice").text)
+    assert len(moments) == len(set(moments)) == 2
+
+
 def test_plays_pauses_and_scrubs(browser: webdriver.Chrome, report: Path) -> None:
     opened(browser, report)
     still = scene_hash(browser)
@@ -175,7 +224,7 @@ def test_plays_pauses_and_scrubs(browser: webdriver.Chrome, report: Path) -> Non
     )
     end = browser.find_element(By.ID, "moment").text
     duration = browser.execute_script(
-        "return report.data.trajectories[report.state.selected].duration"
+        "return report.data.trajectories[report.state.selected].motions[0].duration"
     )
     assert end == f"{duration:.2f} s"
 

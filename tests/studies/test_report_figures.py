@@ -18,7 +18,7 @@ from PIL import Image
 
 from studies.report.figures import ReportFigure, report_figures
 from studies.report.records import ReportData, Run
-from studies.report.style import ARMS, INITIAL, SERIES, in_style, save
+from studies.report.style import ARMS, HAND_MADE, SERIES, in_style, save
 from symbolic.array import Array
 
 NAMES = (
@@ -268,7 +268,7 @@ def luminance(colour: str) -> float:
 
 
 def test_looks_differ_without_colour() -> None:
-    looks = (INITIAL, *SERIES)
+    looks = (HAND_MADE, *SERIES)
     assert len({str(look.line) for look in looks}) == len(looks)
     assert len({look.marker for look in looks}) == len(looks)
 

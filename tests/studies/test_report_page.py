@@ -9,12 +9,15 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import hybrid_opt as ho
 from hybrid_opt.cell import Cell
-from hybrid_opt.timing import TimingModel
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from studies.recommendation_text import recommendation_text
 from studies.report.generate import write_report
 from studies.report.page_data import PageData
 from studies.report.records import ReportData
@@ -104,14 +107,21 @@ def test_hostile_names_stay_text(data: ReportData, tmp_path: Path, text: str) ->
     assert count[0] == count[1]
 
 
-def test_data_of_the_page_are_the_trajectories(data: ReportData) -> None:
-    document = PageData(data, TimingModel(data.workcell)).document()
+@pytest.fixture(scope="module")
+def document(data: ReportData) -> dict[str, Any]:
+    return PageData(data, Cell(data.workcell)).document()
+
+
+def test_data_of_the_page_are_the_trajectories(data: ReportData, document: dict[str, Any]) -> None:
     front = data.algorithms[0].shown.front
-    group = document["groups"][0]
+    view = document["views"][1]
+    group = view["groups"][0]
     assert len(group["members"]) == len(front)
+    np.testing.assert_allclose(group["x"], front.objectives[:, 0])
     first = document["trajectories"][group["members"][0]]
     np.testing.assert_allclose(first["objectives"], front.objectives[0], rtol=1e-12)
-    samples = np.frombuffer(base64.b64decode(first["data"]), "<f4").reshape(-1, 23)
+    assumed = first["motions"][-1]
+    samples = np.frombuffer(base64.b64decode(assumed["data"]), "<f4").reshape(-1, 23)
     # The objectives are the peaks over the reference forces, and the page keeps the peaks.
     peaks = samples[:, 19:21].max(axis=0) / data.workcell.task.reference_force
     np.testing.assert_allclose(peaks, front.objectives[0], rtol=1e-6)
@@ -121,15 +131,70 @@ def test_data_of_the_page_are_the_trajectories(data: ReportData) -> None:
     assert len(samples) <= 70
 
 
+def test_every_point_shows_what_robots_drive(data: ReportData, document: dict[str, Any]) -> None:
+    """Timed by `time_path`, and named by algorithm, replica and values."""
+    assert data.drivable is not None
+    view = document["views"][0]
+    entry = data.drivable.fronts[0]
+    group = next(g for g in view["groups"] if g["label"] == entry.front.label)
+    assert len(group["members"]) == len(entry.front.x)
+    cell = ho.Cell(data.drivable.workcell, DRIVABLE_OBJECTIVES)
+    for k in (0, len(entry.front.x) - 1):
+        x = entry.front.x[k]
+        timing = ho.time_path(cell, x, ho.TimingLimits(force=float(x[-1])))
+        shown = document["trajectories"][group["members"][k]]
+        (motion,) = shown["motions"]
+        assert motion["duration"] == pytest.approx(timing.duration, abs=1e-5)
+        assert max(motion["peaks"]) <= x[-1] * 1.005
+        assert (group["x"][k], group["y"][k]) == (max(motion["peaks"]), motion["duration"])
+        name = f"{entry.front.source}: {timing.duration:.2f} s, "
+        assert shown["label"].startswith(name)
+        assert timing.carry is not None
+        torque = np.abs(timing.carry.torque).max(axis=0)
+        limit = np.concatenate([robot.torque_max for robot in data.workcell.robots])
+        np.testing.assert_allclose(motion["torqueUse"], 100.0 * torque / limit, atol=1e-2)
+    searched = document["trajectories"][document["views"][1]["groups"][0]["members"][0]]
+    assert [motion["name"] for motion in searched["motions"]] == [
+        "as robots drive it",
+        "as the search assumed: ramped speed",
+    ]
+
+
+def test_the_page_begins_with_the_recommended_carry(
+    data: ReportData, document: dict[str, Any], text: str
+) -> None:
+    found = data.summary.recommendation
+    assert found is not None
+    first = document["trajectories"][document["first"]]
+    assert first["label"].startswith("Recommended")
+    assert first["motions"][0]["duration"] == pytest.approx(found.duration, abs=1e-5)
+    words = recommendation_text(found, data.summary.robots, str(data.root))
+    for _, sentence in words.facts:
+        assert html.escape(sentence) in text
+    assert html.escape(words.headline) in text
+
+
+def test_the_first_look_is_not_squashed(document: dict[str, Any], data: ReportData) -> None:
+    for view in document["views"]:
+        for first, whole in zip(view["first"], view["whole"], strict=True):
+            assert whole[0] <= first[1]
+            assert first[1] - first[0] <= whole[1] - whole[0] + 1e-9
+    # All the searches' fronts are in sight.
+    (low, high), _ = document["views"][1]["first"]
+    for algorithm in data.solved:
+        inside = algorithm.shown.front.objectives[:, 0]
+        assert low <= inside.min() <= inside.max() <= high
+
+
 def test_polished_fronts_stand_beside_the_searchs(hybrid_data: ReportData) -> None:
-    document = PageData(hybrid_data, TimingModel(hybrid_data.workcell)).document()
-    labels = [group["label"] for group in document["groups"]]
-    assert labels == [
-        f"{title}: {stage}" for title in ("NSGA-II", "MOPSO") for stage in ("search", "polished")
+    document = PageData(hybrid_data, Cell(hybrid_data.workcell)).document()
+    groups = document["views"][1]["groups"]
+    assert [group["label"] for group in groups] == [
+        f"{title}{stage}" for title in ("NSGA-II", "MOPSO") for stage in ("", ", polished")
     ]
     hybrid = hybrid_data.algorithms[0].shown.hybrid
     assert hybrid is not None
-    assert len(document["groups"][1]["members"]) == len(hybrid)
+    assert len(groups[1]["members"]) == len(hybrid)
 
 
 def test_every_file_of_the_report_is_written(report: Path, text: str) -> None:
@@ -137,7 +202,7 @@ def test_every_file_of_the_report_is_written(report: Path, text: str) -> None:
     assert figures == {path.stem for path in (report.parent / "figures").glob("*.pdf")}
     assert text.count("<figure>") == len(figures)
     tables = sorted(path.name for path in (report.parent / "tables").iterdir())
-    for name in ("table1_quality", "table2_selected", "timing", "margins"):
+    for name in ("table1_quality", "time_against_force", "bounds", "timing", "margins"):
         assert [f"{name}.{suffix}" for suffix in ("csv", "md", "tex")] == [
             entry for entry in tables if entry.startswith(f"{name}.")
         ]

@@ -11,15 +11,18 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 
 from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.indicators import metrics
+from hybrid_opt.store.replay import replay
 from hybrid_opt.store.trajectory_file import read_trajectory
-from studies import rack, run
+from studies import rack, recommend, run
 from studies.cli import campaign_parser, campaign_settings
+from studies.recommendation_text import recommendation_text
 from symbolic.workcell.file import load
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
 
@@ -69,6 +72,56 @@ def test_study_leaves_everything_behind(study: tuple[Path, str]) -> None:
     assert "paper" not in printed.lower()
 
 
+def test_study_opens_with_a_carry_to_run(study: tuple[Path, str]) -> None:
+    """Terminal, summary.json and the stored trajectory agree; the hand-made one stands beside."""
+    root, printed = study
+    found = read_summary(root).recommendation
+    assert found is not None
+    words = recommendation_text(found, read_summary(root).robots, str(root))
+    assert printed.startswith(words.terminal())
+    assert f"Run this carry: {found.duration:.2f} s" in printed
+    assert found.export in printed
+    stored = read_trajectory(root / found.file)
+    assert stored.x[-1] == found.force_limit
+    drivable = read_campaign(root / "drivable")
+    assert drivable.objectives == ("duration", "peak_force")
+    assert drivable.workcell.task.time_law == "optimal"
+    fronts = np.concatenate([replica.front_x for replica in drivable.replicas])
+    assert (fronts[:, :-1] == stored.x[:-1]).all(axis=1).any()
+    assert [rival.label for rival in found.rivals] == ["hand-made", "least-force"]
+    labels = [row.label for row in found.durations.rows]
+    assert labels == ["hand-made", "least-force", "NSGA-II", "MOPSO"]
+    assert [row.replicas for row in found.durations.rows] == [1, 1, 2, 2]
+    for folder, law in ((root, "ramped"), (root / "drivable", "optimal")):
+        hand_made = read_trajectory(folder / "selected/hand-made.json")
+        with TemporaryDirectory() as unpacked:
+            workcell = hand_made.unpack(Path(unpacked))
+        assert workcell.task.time_law == law
+        np.testing.assert_array_equal(
+            hand_made.x[: workcell.task.n_path], load(Path(CELL)).task.initial.ravel()
+        )
+    assert (root / "timing/hand-made.json").exists()
+
+
+def test_the_recommended_file_is_reproduced(study: tuple[Path, str], tmp_path: Path) -> None:
+    root, _ = study
+    assert replay(read_trajectory(root / "recommended.json"), tmp_path).reproduced
+
+
+def test_another_wish_needs_no_other_study(
+    study: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, _ = study
+    file = tmp_path / "gentle.json"
+    assert recommend.main([str(root), "--duration", "4", "--output", str(file)]) == 0
+    printed = capsys.readouterr().out
+    assert "the least force of all carries of at most 4 s" in printed
+    assert str(file) in printed
+    assert read_trajectory(file).figures["duration"] < 4.1
+    assert recommend.main([str(root), "--duration", "4", "--payload", "9"]) == 2
+    assert "give at most one" in capsys.readouterr().err
+
+
 def test_searches_start_from_the_initial_trajectory(study: tuple[Path, str]) -> None:
     for replica in read_campaign(study[0]).replicas:
         initial = load(Path(CELL)).task.initial.ravel()
@@ -91,7 +144,8 @@ def test_a_stored_study_can_be_repeated_from_its_own_workcell(
     root, _ = study
     configuration = json.loads((root / "configuration.json").read_text())
     cell = str(root / configuration["workcell"]["file"])
-    arguments = [cell, "--output", str(tmp_path / "b"), *SMALL, "--quiet"]
+    arguments = [cell, "--output", str(tmp_path / "b"), *SMALL, "--no-drivable", "--no-report"]
+    arguments += ["--quiet"]
     assert run.main(arguments) == 0
     assert capsys.readouterr().err == ""
     for name in ("mopso", "nsga2"):

@@ -26,6 +26,7 @@ static const int GROUP[KINDS] = {MOTION, MOTION, MOTION, MOTION, MOTION, MOTION,
 #define MAX_ROUNDS 40             /* of rows added at one stage */
 #define MAX_RENEWALS 6            /* of linearisations at one stage */
 #define MAX_SWEEPS 12
+#define MAX_HALVINGS 60
 #define MAX_REPAIRS (100 * STAGES)
 #define CONVEX_TOLERANCE 1e-7     /* excess over a limit that counts as none */
 #define RATIO_TOLERANCE 1e-4      /* the same, of limits that are linearised */
@@ -297,7 +298,8 @@ static double backward(const problem* p, int stage, double ceiling, double top, 
 /* Between an allowed u'^2 at the end of a stage and one beyond it: a linearisation may have left
    the limit far behind. */
 static double halve(const problem* p, int stage, double x, double low, double high) {
-  while (high - low > 1e-4 * high) {
+  /* Counted: between 0 and the least number there is no middle that would end the loop. */
+  for (int k = 0; k < MAX_HALVINGS && high - low > 1e-4 * high; ++k) {
     const double middle = 0.5 * (low + high);
     if (allowed(p, stage, x, middle, RATIO_TOLERANCE)) low = middle; else high = middle;
   }

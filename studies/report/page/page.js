@@ -22,20 +22,21 @@
     return String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
   }
 
-  const carries = data.trajectories.map((carry) => ({ ...carry, samples: null }));
+  const carries = data.trajectories;
 
-  function samplesOf(carry) {
-    if (!carry.samples) {
-      const flat = decode(carry.data, Float32Array);
-      carry.samples = [];
+  function samplesOf(motion) {
+    if (!motion.samples) {
+      const flat = decode(motion.data, Float32Array);
+      motion.samples = [];
       for (let i = 0; i < flat.length; i += COLUMNS.width) {
-        carry.samples.push(flat.subarray(i, i + COLUMNS.width));
+        motion.samples.push(flat.subarray(i, i + COLUMNS.width));
       }
     }
-    return carry.samples;
+    return motion.samples;
   }
 
-  const state = { selected: -1, share: 0, playing: false, last: 0, marked: 0 };
+  const state = { selected: -1, motion: 0, view: 0, whole: false, share: 0, playing: false,
+    last: 0, marked: 0 };
   let scene = null;
   try {
     scene = new CellScene($("scene"), data, decode);
@@ -46,48 +47,85 @@
     $("scene").replaceChildren(note);
   }
 
-  function drawFront() {
-    const traces = [];
-    data.clouds.forEach((cloud) => {
+  function shown() {
+    return carries[state.selected].motions[state.motion];
+  }
+
+  function frontTraces(view) {
+    const traces = view.clouds.map((cloud) => {
       const points = decode(cloud.points, Float32Array);
-      traces.push({ type: "scatter", mode: "markers", name: plain(cloud.label), hoverinfo: "skip",
+      return { type: "scatter", mode: "markers", name: plain(cloud.label), hoverinfo: "skip",
         x: points.filter((_, i) => i % 2 === 0), y: points.filter((_, i) => i % 2 === 1),
-        marker: { color: cloud.colour, size: 3, opacity: 0.25, symbol: cloud.symbol } });
+        marker: { color: cloud.colour, size: 3, opacity: 0.25, symbol: cloud.symbol } };
     });
-    data.groups.forEach((group) => {
-      const members = group.members.map((k) => carries[k]);
-      traces.push({ type: "scatter", mode: "markers", name: plain(group.label),
-        x: members.map((m) => m.objectives[0]), y: members.map((m) => m.objectives[1]),
-        customdata: group.members, text: members.map((m) => plain(m.label)),
-        hovertemplate: "%{text}<br>%{x:.4f}, %{y:.4f}<extra></extra>",
-        marker: { color: group.colour, size: 9, symbol: group.symbol,
-          line: { color: "#000", width: 0.7 } } });
-    });
-    if (data.rest) {
-      traces.push({ type: "scatter", mode: "markers", name: "level payload at rest",
-        x: [data.rest[0]], y: [data.rest[1]], hoverinfo: "name",
+    view.lines.forEach((line) => traces.push({ type: "scatter", mode: "lines",
+      name: plain(line.label), x: line.x, y: line.y, hoverinfo: "skip",
+      line: { color: line.colour, dash: line.dash, width: 1.6 } }));
+    view.groups.forEach((group) => traces.push({ type: "scatter", mode: "markers",
+      name: plain(group.label), x: group.x, y: group.y, customdata: group.members,
+      text: group.members.map((k) => plain(carries[k].label)),
+      hovertemplate: "%{text}<extra></extra>",
+      showlegend: !view.lines.some((line) => group.label === line.label + ", timed"),
+      marker: { color: group.colour, size: group.size, symbol: group.symbol,
+        line: { color: "#000", width: 0.7 } } }));
+    if (view.star) {
+      traces.push({ type: "scatter", mode: "markers", name: view.star[2],
+        x: [view.star[0]], y: [view.star[1]], hoverinfo: "name",
         marker: { color: "#b00020", size: 13, symbol: "star" } });
     }
     traces.push({ type: "scatter", mode: "markers", name: "chosen", x: [], y: [],
       hoverinfo: "skip", showlegend: false,
-      marker: { color: "rgba(0,0,0,0)", size: 18, line: { color: "#b00020", width: 2.5 } } });
-    const narrow = $("front-plot").clientWidth < 600;
-    const layout = { font: FONT, hovermode: "closest",
-      margin: { l: 70, r: 15, t: 30, b: narrow ? 190 : 100 },
-      xaxis: { title: { text: plain(data.objectiveTitles[0]) + " [-]", standoff: 8 }, range: data.ranges[0] },
-      yaxis: { title: { text: plain(data.objectiveTitles[1]) + " [-]" }, range: data.ranges[1] },
-      legend: { orientation: "h", yref: "container", y: 0.01, yanchor: "bottom",
-        font: { size: 11 } } };
-    Plotly.newPlot("front-plot", traces, layout, CONFIG);
-    $("front-plot").on("plotly_click", (event) => {
-      const point = event.points.find((p) => p.customdata !== undefined);
-      if (point) select(point.customdata);
-    });
-    state.chosenTrace = traces.length - 1;
+      marker: { color: "rgba(0,0,0,0)", size: 20, line: { color: "#b00020", width: 2.5 } } });
+    return traces;
   }
 
-  function lines(id, carry, column, scale, title, limits) {
-    const samples = samplesOf(carry);
+  function drawFront() {
+    const view = data.views[state.view];
+    const traces = frontTraces(view);
+    const range = state.whole ? view.whole : view.first;
+    const narrow = $("front-plot").clientWidth < 600;
+    const layout = { font: FONT, hovermode: "closest",
+      margin: { l: 70, r: 15, t: 20, b: narrow ? 190 : 120 },
+      xaxis: { title: { text: plain(view.xTitle), standoff: 8 }, range: range[0].slice() },
+      yaxis: { title: { text: plain(view.yTitle) }, range: range[1].slice() },
+      legend: { orientation: "h", yref: "container", y: 0.01, yanchor: "bottom",
+        font: { size: 11 } } };
+    Plotly.react("front-plot", traces, layout, CONFIG);
+    state.chosenTrace = traces.length - 1;
+    mark();
+    [...$("views").querySelectorAll("button[data-view]")].forEach((button) =>
+      button.setAttribute("aria-pressed", String(Number(button.dataset.view) === state.view)));
+    $("whole").setAttribute("aria-pressed", String(state.whole));
+  }
+
+  /* A ring around the point of the chosen trajectory, where the picture has it. */
+  function mark() {
+    const place = { x: [[]], y: [[]] };
+    data.views[state.view].groups.forEach((group) => {
+      const at = group.members.indexOf(state.selected);
+      if (at >= 0) { place.x = [[group.x[at]]]; place.y = [[group.y[at]]]; }
+    });
+    Plotly.restyle("front-plot", place, [state.chosenTrace]);
+  }
+
+  function fillViews() {
+    const button = (text, act) => {
+      const made = document.createElement("button");
+      made.type = "button";
+      made.textContent = text;
+      made.addEventListener("click", act);
+      $("views").appendChild(made);
+      return made;
+    };
+    data.views.forEach((view, k) => {
+      const made = button(view.name, () => { state.view = k; state.whole = false; drawFront(); });
+      made.dataset.view = String(k);
+    });
+    button("Whole fronts", () => { state.whole = !state.whole; drawFront(); }).id = "whole";
+  }
+
+  function lines(id, motion, column, scale, title, limits) {
+    const samples = samplesOf(motion);
     const times = samples.map((s) => s[COLUMNS.time]);
     const end = times[times.length - 1];
     const traces = data.robots.map((robot, i) => ({ type: "scatter", mode: "lines",
@@ -123,42 +161,56 @@
     return step / 2 + step * taken.indexOf(Math.min(...taken));
   }
 
-  function drawTorque(carry) {
-    const traces = data.robots.map((robot, i) => {
-      const use = useOf(carry.torqueUse, i);
-      const joints = [...use.keys(), 0].map((j) => "joint " + (j + 1));
-      return { type: "scatterpolar", mode: "lines+markers", name: plain(robot),
-        r: [...use, use[0]], theta: joints,
-        line: { color: ["#3b6ea8", "#a8733b"][i], dash: ["solid", "dash"][i] } };
+  function drawTorque(motion) {
+    const closed = (use) => [...use, use[0]];
+    const traces = data.robots.flatMap((robot, i) => {
+      const whole = useOf(motion.torqueUse, i), load = useOf(motion.contactTorqueUse, i);
+      const joints = [...whole.keys(), 0].map((j) => "joint " + (j + 1));
+      const colour = ["#3b6ea8", "#a8733b"][i];
+      return [
+        { type: "scatterpolar", mode: "lines+markers", name: plain(robot), r: closed(whole),
+          theta: joints, line: { color: colour, dash: ["solid", "dash"][i] } },
+        { type: "scatterpolar", mode: "lines", name: plain(robot) + ", load alone",
+          r: closed(load), theta: joints, line: { color: colour, dash: "dot", width: 1 } },
+      ];
     });
     const layout = { font: FONT, margin: { l: 50, r: 50, t: 40, b: 30 },
-      title: { text: "torque of the contact wrench [% of maximum]", font: { size: 12 } },
+      title: { text: "largest joint torque [% of maximum]", font: { size: 12 } },
       polar: { radialaxis: { rangemode: "tozero", ticksuffix: " %", nticks: 5,
-        angle: freeDirection(carry.torqueUse), tickfont: { size: 10 } } },
+        angle: freeDirection(motion.torqueUse), tickfont: { size: 10 } } },
       legend: { orientation: "h", y: -0.08, font: { size: 10 } } };
     Plotly.react("torque-plot", traces, layout, PLAIN);
   }
 
   function select(index) {
-    const carry = carries[index];
     state.selected = index;
+    state.motion = 0;
+    const carry = carries[index];
     $("chooser").value = String(index);
-    const peaks = carry.peaks.map((v) => v.toFixed(2) + " N").join(" and ");
+    $("motion").replaceChildren(...carry.motions.map((m, k) => new Option(m.name, String(k))));
+    $("motion").disabled = carry.motions.length < 2;
+    $("save").disabled = !data.cells[carry.cell];
+    if (data.views.some((view) => view.groups.length)) mark();
+    show();
+  }
+
+  /* Everything that depends on the timing of the chosen trajectory. */
+  function show() {
+    const carry = carries[state.selected];
+    const motion = shown();
+    const peaks = data.robots.map((robot, i) => `${robot} ${motion.peaks[i].toFixed(2)} N`);
     $("figures-of-choice").textContent =
-      `peak normal forces ${peaks}, ${carry.duration.toFixed(2)} s, payload at the limit ` +
-      `${carry.payloadLimit.toFixed(2)} kg`;
-    if (carry.objectives.length > 1) {
-      Plotly.restyle("front-plot", { x: [[carry.objectives[0]]], y: [[carry.objectives[1]]] },
-        [state.chosenTrace]);
-    }
+      `${motion.duration.toFixed(2)} s, peak normal forces ${peaks.join(", ")}, payload at the ` +
+      `limit ${motion.payloadLimit.toFixed(2)} kg (${motion.name})` +
+      (carry.problem ? `; ${carry.problem}` : "");
     const rest = data.restForce === null ? []
       : [{ label: "level payload at rest", value: data.restForce, colour: "#b00020" }];
-    lines("force-plot", carry, COLUMNS.force, 1, "normal force [N]", rest);
-    lines("pressure-plot", carry, COLUMNS.shift, 1000, "pressure shift [mm]",
+    lines("force-plot", motion, COLUMNS.force, 1, "normal force [N]", rest);
+    lines("pressure-plot", motion, COLUMNS.shift, 1000, "pressure shift [mm]",
       [{ label: "patch radius", value: 1000 * data.patchRadius, colour: "#000" }]);
-    drawTorque(carry);
+    drawTorque(motion);
     if (scene) {
-      const samples = samplesOf(carry);
+      const samples = samplesOf(motion);
       const points = new Float32Array(3 * samples.length);
       samples.forEach((s, i) => points.set(s.subarray(COLUMNS.pose, COLUMNS.pose + 3), 3 * i));
       scene.showPath(points);
@@ -166,8 +218,25 @@
     seek(0);
   }
 
+  /* A trajectory file, as docs/export.md describes it. */
+  function fileOf(carry) {
+    return JSON.stringify({ format: "dual-arm-carry trajectory", version: 1,
+      decision: carry.decision, start: carry.start, figures: carry.figures,
+      provenance: carry.provenance, cell: data.cells[carry.cell] }, null, 1) + "\n";
+  }
+
+  function save() {
+    const carry = carries[state.selected];
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(new Blob([fileOf(carry)], { type: "application/json" }));
+    link.download = carry.label.toLowerCase().replace(/[^a-z0-9.]+/g, "-").replace(/^-|-$/g, "")
+      .slice(0, 80) + ".json";
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  }
+
   function seek(share) {
-    const samples = samplesOf(carries[state.selected]);
+    const samples = samplesOf(shown());
     const end = samples[samples.length - 1][COLUMNS.time];
     state.share = Math.min(1, Math.max(0, share));
     const time = state.share * end;
@@ -202,7 +271,7 @@
 
   function frame(now) {
     if (!state.playing) return;
-    const duration = carries[state.selected].duration;
+    const duration = shown().duration;
     const passed = (Math.max(0, now - state.last) / 1000) * Number($("speed").value);
     state.last = now;
     const share = state.share + passed / duration;
@@ -221,9 +290,23 @@
   }
 
   fillChooser();
-  if (data.objectiveTitles.length > 1) drawFront();
-  else $("front-plot").remove();
+  const pictures = data.views.some((view) => view.groups.length);
+  if (pictures) {
+    fillViews();
+    drawFront();
+    $("front-plot").on("plotly_click", (event) => {
+      const point = event.points.find((p) => p.customdata !== undefined);
+      if (point) select(point.customdata);
+    });
+  } else {
+    $("front-plot").remove();
+  }
   $("chooser").addEventListener("change", (event) => select(Number(event.target.value)));
+  $("motion").addEventListener("change", (event) => {
+    state.motion = Number(event.target.value);
+    show();
+  });
+  $("save").addEventListener("click", save);
   $("play").addEventListener("click", () => setPlaying(!state.playing));
   $("scrub").addEventListener("input", (event) => {
     setPlaying(false);
@@ -231,6 +314,6 @@
   });
   $("reset-view").addEventListener("click", () => scene && scene.resetView());
   select(data.first);
-  window.report = { data, state, select, seek, setPlaying, scene };
+  window.report = { data, state, select, seek, setPlaying, scene, fileOf };
   document.documentElement.dataset.ready = "true";
 })();

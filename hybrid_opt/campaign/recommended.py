@@ -1,0 +1,157 @@
+"""recommendation.json as records: the carry to run, as a study stores it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hybrid_opt.campaign.documents import Count, Pair
+from hybrid_opt.recommending.recommendation import Recommendation
+from hybrid_opt.store.json_records import Figure
+
+
+@dataclass(frozen=True)
+class StoredWish:
+    """What was asked for: at most one of duration [s], force [N] and payload [kg]."""
+
+    duration: float | None
+    force: float | None
+    payload: float | None
+
+
+@dataclass(frozen=True)
+class StoredRival:
+    """Another path beside the recommended carry, driven as fast as the same limits allow.
+
+    Attributes:
+        label: what it is.
+        duration_at_force: [s] with the same force, null where it cannot.
+        force_at_duration: [N] in the same time, null where it cannot.
+    """
+
+    label: str
+    duration_at_force: Figure
+    force_at_duration: Figure
+
+
+@dataclass(frozen=True)
+class StoredMargin:
+    """How far one assumption may be off, see `hybrid_opt.timing.robustness.Margin`."""
+
+    quantity: str
+    unit: str
+    nominal: float
+    limit: float
+    fails: str
+
+
+@dataclass(frozen=True)
+class StoredUnsure:
+    """Normal forces [N] that hold if the cell is less sure than stated."""
+
+    doubt: str
+    peak_force: Pair
+    within_reference: bool
+
+
+@dataclass(frozen=True)
+class StoredDurations:
+    """How long paths take at the forces of a table [s], null where they cannot move.
+
+    Attributes:
+        label: whose they are.
+        replicas: how many fronts stand behind the figures, 1 for a single path.
+        median, least, largest: over the replicas, one per force.
+    """
+
+    label: str
+    replicas: Count
+    median: tuple[Figure, ...]
+    least: tuple[Figure, ...]
+    largest: tuple[Figure, ...]
+
+
+@dataclass(frozen=True)
+class ForceTable:
+    """Durations at the same forces.
+
+    Attributes:
+        forces: limits on both normal forces [N].
+        rows: hand-made path, optimum of the other experiment, then every algorithm's fronts.
+    """
+
+    forces: tuple[float, ...]
+    rows: tuple[StoredDurations, ...]
+
+
+@dataclass(frozen=True)
+class StoredRecommendation:
+    """The carry to run.
+
+    Attributes:
+        wish, why: what was asked for, as values and as words.
+        source: whose it is, as 'NSGA-II, polished, replica 3'.
+        file: its trajectory file, relative to the folder.
+        export: the command that makes of it what robots need.
+        duration: [s].
+        force_limit: [N].
+        peak_force: largest normal force of each robot [N].
+        squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
+        payload_limit: payload that the robots bear on the same motion [kg].
+        rivals: other paths at the same force and in the same time, the hand-made one first.
+        margins: how far the cell's description may be off.
+        unsure: forces that hold if it is off.
+        warnings: what speaks against it.
+        considered: carries that it was chosen from.
+        durations: how long all fronts take at the same forces.
+    """
+
+    wish: StoredWish
+    why: str
+    source: str
+    file: str
+    export: str
+    duration: float
+    force_limit: float
+    peak_force: Pair
+    squeeze: Pair
+    squeeze_reason: str
+    payload_limit: float
+    rivals: tuple[StoredRival, ...]
+    margins: tuple[StoredMargin, ...]
+    unsure: tuple[StoredUnsure, ...]
+    warnings: tuple[str, ...]
+    considered: Count
+    durations: ForceTable
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a study says of a recommendation besides: the attributes of those names there."""
+
+    source: str
+    file: str
+    export: str
+    considered: int
+    durations: ForceTable
+
+
+def stored_recommendation(found: Recommendation, told: Told) -> StoredRecommendation:
+    """A recommendation as a study stores it."""
+    return StoredRecommendation(
+        **vars(told),
+        wish=StoredWish(**vars(found.wish)),
+        why=str(found.wish),
+        duration=found.timing.duration,
+        force_limit=found.force,
+        peak_force=found.carry.peak_normal_force,
+        squeeze=found.squeeze.peak,
+        squeeze_reason=found.squeeze.reason,
+        payload_limit=found.carry.payload_limit,
+        rivals=tuple(
+            StoredRival(rival.label, rival.duration_at_force, rival.force_at_duration)
+            for rival in found.rivals
+        ),
+        margins=tuple(StoredMargin(**vars(margin)) for margin in found.margins),
+        unsure=tuple(StoredUnsure(**vars(doubt)) for doubt in found.unsure),
+        warnings=found.warnings,
+    )

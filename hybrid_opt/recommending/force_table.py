@@ -1,0 +1,42 @@
+"""How long fronts take at the same forces: the fastest member of each, timed anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hybrid_opt.evaluate.static_hold import static_hold
+from hybrid_opt.recommending.driven_paths import DrivenPaths
+from symbolic.array import Array
+from symbolic.workcell.records import Workcell
+
+ABOVE_STILL = (1.02, 1.04, 1.06, 1.08, 1.12, 1.2)
+"""Forces of the table over that of holding the payload level and still."""
+
+MEMBERS = 24
+"""Of a front that are timed, evenly spread over it."""
+
+
+def table_forces(workcell: Workcell) -> Array:
+    """(n,) force limits of the table [N], those within the force limit's bounds."""
+    forces = float(static_hold(workcell).normal_force.max()) * np.array(ABOVE_STILL)
+    low, high = workcell.task.force_limit
+    return np.asarray(forces[(forces >= low) & (forces <= high)])
+
+
+def front_durations(paths: DrivenPaths, forces: Array) -> Array:
+    """(n,) shortest duration [s] of any of the paths at each force, infinite for none."""
+    return np.array([paths.durations(float(force)).min(initial=np.inf) for force in forces])
+
+
+def spread_members(x: Array) -> Array:
+    """At most `MEMBERS` rows of a front (k, n), both ends among them."""
+    rows = np.linspace(0, len(x) - 1, min(len(x), MEMBERS)).round().astype(int)
+    return np.asarray(x[np.unique(rows)])
+
+
+def over_replicas(durations: Sequence[Array]) -> tuple[Array, Array, Array]:
+    """Median, least and largest (n,) of the replicas' durations at each force."""
+    every = np.array(durations)
+    return np.median(every, axis=0), every.min(axis=0), every.max(axis=0)

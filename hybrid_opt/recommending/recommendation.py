@@ -1,0 +1,184 @@
+"""The carry to run, and why: what `hybrid_opt.recommend` gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
+from hybrid_opt.recommending.choice import Choice, choices
+from hybrid_opt.recommending.driven_paths import DrivenPaths
+from hybrid_opt.recommending.rival import BETTER, Reference, Rival, comparison_forces, rivals
+from hybrid_opt.recommending.squeeze import Squeeze, squeeze_of
+from hybrid_opt.recommending.unsure import Unsure, unsure_forces
+from hybrid_opt.recommending.wish import Wish
+from hybrid_opt.timing.records import Timing, TimingLimits
+from hybrid_opt.timing.robustness import Margin, robustness_margins
+from hybrid_opt.timing.solve import time_path
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+
+HAND_MADE = "hand-made"
+"""What the workcell file's own trajectory is called."""
+
+LEAST_ROOM = 0.1
+"""Margins below this share of a centimetre, or of a tenth of a coefficient, are warned of."""
+
+TRIED = 8
+"""Answers to a wish that are held against the independent timing before giving up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recommendation:
+    """The carry to run.
+
+    Attributes:
+        wish: what was asked for.
+        member: its path's place in the front that it was chosen from.
+        x: (n_var,) decision vector: the path, then the force limit [N].
+        timing: as the independent timing drives it, every limit recomputed; its `carry` is what
+            robots drive.
+        squeeze: how hard to press.
+        margins: how wrong the cell's description may be.
+        rivals: the hand-made path, and others, at the same force and in the same time.
+        unsure: forces that hold if the cell is less sure than stated.
+        warnings: what speaks against it, sentences; empty where nothing does.
+    """
+
+    wish: Wish
+    member: int
+    x: Array
+    timing: Timing
+    squeeze: Squeeze
+    margins: tuple[Margin, ...]
+    rivals: tuple[Rival, ...]
+    unsure: tuple[Unsure, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def carry(self) -> Carry:
+        """The carry as robots drive it."""
+        assert self.timing.carry is not None, "what is recommended has a timing"
+        return self.timing.carry
+
+    @property
+    def force(self) -> float:
+        """Limit on both normal forces [N]."""
+        return float(self.x[-1])
+
+    def __repr__(self) -> str:
+        first, second = self.carry.peak_normal_force
+        lines = [
+            f"Recommended: {self.timing.duration:.3f} s, peak normal forces {first:.2f} and "
+            f"{second:.2f} N; press with {self.squeeze.peak.max():.1f} N ({self.squeeze.reason})",
+            f"  {self.wish}",
+        ]
+        lines += [
+            f"  {rival.label}: {rival.duration_at_force:.3f} s at the same force, "
+            f"{rival.force_at_duration:.2f} N in the same time"
+            for rival in self.rivals
+        ]
+        return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
+
+
+def recommend(
+    cell: Cell, x: Array, wish: Wish | None = None, others: Mapping[str, Array] | None = None
+) -> Recommendation:
+    """The carry to run of a drivable front.
+
+    Args:
+        cell: under the time law 'optimal', see `Cell.drivable`.
+        x: (k, n_var) decision vectors of the front's members, certified free of collisions.
+        wish: what is asked for; None for the knee.
+        others: (n_path,) paths by label, beside which the answer stands; the hand-made one always
+            is.
+
+    Raises:
+        SettingsError: the cell has another time law, the front is empty, or no member can do what
+            is wished for.
+    """
+    task = cell.workcell.task
+    if task.time_law != "optimal":
+        raise SettingsError(
+            f"the cell's time law is {task.time_law!r}, which no robot drives; give the front of "
+            "cell.drivable()"
+        )
+    x = np.asarray(x, dtype=float).reshape(-1, task.n_var)
+    if len(x) == 0:
+        raise SettingsError(
+            "the drivable front is empty: no feasible carry was found; give the search more "
+            "evaluations or the task wider bounds"
+        )
+    wish = wish or Wish()
+    paths = DrivenPaths(cell.path_timer, x[:, :-1], task.force_limit[1])
+    members = paths.timings(x[:, -1])
+    points = np.array([[member.duration, member.peak_force.max()] for member in members])
+    choice, timing = _driven(cell, x, choices(cell.workcell, paths, points, wish))
+    assert timing.carry is not None, "the timing respects every limit"
+    named = {HAND_MADE: cell.initial[:-1]} | dict(others or {})
+    reference = Reference(paths, choice.index, choice.force, comparison_forces(points))
+    beside = rivals(cell, named, reference)
+    margins = robustness_margins(cell.timing_model, timing.carry)
+    return Recommendation(
+        wish=wish,
+        member=choice.index,
+        x=timing.carry.x,
+        timing=timing,
+        squeeze=squeeze_of(timing.carry),
+        margins=margins,
+        rivals=beside,
+        unsure=unsure_forces(timing.carry),
+        warnings=(*_warnings(beside, timing, choice.force), *_without_room(margins)),
+    )
+
+
+def _driven(cell: Cell, x: Array, wanted: Iterable[Choice]) -> tuple[Choice, Timing]:
+    """The first choice that the independent timing confirms."""
+    reason = ""
+    for choice in islice(wanted, TRIED):
+        decision = np.append(x[choice.index, :-1], choice.force)
+        timing = time_path(cell.timing_model, decision, TimingLimits(force=choice.force))
+        if timing.ok:
+            return choice, timing
+        reason = timing.reason
+    raise SettingsError(f"no carry of the front can be driven as wished for: {reason}")
+
+
+def _warnings(beside: Iterable[Rival], timing: Timing, force: float) -> Iterator[str]:
+    """What speaks against the recommended carry."""
+    for rival in beside:
+        if rival.duration_at_force < timing.duration * (1.0 - BETTER):
+            yield (
+                f"the {rival.label} trajectory is better: at {force:.2f} N it takes "
+                f"{rival.duration_at_force:.3f} s instead of {timing.duration:.3f} s"
+            )
+        elif rival.faster_between is not None:
+            low, high = rival.faster_between
+            where = f"at {low:.2f} N" if low == high else f"between {low:.2f} and {high:.2f} N"
+            yield (
+                f"the {rival.label} trajectory is faster than the whole front {where}; a longer "
+                "search or polish would help there"
+            )
+
+
+def _without_room(margins: Iterable[Margin]) -> Iterator[str]:
+    """What the carry has no room for at all."""
+    tight = [
+        margin
+        for margin in margins
+        if margin.fails and abs(margin.limit - margin.nominal) < LEAST_ROOM * _whole(margin)
+    ]
+    if tight:
+        yield (
+            f"no room is left for errors of {', '.join(margin.quantity for margin in tight)} "
+            f"({tight[0].fails}); wish for a longer carry, or state the errors as [uncertainty]"
+        )
+
+
+def _whole(margin: Margin) -> float:
+    """What a margin is compared with: a tenth of a coefficient, a length of a centimetre."""
+    return 1e-2 if margin.unit == "m" else 0.1 * margin.nominal

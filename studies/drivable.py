@@ -1,0 +1,100 @@
+"""The fronts of a study's drivable experiment, read back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_opt.campaign.layout import DRIVABLE
+from hybrid_opt.campaign.polish_stage import read_polished
+from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.indicators import metrics
+from studies.terminal_summary import title
+from symbolic.array import Array
+
+POLISHED = ", polished"
+"""After an algorithm's title."""
+
+
+@dataclass(frozen=True)
+class ReplicaFront:
+    """One replica's front, as searched or as polished; arrays are read-only.
+
+    Attributes:
+        algorithm, replica: whose it is; replicas count from 0.
+        polished: whether it is the polished one.
+        x, objectives: (k, n_var) and (k, 2).
+    """
+
+    algorithm: str
+    replica: int
+    polished: bool
+    x: Array
+    objectives: Array
+
+    @property
+    def label(self) -> str:
+        """Of the algorithm, and whether polished."""
+        return title(self.algorithm) + (POLISHED if self.polished else "")
+
+    @property
+    def source(self) -> str:
+        """The label with the number of the replica, as its files have it."""
+        return f"{self.label}, replica {self.replica}"
+
+
+@dataclass(frozen=True)
+class DrivableFronts:
+    """All fronts of a drivable experiment, and their non-dominated union.
+
+    Attributes:
+        results: of the experiment.
+        fronts: of all replicas, searched and polished.
+        x: (k, n_var) of the union, by increasing duration.
+        sources: whose each of the union is.
+    """
+
+    results: CampaignResults
+    fronts: tuple[ReplicaFront, ...]
+    x: Array
+    sources: tuple[str, ...]
+
+    def labelled(self) -> dict[str, list[ReplicaFront]]:
+        """The fronts by label."""
+        found: dict[str, list[ReplicaFront]] = {}
+        for front in self.fronts:
+            found.setdefault(front.label, []).append(front)
+        return found
+
+
+def drivable_root(root: Path, objectives: Sequence[str]) -> Path:
+    """Where a study's drivable experiment lies: in a folder inside, unless it is the only one."""
+    return root if tuple(objectives) == DRIVABLE_OBJECTIVES else root / DRIVABLE
+
+
+def drivable_fronts(root: Path) -> DrivableFronts:
+    """The fronts of a drivable experiment.
+
+    Args:
+        root: its own results folder, see `drivable_root`.
+
+    Raises:
+        ResultsError: the folder is not complete or damaged.
+    """
+    results = read_campaign(root)
+    fronts = []
+    for replica in results.replicas:
+        key = replica.algorithm, replica.replica
+        fronts.append(ReplicaFront(*key, False, replica.front_x, replica.front))
+        polished = read_polished(results.root, replica, results.workcell)
+        if polished is not None:
+            fronts.append(ReplicaFront(*key, True, polished.x, polished.objectives))
+    x = np.concatenate([front.x for front in fronts])
+    objectives = np.concatenate([front.objectives for front in fronts])
+    sources = [front.source for front in fronts for _ in front.x]
+    rows = metrics.front_rows(objectives, np.ones(len(objectives), dtype=bool))
+    return DrivableFronts(results, tuple(fronts), x[rows], tuple(sources[row] for row in rows))

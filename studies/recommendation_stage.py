@@ -1,0 +1,162 @@
+"""The stage that picks the carry to run from the drivable fronts."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+import hybrid_opt as ho
+from hybrid_opt.campaign import CampaignFolder, Progress, Stage
+from hybrid_opt.campaign.layout import RECOMMENDATION, RECOMMENDED, STAGES
+from hybrid_opt.campaign.polish_stage import read_polished
+from hybrid_opt.campaign.recommended import (
+    ForceTable,
+    StoredDurations,
+    StoredRecommendation,
+    Told,
+    stored_recommendation,
+)
+from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.indicators.selection import select
+from hybrid_opt.recommending.driven_paths import DrivenPaths
+from hybrid_opt.recommending.force_table import (
+    front_durations,
+    over_replicas,
+    spread_members,
+    table_forces,
+)
+from hybrid_opt.recommending.recommendation import HAND_MADE, Recommendation
+from hybrid_opt.store.files import write_json
+from hybrid_opt.store.json_records import read_record, to_json
+from hybrid_opt.store.trajectory_figures import trajectory_figures
+from hybrid_opt.store.trajectory_file import write_trajectory
+from studies.drivable import DrivableFronts, drivable_fronts, drivable_root
+from symbolic.array import Array
+
+LEAST_FORCE = "least-force"
+"""The path that the other experiment ends with, beside which the recommended carry stands."""
+
+EXPORT_FORM = "ros2"
+
+
+def recommendation_stage(wish: ho.Wish) -> Stage:
+    """The stage that writes `recommended.json`, a trajectory file, and `recommendation.json`."""
+
+    def run(folder: CampaignFolder, progress: Progress) -> None:
+        with progress.stage("recommendation", 1, "carry") as advance:
+            found = recommend_from(folder.root, wish, folder.root / RECOMMENDED)
+            if found is None:  # also after an earlier attempt that was interrupted
+                (folder.root / RECOMMENDATION).unlink(missing_ok=True)
+            else:
+                write_json(folder.root / RECOMMENDATION, to_json(found))
+            advance(1)
+
+    return Stage("recommendation", run, dict(wish.given))
+
+
+def read_recommendation(root: Path) -> StoredRecommendation | None:
+    """The recommendation in a results folder, None where there is none.
+
+    Raises:
+        ResultsError: it is damaged.
+    """
+    path = root / RECOMMENDATION
+    if not path.exists():
+        return None
+    remedy = f"delete {STAGES}/recommendation.json in its folder and continue with --resume"
+    return read_record(StoredRecommendation, path, remedy)
+
+
+def export_command(path: Path, force: float) -> str:
+    """The command that makes of a trajectory file, timed within a force limit [N], what robots
+    need."""
+    output = path.with_name(f"{path.stem}-{EXPORT_FORM}")
+    return (
+        f"python -m studies.export {shlex.quote(str(path))} --form {EXPORT_FORM} "
+        f"--force-limit {force:.6g} --output {shlex.quote(str(output))}"
+    )
+
+
+def recommend_from(root: Path, wish: ho.Wish, path: Path) -> StoredRecommendation | None:
+    """Recommend a carry of a study's drivable fronts, and store it.
+
+    Args:
+        root: the results folder, its drivable experiment done.
+        wish: what is asked for.
+        path: the trajectory file to write.
+
+    Returns:
+        What is said of it; None where no drivable carry was found.
+
+    Raises:
+        SettingsError: no carry can do what is wished for.
+        ResultsError: the folder is not complete or damaged, or the file cannot be written.
+    """
+    campaign = read_campaign(root)
+    drivable = drivable_fronts(drivable_root(root, campaign.objectives))
+    if len(drivable.x) == 0:
+        return None
+    cell = ho.Cell(drivable.results.workcell, DRIVABLE_OBJECTIVES)
+    others = {} if campaign.objectives == DRIVABLE_OBJECTIVES else _least_force(campaign)
+    found = ho.recommend(cell, drivable.x, wish, others)
+    source = drivable.sources[found.member]
+    provenance = {
+        "recommended": str(wish),
+        "source": source,
+        "settings": to_json(campaign.configuration.settings),
+    }
+    figures = trajectory_figures(cell.carry(found.x))
+    write_trajectory(path, cell.workcell, found.x, figures, provenance)
+    inside = path.resolve().is_relative_to(root.resolve())
+    told = Told(
+        source=source,
+        file=path.resolve().relative_to(root.resolve()).as_posix() if inside else str(path),
+        export=export_command(path, found.force),
+        considered=len(drivable.x),
+        durations=_force_table(cell, drivable, others, found),
+    )
+    return stored_recommendation(found, told)
+
+
+def _force_table(
+    cell: ho.Cell, drivable: DrivableFronts, others: Mapping[str, Array], found: Recommendation
+) -> ForceTable:
+    """Every front's durations at the same forces, that of the recommended carry among them."""
+    task = cell.workcell.task
+    forces = np.unique(np.append(table_forces(cell.workcell), found.force))
+
+    def durations(paths: Array) -> Array:
+        if len(paths) == 0:
+            return np.full(len(forces), np.inf)
+        driven = DrivenPaths(cell.path_timer, paths, task.force_limit[1])
+        return front_durations(driven, forces)
+
+    paths = {HAND_MADE: cell.initial[: task.n_path]} | dict(others)
+    rows = [_row(label, [durations(path[None])]) for label, path in paths.items()]
+    rows += [
+        _row(label, [durations(spread_members(front.x)[:, : task.n_path]) for front in fronts])
+        for label, fronts in drivable.labelled().items()
+    ]
+    return ForceTable(tuple(forces.tolist()), tuple(rows))
+
+
+def _row(label: str, found: list[Array]) -> StoredDurations:
+    figures = [tuple(values.tolist()) for values in over_replicas(found)]
+    return StoredDurations(label, len(found), *figures)
+
+
+def _least_force(campaign: CampaignResults) -> dict[str, Array]:
+    """The balanced path of all fronts of the other experiment, by its label."""
+    fronts = [replica.front_x for replica in campaign.replicas]
+    for replica in campaign.replicas:
+        polished = read_polished(campaign.root, replica, campaign.workcell)
+        if polished is not None:
+            fronts.append(polished.x)
+    evaluator = CandidateEvaluator(campaign.workcell, campaign.objectives)
+    chosen = select(evaluator, np.concatenate(fronts))
+    return {} if chosen is None else {LEAST_FORCE: chosen.x[: campaign.workcell.task.n_path]}

@@ -1,0 +1,117 @@
+"""The carry to run, as words: the terminal and the page say the same."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from hybrid_opt.campaign.recommended import StoredRecommendation, StoredRival
+from symbolic.array import Array
+
+
+@dataclass(frozen=True)
+class RecommendationText:
+    """What a study opens with.
+
+    Attributes:
+        headline: the carry in one line.
+        facts: heading and text, in the order in which they matter.
+        warnings: what speaks against it.
+    """
+
+    headline: str
+    facts: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+
+    def terminal(self) -> str:
+        """For a terminal."""
+        width = max(len(heading) for heading, _ in self.facts)
+        lines = [self.headline]
+        lines += [f"  {heading:<{width}}  {text}" for heading, text in self.facts]
+        return "\n".join(lines + [f"  WARNING: {text}" for text in self.warnings])
+
+
+def recommendation_text(
+    found: StoredRecommendation, robots: Sequence[str], folder: str
+) -> RecommendationText:
+    """The words for a stored recommendation.
+
+    Args:
+        robots: both robots' names.
+        folder: of the results, in front of the file's name.
+    """
+    headline = (
+        f"Run this carry: {found.duration:.2f} s, pressing with at most "
+        f"{max(found.peak_force):.2f} N ({_of_robots(found.peak_force, robots)})"
+    )
+    facts = [
+        ("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}"),
+        ("file", str(Path(folder) / found.file)),
+        ("export", found.export),
+        ("press with", f"{_of_robots(found.squeeze, robots)}, {found.squeeze_reason}"),
+        ("payload", f"up to {found.payload_limit:.2f} kg on the same motion"),
+        *[(rival.label, _rival(rival, found)) for rival in found.rivals],
+        ("margins", "; ".join(_margins(found)) or "not known"),
+    ]
+    if found.unsure:
+        facts.append(
+            (
+                "if less sure",
+                "command "
+                + "; ".join(
+                    f"{max(doubt.peak_force):.1f} N if {doubt.doubt}"
+                    + ("" if doubt.within_reference else " (beyond the reference force)")
+                    for doubt in found.unsure
+                )
+                + "; state it as [uncertainty] in the workcell",
+            )
+        )
+    return RecommendationText(headline, tuple(facts), found.warnings)
+
+
+def _of_robots(values: Array, robots: Sequence[str]) -> str:
+    return ", ".join(f"{name} {value:.1f} N" for name, value in zip(robots, values, strict=True))
+
+
+def _rival(rival: StoredRival, found: StoredRecommendation) -> str:
+    """Another path beside the recommended carry."""
+    parts = []
+    if math.isfinite(rival.duration_at_force):
+        parts.append(
+            f"{rival.duration_at_force:.2f} s at the same force "
+            f"({_percent(rival.duration_at_force / found.duration)})"
+        )
+    else:
+        parts.append("cannot move with so little force")
+    if math.isfinite(rival.force_at_duration):
+        parts.append(
+            f"{rival.force_at_duration:.2f} N in the same time "
+            f"({_percent(rival.force_at_duration / found.force_limit)})"
+        )
+    else:
+        parts.append("is never so fast")
+    return ", ".join(parts)
+
+
+def _percent(ratio: float) -> str:
+    return f"{100.0 * (ratio - 1.0):+.1f} %"
+
+
+def _margins(found: StoredRecommendation) -> list[str]:
+    """Friction of both contacts, and the nearest limit of the centre of mass along each axis."""
+    texts = []
+    for margin in found.margins:
+        if margin.quantity == "friction of both contacts":
+            end = f" ({margin.fails} beyond)" if margin.fails else ""
+            texts.append(f"friction down to {margin.limit:.2f}{end}")
+    offs = {
+        margin.quantity[-1]: abs(margin.limit - margin.nominal)
+        for margin in sorted(found.margins, key=lambda m: -abs(m.limit - m.nominal))
+        if margin.quantity.startswith("centre of mass")
+    }
+    if offs:
+        along = ", ".join(f"{1e3 * offs[axis]:.0f} mm along {axis}" for axis in sorted(offs))
+        texts.append(f"centre of mass off by {along}")
+    return texts
