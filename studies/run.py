@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hybrid_opt.campaign import (
@@ -22,6 +22,7 @@ from hybrid_opt.campaign.experiment_stage import drivable_stage
 from hybrid_opt.campaign.layout import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
+from hybrid_opt.polishing.drivable.point import is_polishable
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
 from hybrid_opt.work.processes import warm_up
@@ -108,6 +109,9 @@ def run_study(
         DualArmError: the workcell, a setting or the results folder is wrong, or work failed.
     """
     cell, competition = decided_cell(load(workcell), settings, execution)
+    if study.drivable_polish is not None and not is_polishable(cell.task):
+        progress.note("the drivable carries of this cell cannot be polished: search alone")
+        study = replace(study, drivable_polish=None)
     with open_folder(settings, execution, cell) as folder:
         told = store_branches(folder.root, competition)
         run_stages(folder, stages(study), progress)
@@ -160,9 +164,11 @@ def main(
         execution = execution_settings(options, Path("results") / cell.stem)
         if execution.executor == "processes":
             warm_up(*WORKERS_LOAD)
+        polish = polish_settings(options)
         study = StudySettings(
-            polish=polish_settings(options),
+            polish=polish,
             drivable=options.drivable,
+            drivable_polish=polish,
             wish=wish(options),
             report=options.report,
             with_paper=bool(workcell),

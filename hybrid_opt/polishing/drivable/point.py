@@ -29,6 +29,7 @@ from hybrid_opt.polishing.residuals import Residuals
 from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.workcell.records import Task
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,12 @@ class DriveTask:
     radius: float
 
 
+def is_polishable(task: Task) -> bool:
+    """Whether drivable carries of a task can be polished: the paper's allocation of forces, and no
+    redundant joints."""
+    return task.allocation == "paper" and task.n_path == 6 * len(task.free_indices)
+
+
 class DrivableSolver:
     """Solves for one evaluator's cell. A resource: one per process."""
 
@@ -53,8 +60,7 @@ class DrivableSolver:
         self, evaluator: CandidateEvaluator, functions: PolishFunctions, settings: PolishSettings
     ) -> None:
         driver, task = evaluator.driver, evaluator.workcell.task
-        redundant = task.n_path != 6 * len(task.free_indices)
-        if driver is None or functions.driven is None or task.allocation != "paper" or redundant:
+        if driver is None or functions.driven is None or not is_polishable(task):
             raise SettingsError(
                 "the polish of drivable carries needs the time law 'optimal', the paper's "
                 "allocation of forces, and arms of six joints: switch the polish off"
