@@ -23,6 +23,9 @@ _DEFAULT = CampaignSettings()
 QUICK_EVALUATIONS, QUICK_REPLICAS, QUICK_POLISH_POINTS = 300, 2, 2
 """Of a small but complete study."""
 
+DRIVABLE_POLISH_POINTS = 10
+"""Solves of one drivable front: each takes several times as long as one of a paper's front."""
+
 
 class Parser(argparse.ArgumentParser):
     """A parser that says in one line what is wrong with a command."""
@@ -117,7 +120,7 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         type=int,
         metavar="N",
         help=f"solves that the polish of one front may take (default: {PolishSettings().points}, "
-        f"with --quick {QUICK_POLISH_POINTS})",
+        f"{DRIVABLE_POLISH_POINTS} for a drivable one, with --quick {QUICK_POLISH_POINTS})",
     )
     after.add_argument(
         "--drivable",
@@ -211,8 +214,13 @@ def campaign_settings(options: argparse.Namespace) -> CampaignSettings:
     )
 
 
-def polish_settings(options: argparse.Namespace) -> PolishSettings | None:
+def polish_settings(
+    options: argparse.Namespace, points: int | None = None
+) -> PolishSettings | None:
     """How the options want fronts polished, None for not at all.
+
+    Args:
+        points: solves of one front where the options do not say.
 
     Raises:
         SettingsError: a value is not allowed.
@@ -222,10 +230,11 @@ def polish_settings(options: argparse.Namespace) -> PolishSettings | None:
         wanted = campaign_settings(options).objectives == PAPER_OBJECTIVES
     if not wanted:
         return None
-    points = options.polish_points
-    if points is None:
-        points = QUICK_POLISH_POINTS if options.quick else PolishSettings().points
-    return PolishSettings(points=points)
+    if options.polish_points is not None:
+        points = options.polish_points
+    elif options.quick:
+        points = QUICK_POLISH_POINTS
+    return PolishSettings() if points is None else PolishSettings(points=points)
 
 
 def wish(options: argparse.Namespace) -> Wish:

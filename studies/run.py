@@ -27,6 +27,7 @@ from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
 from hybrid_opt.work.processes import warm_up
 from studies.cli import (
+    DRIVABLE_POLISH_POINTS,
     campaign_parser,
     campaign_settings,
     execution_settings,
@@ -164,11 +165,10 @@ def main(
         execution = execution_settings(options, Path("results") / cell.stem)
         if execution.executor == "processes":
             warm_up(*WORKERS_LOAD)
-        polish = polish_settings(options)
         study = StudySettings(
-            polish=polish,
+            polish=polish_settings(options),
             drivable=options.drivable,
-            drivable_polish=polish,
+            drivable_polish=polish_settings(options, DRIVABLE_POLISH_POINTS),
             wish=wish(options),
             report=options.report,
             with_paper=bool(workcell),

@@ -195,7 +195,7 @@ class PolishSettings:
         near, trust, solve, front, drivable: the parts' own.
     """
 
-    points: int = 16
+    points: int = 24
     method: Method = "pascoletti-serafini"
     max_iterations: int = 30
     rounds: int = 7

@@ -93,6 +93,11 @@ def test_records_that_are_none_are_not_found(cache: Cache, kind: str) -> None:
     assert cache.find(name.removesuffix(".json")) is None
 
 
+def _made(library: Path) -> dict[str, object]:
+    library.write_bytes(b"made")
+    return {}
+
+
 @pytest.mark.parametrize("jump", [-2 * 86400.0, 2 * 86400.0])
 def test_a_clock_that_jumps_ends_no_living_build(cache: Cache, jump: float) -> None:
     cache.write_record(KEY, {})
@@ -103,7 +108,7 @@ def test_a_clock_that_jumps_ends_no_living_build(cache: Cache, jump: float) -> N
     handle = os.open(living, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
-        cache.write_record(KEY, {})
+        cache.store(KEY, _made)  # sweeps
     finally:
         os.close(handle)
     assert living.exists()
@@ -113,7 +118,7 @@ def test_a_clock_that_jumps_ends_no_living_build(cache: Cache, jump: float) -> N
 def test_a_build_holds_its_folder(cache: Cache) -> None:
     def make(library: Path) -> dict[str, object]:
         os.utime(library.parent, (0.0, 0.0))
-        Cache(cache.folder).write_record(digest("other"), {})  # sweeps
+        Cache(cache.folder).store(digest("other"), _made)  # sweeps
         library.write_bytes(b"made")
         return {}
 

@@ -143,13 +143,18 @@ def test_prints_text_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["missing.toml"], "missing.toml"),
-        ([str(TRANSFER), "--candidates", "0"], "at least 1"),
-        ([str(TRANSFER), "--seed", "-1"], "--seed"),
+        (["--candidates", "0"], "--candidates: found '0'; allowed is a whole number 1 to"),
+        (["--seed", "-1"], "--seed: found '-1'; allowed is a whole number 0 to"),
     ],
 )
 def test_misuse_is_one_message(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*arguments, "--no-pictures"]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        main([str(TRANSFER), *arguments, "--no-pictures"])
     assert message in capsys.readouterr().err
+
+
+def test_a_missing_cell_is_one_message(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["missing.toml", "--no-pictures"]) == 2
+    assert "missing.toml" in capsys.readouterr().err

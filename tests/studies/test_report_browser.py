@@ -258,7 +258,7 @@ def test_joints_move_as_in_python(
     for i, arm in enumerate(data.geometry.arms):
         joint = browser.execute_script(
             "report.scene.scene.updateMatrixWorld(true);"
-            "return report.scene.arms[arguments[0]][5].turning.matrixWorld.toArray()",
+            "return report.scene.arms[arguments[0]][5].moving.matrixWorld.toArray()",
             i,
         )
         placed = np.array(joint).reshape(4, 4).T @ arm.T_joint_box

@@ -77,14 +77,12 @@ class DrivablePolisher(FrontPolisher):
         self.evaluator, self.settings = evaluator, settings
         known = functions or polish_functions(evaluator.compiled)
         self.drivable = DrivableSolver(evaluator, known, settings)
-        self._timings: TimingModel | None = None
+        # At once: the cell's files may be there only for as long as this is made.
+        self._timings = TimingModel(evaluator.compiled, self.drivable.driver.timer.stages)
 
     def doubt(self, x: Array) -> str:
         """Why a timing is not believed, see `hybrid_opt.polishing.drivable.certified`."""
-        driver = self.drivable.driver
-        if self._timings is None:
-            self._timings = TimingModel(self.evaluator.compiled, driver.timer.stages)
-        return second_opinion(driver, self._timings, x)
+        return second_opinion(self.drivable.driver, self._timings, x)
 
     def _run(
         self,

@@ -39,9 +39,11 @@ def shortest_duration(model: TimingModel, x: Array, start: Array) -> float:
             # The load is quadratic in the rate, so its sign and root need no care at rest.
             rate = motion.pose_first[k] * ca.sqrt(s + 1e-12)
             out = dict(zip(LOAD_OUTPUTS, load(motion.pose[k], rate, linear), strict=True))
+            n_first = len(cell.robots[0].torque_max)
+            split = (motion.wrench_torque[k, :n_first], motion.wrench_torque[k, n_first:])
             contact = [
-                ca.mtimes(ca.DM(motion.wrench_torque[k, arm]), out[f"wrench_{arm + 1}"])
-                for arm in (0, 1)
+                ca.mtimes(ca.DM(matrix), out[f"wrench_{arm + 1}"])
+                for arm, matrix in enumerate(split)
             ]
             own = motion.torque_by_acceleration[k] * a + motion.torque_by_speed[k] * s
             torque = ca.vertcat(*contact) + own + motion.torque_at_rest[k]
