@@ -83,7 +83,7 @@
     const view = data.views[state.view];
     const traces = frontTraces(view);
     const range = state.whole ? view.whole : view.first;
-    const narrow = $("front-plot").clientWidth < 600;
+    const narrow = $("front-plot").clientWidth < 750;
     const layout = { font: FONT, hovermode: "closest",
       margin: { l: 70, r: 15, t: 20, b: narrow ? 190 : 120 },
       xaxis: { title: { text: plain(view.xTitle), standoff: 8 }, range: range[0].slice() },
