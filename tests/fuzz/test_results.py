@@ -108,7 +108,7 @@ def in_values(root: Path, whole: Path, share: float, damaged: Tree) -> None:
 
 def in_evaluations(root: Path, whole: Path, share: float, damaged: Bytes) -> None:
     """The table is damaged before it was packed, and its checksum is right."""
-    (path,) = root.rglob(EVALUATIONS)
+    (path,) = (root / "replicas").rglob(EVALUATIONS)
     table = gzip.compress(damaged(gzip.decompress(path.read_bytes())), mtime=0)
     mark: dict[str, Any] = json.loads((path.parent / MARK).read_bytes())
     mark["sha256"][EVALUATIONS] = hashlib.sha256(table).hexdigest()
