@@ -8,7 +8,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.job.compliance import SKEWS, STIFFNESSES, position_control, skewed
+from hybrid_opt.job.compliance import (
+    SKEWS,
+    STIFFNESSES,
+    largest_skew,
+    position_control,
+    skewed,
+)
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import WIDTH
@@ -16,6 +22,7 @@ from hybrid_opt.job.squeeze import FACTOR, SqueezeSettings
 from hybrid_opt.job.text import job_text, position_text, skew_text
 from hybrid_opt.store.export import FORMATS, BundleOptions, Origin, export
 from hybrid_opt.store.export.manifest import warnings_of
+from hybrid_opt.store.export.start import SKEW
 from hybrid_opt.store.files import read_bytes
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing import (
@@ -80,6 +87,13 @@ def _parser() -> argparse.ArgumentParser:
         help="of each arm at its pad, for what a late arm does",
     )
     parser.add_argument(
+        "--skew",
+        type=float,
+        metavar="S",
+        help="between the starts of both arms [s]; a job whose squeeze it breaks is refused "
+        f"(default: {SKEW:g} where a controller of its own drives each arm, else 0)",
+    )
+    parser.add_argument(
         "--per-arm", action="store_true", help="ros2: a trajectory and a controller per arm"
     )
     parser.add_argument(
@@ -91,7 +105,9 @@ def _parser() -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace) -> int:
     path = Path(options.file)
     stored = read_trajectory(path)
-    bundle = BundleOptions(options.step, options.per_arm, options.any_arm, options.stiffness)
+    bundle = BundleOptions(
+        options.step, options.per_arm, options.any_arm, options.stiffness, options.skew
+    )
     squeeze = SqueezeSettings(options.squeeze, options.leader - 1)
     with TemporaryDirectory() as folder:
         job = _planned(stored, Path(folder), options, squeeze)
@@ -130,7 +146,8 @@ def _report(job: Job, stiffness: float) -> str:
         job_text(job),
         "\nPosition control, by the arms' stiffness at their pads",
         position_text([position_control(job, each) for each in STIFFNESSES]),
-        f"\nThe second arm late, at {stiffness:g} N/m",
+        f"\nEither arm late, at {stiffness:g} N/m: up to "
+        f"{1e3 * largest_skew(job, stiffness):.1f} ms are survived",
         skew_text([skewed(job, delay, stiffness) for delay in SKEWS]),
     ]
     parts += [f"\nwarning: {warning}" for warning in warnings_of(job)]

@@ -27,7 +27,7 @@ from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.front import FrontPolisher
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.store.files import read_bytes, write_atomically
+from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
 from hybrid_opt.work.job import Emit, Job, answer_all
 from hybrid_opt.work.processes import local_executor
 from studies.options import seed, whole
@@ -196,7 +196,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.jobs,
         lambda text: print(text, file=sys.stderr, flush=True),
     )
-    write_atomically(options.output, encode(front, command))
+    write_atomically(options.output, encode(front, command), AGAIN)
     print(
         f"{options.output}: {len(front.x)} points, hypervolume "
         f"{metrics.hypervolume(front.objectives):.6f}"

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
-from hybrid_opt.store.files import storing
+from hybrid_opt.store.files import AGAIN, storing
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.analysis import closest_to_reference_timing
@@ -122,7 +122,7 @@ def _run(options: argparse.Namespace) -> int:
         text = simulate_arms(cell, carry, arms, options)
     if options.mjcf:
         path = Path(options.mjcf)
-        with storing(path):
+        with storing(path, AGAIN):
             path.write_text(text, encoding="utf-8")
         print(f"  cell written to {path}")
     return 0

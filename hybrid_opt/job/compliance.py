@@ -7,15 +7,16 @@ pads changes the squeeze by k d / 2.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
 
+from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import Job, Phase
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.pose import rotation_from_rpy
 
 STIFFNESSES = (2e3, 1e4, 5e4, 2e5, 1e6)
 """From a soft Cartesian impedance to a stiff industrial arm [N/m]."""
@@ -27,10 +28,15 @@ TRACKED = 0.05
 """Share of the force by which it may miss its reference and count as tracked."""
 
 SKEWS = (0.001, 0.002, 0.005, 0.01, 0.02)
-"""Delays of the second arm [s]."""
+"""Delays of one arm [s]."""
+
+LARGEST_SKEW = 0.1
+"""Largest delay that is looked at [s]."""
 
 HELD = ("lift", "carry", "set_down")
 """Phases in which the box is held and moves."""
+
+_BISECTIONS = 16
 
 
 @dataclass(frozen=True)
@@ -63,21 +69,25 @@ class PositionControl:
 
 @dataclass(frozen=True)
 class Skew:
-    """What a delay of the second arm does while the box is held, at one stiffness.
+    """What a delay of one arm does while the box is held, at one stiffness.
 
     Attributes:
         delay: [s].
         stiffness: of each arm at its pad, in all directions [N/m].
         displacement: largest relative displacement of the pads [m].
         force_change: largest change of the normal forces [N].
+        share: the same, of the normal force commanded at that moment.
         margin: least normal force beyond what then holds the box [N].
+        late: index of the arm whose delay leaves that least.
     """
 
     delay: float
     stiffness: float
     displacement: float
     force_change: float
+    share: float
     margin: float
+    late: int
 
     @property
     def survived(self) -> bool:
@@ -91,7 +101,7 @@ def position_control(job: Job, stiffness: float) -> PositionControl:
     Raises:
         SettingsError: the stiffness is not positive.
     """
-    _require(stiffness)
+    require_stiffness(stiffness)
     held = [phase for phase in job.phases if phase.name in HELD]
     least = min(float(phase.force.normal.min()) for phase in held)
     error = stiffness * POSITION_ERROR
@@ -107,7 +117,7 @@ def force_margin(job: Job) -> float:
 
 
 def skewed(job: Job, delay: float, stiffness: float) -> Skew:
-    """What happens while the box is held if the second arm is late.
+    """What happens while the box is held if either arm is late: the worse of both.
 
     Pads and box as springs, quasi-static: the pads' relative displacement along the normal changes
     the squeeze, the one across it has to be borne by friction as well.
@@ -117,39 +127,99 @@ def skewed(job: Job, delay: float, stiffness: float) -> Skew:
         stiffness: of each arm at its pad [N/m].
 
     Raises:
+        SettingsError: the stiffness is not positive, or the delay out of range.
+    """
+    require_stiffness(stiffness)
+    require_delay(delay)
+    held = [phase for phase in job.phases if phase.name in HELD]
+    found = [_skewed(job, phase, late, delay, stiffness) for phase in held for late in (0, 1)]
+    worst = min(found, key=lambda each: each.margin)
+    return replace(
+        worst,
+        displacement=max(each.displacement for each in found),
+        force_change=max(each.force_change for each in found),
+        share=max(each.share for each in found),
+    )
+
+
+def largest_skew(job: Job, stiffness: float) -> float:
+    """The longest delay of either arm that friction survives, up to `LARGEST_SKEW` [s].
+
+    Raises:
         SettingsError: the stiffness is not positive.
     """
-    _require(stiffness)
-    found = [_skewed(job, phase, delay, stiffness) for phase in job.phases if phase.name in HELD]
-    displacement, change, margin = zip(*found, strict=True)
-    return Skew(delay, stiffness, max(displacement), max(change), min(margin))
+    low, high = 0.0, LARGEST_SKEW
+    if skewed(job, high, stiffness).survived:
+        return high
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2.0
+        if skewed(job, middle, stiffness).survived:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
-def _skewed(job: Job, phase: Phase, delay: float, stiffness: float) -> tuple[float, float, float]:
-    motion, contacts = phase.motion, job.workcell.contacts
+def require_skew(job: Job, delay: float, stiffness: float) -> None:
+    """Refuse a job whose squeeze a delay of either arm breaks.
+
+    Args:
+        delay: [s].
+        stiffness: of each arm at its pad [N/m].
+
+    Raises:
+        SettingsError: the stiffness is not positive, or the delay out of range.
+        JobError: friction would not hold the box; the message says by how much, and what would.
+    """
+    found = skewed(job, delay, stiffness)
+    if found.survived:
+        return
+    raise JobError(
+        f"a skew of {1e3 * delay:g} ms brings the pads {1e3 * found.displacement:.1f} mm apart; "
+        f"arms of {stiffness:g} N/m then miss {-found.margin:.1f} N to hold the box, with "
+        f"{1e3 * largest_skew(job, stiffness):.1f} ms they hold it: press more (squeeze), choose "
+        "a slower timing, or give the stiffness and the skew that your arms have"
+    )
+
+
+def _skewed(job: Job, phase: Phase, late: int, delay: float, stiffness: float) -> Skew:
+    motion, contact = phase.motion, job.workcell.contacts[late]
     keep = np.concatenate([[True], np.diff(motion.time) > 0.0])
     time = motion.time[keep]
     path = CubicHermiteSpline(time, motion.pose[keep], motion.rate[keep])
-    point = contacts[1].T_box_pad[:3, 3]
-    now = path(time)
-    late = path(np.clip(time - delay, 0.0, None))
-    rotation = _rotations(now)
-    moved = late[:, :3] + _rotations(late) @ point - now[:, :3] - rotation @ point
-    normal = rotation @ contacts[1].T_box_pad[:3, 2]
+    now, before = path(time), path(np.clip(time - delay, 0.0, None))
+    rotation, point = _rotations(now), contact.T_box_pad[:3, 3]
+    moved = before[:, :3] + _rotations(before) @ point - now[:, :3] - rotation @ point
+    normal = rotation @ contact.T_box_pad[:3, 2]
     along = np.einsum("ni,ni->n", moved, normal)
     across = np.linalg.norm(moved - along[:, None] * normal, axis=1)
     change = stiffness / 2.0 * along
-    friction = min(contact.friction for contact in contacts)
-    needed = phase.force.least[keep] + (stiffness / 2.0 * across / friction)[:, None]
-    margin = phase.force.normal[keep] + change[:, None] - needed
-    displacement = float(np.linalg.norm(moved, axis=1).max())
-    return displacement, float(np.abs(change).max()), float(margin.min())
+    friction = min(contact.friction for contact in job.workcell.contacts)
+    commanded, least = phase.force.normal[keep], phase.force.least[keep]
+    needed = least + (stiffness / 2.0 * across / friction)[:, None]
+    return Skew(
+        delay,
+        stiffness,
+        displacement=float(np.linalg.norm(moved, axis=1).max()),
+        force_change=float(np.abs(change).max()),
+        share=float((np.abs(change)[:, None] / commanded).max()),
+        margin=float((commanded + change[:, None] - needed).min()),
+        late=late,
+    )
 
 
 def _rotations(poses: Array) -> Array:
-    return np.array([rotation_from_rpy(pose[3:]) for pose in poses])
+    found: Array = Rotation.from_euler("xyz", poses[:, 3:]).as_matrix()
+    return found
 
 
-def _require(stiffness: float) -> None:
+def require_stiffness(stiffness: float) -> None:
+    """Refuse a stiffness [N/m] that is not positive."""
     if not 0.0 < stiffness < float("inf"):
         raise SettingsError(f"stiffness {stiffness:g} N/m: give a finite positive one")
+
+
+def require_delay(delay: float) -> None:
+    """Refuse a delay [s] out of range."""
+    if not 0.0 <= delay <= LARGEST_SKEW:
+        raise SettingsError(f"skew of {delay:g} s: allowed is 0 to {LARGEST_SKEW:g} s")

@@ -56,16 +56,17 @@ def position_text(found: Sequence[PositionControl]) -> str:
 
 
 def skew_text(found: Sequence[Skew]) -> str:
-    """What a late second arm does, by delay."""
+    """What a late arm does, by delay: the worse of both."""
     rows = [
         [
             f"{1e3 * each.delay:g}",
             f"{1e3 * each.displacement:.2f}",
             f"{each.force_change:.1f}",
+            f"{100.0 * each.share:.0f} %",
             f"{each.margin:.1f}",
             "holds" if each.survived else "SLIPS",
         ]
         for each in found
     ]
-    head = ["late [ms]", "pads apart [mm]", "force [N]", "left [N]", "the box"]
-    return text_table([head, *rows], left=(4,))
+    head = ["late [ms]", "pads apart [mm]", "force [N]", "of force", "left [N]", "the box"]
+    return text_table([head, *rows], left=(5,))

@@ -22,30 +22,41 @@ LOCK = ".lock"
 MOST_BYTES = 512 * outside.MEBIBYTE
 """Largest file of a results folder that is read."""
 
+RESUME = "make room and continue with --resume"
+AGAIN = "make room and try again"
+"""What to do about a full disk: for a study's own files, and for any other."""
+
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 @contextmanager
-def storing(path: Path) -> Iterator[None]:
-    """Turn a failure to store `path` into one clear message."""
+def storing(path: Path, remedy: str = RESUME) -> Iterator[None]:
+    """Turn a failure to store `path` into one clear message.
+
+    Args:
+        remedy: what to do where the disk is full.
+    """
     try:
         yield
     except OSError as error:
         if error.errno in _FULL:
             raise ResultsError(
                 f"{path}: no space left to write ({error.strerror}); everything stored before is "
-                "kept: make room and continue with --resume"
+                f"kept: {remedy}"
             ) from error
         raise ResultsError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def write_atomically(path: Path, content: bytes) -> None:
+def write_atomically(path: Path, content: bytes, remedy: str = RESUME) -> None:
     """Replace a file in one step, durably; its folder is made if it is missing.
+
+    Args:
+        remedy: what to do where the disk is full.
 
     Raises:
         ResultsError: it cannot be written.
     """
-    with storing(path):
+    with storing(path, remedy):
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, content)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.files import storing
+from hybrid_opt.store.files import AGAIN, storing
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import BundleError, OutsideError
@@ -120,7 +120,7 @@ def write_trajectory(
     except (TypeError, ValueError) as error:
         raise ResultsError(f"the trajectory cannot be stored as JSON: {error}") from error
     path = Path(path)
-    with storing(path):
+    with storing(path, AGAIN):
         replace_file(path, f"{text}\n".encode())
 
 

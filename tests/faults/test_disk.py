@@ -13,7 +13,8 @@ import pytest
 
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.files import locked, read_json, write_atomically, write_json
+from hybrid_opt.store.export.bundle import read_manifest, write_bundle
+from hybrid_opt.store.files import locked, read_json, sha256, write_atomically, write_json
 from hybrid_opt.store.trajectory_file import read_trajectory, write_trajectory
 from tests.faults.kills import contents, differences, ended, started, study
 from tests.symbolic.cells import ROOT, rack_cell
@@ -74,6 +75,10 @@ def _trajectory(path: Path) -> None:
     write_trajectory(path, rack_cell(), rack_cell().task.initial.ravel(), {"duration": 1.0}, {})
 
 
+def _bundle(path: Path) -> None:
+    write_bundle(path, {"sub/job.csv": "x" * 500_000}, {})
+
+
 def _lock(path: Path) -> None:
     with locked(path.parent / "new"):
         pass
@@ -84,6 +89,7 @@ WRITERS: dict[str, Writer] = {
     "json": lambda path: write_json(path, ["x" * 500_000]),
     "journal": _append,
     "trajectory": _trajectory,
+    "bundle": _bundle,
 }
 
 
@@ -113,9 +119,21 @@ def test_a_trajectory_is_replaced_only_by_a_whole_one(disk: Path) -> None:
     path = disk / "trajectory.json"
     _trajectory(path)
     fill(disk)
-    with pytest.raises(ResultsError, match="No space left"):
+    with pytest.raises(ResultsError, match=r"No space left.*make room and try again"):
         _trajectory(path)
     assert read_trajectory(path).figures == {"duration": 1.0}
+
+
+def test_a_bundle_is_replaced_only_by_a_whole_one(disk: Path) -> None:
+    """An export has no --resume: its message does not speak of one."""
+    folder = disk / "bundle"
+    write_bundle(folder, {"job.csv": "before"}, {})
+    fill(disk)
+    with pytest.raises(ResultsError, match=r"No space left.*make room and try again"):
+        write_bundle(folder, {"job.csv": "x" * 500_000}, {})
+    assert read_manifest(folder)["files"] == {"job.csv": sha256(b"before")}
+    assert (folder / "job.csv").read_text() == "before"
+    assert {entry.name for entry in disk.iterdir()} == {"bundle", "filler"}
 
 
 TELL = f"""

@@ -18,6 +18,7 @@ from hybrid_opt.campaign.evaluations_file import decode
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.results import read_configuration
 from hybrid_opt.campaign.summary import CampaignSummary
+from hybrid_opt.store.export.bundle import read_manifest
 from hybrid_opt.store.files import read_bytes
 from hybrid_opt.store.json_records import read_record
 from hybrid_opt.store.trajectory_file import read_trajectory
@@ -42,6 +43,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "stage": lambda path: read_record(StageMark, path, ""),
     "evaluations": lambda path: decode(read_bytes(path), path),
     "journal": lambda path: Journal(path, b"\0" * 32),
+    "manifest": lambda path: read_manifest(path.parent),
     "reference front": read_reference_front,
     "cache": lambda path: Cache(path.parent).find(path.stem),
 }

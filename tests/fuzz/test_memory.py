@@ -169,6 +169,16 @@ FILES: dict[str, tuple[str, str, Callable[[], bytes]]] = {
     "one long line": ("evaluations", "e.csv.gz", lambda: gzip.compress(b"a" * 2**29)),
     "many blocks": ("journal", "journal.bin", lambda: journal(b"\0" * 12, times=2_000_000)),
     "one block": ("journal", "journal.bin", lambda: journal(b"\0" * 100 * MEBIBYTE)),
+    "manifest": (
+        "manifest",
+        "manifest.json",
+        lambda: named(
+            b'{"format": "dual-arm-carry bundle", "version": 1, "files": {"a": "a"',
+            b', "%d": "a"',
+            b"}}",
+            MOST_VALUES - 10,
+        ),
+    ),
     "front": ("reference front", "r.csv", lambda: full(b"#\n#\nh\n", b"1,1,1\n", b"", 2_000_000)),
     "larger front": (
         "reference front",

@@ -28,7 +28,7 @@ def test_a_bundle_is_written(
     arguments = [str(stored), "--form", "csv", "--output", str(tmp_path)]
     assert main(arguments) == 0
     text = capsys.readouterr().out
-    for part in ("approach", "set down", "Position control", "The second arm late", "warning"):
+    for part in ("approach", "set down", "Position control", "Either arm late", "warning"):
         assert part in text
     (folder,) = tmp_path.iterdir()
     assert folder.name.startswith("rack-nsga2-r02-p0017-")
@@ -54,6 +54,8 @@ def test_a_bundle_is_written(
         (["--form", "csv", "--smoothing", "-1"], "smoothing"),
         (["--form", "csv", "--smoothing", "nan"], "smoothing"),
         (["--form", "urscript"], "--any-arm"),
+        (["--form", "csv", "--skew", "0.02", "--stiffness", "50000"], "a skew of 20 ms"),
+        (["--form", "csv", "--skew", "-1"], "skew"),
     ],
 )
 def test_what_is_wrong_is_told_in_one_line(

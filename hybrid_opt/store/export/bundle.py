@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.files import read_bytes, read_json, sha256, storing
+from hybrid_opt.store.files import AGAIN, read_bytes, read_json, sha256, storing
 from symbolic.replacing import replace_file, sync_folder
 
 MANIFEST = "manifest.json"
@@ -30,7 +30,7 @@ def write_bundle(folder: Path, contents: Contents, manifest: Mapping[str, Any]) 
     Args:
         folder: of the bundle alone.
         contents: its files.
-        manifest: JSON values; the files' digests are added.
+        manifest: JSON values; the digests of the files and of itself are added.
 
     Returns:
         The files written, the manifest first.
@@ -44,12 +44,13 @@ def write_bundle(folder: Path, contents: Contents, manifest: Mapping[str, Any]) 
     }
     document = {"format": FORMAT, "version": VERSION, **manifest}
     document["files"] = {name: sha256(content) for name, content in data.items()}
-    text = json.dumps(document, indent=1, allow_nan=False) + "\n"
+    document["sha256"] = sha256(_text(document))
+    text = _text(document)
     draft = folder.with_name(f".{folder.name}.{os.getpid()}")
     old = folder.with_name(f".{folder.name}.old")
-    with storing(folder):
+    with storing(folder, AGAIN):
         try:
-            for name, content in ((MANIFEST, text.encode()), *data.items()):
+            for name, content in ((MANIFEST, text), *data.items()):
                 _write(draft / name, content)
             if folder.exists():
                 shutil.rmtree(old, ignore_errors=True)
@@ -70,7 +71,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of a bundle.
 
     Raises:
-        ResultsError: there is none, or it is damaged.
+        ResultsError: there is none, it is damaged, or was changed since it was written.
     """
     path = folder / MANIFEST
     document = read_json(path)
@@ -81,6 +82,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     files = document.get("files")
     if not isinstance(files, dict) or not all(isinstance(f, str) for f in files.values()):
         raise ResultsError(f"{path}: damaged (files: expected digests by name)")
+    if document.pop("sha256", None) != sha256(_text(document)):
+        raise ResultsError(f"{path}: was changed since it was written, its checksum differs")
     return document
 
 
@@ -110,6 +113,10 @@ def _require_own(folder: Path) -> None:
             raise ResultsError(f"{path} is no file of this bundle; {remedy}")
         if sha256(read_bytes(path)) != files[name]:
             raise ResultsError(f"{path} was changed since it was written; {remedy}")
+
+
+def _text(document: Mapping[str, Any]) -> bytes:
+    return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
 
 
 def _write(path: Path, content: bytes) -> None:

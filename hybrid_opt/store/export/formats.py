@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from hybrid_opt.job.compliance import require_skew
 from hybrid_opt.job.plan import plan_job
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.sampling import SampledJob, sample_job
@@ -16,6 +17,7 @@ from hybrid_opt.store.export.options import BundleOptions
 from hybrid_opt.store.export.origin import Origin
 from hybrid_opt.store.export.rapid import rapid_files
 from hybrid_opt.store.export.ros2 import ros2_files
+from hybrid_opt.store.export.start import start_of
 from hybrid_opt.store.export.tables import csv_text, json_text
 from hybrid_opt.store.export.urscript import urscript_files
 from hybrid_opt.timing.records import Timing
@@ -70,13 +72,16 @@ def export(
     Raises:
         SettingsError: the form is unknown, the step out of range, the timing failed, or the form is
             not for these arms.
-        JobError: the job cannot be done.
+        JobError: the job cannot be done, or the skew between both arms breaks its squeeze.
         ResultsError: the bundle cannot be written, or something else is in its place.
     """
     if form not in FORMATS:
         raise SettingsError(f"unknown format {form!r}; known are {', '.join(FORMATS)}")
     options, origin = options or BundleOptions(), origin or Origin()
     whole = job if isinstance(job, Job) else plan_job(job)
+    skew = start_of(form, options).skew
+    if skew is not None:
+        require_skew(whole, skew, options.stiffness)
     found = FORMATS[form]
     sampled = sample_job(whole, found.step if options.step is None else options.step)
     contents = found.files(sampled, options)

@@ -10,6 +10,7 @@ from hybrid_opt.job.compliance import (
     STIFFNESSES,
     PositionControl,
     Skew,
+    largest_skew,
     position_control,
     skewed,
 )
@@ -18,6 +19,7 @@ from hybrid_opt.job.sampling import SampledJob
 from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
 from hybrid_opt.store.export.options import BundleOptions
 from hybrid_opt.store.export.origin import Origin, job_digest
+from hybrid_opt.store.export.start import start_of
 
 UNITS = {
     "length": "m",
@@ -46,7 +48,7 @@ def manifest(
 ) -> dict[str, Any]:
     """JSON values: what the bundle holds, from which trajectory, and what it keeps to."""
     job = sampled.job
-    stiffness = options.stiffness
+    stiffness, start = options.stiffness, start_of(form, options)
     return {
         "form": form,
         "name": origin.name(job),
@@ -76,7 +78,13 @@ def manifest(
             "peak_normal_force": job.peak_normal_force.tolist(),
         },
         "position_control": [_position(position_control(job, k)) for k in STIFFNESSES],
-        "start_skew": [_skew(skewed(job, delay, stiffness)) for delay in SKEWS],
+        "start_skew": {
+            "how": start.how,
+            "required": start.skew,
+            "survived": largest_skew(job, stiffness),
+            "stiffness": stiffness,
+            "cases": [_skew(skewed(job, delay, stiffness)) for delay in SKEWS],
+        },
         "warnings": warnings_of(job),
         "units": UNITS,
         "how_to_run": HOW_TO_RUN[form],
@@ -140,9 +148,9 @@ def _position(found: PositionControl) -> dict[str, Any]:
 def _skew(found: Skew) -> dict[str, Any]:
     return {
         "delay": found.delay,
-        "stiffness": found.stiffness,
         "displacement": found.displacement,
         "force_change": found.force_change,
+        "share_of_force": found.share,
         "margin": found.margin,
         "holds": found.survived,
     }

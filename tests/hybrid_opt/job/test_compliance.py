@@ -5,9 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid_opt.job.compliance import force_margin, position_control, skewed
+from hybrid_opt.errors import JobError
+from hybrid_opt.job.compliance import (
+    LARGEST_SKEW,
+    force_margin,
+    largest_skew,
+    position_control,
+    require_skew,
+    skewed,
+)
 from hybrid_opt.job.text import job_text, position_text, skew_text
+from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.physics.pose import pose_matrix
 from tests.hybrid_opt.job.jobs import rack_job
 
 
@@ -27,11 +37,58 @@ def test_a_late_arm_lags_by_the_way_of_that_time() -> None:
     speed = np.linalg.norm(carry.rate[:, :3], axis=1).max()
     late = skewed(job, 0.01, 1e4)
     assert late.displacement == pytest.approx(0.01 * speed, rel=0.02)
-    assert late.survived
     assert skewed(job, 0.0, 1e4).margin == pytest.approx(force_margin(job))
     margins = [skewed(job, delay, 1e4).margin for delay in (0.0, 0.005, 0.01, 0.02)]
     assert margins == sorted(margins, reverse=True)
     assert not skewed(job, 0.01, 1e5).survived
+
+
+def test_the_worse_of_both_arms_counts() -> None:
+    """By hand, where the box moves fastest along the pads' common line."""
+    job, delay, stiffness = rack_job(), 0.005, 1e4
+    motion, force = job.phase("carry").motion, job.phase("carry").force
+    worst = np.inf
+    for late, contact in enumerate(job.workcell.contacts):
+        for k in range(0, len(motion.time), 20):
+            T = pose_matrix(motion.pose[k, :3], motion.pose[k, 3:])
+            rotation = T[:3, :3]
+            # The pad's point moves like the box; it lags by its velocity times the delay.
+            velocity, spin = motion.rate[k, :3], angular_velocity(motion.pose[k], motion.rate[k])
+            lag = -delay * (velocity + np.cross(spin, rotation @ contact.T_box_pad[:3, 3]))
+            normal = rotation @ contact.T_box_pad[:3, 2]
+            along = float(lag @ normal)
+            across = float(np.linalg.norm(lag - along * normal))
+            shear = stiffness / 2.0 * across / min(c.friction for c in job.workcell.contacts)
+            left = force.normal[k] + stiffness / 2.0 * along - force.least[k] - shear
+            if left.min() < worst:
+                worst, index = float(left.min()), late
+    found = skewed(job, delay, stiffness)
+    assert found.late == index
+    assert found.margin == pytest.approx(worst, abs=0.3)
+
+
+def angular_velocity(pose: Array, rate: Array) -> Array:
+    """(3,) of a pose by differences, world frame [rad/s]."""
+    h = 1e-6
+    now, then = (pose_matrix(p[:3], p[3:])[:3, :3] for p in (pose, pose + h * rate))
+    turn = (then - now) / h @ now.T
+    return np.array([turn[2, 1], turn[0, 2], turn[1, 0]])
+
+
+def test_a_skew_that_breaks_the_squeeze_is_refused_with_a_figure() -> None:
+    job, stiffness = rack_job(), 5e4
+    most = largest_skew(job, stiffness)
+    assert 0.0 < most < LARGEST_SKEW
+    assert skewed(job, most, stiffness).survived
+    assert not skewed(job, 1.01 * most, stiffness).survived
+    require_skew(job, most, stiffness)
+    missing = -skewed(job, 0.02, stiffness).margin
+    with pytest.raises(JobError, match=rf"20 ms .*{missing:.1f} N .*with {1e3 * most:.1f} ms they"):
+        require_skew(job, 0.02, stiffness)
+    assert largest_skew(job, 1.0) == LARGEST_SKEW
+    for delay in (-1e-3, 1.0, float("nan")):
+        with pytest.raises(SettingsError, match="skew"):
+            skewed(job, delay, stiffness)
 
 
 def test_a_stiffness_is_positive() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid_opt.errors import ResultsError
+from hybrid_opt.errors import JobError, ResultsError
 from hybrid_opt.job.squeeze import SqueezeSettings
 from hybrid_opt.store.export import FORMATS, BundleOptions, Origin, export
 from hybrid_opt.store.export.bundle import read_manifest, write_bundle
@@ -52,14 +52,16 @@ def test_a_bundle_is_replaced_as_a_whole(tmp_path: Path) -> None:
         ("a.txt", "edited", "was changed"),
         ("manifest.json", "{}", "in the way"),
         ("manifest.json", "{", "in the way"),
+        ("manifest.json", None, "in the way .*was changed"),
     ],
 )
 def test_foreign_and_edited_files_stay(
-    tmp_path: Path, name: str, content: str, message: str
+    tmp_path: Path, name: str, content: str | None, message: str
 ) -> None:
     folder = tmp_path / "bundle"
-    write_bundle(folder, FILES, {})
-    (folder / name).write_text(content)
+    write_bundle(folder, FILES, {"note": "as written"})
+    own = (folder / "manifest.json").read_text().replace("as written", "mine")
+    (folder / name).write_text(own if content is None else content)
     before = tree(tmp_path)
     with pytest.raises(ResultsError, match=message):
         write_bundle(folder, FILES, {})
@@ -168,7 +170,29 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
     rough = rack_jobs().plan(rack_timing(), smoothing=0.0)
     warnings = json.loads(export(rough, "csv", tmp_path)[0].read_text())["warnings"]
     assert any("acceleration" in warning for warning in warnings)
-    assert [each["delay"] for each in document["start_skew"]] == [0.001, 0.002, 0.005, 0.01, 0.02]
+    skew = document["start_skew"]
+    assert [each["delay"] for each in skew["cases"]] == [0.001, 0.002, 0.005, 0.01, 0.02]
+    assert [each["holds"] for each in skew["cases"]] == [
+        each["delay"] <= skew["survived"] for each in skew["cases"]
+    ]
+    assert skew["required"] is None
+
+
+def test_two_controllers_have_to_survive_their_skew(tmp_path: Path) -> None:
+    """One clock needs nothing; where each arm has its own, 10 ms or what is asked for."""
+    stiff = BundleOptions(step=0.2, stiffness=5e4)
+    document = json.loads(export(rack_job(), "ros2", tmp_path, options=stiff)[0].read_text())
+    assert document["start_skew"]["required"] == 0.0
+    assert document["start_skew"]["survived"] < 0.01
+    with pytest.raises(JobError, match="a skew of 10 ms"):
+        export(rack_job(), "ros2", tmp_path, options=replace(stiff, per_arm=True))
+    with pytest.raises(JobError, match="a skew of 20 ms"):
+        export(rack_job(), "csv", tmp_path, options=replace(stiff, skew=0.02))
+    reached = replace(stiff, per_arm=True, skew=1e-3)
+    document = json.loads(export(rack_job(), "ros2", tmp_path, options=reached)[0].read_text())
+    assert document["start_skew"]["required"] == 1e-3
+    with pytest.raises(SettingsError, match="skew"):
+        BundleOptions(skew=-1.0)
 
 
 def test_a_timing_is_exported_with_its_job(tmp_path: Path) -> None:
