@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from hybrid_opt.front import Front
     from hybrid_opt.job.plan import plan_job
     from hybrid_opt.job.records import Job
-    from hybrid_opt.job.squeeze import SqueezeSettings
     from hybrid_opt.metaheuristics.carries import SearchSettings
     from hybrid_opt.polishing.settings import PolishSettings
     from hybrid_opt.recommending.recommendation import Recommendation, recommend
     from hybrid_opt.recommending.wish import Wish
+    from hybrid_opt.robust.squeeze import SqueezeSettings
     from hybrid_opt.store.export.formats import export
     from hybrid_opt.store.export.options import BundleOptions
     from hybrid_opt.store.export.origin import Origin
@@ -73,7 +73,7 @@ _HOMES = {
     "Objective": "hybrid_opt.evaluate.objectives",
     "Origin": "hybrid_opt.store.export.origin",
     "PolishSettings": "hybrid_opt.polishing.settings",
-    "SqueezeSettings": "hybrid_opt.job.squeeze",
+    "SqueezeSettings": "hybrid_opt.robust.squeeze",
     "Recommendation": "hybrid_opt.recommending.recommendation",
     "SearchSettings": "hybrid_opt.metaheuristics.carries",
     "Timing": "hybrid_opt.timing.records",

@@ -18,8 +18,8 @@ from hybrid_opt.job.compliance import (
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import WIDTH
-from hybrid_opt.job.squeeze import FACTOR, SqueezeSettings
 from hybrid_opt.job.text import job_text, position_text, skew_text
+from hybrid_opt.robust.squeeze import FACTOR, SqueezeSettings
 from hybrid_opt.store.export import FORMATS, BundleOptions, Origin, export
 from hybrid_opt.store.export.manifest import warnings_of
 from hybrid_opt.store.export.start import SKEW

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -36,12 +35,11 @@ from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.drivable import DrivableFronts, drivable_fronts, drivable_root
+from studies.recommendation_text import export_command
 from symbolic.array import Array
 
 LEAST_FORCE = "least-force"
 """The path that the other experiment ends with, beside which the recommended carry stands."""
-
-EXPORT_FORM = "ros2"
 
 
 def recommendation_stage(wish: ho.Wish) -> Stage:
@@ -70,16 +68,6 @@ def read_recommendation(root: Path) -> StoredRecommendation | None:
         return None
     remedy = f"delete {STAGES}/recommendation.json in its folder and continue with --resume"
     return read_record(StoredRecommendation, path, remedy)
-
-
-def export_command(path: Path, force: float) -> str:
-    """The command that makes of a trajectory file, timed within a force limit [N], what robots
-    need."""
-    output = path.with_name(f"{path.stem}-{EXPORT_FORM}")
-    return (
-        f"python -m studies.export {shlex.quote(str(path))} --form {EXPORT_FORM} "
-        f"--force-limit {force:.6g} --output {shlex.quote(str(output))}"
-    )
 
 
 def recommend_from(root: Path, wish: ho.Wish, path: Path) -> StoredRecommendation | None:
@@ -113,10 +101,11 @@ def recommend_from(root: Path, wish: ho.Wish, path: Path) -> StoredRecommendatio
     figures = trajectory_figures(cell.carry(found.x))
     write_trajectory(path, cell.workcell, found.x, figures, provenance)
     inside = path.resolve().is_relative_to(root.resolve())
+    file = path.resolve().relative_to(root.resolve()).as_posix() if inside else str(path)
     told = Told(
         source=source,
-        file=path.resolve().relative_to(root.resolve()).as_posix() if inside else str(path),
-        export=export_command(path, found.force),
+        file=file,
+        export=export_command(Path(file), found.force),
         considered=len(drivable.x),
         durations=_force_table(cell, drivable, others, found),
     )

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from hybrid_opt.campaign.recommended import StoredRecommendation, StoredRival
 from symbolic.array import Array
+
+EXPORT_FORM = "ros2"
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ def recommendation_text(
 
     Args:
         robots: both robots' names.
-        folder: of the results, in front of the file's name.
+        folder: of the results, in front of the files' names; '' where the reader is in it.
     """
     headline = (
         f"Run this carry: {found.duration:.2f} s, pressing with at most "
@@ -49,7 +52,7 @@ def recommendation_text(
     facts = [
         ("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}"),
         ("file", str(Path(folder) / found.file)),
-        ("export", found.export),
+        ("export", export_command(Path(folder) / found.file, found.force_limit)),
         ("press with", f"{_of_robots(found.squeeze, robots)}, {found.squeeze_reason}"),
         ("payload", f"up to {found.payload_limit:.2f} kg on the same motion"),
         *[(rival.label, _rival(rival, found)) for rival in found.rivals],
@@ -69,6 +72,16 @@ def recommendation_text(
             )
         )
     return RecommendationText(headline, tuple(facts), found.warnings)
+
+
+def export_command(path: Path, force: float) -> str:
+    """The command that makes of a trajectory file, timed within a force limit [N], what robots
+    need."""
+    output = path.with_name(f"{path.stem}-{EXPORT_FORM}")
+    return (
+        f"python -m studies.export {shlex.quote(str(path))} --form {EXPORT_FORM} "
+        f"--force-limit {force:.6g} --output {shlex.quote(str(output))}"
+    )
 
 
 def _of_robots(values: Array, robots: Sequence[str]) -> str:

@@ -24,8 +24,8 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.front import FrontPolisher
 from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.polishing.run import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
 from hybrid_opt.work.job import Emit, Job, answer_all
@@ -113,14 +113,14 @@ def compute_reference_front(
 
 def _polish_job(
     cell: PackedCell, attempts: int
-) -> Job[FrontPolisher, tuple[Array, np.random.Generator], PolishedFront]:
+) -> Job[Polisher, tuple[Array, np.random.Generator], PolishedFront]:
     settings = PolishSettings(points=attempts, rounds=ROUNDS)
     source = PolisherSource(cell, PAPER_OBJECTIVES, settings)
     return Job(source, _polished)
 
 
 def _polished(
-    polisher: FrontPolisher, request: tuple[Array, np.random.Generator], emit: Emit
+    polisher: Polisher, request: tuple[Array, np.random.Generator], emit: Emit
 ) -> PolishedFront:
     return polisher.polish(*request)
 

@@ -30,7 +30,6 @@ from hybrid_opt.campaign.stages import Stage
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.attempt import Lost, use_one_thread
-from hybrid_opt.polishing.front import FrontPolisher
 from hybrid_opt.polishing.polisher import polisher_for
 from hybrid_opt.polishing.records import (
     PolishedFront,
@@ -38,6 +37,7 @@ from hybrid_opt.polishing.records import (
     outcome_from_json,
     outcome_to_json,
 )
+from hybrid_opt.polishing.run import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
@@ -65,12 +65,12 @@ class PolisherSource:
     objectives: tuple[str, ...]
     settings: PolishSettings
 
-    def __call__(self) -> FrontPolisher:
+    def __call__(self) -> Polisher:
         """Load the compiled functions, or build them where they are missing."""
         use_one_thread()
         return self.cell.make(self._polisher)
 
-    def _polisher(self, workcell: Workcell) -> FrontPolisher:
+    def _polisher(self, workcell: Workcell) -> Polisher:
         return polisher_for(CandidateEvaluator(workcell, self.objectives), self.settings)
 
 
@@ -116,7 +116,7 @@ def _is_polished(folder: CampaignFolder, replica: Replica) -> bool:
 
 
 def polish_replica(
-    polisher: FrontPolisher, request: PolishRequest, emit: Callable[[bytes], None]
+    polisher: Polisher, request: PolishRequest, emit: Callable[[bytes], None]
 ) -> PolishedFront:
     """Polish one front; attempts that were recorded are not repeated."""
     rng = request.settings.replica_rng(f"{request.algorithm}/polish", request.replica)

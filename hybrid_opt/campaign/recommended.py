@@ -91,7 +91,7 @@ class StoredRecommendation:
         wish, why: what was asked for, as values and as words.
         source: whose it is, as 'NSGA-II, polished, replica 3'.
         file: its trajectory file, relative to the folder.
-        export: the command that makes of it what robots need.
+        export: the command that makes of it what robots need, run in the folder.
         duration: [s].
         force_limit: [N].
         peak_force: largest normal force of each robot [N].

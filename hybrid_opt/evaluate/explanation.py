@@ -32,7 +32,7 @@ class Explanation:
     """What is in the way of one candidate where it first fails.
 
     Attributes:
-        reason: one of `hybrid_opt.evaluate.evaluation.REASONS`.
+        reason: one of `hybrid_opt.evaluate.evaluations.REASONS`.
         position: path parameter of the sample.
         sample: its number, from 0.
         pair: names of the bodies that collide there, None for another reason.

@@ -2,6 +2,6 @@
 
 from hybrid_opt.job.plan import JobModel, plan_job
 from hybrid_opt.job.records import PHASES, Job, Phase
-from hybrid_opt.job.squeeze import SqueezeSettings
+from hybrid_opt.robust.squeeze import SqueezeSettings
 
 __all__ = ["PHASES", "Job", "JobModel", "Phase", "SqueezeSettings", "plan_job"]

@@ -8,9 +8,9 @@ import numpy as np
 
 from hybrid_opt.job.profile import PEAK_RATE, at_even_steps, rise
 from hybrid_opt.job.records import Force, Motion
-from hybrid_opt.job.squeeze import Squeeze, extra_force
 from hybrid_opt.job.straight import SAMPLES, TICK
 from hybrid_opt.robust.force import BoxMotion
+from hybrid_opt.robust.squeeze import Squeeze, extra_force
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
 from symbolic.physics.pose import rotation_from_rpy

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -27,7 +26,6 @@ from hybrid_opt.job.limits import EXCESS, phase_use
 from hybrid_opt.job.profile import rise
 from hybrid_opt.job.records import Force, Job, Motion, Phase
 from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, smoothed
-from hybrid_opt.job.squeeze import SqueezeSettings, chosen_squeeze
 from hybrid_opt.job.straight import (
     SAMPLES,
     Straight,
@@ -37,6 +35,8 @@ from hybrid_opt.job.straight import (
     standing_still,
     timed,
 )
+from hybrid_opt.per_workcell import kept_per_workcell
+from hybrid_opt.robust.squeeze import SqueezeSettings, chosen_squeeze
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
@@ -250,22 +250,7 @@ def refuse_excess(job: Job) -> None:
             )
 
 
-class _Identity:
-    """Lets a cache compare workcells by what they are, not by what they say."""
-
-    def __init__(self, workcell: Workcell) -> None:
-        self.workcell = workcell
-
-    def __hash__(self) -> int:
-        return id(self.workcell)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identity) and self.workcell is other.workcell
-
-
-@lru_cache(maxsize=2)
-def _model(identity: _Identity) -> JobModel:
-    return JobModel(identity.workcell)
+_model = kept_per_workcell(JobModel)
 
 
 def plan_job(
@@ -274,4 +259,4 @@ def plan_job(
     """The whole job around a timed carry, see `JobModel.plan`."""
     if timing.carry is None:
         raise SettingsError(f"there is no timing to export ({timing.status}: {timing.reason})")
-    return _model(_Identity(timing.carry.workcell)).plan(timing, squeeze, smoothing)
+    return _model(timing.carry.workcell).plan(timing, squeeze, smoothing)

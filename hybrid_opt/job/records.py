@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from hybrid_opt.collision.certify import Certificate
-from hybrid_opt.job.squeeze import Squeeze
+from hybrid_opt.robust.squeeze import Squeeze
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell

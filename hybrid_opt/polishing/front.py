@@ -8,10 +8,8 @@ answer is judged by the full evaluator and certified between the samples before 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -23,17 +21,13 @@ from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.plan import Attempt, PlanState, aimed, points, widest_gap
 from hybrid_opt.polishing.point import PolishSolver, Solution, SolveTask
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
-from hybrid_opt.polishing.run import PolishRun
+from hybrid_opt.polishing.run import Polisher, PolishRun
 from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.decision import initial_decision
-
-TIMED_EVALUATIONS = 32
-"""Candidates whose evaluation is timed, to express the polish in their unit."""
 
 
-class FrontPolisher:
+class FrontPolisher(Polisher):
     """Polishes fronts of one evaluator. A resource: keep it for several fronts."""
 
     def __init__(
@@ -53,65 +47,17 @@ class FrontPolisher:
                 f"the polish minimises {' and '.join(PAPER_OBJECTIVES)}; the objectives are "
                 f"{', '.join(evaluator.objective_names)}: switch the polish off for them"
             )
-        self.evaluator, self.settings = evaluator, settings
-        self.solver = PolishSolver(
-            evaluator, functions or polish_functions(evaluator.compiled), settings
-        )
-
-    def polish(
-        self,
-        front_x: Array,
-        rng: np.random.Generator,
-        recorded: Sequence[PolishOutcome | Lost] = (),
-        emit: Callable[[PolishOutcome], None] = lambda outcome: None,
-    ) -> PolishedFront:
-        """Polish a front.
-
-        Args:
-            front_x: (k, n_var) decision vectors; k may be 0.
-            rng: spreads the starts of attempts at the balanced middle.
-            recorded: outcomes of an earlier, interrupted polish of the same front, not repeated;
-                `Lost` for an attempt that ended its process.
-            emit: takes each new outcome.
-        """
-        begin = time.perf_counter()
-        x = np.asarray(front_x, dtype=float).reshape(-1, self.evaluator.n_var)
-        unit = self._evaluation_seconds(x)
-        found = self.evaluator.certified(self.evaluator.evaluate(x))
-        feasible = np.flatnonzero(found.feasible)
-        archive = GrowingFront(x[feasible], found.objectives[feasible], feasible.tolist())
-        run = self._run(archive, list(recorded), emit)
-        if len(feasible) and self.settings.points:
-            run.all(rng)
-        rows = archive.rows() if len(feasible) else []
-        return PolishedFront(
-            x=np.array([archive.x[k] for k in rows]).reshape(-1, self.evaluator.n_var),
-            objectives=np.array([archive.objectives[k] for k in rows]).reshape(-1, 2),
-            parent=np.array([archive.parent[k] for k in rows], dtype=np.int64),
-            polished=np.array([archive.polished[k] for k in rows], dtype=bool),
-            outcomes=tuple(run.outcomes),
-            seconds=time.perf_counter()
-            - begin
-            + sum(o.seconds for o in recorded if isinstance(o, PolishOutcome)),
-            evaluation_seconds=unit,
-        )
+        super().__init__(evaluator, settings)
+        known = functions or polish_functions(evaluator.compiled)
+        self.solver = PolishSolver(evaluator, known, settings)
 
     def _run(
         self,
         archive: GrowingFront,
         recorded: list[PolishOutcome | Lost],
         emit: Callable[[PolishOutcome], None],
-    ) -> PolishRun[Any]:
-        """A polish of one front, about to begin."""
+    ) -> ForceRun:
         return ForceRun(self, archive, recorded, emit)
-
-    def _evaluation_seconds(self, x: Array) -> float:
-        """Time of one candidate evaluation; the initial trajectory's for an empty front."""
-        sample = x if len(x) else initial_decision(self.evaluator.workcell.task)[None]
-        batch = np.resize(sample, (TIMED_EVALUATIONS, self.evaluator.n_var))
-        begin = time.perf_counter()
-        self.evaluator.evaluate(batch)
-        return (time.perf_counter() - begin) / len(batch)
 
 
 class ForceRun(PolishRun[Attempt]):

@@ -10,13 +10,14 @@ than the start. One that ends inside the box at an optimum ends the polish.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.constraints.active import ActiveSet
 from hybrid_opt.polishing.constraints.kind import Surroundings
+from hybrid_opt.polishing.constraints.learned import Learned
 from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.interior import dense
@@ -81,12 +82,11 @@ class Solution:
 
 @dataclass
 class _Best:
-    """The candidate that a solve has reached, and the rows that it learned of, with what each
-    has to keep."""
+    """The candidate that a solve has reached, and what its steps taught."""
 
     x: Array
     carry: PlacedCarry
-    learned: dict[Row, float] = field(default_factory=dict)
+    learned: Learned
 
 
 class PolishSolver:
@@ -107,13 +107,11 @@ class PolishSolver:
     def solve(self, task: SolveTask) -> Solution:
         """Improve towards the task's target."""
         x = np.clip(task.x, self._cell.task.lower, self._cell.task.upper)
-        best, region = (
-            _Best(x, self._reader.read(x)),
-            TrustRegion(self._settings.trust, task.radius),
-        )
+        best = _Best(x, self._reader.read(x), Learned(self._active, self._settings.stricter))
+        region = TrustRegion(self._settings.trust, task.radius)
         solution, settings = Solution(x), self._wide if task.wide else self._settings
         while solution.rounds < self._settings.rounds and not region.is_spent:
-            required = self._required(best, task.target, lenient=solution.rounds == 0)
+            required = best.learned.required(best.carry, task.target, lenient=solution.rounds == 0)
             program = SmoothProgram(
                 self._cell, required, task.target, best.carry, best.x, region.radius
             )
@@ -126,7 +124,7 @@ class PolishSolver:
             step, carry = self._cell.unit.step(best.x, x), self._reader.read(x)
             violated = self._active.violated(carry, best.carry, required)
             if violated or not carry.is_followed:
-                learned = self._learn(best, carry, violated, required)
+                learned = best.learned.refuse(carry, best.carry, violated, required)
                 region.refused(learned and carry.is_followed)
                 if (part := self._part(best, x, required, task.target)) is not None:
                     self._move(best, *part)
@@ -134,7 +132,7 @@ class PolishSolver:
                     solution.residuals = program.residuals_at(best.x, best.carry, answer)
             elif level(task.target, carry.peak) >= level(task.target, best.carry.peak):
                 higher = self._active.forces.higher(carry, task.target) - required.keys()
-                best.learned.update(dict.fromkeys(higher, 0.0))
+                best.learned.ask(higher)
                 if not higher:
                     region.barren(step)
             else:
@@ -147,26 +145,6 @@ class PolishSolver:
             if not np.isfinite(solution.residuals.stationarity):
                 solution.residuals = answer.residuals
         return solution
-
-    def _required(self, best: _Best, target: Target, lenient: bool) -> dict[Row, float]:
-        """The rows of the next round and what each has to keep."""
-        rows = self._active.near(best.carry, target) | best.learned.keys()
-        required = self._active.required(best.carry, rows, lenient)
-        for row, value in best.learned.items():
-            required[row] = max(value, required[row])
-        return required
-
-    def _learn(
-        self, best: _Best, carry: PlacedCarry, violated: set[Row], required: dict[Row, float]
-    ) -> bool:
-        """Take in what a step violated; whether that asks for anything new."""
-        demanded = self._active.demanded(carry, best.carry, violated, required)
-        stricter = False
-        for row, value in demanded.items():
-            asked = required.get(row, -np.inf)
-            stricter |= value > asked + self._settings.stricter
-            best.learned[row] = max(value, best.learned.get(row, -np.inf))
-        return stricter
 
     def _part(
         self, best: _Best, x: Array, required: dict[Row, float], target: Target
@@ -188,4 +166,4 @@ class PolishSolver:
     def _move(self, best: _Best, x: Array, carry: PlacedCarry) -> None:
         """Go on from a better candidate."""
         best.x, best.carry = x, carry
-        best.learned = {row: v for row, v in best.learned.items() if self._active.lasting(row)}
+        best.learned.move()

@@ -6,6 +6,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.drivable.front import DrivablePolisher
 from hybrid_opt.polishing.front import FrontPolisher
 from hybrid_opt.polishing.functions import PolishFunctions
+from hybrid_opt.polishing.run import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 
 
@@ -13,7 +14,7 @@ def polisher_for(
     evaluator: CandidateEvaluator,
     settings: PolishSettings,
     functions: PolishFunctions | None = None,
-) -> FrontPolisher:
+) -> Polisher:
     """The polish of path and timing under the time law 'optimal', otherwise that of forces.
 
     Raises:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -15,11 +15,15 @@ from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost, solve_safely
 from hybrid_opt.polishing.point import Solution
-from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
+from hybrid_opt.polishing.records import Aim, PolishedFront, PolishOutcome, Status
 from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
+from symbolic.workcell.decision import initial_decision
 
 NO_SOLUTION = Solution(np.empty(0))
+
+TIMED_EVALUATIONS = 32
+"""Candidates whose evaluation is timed, to express the polish in their unit."""
 
 
 class Attempted(Protocol):
@@ -143,3 +147,70 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         if answer.converged or answer.residuals.stationarity <= self._settings.front.optimal:
             return "optimal", "not improved", attempt.start
         return "failed", f"not improved: {answer.message}", attempt.start
+
+
+class Polisher(ABC):
+    """Polishes fronts of one evaluator. A resource: keep it for several fronts.
+
+    Attributes:
+        evaluator: judges what is found.
+        settings: effort and tolerances.
+    """
+
+    def __init__(self, evaluator: CandidateEvaluator, settings: PolishSettings) -> None:
+        self.evaluator, self.settings = evaluator, settings
+
+    @abstractmethod
+    def _run(
+        self,
+        archive: GrowingFront,
+        recorded: list[PolishOutcome | Lost],
+        emit: Callable[[PolishOutcome], None],
+    ) -> PolishRun[Any]:
+        """A polish of one front, about to begin."""
+
+    def polish(
+        self,
+        front_x: Array,
+        rng: np.random.Generator,
+        recorded: Sequence[PolishOutcome | Lost] = (),
+        emit: Callable[[PolishOutcome], None] = lambda outcome: None,
+    ) -> PolishedFront:
+        """Polish a front.
+
+        Args:
+            front_x: (k, n_var) decision vectors; k may be 0.
+            rng: spreads the starts of attempts at the balanced middle.
+            recorded: outcomes of an earlier, interrupted polish of the same front, not repeated;
+                `Lost` for an attempt that ended its process.
+            emit: takes each new outcome.
+        """
+        begin = time.perf_counter()
+        x = np.asarray(front_x, dtype=float).reshape(-1, self.evaluator.n_var)
+        unit = self._evaluation_seconds(x)
+        found = self.evaluator.certified(self.evaluator.evaluate(x))
+        feasible = np.flatnonzero(found.feasible)
+        archive = GrowingFront(x[feasible], found.objectives[feasible], feasible.tolist())
+        run = self._run(archive, list(recorded), emit)
+        if len(feasible) and self.settings.points:
+            run.all(rng)
+        rows = archive.rows() if len(feasible) else []
+        return PolishedFront(
+            x=np.array([archive.x[k] for k in rows]).reshape(-1, self.evaluator.n_var),
+            objectives=np.array([archive.objectives[k] for k in rows]).reshape(-1, 2),
+            parent=np.array([archive.parent[k] for k in rows], dtype=np.int64),
+            polished=np.array([archive.polished[k] for k in rows], dtype=bool),
+            outcomes=tuple(run.outcomes),
+            seconds=time.perf_counter()
+            - begin
+            + sum(o.seconds for o in recorded if isinstance(o, PolishOutcome)),
+            evaluation_seconds=unit,
+        )
+
+    def _evaluation_seconds(self, x: Array) -> float:
+        """Time of one candidate evaluation; the initial trajectory's for an empty front."""
+        sample = x if len(x) else initial_decision(self.evaluator.workcell.task)[None]
+        batch = np.resize(sample, (TIMED_EVALUATIONS, self.evaluator.n_var))
+        begin = time.perf_counter()
+        self.evaluator.evaluate(batch)
+        return (time.perf_counter() - begin) / len(batch)

@@ -13,9 +13,10 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.recommending.choice import Choice, choices
 from hybrid_opt.recommending.driven_paths import DrivenPaths
 from hybrid_opt.recommending.rival import BETTER, Reference, Rival, comparison_forces, rivals
-from hybrid_opt.recommending.squeeze import Squeeze, squeeze_of
+from hybrid_opt.recommending.squeeze import Commanded, commanded
 from hybrid_opt.recommending.unsure import Unsure, unsure_forces
 from hybrid_opt.recommending.wish import Wish
+from hybrid_opt.robust.squeeze import FACTOR, SqueezeSettings
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
@@ -53,7 +54,7 @@ class Recommendation:
     member: int
     x: Array
     timing: Timing
-    squeeze: Squeeze
+    squeeze: Commanded
     margins: tuple[Margin, ...]
     rivals: tuple[Rival, ...]
     unsure: tuple[Unsure, ...]
@@ -123,16 +124,17 @@ def recommend(
     reference = Reference(paths, choice.index, choice.force, comparison_forces(points))
     beside = rivals(cell, named, reference)
     margins = robustness_margins(cell.timing_model, timing.carry)
+    squeeze, doubt = _commanded(timing.carry)
     return Recommendation(
         wish=wish,
         member=choice.index,
         x=timing.carry.x,
         timing=timing,
-        squeeze=squeeze_of(timing.carry),
+        squeeze=squeeze,
         margins=margins,
         rivals=beside,
         unsure=unsure_forces(timing.carry),
-        warnings=(*_warnings(beside, timing, choice.force), *_without_room(margins)),
+        warnings=(*_warnings(beside, timing, choice.force), *_without_room(margins), *doubt),
     )
 
 
@@ -146,6 +148,14 @@ def _driven(cell: Cell, x: Array, wanted: Iterable[Choice]) -> tuple[Choice, Tim
             return choice, timing
         reason = timing.reason
     raise SettingsError(f"no carry of the front can be driven as wished for: {reason}")
+
+
+def _commanded(carry: Carry) -> tuple[Commanded, tuple[str, ...]]:
+    """What to press with, and a warning where the cell's own set cannot be held."""
+    try:
+        return commanded(carry), ()
+    except SettingsError as error:
+        return commanded(carry, SqueezeSettings(FACTOR)), (f"no robust forces: {error}",)
 
 
 def _warnings(beside: Iterable[Rival], timing: Timing, force: float) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""How hard to press: what to command so that the carry holds although nothing is exact."""
+"""How hard to press along a recommended carry: what its exported job commands as well."""
 
 from __future__ import annotations
 
@@ -7,27 +7,35 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybrid_opt.carry import Carry
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, chosen_squeeze, extra_force
 from symbolic.array import Array
-
-FACTOR = 1.3
-"""Commanded over planned force where nothing says how uncertain the cell is."""
 
 
 @dataclass(frozen=True)
-class Squeeze:
+class Commanded:
     """What to press with.
 
     Attributes:
         peak: (2,) largest normal force to command of each robot [N].
-        reason: where it comes from.
+        squeeze: how it came about.
     """
 
     peak: Array
-    reason: str
+    squeeze: Squeeze
+
+    @property
+    def reason(self) -> str:
+        """How it came about, in words."""
+        return str(self.squeeze)
 
 
-def squeeze_of(carry: Carry) -> Squeeze:
-    """The forces to command for a carry."""
-    extra = (FACTOR - 1.0) * carry.normal_force.mean(axis=1, keepdims=True)
-    peak = np.asarray((carry.normal_force + extra).max(axis=0))
-    return Squeeze(peak, f"{FACTOR:g} times the planned squeeze")
+def commanded(carry: Carry, settings: SqueezeSettings | None = None) -> Commanded:
+    """The forces to command along a carry.
+
+    Raises:
+        SettingsError: the cell's uncertainty leaves no friction or patch, or its pads do not face
+            one another.
+    """
+    squeeze = chosen_squeeze(carry.workcell, settings or SqueezeSettings())
+    extra = extra_force(carry.workcell, squeeze, carry.time, carry, carry.normal_force)
+    return Commanded(np.asarray((carry.normal_force + extra[:, None]).max(axis=0)), squeeze)

@@ -40,8 +40,7 @@ def usual_doubts(workcell: Workcell) -> dict[str, Uncertainty]:
         "centre of mass 10 mm off": Uncertainty(centre_of_mass=np.full(3, 0.01)),
     }
     own = workcell.uncertainty
-    ranges = [own.friction, own.mass, own.pad_position, *own.centre_of_mass, *own.disturbance]
-    return ({"all that [uncertainty] states": own} if any(ranges) else {}) | doubts
+    return ({} if own.is_empty else {"all that [uncertainty] states": own}) | doubts
 
 
 def unsure_forces(carry: Carry, model: RobustModel | None = None) -> tuple[Unsure, ...]:

@@ -8,13 +8,13 @@ fixed by the motion (and the case), the commanded force decides the squeeze.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from codegen.build import compile_function
 from codegen.cache import Cache
 from hybrid_opt.carry import Carry
+from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.cases import nominal_case, random_cases, worst_cases
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -233,24 +233,5 @@ def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
     return min(limits)
 
 
-class _Identity:
-    """Lets a cache compare workcells by what they are, not by what they say."""
-
-    def __init__(self, workcell: Workcell) -> None:
-        self.workcell = workcell
-
-    def __hash__(self) -> int:
-        return id(self.workcell)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identity) and self.workcell is other.workcell
-
-
-@lru_cache(maxsize=2)
-def _model(identity: _Identity) -> RobustModel:
-    return RobustModel(identity.workcell)
-
-
-def robust_model(workcell: Workcell) -> RobustModel:
-    """The model of a workcell, the same one for the same record."""
-    return _model(_Identity(workcell))
+robust_model = kept_per_workcell(RobustModel)
+"""The model of a workcell, the same one for the same record."""

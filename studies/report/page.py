@@ -102,14 +102,19 @@ def _lead(data: ReportData) -> str:
     )
 
 
+IN_FOLDER = {"file": "file, beside this page", "export": "export, from this folder"}
+"""Headings of what names files, and how the page calls them, which moves with its folder."""
+
+
 def _recommendation(data: ReportData) -> str:
     """The words that the terminal opens with, too."""
     found = data.summary.recommendation
     if found is None:
         return ""
-    words = recommendation_text(found, data.summary.robots, str(data.root))
+    words = recommendation_text(found, data.summary.robots, "")
     facts = "".join(
-        f"<dt>{html.escape(heading)}</dt><dd>{_monospaced(heading, text)}</dd>"
+        f"<dt>{html.escape(IN_FOLDER.get(heading, heading))}</dt>"
+        f"<dd>{_monospaced(heading, text)}</dd>"
         for heading, text in words.facts
     )
     warnings = "".join(
@@ -123,7 +128,7 @@ def _recommendation(data: ReportData) -> str:
 
 def _monospaced(heading: str, text: str) -> str:
     escaped = html.escape(text)
-    return f"<code>{escaped}</code>" if heading in ("file", "export") else escaped
+    return f"<code>{escaped}</code>" if heading in IN_FOLDER else escaped
 
 
 def _facts(data: ReportData) -> str:

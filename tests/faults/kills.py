@@ -185,13 +185,12 @@ def durations(output: Path) -> dict[str, float]:
 
 
 def contents(root: Path) -> dict[str, Any]:
-    """Every file of a results folder; of JSON the values, without times. The folder's own path,
-    which the command that exports the recommended carry names, is left out."""
+    """Every file of a results folder; of JSON the values, without times."""
     found: dict[str, Any] = {}
     for path in sorted(root.rglob("*")):
         name = path.relative_to(root).as_posix()
         if path.is_file() and not any(part.startswith(".") for part in name.split("/")):
-            content = path.read_bytes().replace(str(root).encode(), b"RESULTS")
+            content = path.read_bytes()
             found[name] = _timeless(json.loads(content)) if path.suffix == ".json" else content
     return found
 

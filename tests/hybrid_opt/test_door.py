@@ -15,6 +15,8 @@ import hybrid_opt as ho
 from hybrid_opt.campaign.replica import ReplicaRequest, run_replica
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.indicators import metrics
+from hybrid_opt.store.export.bundle import read_manifest
+from hybrid_opt.store.files import sha256
 from hybrid_opt.store.trajectory_file import read_trajectory
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -134,8 +136,11 @@ def test_a_carry_is_timed_and_exported(tmp_path: Path) -> None:
     assert "joint acceleration" in repr(timing)
     assert "<table" in timing._repr_html_()
     files = ho.export(timing, "ros2", tmp_path)
-    assert all(file.stat().st_size > 0 for file in files)
     assert {"manifest.json", "job.yaml"} <= {file.name for file in files}
+    (folder,) = {file.parent for file in files if file.name == "manifest.json"}
+    told = read_manifest(folder)["files"]
+    assert {folder / name for name in told} == set(files) - {folder / "manifest.json"}
+    assert told == {name: sha256((folder / name).read_bytes()) for name in told}
     every = ho.time_every_way(cell(), carry.x, force_limit=52.0)
     assert every.report.timings["force limited"].duration == pytest.approx(timing.duration)
 

@@ -168,7 +168,7 @@ def test_the_page_begins_with_the_recommended_carry(
     first = document["trajectories"][document["first"]]
     assert first["label"].startswith("Recommended")
     assert first["motions"][0]["duration"] == pytest.approx(found.duration, abs=1e-5)
-    words = recommendation_text(found, data.summary.robots, str(data.root))
+    words = recommendation_text(found, data.summary.robots, "")
     for _, sentence in words.facts:
         assert html.escape(sentence) in text
     assert html.escape(words.headline) in text

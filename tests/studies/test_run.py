@@ -80,7 +80,8 @@ def test_study_opens_with_a_carry_to_run(study: tuple[Path, str]) -> None:
     words = recommendation_text(found, read_summary(root).robots, str(root))
     assert printed.startswith(words.terminal())
     assert f"Run this carry: {found.duration:.2f} s" in printed
-    assert found.export in printed
+    assert f"--form ros2 --force-limit {found.force_limit:.6g}" in printed
+    assert str(root) not in found.export, "it holds wherever the folder is moved"
     stored = read_trajectory(root / found.file)
     assert stored.x[-1] == found.force_limit
     drivable = read_campaign(root / "drivable")

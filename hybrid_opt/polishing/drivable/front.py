@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
-from typing import Any
 
 import numpy as np
 
@@ -22,11 +21,10 @@ from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.drivable.certified import second_opinion
 from hybrid_opt.polishing.drivable.point import DrivableSolver, DriveTask
 from hybrid_opt.polishing.drivable.timed import Goal
-from hybrid_opt.polishing.front import FrontPolisher
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
-from hybrid_opt.polishing.run import PolishRun
+from hybrid_opt.polishing.run import Polisher, PolishRun
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
@@ -52,7 +50,7 @@ class DriveAttempt:
     goal: Goal
 
 
-class DrivablePolisher(FrontPolisher):
+class DrivablePolisher(Polisher):
     """Polishes fronts of duration against force. A resource: keep it for several fronts."""
 
     def __init__(
@@ -74,7 +72,7 @@ class DrivablePolisher(FrontPolisher):
                 f"{' and '.join(DRIVABLE_OBJECTIVES)}; the objectives are "
                 f"{', '.join(evaluator.objective_names)}: switch the polish off for them"
             )
-        self.evaluator, self.settings = evaluator, settings
+        super().__init__(evaluator, settings)
         known = functions or polish_functions(evaluator.compiled)
         self.drivable = DrivableSolver(evaluator, known, settings)
         # At once: the cell's files may be there only for as long as this is made.
@@ -89,7 +87,7 @@ class DrivablePolisher(FrontPolisher):
         archive: GrowingFront,
         recorded: list[PolishOutcome | Lost],
         emit: Callable[[PolishOutcome], None],
-    ) -> PolishRun[Any]:
+    ) -> DriveRun:
         return DriveRun(self, archive, recorded, emit)
 
 

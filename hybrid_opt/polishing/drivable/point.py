@@ -17,12 +17,13 @@ import numpy as np
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.constraints.active import ActiveSet
 from hybrid_opt.polishing.constraints.kind import Surroundings
+from hybrid_opt.polishing.constraints.learned import Learned
 from hybrid_opt.polishing.drivable.proposal import Proposal, Proposer, Reached
 from hybrid_opt.polishing.drivable.timed import Goal, PathJudge, TimedPath
 from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.grid import Grid
-from hybrid_opt.polishing.layout import PlaceRow, Row
-from hybrid_opt.polishing.placed_carry import CarryReader, PlacedCarry
+from hybrid_opt.polishing.layout import PlaceRow
+from hybrid_opt.polishing.placed_carry import CarryReader
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.program import SmoothCell
 from hybrid_opt.polishing.residuals import Residuals
@@ -71,7 +72,7 @@ class DrivableSolver:
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
         self._reader = CarryReader(evaluator, grid, functions.rows)
         self._proposer = Proposer(
-            self._cell, functions.driven, self._active, driver.timer.stages, settings.drivable
+            self._cell, functions.driven, driver.timer.stages, settings.drivable
         )
         self.driver = driver
         self._half = self._cell.unit.half[: task.n_path]
@@ -83,7 +84,8 @@ class DrivableSolver:
         x = np.clip(task.x, self._task.lower, self._task.upper)
         timed = self.judge.timed(x[: self._task.n_path], goal)
         x = self._with_force(x, timed)
-        best = Reached(timed, timed.squared, x, self._reader.read(x), timed.level(goal))
+        learned = Learned(self._active, self._settings.stricter)
+        best = Reached(timed, timed.squared, x, self._reader.read(x), timed.level(goal), learned)
         solution = Solution(x)
         if not np.isfinite(timed.duration):
             solution.message = "the start has no timing"
@@ -144,27 +146,15 @@ class DrivableSolver:
         carry = self._reader.read(x)
         violated = self._active.violated(carry, best.carry, found.required)
         if violated or not carry.is_followed:
-            learned = self._learn(best, carry, violated, found.required)
+            learned = best.learned.refuse(carry, best.carry, violated, found.required)
             return radius if learned and carry.is_followed else 0.5 * min(radius, step)
         best.timed, best.x, best.carry = timed, x, carry
         best.lowest = min(best.lowest, after)
         best.squared = found.squared if step <= self._driven.newton else timed.squared
-        best.learned = {row: v for row, v in best.learned.items() if self._active.lasting(row)}
+        best.learned.move()
         if gain > 0.7 * found.gain and step > 0.9 * radius:
             return min(2.0 * radius, self._settings.trust.largest)
         return radius if gain > 0.3 * found.gain or tiny else 0.5 * radius
-
-    def _learn(
-        self, best: Reached, carry: PlacedCarry, violated: set[Row], required: dict[Row, float]
-    ) -> bool:
-        """Take in what a step violated; whether that asks for anything new."""
-        demanded = self._active.demanded(carry, best.carry, violated, required)
-        stricter = False
-        for row, value in demanded.items():
-            asked = required.get(row, -np.inf)
-            stricter |= value > asked + self._settings.stricter
-            best.learned[row] = max(value, best.learned.get(row, -np.inf))
-        return stricter
 
     def _with_force(self, x: Array, timed: TimedPath) -> Array:
         """The decision vector whose force limit is that of a timing."""

@@ -7,12 +7,12 @@ geometric rows bend along the step, it is corrected for that.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.polishing.constraints.active import ActiveSet
+from hybrid_opt.polishing.constraints.learned import Learned
 from hybrid_opt.polishing.drivable import quadratic
 from hybrid_opt.polishing.drivable.functions import DrivenFunctions
 from hybrid_opt.polishing.drivable.program import Iterate, JointProgram, Linear, Multipliers
@@ -42,7 +42,7 @@ class Reached:
     x: Array
     carry: PlacedCarry
     lowest: float
-    learned: dict[Row, float] = field(default_factory=dict)
+    learned: Learned
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,11 @@ class Proposer:
         self,
         cell: SmoothCell,
         functions: DrivenFunctions,
-        active: ActiveSet,
         stages: int,
         settings: DrivableSettings,
     ) -> None:
         """stages: pieces of constant u''."""
-        self._cell, self._functions, self._active = cell, functions, active
+        self._cell, self._functions = cell, functions
         self._task, self._driven = cell.task, settings
         self._stages = StageGrid(cell.workcell, stages)
         self._half = cell.unit.half[: cell.task.n_path]
@@ -122,7 +121,7 @@ class Proposer:
         bent: Array | float = 0.0,
     ) -> tuple[quadratic.Step, Multipliers, Linear] | None:
         """Solve a quadratic model; rows that its answer violates are added. `chosen` grows."""
-        for _ in range(self._driven.row_rounds):
+        for left in reversed(range(self._driven.row_rounds)):
             linear, scales = program.linear(chosen, bent)
             H, g = model[0], program.gradient() + model[1]
             step = quadratic.solve(H, g, linear.A, linear.b, low, high)
@@ -136,7 +135,7 @@ class Proposer:
             if not fresh.any():
                 break
             chosen |= fresh
-            if _ + 1 == self._driven.row_rounds:
+            if not left:
                 chosen &= ~fresh
         point, kind = np.nonzero(chosen)
         timing = np.zeros(chosen.shape)
@@ -170,10 +169,7 @@ class Proposer:
     def _program(
         self, best: Reached, goal: Goal, lenient: bool
     ) -> tuple[JointProgram, dict[Row, float]]:
-        rows = self._active.near(best.carry, ANY_TARGET) | best.learned.keys()
-        required = self._active.required(best.carry, rows, lenient)
-        for row, value in best.learned.items():
-            required[row] = max(value, required[row])
+        required = best.learned.required(best.carry, ANY_TARGET, lenient)
         listed = sorted(
             (row for row in required if isinstance(row, PlaceRow)),
             key=lambda row: (repr(row.constraint), row.place),

@@ -67,6 +67,12 @@ class Uncertainty:
     pad_position: float = 0.0
     disturbance: Array = field(default_factory=lambda: np.zeros(3))
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing may be different from what the workcell says."""
+        ranges = (self.friction, self.mass, self.pad_position)
+        return not (any(ranges) or self.centre_of_mass.any() or self.disturbance.any())
+
     def scaled(self, factor: float) -> Uncertainty:
         """All ranges times a factor."""
         return Uncertainty(

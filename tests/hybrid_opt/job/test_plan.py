@@ -9,7 +9,7 @@ import pytest
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import PHASES, Job, Phase
 from hybrid_opt.job.sampling import sample_job
-from hybrid_opt.job.squeeze import SqueezeSettings
+from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.timing import TimingLimits, time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hybrid_opt.errors import JobError, ResultsError
-from hybrid_opt.job.squeeze import SqueezeSettings
+from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.store.export import FORMATS, BundleOptions, Origin, export
 from hybrid_opt.store.export.bundle import read_manifest, write_bundle
 from hybrid_opt.store.files import sha256

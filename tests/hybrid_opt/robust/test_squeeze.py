@@ -9,14 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.job.squeeze import (
+from hybrid_opt.robust.force import RobustModel
+from hybrid_opt.robust.squeeze import (
     SqueezeSettings,
     chosen_squeeze,
     extra_force,
-    is_uncertain,
     smooth_above,
 )
-from hybrid_opt.robust.force import BoxMotion, RobustModel
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Uncertainty
 from tests.hybrid_opt.job.jobs import rack, rack_job
@@ -64,8 +63,7 @@ def test_an_uncertain_cell_is_pressed_robustly() -> None:
     assert squeeze.factor is None
     carry = rack_job().timing.carry
     assert carry is not None
-    box = BoxMotion(carry.pose, carry.rate, carry.second_rate)
-    extra = extra_force(uncertain, squeeze, carry.time, box, carry.normal_force)
+    extra = extra_force(uncertain, squeeze, carry.time, carry, carry.normal_force)
     commanded = carry.normal_force[:, 1] + extra
     robust = RobustModel(uncertain).robust_force(carry)
     assert (commanded >= robust.commanded - 1e-6).all()
@@ -73,8 +71,8 @@ def test_an_uncertain_cell_is_pressed_robustly() -> None:
 
 
 def test_a_cell_without_uncertainty_gets_the_factor() -> None:
-    assert not is_uncertain(Uncertainty())
-    assert is_uncertain(Uncertainty(disturbance=np.array([0.0, 0.1, 0.0])))
+    assert Uncertainty().is_empty
+    assert not Uncertainty(disturbance=np.array([0.0, 0.1, 0.0])).is_empty
     assert chosen_squeeze(rack().workcell, SqueezeSettings()).factor == 1.3
     assert chosen_squeeze(rack().workcell, SqueezeSettings(1.1)).factor == 1.1
 

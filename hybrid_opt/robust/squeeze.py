@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from hybrid_opt.robust.force import BoxMotion, robust_model
+from hybrid_opt.robust.force import Motion, robust_model
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Uncertainty, Workcell
@@ -82,21 +82,15 @@ class Squeeze:
 def chosen_squeeze(workcell: Workcell, settings: SqueezeSettings) -> Squeeze:
     """What the settings mean for a workcell."""
     factor, uncertainty = settings.factor, None
-    if factor is None and is_uncertain(workcell.uncertainty):
+    if factor is None and not workcell.uncertainty.is_empty:
         uncertainty = workcell.uncertainty
     elif factor is None:
         factor = FACTOR
     return Squeeze(settings.leader, factor, uncertainty, settings.smoothing)
 
 
-def is_uncertain(uncertainty: Uncertainty) -> bool:
-    """Whether anything may be different from what the workcell says."""
-    ranges = (uncertainty.friction, uncertainty.mass, uncertainty.pad_position)
-    return bool(any(ranges) or uncertainty.centre_of_mass.any() or uncertainty.disturbance.any())
-
-
 def extra_force(
-    workcell: Workcell, squeeze: Squeeze, time: Array, motion: BoxMotion, least: Array
+    workcell: Workcell, squeeze: Squeeze, time: Array, motion: Motion, least: Array
 ) -> Array:
     """(n,) what both robots press with beyond the planned normal forces [N].
 
