@@ -32,6 +32,7 @@ from hybrid_opt.timing import (
     force_limited_timing,
 )
 from hybrid_opt.timing.model import TimingModel
+from studies.options import add_leader
 from studies.program import program_of, run_program
 from symbolic.errors import SettingsError
 
@@ -67,9 +68,7 @@ def _parser() -> argparse.ArgumentParser:
         help="commanded over planned squeeze (default: the robust forces of the cell's "
         f"[uncertainty], {FACTOR:g} where it has none)",
     )
-    parser.add_argument(
-        "--leader", type=int, choices=(1, 2), default=1, help="the arm that keeps its place"
-    )
+    add_leader(parser)
     parser.add_argument(
         "--smoothing",
         type=float,

@@ -18,7 +18,7 @@ from studies.report.figures_cell import environment, reachable_regions
 from studies.report.reach import reach_map
 from studies.report.style import in_style, save, settled
 from symbolic.array import Array
-from symbolic.cell_model import CellModel, build_cell_model, own_pairs
+from symbolic.cell_model import CellModel, own_pairs
 from symbolic.errors import SettingsError
 from symbolic.robot.branches import StartBranch, initial_poses
 from symbolic.workcell.decision import straight_line
@@ -130,8 +130,8 @@ def inspect(
     """
     if candidates < 1:
         raise SettingsError(f"--candidates is {candidates}; at least 1 is needed")
-    model = build_cell_model(workcell)
     cell = Cell(workcell)
+    model = cell.compiled.model
     found = cell.evaluate(cell.random(candidates, np.random.default_rng(seed)))
     hold = cell.static_hold
     geometry = model.geometry

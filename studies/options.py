@@ -47,6 +47,13 @@ force = number(1e-3, 1e6)
 """The type of normal forces [N]."""
 
 
+def add_leader(parser: argparse._ActionsContainer) -> None:
+    """Add which arm keeps its place while the other is force-controlled; counted from 1."""
+    parser.add_argument(
+        "--leader", type=int, choices=(1, 2), default=1, help="the arm that keeps its place"
+    )
+
+
 def _refusal(text: str, allowed: str) -> argparse.ArgumentTypeError:
     shown = ascii(text) if len(text) <= 40 else f"{text[:37]!a}..."
     return argparse.ArgumentTypeError(f"found {shown}; allowed is {allowed}")

@@ -99,7 +99,7 @@ def recommend_from(root: Path, wish: ho.Wish, path: Path) -> StoredRecommendatio
         "settings": to_json(campaign.configuration.settings),
     }
     figures = trajectory_figures(cell.carry(found.x))
-    write_trajectory(path, cell.workcell, found.x, figures, provenance)
+    write_trajectory(path, cell.compiled, found.x, figures, provenance)
     inside = path.resolve().is_relative_to(root.resolve())
     file = path.resolve().relative_to(root.resolve()).as_posix() if inside else str(path)
     told = Told(

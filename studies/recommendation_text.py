@@ -90,22 +90,13 @@ def _of_robots(values: Array, robots: Sequence[str]) -> str:
 
 def _rival(rival: StoredRival, found: StoredRecommendation) -> str:
     """Another path beside the recommended carry."""
-    parts = []
-    if math.isfinite(rival.duration_at_force):
-        parts.append(
-            f"{rival.duration_at_force:.2f} s at the same force "
-            f"({_percent(rival.duration_at_force / found.duration)})"
-        )
-    else:
-        parts.append("cannot move with so little force")
-    if math.isfinite(rival.force_at_duration):
-        parts.append(
-            f"{rival.force_at_duration:.2f} N in the same time "
-            f"({_percent(rival.force_at_duration / found.force_limit)})"
-        )
-    else:
-        parts.append("is never so fast")
-    return ", ".join(parts)
+    duration, force = rival.duration_at_force, rival.force_at_duration
+    same_force, same_time = "cannot move with so little force", "is never so fast"
+    if math.isfinite(duration):
+        same_force = f"{duration:.2f} s at the same force ({_percent(duration / found.duration)})"
+    if math.isfinite(force):
+        same_time = f"{force:.2f} N in the same time ({_percent(force / found.force_limit)})"
+    return f"{same_force}, {same_time}"
 
 
 def _percent(ratio: float) -> str:

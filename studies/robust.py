@@ -12,7 +12,7 @@ import numpy as np
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.store.trajectory_file import read_trajectory
-from studies.options import seed, whole
+from studies.options import add_leader, seed, whole
 from studies.program import program_of, run_program
 from studies.text_table import number, text_table
 from symbolic.array import Array
@@ -31,9 +31,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("file", metavar="FILE", help="a trajectory file")
-    parser.add_argument(
-        "--leader", type=int, choices=(1, 2), default=1, help="the arm that keeps its place"
-    )
+    add_leader(parser)
     parser.add_argument(
         "--cases", type=whole(1, 10**7), default=100_000, help="random cases to check"
     )

@@ -18,7 +18,7 @@ from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.cell_scene import ArmSettings
 from hybrid_opt.witness.controller import CONTROLS
 from hybrid_opt.witness.scene import SimulationSettings
-from studies.options import force, number, seed, whole
+from studies.options import add_leader, force, number, seed, whole
 from studies.program import program_of, run_program
 from studies.simulate_arms import simulate_arms
 from studies.simulate_pads import simulate_pads
@@ -51,9 +51,7 @@ def _parser() -> argparse.ArgumentParser:
         "--timing", choices=("closest", "fastest"), default="closest", help="how it is driven"
     )
     parser.add_argument("--force-limit", type=force, metavar="N", help="fastest below this force")
-    parser.add_argument(
-        "--leader", type=int, choices=(1, 2), default=1, help="the arm that keeps its place"
-    )
+    add_leader(parser)
     parser.add_argument(
         "--runs", type=whole(0, 10**6), default=20, help="random cases of the uncertainty"
     )

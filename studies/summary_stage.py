@@ -102,7 +102,7 @@ def _store_hand_made(folder: CampaignFolder) -> None:
     # An infeasible one may be without some of its figures.
     figures = trajectory_figures(carry).items()
     known = {name: value for name, value in figures if np.isfinite(value)}
-    write_trajectory(path, folder.workcell, carry.x, known, provenance)
+    write_trajectory(path, folder.cell.compiled, carry.x, known, provenance)
 
 
 def _store_selected(
@@ -119,7 +119,7 @@ def _store_selected(
         "row": selected.row,
         "settings": folder.settings.effective(),
     }
-    write_trajectory(path, folder.workcell, selected.x, selected.figures, provenance)
+    write_trajectory(path, folder.cell.compiled, selected.x, selected.figures, provenance)
     return path.relative_to(folder.root).as_posix()
 
 

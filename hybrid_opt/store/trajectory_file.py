@@ -85,7 +85,7 @@ class StoredTrajectory:
 
 def write_trajectory(
     path: str | Path,
-    workcell: Workcell,
+    cell: Workcell | CompiledCell,
     x: Array,
     figures: Mapping[str, float],
     provenance: Mapping[str, Any],
@@ -94,7 +94,7 @@ def write_trajectory(
 
     Args:
         path: the file to write; its folder has to exist.
-        workcell: as read from its file.
+        cell: as read from its file; compiled, where several are stored.
         x: (n_var,) decision vector.
         figures: finite numbers by name, as from `hybrid_opt.store.trajectory_figures`.
         provenance: JSON values: algorithm, seed, versions and whatever else explains it.
@@ -102,10 +102,11 @@ def write_trajectory(
     Raises:
         ResultsError: the workcell was changed after reading, or a value cannot be stored.
     """
-    x = np.asarray(x, dtype=float)
+    compiled, x = CompiledCell.of(cell), np.asarray(x, dtype=float)
+    workcell = compiled.workcell
     if x.shape != (workcell.task.n_var,) or not np.isfinite(x).all():
         raise ResultsError(f"decision vector: expected {workcell.task.n_var} finite numbers")
-    outputs = CompiledCell(workcell).evaluators["candidate"](x, *_standing_still(workcell))
+    outputs = compiled.evaluators["candidate"](x, *_standing_still(workcell))
     document = {
         "format": FORMAT,
         "version": VERSION,
