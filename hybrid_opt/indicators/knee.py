@@ -9,20 +9,18 @@ from symbolic.errors import SettingsError
 
 
 def knee(points: Array) -> int:
-    """Index of the point (k, 2) farthest below the line between the front's ends.
+    """Index of the point (k, 2) whose objectives, both positive, have the least product.
 
-    Distances are taken with both objectives scaled to the front's own ranges, as in Das (1999), 'On
-    characterizing the knee of the Pareto curve based on Normal-Boundary Intersection'. A front
-    without a range in one objective has its knee where the other is least.
+    Beside it one per cent of either objective buys at most one per cent of the other. The distance
+    from the line between the front's ends (Das 1999) would depend on how far the ends were
+    explored: one long carry at almost the least force moves it by a newton.
 
     Raises:
-        SettingsError: there are no points.
+        SettingsError: there are no points, or an objective is not positive.
     """
     points = np.asarray(points, dtype=float)
     if len(points) == 0:
         raise SettingsError("the front is empty: it has no knee")
-    low, high = points.min(axis=0), points.max(axis=0)
-    flat = high <= low
-    scaled = (points - low) / np.where(flat, 1.0, high - low)
-    # On the line between the ends (0, 1) and (1, 0) both shares add up to one.
-    return int(np.argmin(scaled.sum(axis=1)))
+    if not (points > 0.0).all():
+        raise SettingsError("the knee needs objectives above zero")
+    return int(np.argmin(np.log(points).sum(axis=1)))

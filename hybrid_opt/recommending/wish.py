@@ -53,4 +53,4 @@ class Wish:
                 "force": f"the shortest of all carries that press with at most {value:g} N",
                 "payload": f"the shortest of all carries that would bear {value:g} kg",
             }[name]
-        return "the knee of the front: from here on, a shorter carry costs much more force"
+        return "the knee of the front: one per cent less time costs more than a per cent of force"

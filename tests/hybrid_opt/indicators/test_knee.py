@@ -12,38 +12,37 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 
 
-def distance_below_chord(points: Array) -> Array:
-    """Signed distances by the cross product, in the front's own ranges."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    scaled = (points - low) / (high - low)
-    first, last = np.array([0.0, 1.0]), np.array([1.0, 0.0])
-    along = (last - first) / np.linalg.norm(last - first)
-    offset = scaled - first
-    return np.asarray(along[1] * offset[:, 0] - along[0] * offset[:, 1])
+def front(n: int, still: float = 49.0) -> Array:
+    """Durations and forces: nearer to the force at rest a carry takes ever longer."""
+    force = still * (1.0 + np.linspace(0.004, 0.5, n))
+    return np.column_stack([2.0 + np.sqrt(0.05 * still / (force - still)), force])
 
 
-def hyperbola(n: int) -> Array:
-    x = np.linspace(0.1, 3.0, n)
-    return np.column_stack([x, 1.0 / x])
+def test_beside_it_a_per_cent_buys_no_more_than_a_per_cent() -> None:
+    points = np.log(front(400))
+    at = knee(front(400))
+    assert 0 < at < len(points) - 1
+    duration, force = (points - points[at]).T
+    assert (duration + force >= 0.0).all()
+    # It is where the slope in logarithms passes through one.
+    slopes = -np.diff(points[:, 0]) / np.diff(points[:, 1])
+    assert slopes[at - 1] >= 1.0 >= slopes[at]
 
 
-def test_it_is_the_point_farthest_below_the_line_between_the_ends() -> None:
-    points = hyperbola(60)
-    assert knee(points) == int(np.argmax(distance_below_chord(points)))
+@given(st.integers(3, 40), st.tuples(st.floats(0.01, 100.0), st.floats(0.01, 100.0)))
+def test_units_do_not_matter(n: int, scale: tuple[float, float]) -> None:
+    points = front(n)
+    product = points.prod(axis=1)
+    found = knee(points * np.array(scale))
+    assert product[found] == pytest.approx(product.min(), rel=1e-12)
 
 
-@given(
-    st.integers(3, 40),
-    st.tuples(st.floats(0.01, 100.0), st.floats(0.01, 100.0)),
-    st.tuples(st.floats(-50.0, 50.0), st.floats(-50.0, 50.0)),
-)
-def test_units_do_not_matter(
-    n: int, scale: tuple[float, float], shift: tuple[float, float]
-) -> None:
-    points = hyperbola(n)
-    best = distance_below_chord(points)
-    moved = knee(points * np.array(scale) + np.array(shift))
-    assert best[moved] == pytest.approx(best.max(), abs=1e-9)
+@given(st.integers(10, 60), st.integers(0, 3), st.integers(0, 3))
+def test_how_far_the_ends_were_explored_does_not_matter(n: int, low: int, high: int) -> None:
+    points = front(n)
+    at = knee(points)
+    low, high = min(low, at), min(high, n - 1 - at)
+    assert knee(points[low : n - high]) == at - low
 
 
 def test_small_fronts() -> None:
@@ -51,3 +50,5 @@ def test_small_fronts() -> None:
     assert knee(np.array([[2.0, 5.0], [2.0, 4.0]])) == 1
     with pytest.raises(SettingsError, match="empty"):
         knee(np.zeros((0, 2)))
+    with pytest.raises(SettingsError, match="above zero"):
+        knee(np.array([[1.0, 0.0]]))
