@@ -166,7 +166,7 @@ class _Sweep:
     Attributes:
         owner: (n_intervals,) motion that an interval belongs to.
         first: (n_motions,) its first interval.
-        required: (n_intervals, 1) clearance to be kept [m].
+        required: (n_intervals, n_pairs) clearance to be kept [m].
     """
 
     def __init__(self, checker: CollisionChecker, sampled: SampledMotions) -> None:
@@ -175,8 +175,7 @@ class _Sweep:
         intervals = np.asarray(sampled.lengths) - 1
         self.owner = np.repeat(np.arange(len(intervals)), intervals)
         self.first = np.cumsum(intervals) - intervals
-        tolerance = checker.geometry.workcell.collision.tolerance
-        self.required = tolerance + sampled.margin[self.owner][:, None]
+        self.required = checker.geometry.tolerance + sampled.margin[self.owner][:, None]
 
     def run(self, depth: int) -> list[MotionVerdict]:
         configuration, clearance = self.sampled.configuration, self.sampled.clearance

@@ -40,7 +40,7 @@ class CollisionChecker:
         geometry: the cell's bodies and pairs.
         judge: FCL's objects, with counters.
         resting_tolerance: see `RESTING_TOLERANCE`.
-        free_beyond: bounds above this call a pair free [m].
+        free_beyond: (n_pairs,) bounds above these call a pair free [m].
         resting_places: per allowed contact and fixed pose that touches: pair, box centre (3,),
             departure [m].
     """
@@ -61,7 +61,7 @@ class CollisionChecker:
         self.resting_tolerance = resting_tolerance
         self.judge = Judge(geometry, resting_tolerance)
         self._functions = functions
-        self.free_beyond = geometry.workcell.collision.tolerance + FCL_RESOLUTION
+        self.free_beyond = geometry.tolerance + FCL_RESOLUTION
         self._pairs = [(pair.first, pair.second) for pair in geometry.active]
         self._names = geometry.pair_names
         self.resting_places = self._find_resting()
@@ -201,7 +201,7 @@ class CollisionChecker:
                 i, j = self._pairs[pair]
                 first = self.judge.shrunk_payload if resting else i
                 apart = self.judge.separation(local, first, j)
-                if apart <= self.free_beyond and self._judge_pair(local, pair, resting):
+                if apart <= self.free_beyond[pair] and self._judge_pair(local, pair, resting):
                     hits[k] = pair
                     break
                 clearance[k, pair] = np.fmax(clearance[k, pair], apart)
@@ -273,7 +273,7 @@ class CollisionChecker:
                 if not waypoint.is_fixed:
                     continue
                 self._place(waypoint.lower[None], *still)
-                reach = self.geometry.workcell.collision.tolerance + self.resting_tolerance
+                reach = self.geometry.tolerance[pair] + self.resting_tolerance
                 if self.judge.distance(0, *self._pairs[pair]) <= reach:
                     found.append((pair, waypoint.lower[:3], allowed.departure))
         return found

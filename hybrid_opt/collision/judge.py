@@ -1,7 +1,7 @@
 """The bodies of a cell as python-fcl objects: the judge of collisions.
 
 Two bodies collide if FCL finds an intersection, or, with a positive tolerance, a distance of at
-most the tolerance.
+most the tolerance (`symbolic.geometry.pairs.pair_tolerance`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.geometry.bodies import BOX, PAYLOAD, CollisionBody
-from symbolic.geometry.pairs import CellGeometry
+from symbolic.geometry.pairs import CellGeometry, pair_tolerance
 from symbolic.geometry.pieces import SMALLEST_SIZE, Capsule, ConvexShape, Hull, Piece, reach
 from symbolic.workcell.records import Box, Cylinder, Sphere
 
@@ -31,7 +31,7 @@ class Judge:
     """
 
     def __init__(self, geometry: CellGeometry, resting_tolerance: float) -> None:
-        self.tolerance = geometry.workcell.collision.tolerance
+        self._geometry = geometry
         self.calls = 0
         self.updates = 0
         self._request = fcl.CollisionRequest()
@@ -63,14 +63,16 @@ class Judge:
     def collides(self, sample: int, i: int, j: int) -> bool:
         """Whether bodies i and j collide in a sample of the placements; see the module."""
         first, second = self._placed(sample, i), self._placed(sample, j)
+        bodies = self._geometry.bodies
+        tolerance = pair_tolerance(self._geometry.workcell, bodies[i], bodies[j])
         for a in first:
             for b in second:
                 self.calls += 1
                 if fcl.collide(a, b, self._request):
                     return True
-                if self.tolerance > 0.0:
+                if tolerance > 0.0:
                     self.calls += 1
-                    if fcl.distance(a, b) <= self.tolerance:
+                    if fcl.distance(a, b) <= tolerance:
                         return True
         return False
 

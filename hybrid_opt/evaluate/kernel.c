@@ -19,8 +19,9 @@ typedef struct {
   const shape* shapes;
   const double* vertices;
   const resting_place* resting;
+  const double *free_beyond, *tolerance; /* of each pair */
   long long n_resting, payload_piece, resting_piece;
-  double free_beyond, apart, overlap, tolerance;
+  double apart, overlap;
 } judge_data;
 
 /* Results of n candidates, an axis over them first. wanted: per output of `sample`, (n, samples,
@@ -167,7 +168,7 @@ static int prejudge(const judge_data* judge, long long pair, int k, int l) {
   int resting = rests(judge, pair, k, l), found = APART;
   if (resting < 0) return OPEN;
   /* A resting payload may come nearer than the tolerance; it only must not intersect. */
-  double apart = judge->apart + (resting ? 0.0 : judge->tolerance);
+  double apart = judge->apart + (resting ? 0.0 : judge->tolerance[pair]);
   long long begin = resting ? judge->resting_piece : first[bodies[0]];
   long long end = resting ? begin + 1 : first[bodies[0] + 1];
   for (long long i = begin; i < end; ++i) {
@@ -186,7 +187,6 @@ static int prejudge(const judge_data* judge, long long pair, int k, int l) {
 /* Which samples of the candidates collide, and which pairs are still to be judged. */
 static int collide(batch_data* batch, const judge_data* judge, long long first, int m) {
   scratch* s = own;
-  lanes_real free_beyond = lanes_all_equal(judge->free_beyond);
   for (int k = 0; k < N_SAMPLES; ++k) {
     unsigned alive = 0, placed_already = 0;
     lanes_real sum = lanes_all_equal(0.0);
@@ -206,7 +206,7 @@ static int collide(batch_data* batch, const judge_data* judge, long long first, 
     long long kept = batch->n_open;
     for (int pair = 0; pair < N_PAIRS; ++pair) {
       /* Not above: a bound that is not a number stays open. */
-      lanes_mask free = s->clearance[pair] > free_beyond;
+      lanes_mask free = s->clearance[pair] > lanes_all_equal(judge->free_beyond[pair]);
       unsigned bits = ~lanes_bits(free) & alive & ~colliding;
       if (__builtin_expect(!bits, 1)) continue;
       if (!placed_already) {

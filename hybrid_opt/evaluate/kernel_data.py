@@ -47,9 +47,9 @@ class JudgeData(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("pairs", "first_piece", "shapes", "vertices")),
-        ("resting", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("resting", "free_beyond", "tolerance")),
         *((name, ctypes.c_longlong) for name in ("n_resting", "payload_piece", "resting_piece")),
-        *((name, ctypes.c_double) for name in ("free_beyond", "apart", "overlap", "tolerance")),
+        *((name, ctypes.c_double) for name in ("apart", "overlap")),
     ]
 
 
@@ -78,6 +78,8 @@ def judge_arrays(checker: CollisionChecker) -> dict[str, NDArray[Any]]:
         "shapes": table,
         "vertices": vertices,
         "resting": np.array(checker.resting_places, dtype=_RESTING),
+        "free_beyond": np.ascontiguousarray(checker.free_beyond),
+        "tolerance": np.ascontiguousarray(geometry.tolerance),
     }
 
 
@@ -96,15 +98,12 @@ def shape_table(shapes: Sequence[ConvexShape]) -> tuple[NDArray[np.void], Array]
 def judge_data(checker: CollisionChecker, arrays: Mapping[str, NDArray[Any]]) -> JudgeData:
     """Pairs, shapes and margins of a cell."""
     first_piece = arrays["first_piece"]
-    tolerance = checker.geometry.workcell.collision.tolerance
     return JudgeData(
         n_resting=len(arrays["resting"]),
         payload_piece=int(first_piece[checker.geometry.index(PAYLOAD)]),
         resting_piece=int(first_piece[-1]),
-        free_beyond=checker.free_beyond,
         apart=PROOF_MARGIN,
         overlap=PROOF_MARGIN,
-        tolerance=tolerance,
         **{name: array.ctypes.data for name, array in arrays.items()},
     )
 

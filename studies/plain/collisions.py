@@ -57,7 +57,6 @@ class PlainCollisionChecker:
 
     def __init__(self, workcell: Workcell) -> None:
         self.workcell = workcell
-        self.tolerance = workcell.collision.tolerance
         self.arms = [_Arm(robot) for robot in workcell.robots]
         self.bodies = {name: solids for arm in self.arms for name, solids in arm.bodies.items()}
         self.payload = _solid(Box(workcell.payload.size))
@@ -87,15 +86,21 @@ class PlainCollisionChecker:
     def _collides(self, pair: tuple[str, str], allowed: set[str]) -> bool:
         first, second = pair
         resting = first == PAYLOAD and second in allowed
+        tolerance = self._tolerance(PAYLOAD in pair)
         hit = False
         for a in [self.shrunk] if resting else self.bodies[first]:
             for b in self.bodies[second]:
                 result = fcl.CollisionResult()
                 fcl.collide(a.object, b.object, fcl.CollisionRequest(), result)
                 hit = hit or result.is_collision
-                if self.tolerance > 0.0 and not resting:
-                    hit = hit or fcl.distance(a.object, b.object) <= self.tolerance
+                if tolerance > 0.0 and not resting:
+                    hit = hit or fcl.distance(a.object, b.object) <= tolerance
         return hit
+
+    def _tolerance(self, of_payload: bool) -> float:
+        """Distance up to which bodies collide [m]: displaced pads have the payload elsewhere."""
+        displaced = self.workcell.uncertainty.pad_position if of_payload else 0.0
+        return self.workcell.collision.tolerance + displaced
 
     def _move_payload(self, pose: Array) -> None:
         world_box = pin.SE3(rotation(pose[3:]), pose[:3])
@@ -112,7 +117,7 @@ class PlainCollisionChecker:
             for allowed in task.allowed_contacts:
                 solids = self.bodies[allowed.body]
                 gap = min(fcl.distance(self.payload.object, solid.object) for solid in solids)
-                if gap <= self.tolerance + RESTING_TOLERANCE:
+                if gap <= self._tolerance(True) + RESTING_TOLERANCE:
                     places.append((allowed.body, waypoint.lower[:3], allowed.departure))
         return places
 

@@ -81,6 +81,14 @@ class CellGeometry:
         """Names of the two bodies of every active pair, in order."""
         return tuple((self.bodies[p.first].name, self.bodies[p.second].name) for p in self.active)
 
+    @cached_property
+    def tolerance(self) -> Array:
+        """(n_active,) `pair_tolerance` of every active pair, in order [m]."""
+        bodies = self.bodies
+        return np.array(
+            [pair_tolerance(self.workcell, bodies[p.first], bodies[p.second]) for p in self.active]
+        )
+
     def index(self, name: str) -> int:
         """Index of a body.
 
@@ -91,6 +99,16 @@ class CellGeometry:
         if name not in names:
             raise CollisionModelError(f"no collision body {name!r}; there are {', '.join(names)}")
         return names.index(name)
+
+
+def pair_tolerance(workcell: Workcell, a: CollisionBody, b: CollisionBody) -> float:
+    """Distance up to which two bodies count as colliding [m].
+
+    That of the workcell, and for the payload how far displaced pads may have it off its place:
+    arms that keep to their paths carry a box that they took hold of elsewhere.
+    """
+    holds = "box" in (a.frame.kind, b.frame.kind)
+    return workcell.collision.tolerance + (workcell.uncertainty.pad_position if holds else 0.0)
 
 
 def build_geometry(workcell: Workcell) -> CellGeometry:
@@ -108,12 +126,13 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
     always = _AlwaysTouching(bodies, arms)
     for i, j in combinations(range(len(bodies)), 2):
         a, b = bodies[i], bodies[j]
+        tolerance = pair_tolerance(workcell, a, b)
         reason = (
             ignored.get(frozenset((a.name, b.name)), "")
             or _rigid(a, b, arms)
             or _neighbours(a, b, bodies)
-            or _out_of_reach(a, b, arms, workcell.collision.tolerance)
-            or _never_meet(a, b, arms, workcell.collision.tolerance)
+            or _out_of_reach(a, b, arms, tolerance)
+            or _never_meet(a, b, arms, tolerance)
             or always.reason(a, b)
         )
         if reason:

@@ -34,7 +34,7 @@ class Clearances(DistanceKind):
         for pair, distance in self.violations(carry).items():
             if pair in self.rows.separable:
                 continue
-            lows = lowest(distance, self.wanted / 2.0)
+            lows = lowest(distance, float(self.least[pair]))
             for place in sorted({k + beside for k in lows for beside in (0, 1, -width, width)}):
                 if place < carry.reached:
                     yield PlaceRow(Clearance(pair), place)

@@ -22,13 +22,21 @@ from symbolic.smooth.passage import Passing, Separation
 
 
 class DistanceKind(Kind[PlaceRow]):
-    """A kind whose values are distances of a pair; `window` is where a row's is measured."""
+    """A kind whose values are distances of a pair; `window` is where a row's is measured.
+
+    Attributes:
+        wanted, least: (n_pairs,) distance to be asked of each pair, and below which it is
+            violated [m].
+    """
 
     window: int = 0
 
     def __init__(self, around: Surroundings) -> None:
         super().__init__(around)
-        self.wanted = around.workcell.collision.tolerance + around.settings.clearance
+        tolerance = around.evaluator.checker.geometry.tolerance
+        self.wanted = tolerance + around.settings.clearance
+        # Half of what is wanted beyond the tolerance is left to what solver and FCL round off.
+        self.least = tolerance + around.settings.clearance / 2.0
         self.rows = around.cell.functions.rows
 
     def required(
@@ -40,7 +48,7 @@ class DistanceKind(Kind[PlaceRow]):
         if not chosen:
             return values.tolist()
         truth = self._measured(carry, [rows[k] for k in chosen])
-        wanted = np.full(len(chosen), self.wanted)
+        wanted = self.wanted[[pair_of(rows[k]) for k in chosen]]
         if lenient:
             wanted = np.where(truth > 0.0, np.minimum(wanted, truth), wanted)
         smooth = smooth_values(self.around, carry, [rows[k] for k in chosen])
@@ -48,11 +56,8 @@ class DistanceKind(Kind[PlaceRow]):
         return values.tolist()
 
     def violations(self, carry: PlacedCarry) -> dict[int, Array]:
-        """(reached,) distances of every pair that comes too close [m], by pair.
-
-        Half of the wanted distance is left to what the solver and FCL round off.
-        """
-        close = carry.lowered < self.wanted / 2.0
+        """(reached,) distances of every pair that comes too close [m], by pair."""
+        close = carry.lowered < self.least
         pairs = np.flatnonzero(close.any(axis=0)).tolist()
         if not pairs:
             return {}

@@ -122,7 +122,7 @@ def violated_passages(
             continue
         gaps = gaps_of(kind, known, pair)
         kinks = edges(gaps, kind.near_settings.kink_distance)
-        for place in lowest(distance, kind.wanted / 2.0):
+        for place in lowest(distance, float(kind.least[pair])):
             yield pair, gaps, place, [k for k in kinks if abs(k[1] - place) <= window]
 
 
