@@ -14,8 +14,10 @@ from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.recommended import (
     ForceTable,
     StoredDurations,
+    StoredPrice,
     StoredRecommendation,
     Told,
+    stored_price,
     stored_recommendation,
 )
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
@@ -30,6 +32,9 @@ from hybrid_opt.recommending.force_table import (
     table_forces,
 )
 from hybrid_opt.recommending.recommendation import HAND_MADE, Recommendation
+from hybrid_opt.recommending.unsure import LEADER
+from hybrid_opt.robust.force import robust_model
+from hybrid_opt.robust.price import robust_price
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_figures import trajectory_figures
@@ -37,6 +42,7 @@ from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.drivable import DrivableFronts, drivable_fronts, drivable_root
 from studies.recommendation_text import export_command
 from symbolic.array import Array
+from symbolic.errors import SettingsError
 
 LEAST_FORCE = "least-force"
 """The path that the other experiment ends with, beside which the recommended carry stands."""
@@ -108,8 +114,19 @@ def recommend_from(root: Path, wish: ho.Wish, path: Path) -> StoredRecommendatio
         export=export_command(Path(file), found.force),
         considered=len(drivable.x),
         durations=_force_table(cell, drivable, others, found),
+        price=_price(found.carry, campaign.configuration.settings.seed),
     )
     return stored_recommendation(found, told)
+
+
+def _price(carry: ho.Carry, seed: int) -> StoredPrice | None:
+    """What robustness costs the recommended carry; None where no set leaves friction and patches,
+    and where the pads do not face one another."""
+    try:
+        model = robust_model(carry.workcell)
+        return stored_price(robust_price(model, carry, np.random.default_rng(seed), LEADER))
+    except SettingsError:
+        return None
 
 
 def _force_table(

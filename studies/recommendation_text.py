@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hybrid_opt.campaign.recommended import StoredRecommendation, StoredRival
+from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation, StoredRival
 from symbolic.array import Array
 
 EXPORT_FORM = "ros2"
@@ -58,6 +58,8 @@ def recommendation_text(
         *[(rival.label, _rival(rival, found)) for rival in found.rivals],
         ("margins", "; ".join(_margins(found)) or "not known"),
     ]
+    if found.price is not None:
+        facts.append(("robust", _robust(found.price)))
     if found.unsure:
         facts.append(
             (
@@ -97,6 +99,25 @@ def _rival(rival: StoredRival, found: StoredRecommendation) -> str:
     if math.isfinite(force):
         same_time = f"{force:.2f} N in the same time ({_percent(force / found.force_limit)})"
     return f"{same_force}, {same_time}"
+
+
+def _robust(price: StoredPrice) -> str:
+    """What the set costs, how much more of it the arms allow, and what random cases say."""
+    named = "[uncertainty]" if price.stated else "a usual set"
+    plan, sure = (max(values) for values in (price.peak[0], price.commanded))
+    allowed = (
+        f"up to {price.largest_factor:.2f} times the set"
+        if math.isfinite(price.largest_factor)
+        else "any multiple of the set"
+    )
+    if not price.largest_factor:
+        allowed = "not even the nominal case"
+    return (
+        f"{sure:.1f} N hold in every case of {named} ({price.text}), "
+        f"{_percent(sure / plan)} against the nominal case; the reference forces allow {allowed}; "
+        f"{price.failing or 'none'} of {price.cases} random cases "
+        f"{'slip' if price.failing != 1 else 'slips'}"
+    )
 
 
 def _percent(ratio: float) -> str:

@@ -19,7 +19,7 @@ from hybrid_opt.witness.cell_scene import ArmSettings
 from hybrid_opt.witness.controller import Control
 from hybrid_opt.witness.reference import Reference, carry_reference, with_tracking_error
 from studies.report.animation import Film, write_animation
-from studies.simulate_pads import is_uncertain, threshold_text, worst_friction
+from studies.simulate_pads import threshold_text, worst_friction
 from symbolic.array import Array
 
 LOW, HIGH, BISECTIONS = 0.9, 1.5, 8
@@ -53,14 +53,14 @@ def simulate_arms(
             )
             print(f"  with a time step of {step:g} s: {found.factor:.4f}")
     pressed, factor = reference, SHOWN_FACTOR
-    if is_uncertain(cell.workcell):
+    if not cell.workcell.uncertainty.is_empty:
         force = RobustModel(cell.workcell).robust_force(carry, leader=leader)
         peak = force.peak
         pressed, factor = carry_reference(cell, carry, force.commanded, leader), 1.0
         print(f"  robust forces up to {peak[0]:.2f} / {peak[1]:.2f} N:")
     outcome = witness.simulate(pressed, control, factor)
     _tell(outcome, carry)
-    if is_uncertain(cell.workcell):
+    if not cell.workcell.uncertainty.is_empty:
         _cases(cell, pressed, settings, options)
         rubs_less = CellWitness(
             workcell_of_case(cell.workcell, worst_friction(cell.workcell)), settings

@@ -42,7 +42,7 @@ def simulate_pads(
             swept = Witness(cell.workcell, other)
             found = swept.threshold(drive_of(carry, other, leader=leader), LOW, HIGH, BISECTIONS)
             print(f"  with a time step of {other.time_step:g} s: {found.factor:.4f}")
-    if is_uncertain(cell.workcell):
+    if not cell.workcell.uncertainty.is_empty:
         _cases(cell, carry, settings, options)
 
 
@@ -54,13 +54,6 @@ def threshold_text(threshold: Threshold[Shown], slip: float) -> str:
         f"at pad {slips.pad + 1}, beginning {slips.begins(slip):.3f} s, beyond "
         f"{1e3 * slip:g} mm at {slips.time[-1]:.3f} s, turned {slips.turn[-1]:.4f} rad"
     )
-
-
-def is_uncertain(workcell: Workcell) -> bool:
-    """Whether anything is uncertain that a simulation can draw."""
-    ranges = workcell.uncertainty
-    widths = (ranges.friction, ranges.mass, *ranges.centre_of_mass, *ranges.disturbance)
-    return bool(max(widths) > 0.0)
 
 
 def worst_friction(workcell: Workcell) -> Array:

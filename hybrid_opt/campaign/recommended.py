@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hybrid_opt.campaign.documents import Count, Pair
+from hybrid_opt.campaign.documents import Count, Pair, Vector
 from hybrid_opt.recommending.recommendation import Recommendation
+from hybrid_opt.robust.price import RobustPrice
 from hybrid_opt.store.json_records import Figure
+from symbolic.array import Array
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,74 @@ class ForceTable:
 
 
 @dataclass(frozen=True)
+class StoredPrice:
+    """What it costs the recommended carry to hold in every case of a set.
+
+    Attributes:
+        stated: whether the workcell states the set; else it is a usual one.
+        friction, mass, centre_of_mass, pad_position, disturbance: the set, as in a workcell.
+        factors: multiples of it.
+        peak: largest normal force of each robot under them [N].
+        commanded: under the set itself [N].
+        limit: reference forces [N].
+        largest_factor: the largest multiple that they allow, null where any.
+        cases, failing: random cases held against the forces, and how many they did not hold.
+        closest: largest share of the forces that a case needed; less is told as 0.97.
+    """
+
+    stated: bool
+    friction: float
+    mass: float
+    centre_of_mass: Vector
+    pad_position: float
+    disturbance: Vector
+    factors: tuple[float, ...]
+    peak: tuple[Pair, ...]
+    commanded: Pair
+    limit: Pair
+    largest_factor: Figure
+    cases: Count
+    failing: Count
+    closest: float
+
+    @property
+    def text(self) -> str:
+        """The set in words."""
+        parts = [
+            f"friction off by {100.0 * self.friction:g} %" if self.friction else "",
+            f"mass by {100.0 * self.mass:g} %" if self.mass else "",
+            _width("centre of mass", 1e3 * self.centre_of_mass, "mm"),
+            f"pads by {1e3 * self.pad_position:g} mm" if self.pad_position else "",
+            _width("disturbance", self.disturbance, "m/s^2"),
+        ]
+        return ", ".join(part for part in parts if part)
+
+
+def _width(name: str, values: Array, unit: str) -> str:
+    if not values.any():
+        return ""
+    same = values.min() == values.max()
+    numbers = f"{values[0]:g}" if same else " / ".join(f"{value:g}" for value in values)
+    return f"{name} by {numbers} {unit}"
+
+
+def stored_price(price: RobustPrice) -> StoredPrice:
+    """A price as a study stores it."""
+    return StoredPrice(
+        **vars(price.uncertainty),
+        stated=price.stated,
+        factors=tuple(price.factors.tolist()),
+        peak=tuple(price.peak),
+        commanded=price.commanded,
+        limit=price.limit,
+        largest_factor=price.largest_factor,
+        cases=price.check.cases,
+        failing=price.check.failing,
+        closest=price.check.closest,
+    )
+
+
+@dataclass(frozen=True)
 class StoredRecommendation:
     """The carry to run.
 
@@ -103,6 +173,7 @@ class StoredRecommendation:
         warnings: what speaks against it.
         considered: carries that it was chosen from.
         durations: how long all fronts take at the same forces.
+        price: of robustness, null where no set leaves friction and patches.
     """
 
     wish: StoredWish
@@ -122,6 +193,7 @@ class StoredRecommendation:
     warnings: tuple[str, ...]
     considered: Count
     durations: ForceTable
+    price: StoredPrice | None = None
 
 
 @dataclass(frozen=True)
@@ -133,6 +205,7 @@ class Told:
     export: str
     considered: int
     durations: ForceTable
+    price: StoredPrice | None
 
 
 def stored_recommendation(found: Recommendation, told: Told) -> StoredRecommendation:

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from studies.report import figures_carry, figures_cell, figures_fronts, figures_search
+from studies.report import (
+    figures_carry,
+    figures_cell,
+    figures_fronts,
+    figures_robust,
+    figures_search,
+)
 from studies.report.records import DrawnCarry, ReportData
 from studies.report.style import in_style, settled
 
@@ -145,6 +151,20 @@ def _carry_figures(data: ReportData) -> Iterator[ReportFigure]:
             "at every limit, and the members of the drivable fronts. All other limits hold "
             "throughout.",
             lambda: figures_carry.duration_against_force(data),
+        )
+    yield from _price_figure(data)
+
+
+def _price_figure(data: ReportData) -> Iterator[ReportFigure]:
+    choice = data.summary.recommendation
+    if choice is not None and choice.price is not None:
+        price = choice.price
+        whose = "the workcell's [uncertainty]" if price.stated else "a usual set of cases"
+        yield ReportFigure(
+            "robust_price",
+            "The price of robustness: largest normal forces of the recommended carry that hold in "
+            f"every case of {whose} ({price.text}), times a factor.",
+            lambda: figures_robust.robust_price(data, price),
         )
 
 

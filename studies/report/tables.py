@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hybrid_opt.campaign.recommended import ForceTable
+from hybrid_opt.campaign.recommended import ForceTable, StoredPrice
 from hybrid_opt.campaign.summary import FrontFigures
 from hybrid_opt.indicators.statistics import summarise
 from studies.report.records import AlgorithmRuns, DrawnCarry, ReportData
@@ -24,6 +24,8 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
     tables = [quality(data, with_paper), selected(data, with_paper)]
     if data.summary.recommendation is not None:
         tables.append(time_against_force(data.summary.recommendation.durations))
+        if data.summary.recommendation.price is not None:
+            tables.append(robust_price(data, data.summary.recommendation.price))
     tables.append(bounds(data))
     if data.summary.tests:
         tables.append(rank_tests(data))
@@ -181,6 +183,26 @@ def time_against_force(table: ForceTable) -> Table:
         tuple(rows),
         "Every path timed anew at the force. Of fronts the fastest member: median over the "
         "replicas [least, most].",
+    )
+
+
+def robust_price(data: ReportData, price: StoredPrice) -> Table:
+    """Forces of the recommended carry that hold for multiples of a set of cases."""
+    rows = tuple(
+        (number(factor), *(number(force) for force in peak))
+        for factor, peak in zip(price.factors, price.peak, strict=True)
+    )
+    left, right = (robot.name for robot in data.workcell.robots)
+    largest = number(price.largest_factor) if math.isfinite(price.largest_factor) else "any"
+    return Table(
+        "robust_price",
+        "The price of robustness of the recommended carry.",
+        ("times the set", f"peak, {left} [N]", f"peak, {right} [N]"),
+        rows,
+        f"The set{'' if price.stated else ', a usual one'}: {price.text}. The first robot leads, "
+        "the force of the second is commanded. The reference forces allow "
+        f"{largest} times the set. Of {price.cases} random cases of the set {price.failing} slip "
+        f"under its forces; the hardest needs {100.0 * price.closest:.2f} % of them.",
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from symbolic.physics.joint_allocation import balance_of, least_squeeze
+from symbolic.physics.joint_allocation import balance_of, even_slack, least_squeeze
 from symbolic.physics.payload_load import resultant_force
 from symbolic.physics.pressure import required_moment
 from symbolic.physics.rotation import angular_acceleration, angular_velocity, rotation_matrix
@@ -42,6 +42,23 @@ def case_squeeze_function(workcell: Workcell) -> ca.Function:
     held = least_squeeze(_balance_function(workcell)(*motion, case), friction, radius)
     names = ["pose", "rate", "second_rate", "case"]
     return ca.Function("case_squeeze", [*motion, case], [held.normal], names, ["normal_force"])
+
+
+def case_slack_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,), a case (15,), force [N] and arm to slack.
+
+    With the force commanded of the arm (0 or 1), a pressure that shares everything evenly holds the
+    case where slack is positive; elsewhere `case_squeeze_function` knows. It takes a hundredth of
+    that one's time.
+    """
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case, force, arm = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force"), ca.SX.sym("arm")
+    friction, radius, *_ = _parts(case)
+    balance = _balance_function(workcell)(*motion, case)
+    n_1 = force + arm * balance[0]
+    names = ["pose", "rate", "second_rate", "case", "force", "arm"]
+    slack = ca.cse([even_slack(balance, friction, radius, n_1)])
+    return ca.Function("case_slack", [*motion, case, force, arm], slack, names, ["slack"])
 
 
 def _parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:

@@ -23,7 +23,13 @@ from typing import Literal
 import casadi as ca
 
 from symbolic.expression import Expression
-from symbolic.physics.patch_cone import BARRIER_DEGREE, WRENCH_SIZE, cross_2, patch_barrier
+from symbolic.physics.patch_cone import (
+    BARRIER_DEGREE,
+    WRENCH_SIZE,
+    cross_2,
+    patch_barrier,
+    patch_slack,
+)
 
 STEPS = 26
 """Newton steps before the one that is differentiated."""
@@ -183,28 +189,64 @@ def _newton_step(objective: Objective) -> ca.Function:
 def _start(objective: Objective) -> ca.Function:
     """A wrench well within both cones, from pressing hard, and the weight of its barriers."""
     balance, friction, radius = cell = [ca.SX.sym(name, size) for name, size in CELL_SIZES]
-    by_friction, by_radius = friction[0] / ca.sum1(friction), radius[0] / ca.sum1(radius)
-    twist = friction * radius
-    by_twist = twist[0] / ca.sum1(twist)
-    tangent = by_friction * balance[1:3]
-    tilt = balance[8] * tangent + balance[3:5]
-    about_n = balance[5] - cross_2(balance[6:8], tangent)
+    _, tilt, about_n = _shared_evenly(cell)
     # The squeeze itself tilts the box where the pads do not face one another.
     overlap = 1.0 - _length(balance[6:8]) / ca.sum1(radius)
     asked = (
         _length(balance[1:3]) / ca.sum1(friction)
         + _length(tilt) / ca.sum1(radius)
-        + ca.fabs(about_n) / ca.sum1(twist)
+        + ca.fabs(about_n) / ca.sum1(friction * radius)
         + ca.fabs(balance[0])
         + START_FLOOR
     )
     n_1 = 2.0 * asked / overlap + ca.fmax(balance[0], 0.0)
-    moment = by_radius * (tilt - n_1 * balance[6:8])
-    wrench = ca.vertcat(
-        n_1, tangent / friction[0], moment / radius[0], by_twist * about_n / twist[0]
-    )
     weight = n_1**2 if objective == "effort" else n_1
-    return ca.Function("start", cell, [wrench, weight / BARRIER_DEGREE])
+    return ca.Function("start", cell, [_evenly(cell, n_1), weight / BARRIER_DEGREE])
+
+
+def even_slack(balance: ca.SX, friction: ca.SX, radius: ca.SX, n_1: ca.SX) -> ca.SX:
+    """Whether wrenches hold that share everything evenly, if contact 1 presses with n_1 [N].
+
+    Positive where both lie within their cones: then the patches carry what is asked. Where it is
+    not, another pressure still may.
+
+    Args:
+        balance, friction, radius: as in `allocate_jointly`.
+    """
+    cell = [balance, friction, radius]
+    left = []
+    for wrench in _both(_evenly(cell, n_1), cell):
+        normal = wrench[0]
+        left += [
+            normal,
+            1.0 - ca.sumsqr(wrench[1:3]) / normal**2,
+            1.0 - ca.sumsqr(wrench[3:5]) / normal**2,
+            patch_slack(wrench) / normal**4,
+        ]
+    return ca.mmin(ca.vertcat(*left))
+
+
+def _shared_evenly(cell: list[ca.SX]) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Tangential force of contact 1 in proportion to friction; the moments in the contact plane,
+    but for the squeeze's, and about n that then are to be carried."""
+    balance, friction, _ = cell
+    tangent = friction[0] / ca.sum1(friction) * balance[1:3]
+    about_n = balance[5] - cross_2(balance[6:8], tangent)
+    return tangent, balance[8] * tangent + balance[3:5], about_n
+
+
+def _evenly(cell: list[ca.SX], n_1: ca.SX) -> ca.SX:
+    """Scaled wrench of contact 1 (6,) under a normal force, moments in proportion to radii and
+    torsion to friction times radius."""
+    balance, friction, radius = cell
+    tangent, tilt, about_n = _shared_evenly(cell)
+    # A share over the contact's own friction or radius is the whole over the sum of both.
+    return ca.vertcat(
+        n_1,
+        tangent / friction[0],
+        (tilt - n_1 * balance[6:8]) / ca.sum1(radius),
+        about_n / ca.sum1(friction * radius),
+    )
 
 
 @cache
