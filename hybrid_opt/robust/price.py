@@ -56,7 +56,11 @@ class RobustPrice:
 
 
 def robust_price(
-    model: RobustModel, carry: Carry, rng: np.random.Generator, leader: int = 0
+    model: RobustModel,
+    carry: Carry,
+    rng: np.random.Generator,
+    leader: int = 0,
+    cases: int = CASES,
 ) -> RobustPrice:
     """What robustness against the workcell's set costs a carry; against `USUAL` without one.
 
@@ -64,6 +68,7 @@ def robust_price(
         model: of the carry's workcell.
         rng: draws the random cases.
         leader: index of the arm that keeps its place.
+        cases: how many.
 
     Raises:
         SettingsError: the set leaves no friction or patch, or there is no such arm.
@@ -82,7 +87,7 @@ def robust_price(
         commanded=force.peak,
         limit=limit,
         largest_factor=model.largest_factor(motion, limit, leader, uncertainty),
-        check=model.check(motion, force, CASES, rng),
+        check=model.check(motion, force, cases, rng),
     )
 
 

@@ -20,7 +20,7 @@ from hybrid_opt.collision.verdict import sample_durations
 from symbolic.geometry.coal_shapes import coal_distance, coal_geometry
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.geometry.pieces import Piece
-from symbolic.workcell.records import AllowedContact, CollisionSettings, Workcell
+from symbolic.workcell.records import AllowedContact, CollisionSettings, Uncertainty, Workcell
 from tests.symbolic.geometry.collision_cells import (
     Configurations,
     functions_of,
@@ -183,19 +183,36 @@ def only_payload(cell: Workcell) -> CellGeometry:
     return replace(geometry, active=(geometry.active[k],))
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.003])
-def test_the_tolerance_is_decided_alike_with_and_without_screening(tolerance: float) -> None:
-    """Gaps a hair below, at and above the tolerance: one judge, so one answer."""
-    cell = replace(rack(), collision=CollisionSettings(tolerance=tolerance))
+@pytest.mark.parametrize(("tolerance", "displaced"), [(0.0, 0.0), (0.003, 0.0), (0.001, 0.002)])
+def test_the_tolerance_is_decided_alike_with_and_without_screening(
+    tolerance: float, displaced: float
+) -> None:
+    """Gaps a hair below, at and above the tolerance: one judge, so one answer. Pads that may be
+    displaced have the payload as much nearer."""
+    cell = replace(
+        rack(),
+        collision=CollisionSettings(tolerance=tolerance),
+        uncertainty=Uncertainty(pad_position=displaced),
+    )
     judge = checker_of(only_payload(cell))
     offsets = [s * d for d in (1e-3, 2e-5, 1e-5, 1e-6, 1e-8, 0.0) for s in (-1.0, 1.0)]
-    at = above_board([tolerance + offset for offset in offsets])
+    at = above_board([tolerance + displaced + offset for offset in offsets])
     time = np.arange(float(len(offsets)))
     screened = judge.check(*at, time).colliding
     assert screened.tolist() == judge.check(*at, time, screened=False).colliding.tolist()
     for offset, hit in zip(offsets, screened, strict=True):
         if abs(offset) > RESOLUTION:
             assert hit == (offset < 0.0)
+
+
+def test_only_the_payload_is_kept_farther_for_displaced_pads() -> None:
+    """Arms are where they are told to be, whatever they took hold of."""
+    settings = CollisionSettings(tolerance=0.001)
+    cell = replace(rack(), collision=settings, uncertainty=Uncertainty(pad_position=0.002))
+    geometry = build_geometry(cell)
+    expected = [0.003 if "payload" in names else 0.001 for names in geometry.pair_names]
+    np.testing.assert_allclose(geometry.tolerance, expected)
+    assert {0.001, 0.003} == set(np.round(geometry.tolerance, 6).tolist())
 
 
 @settings(max_examples=60, deadline=None)

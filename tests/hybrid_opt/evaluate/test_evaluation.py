@@ -21,7 +21,7 @@ from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
 from symbolic.functions.candidate import CONSTRAINTS
 from symbolic.workcell.file import load
-from symbolic.workcell.records import CollisionSettings, Workcell
+from symbolic.workcell.records import CollisionSettings, Uncertainty, Workcell
 from tests.hybrid_opt.collision.test_checker import checker_of, resting_cell
 from tests.symbolic.cells import RACK
 from tests.symbolic.geometry.collision_cells import geometry_of, random_configurations
@@ -103,13 +103,18 @@ def test_a_batch_is_its_candidates_one_by_one() -> None:
 
 
 @pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
-@pytest.mark.parametrize("tolerance", [0.0, 0.02])
+@pytest.mark.parametrize(("tolerance", "displaced"), [(0.0, 0.0), (0.01, 0.02)])
 def test_the_plain_check_places_what_the_compiled_one_places(
-    name: str, tolerance: float, tmp_path: Path
+    name: str, tolerance: float, displaced: float, tmp_path: Path
 ) -> None:
-    """Meshes, every kind of obstacle, a tolerance: pair by pair on random configurations."""
+    """Meshes, every kind of obstacle, a tolerance, displaced pads: pair by pair on random
+    configurations."""
     cell = geometry_of(name, tmp_path).workcell
-    cell = replace(cell, collision=CollisionSettings(tolerance=tolerance))
+    cell = replace(
+        cell,
+        collision=CollisionSettings(tolerance=tolerance),
+        uncertainty=Uncertainty(pad_position=displaced),
+    )
     geometry = replace(geometry_of(name, tmp_path), workcell=cell)
     plain = PlainCollisionChecker(cell)
     plain.pairs = geometry.pair_names
