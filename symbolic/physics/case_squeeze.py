@@ -48,8 +48,8 @@ def case_slack_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate (6,), a case (15,), force [N] and arm to slack.
 
     With the force commanded of the arm (0 or 1), a pressure that shares everything evenly holds the
-    case where slack is positive; elsewhere `case_squeeze_function` knows. It takes a hundredth of
-    that one's time.
+    case where slack is positive; elsewhere `case_squeeze_function` knows. It takes a
+    thirtieth of that one's time.
     """
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case, force, arm = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force"), ca.SX.sym("arm")
