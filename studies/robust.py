@@ -12,7 +12,8 @@ import numpy as np
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.store.trajectory_file import read_trajectory
-from studies.options import add_leader, seed, whole
+from hybrid_opt.timing import TimingLimits, time_path
+from studies.options import add_leader, force, seed, whole
 from studies.program import program_of, run_program
 from studies.text_table import number, text_table
 from symbolic.array import Array
@@ -38,6 +39,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--points", type=whole(2, 1000), default=9, help="points of the price curve"
     )
+    parser.add_argument(
+        "--force-limit",
+        type=force,
+        metavar="N",
+        help="time the path as fast as forces below this allow, planned ones and those that hold "
+        "in all cases (arm 1 leads)",
+    )
     parser.add_argument("--seed", type=seed, default=1, help="of the random cases")
     return parser
 
@@ -47,18 +55,20 @@ def _run(options: argparse.Namespace) -> int:
     with TemporaryDirectory() as folder:
         cell = Cell(stored.unpack(Path(folder)))
         carry = cell.carry(stored.x)
+        limit = options.force_limit
+        timed = [] if limit is None else _timed(cell, stored.x, limit)
     model, leader = RobustModel(cell.workcell), options.leader - 1
-    limit = cell.workcell.task.reference_force
-    force = model.robust_force(carry, leader=leader)
+    reference = cell.workcell.task.reference_force
+    held = model.robust_force(carry, leader=leader)
     factors = np.linspace(0.0, 2.0, options.points)
     factors = factors[factors < model.allowed_factor]
     price = model.price(carry, factors, leader)
-    largest = model.largest_factor(carry, limit, leader)
-    check = model.check(carry, force, options.cases, np.random.default_rng(options.seed))
+    largest = model.largest_factor(carry, reference, leader)
+    check = model.check(carry, held, options.cases, np.random.default_rng(options.seed))
     print(f"{cell.workcell.name}: arm {options.leader} leads, the other's force is commanded")
-    print(f"  least peak forces, nothing uncertain {_both(force.nominal.max(axis=0))} N")
-    print(f"  peak forces that hold in all cases   {_both(force.peak)} N")
-    print(f"  reference forces                     {_both(limit)} N")
+    print(f"  least peak forces, nothing uncertain {_both(held.nominal.max(axis=0))} N")
+    print(f"  peak forces that hold in all cases   {_both(held.peak)} N")
+    print(f"  reference forces                     {_both(reference)} N")
     print(f"  they allow {largest:.3f} times the set")
     rows = [("times the set", "peak force 1 [N]", "peak force 2 [N]")]
     rows += [
@@ -71,7 +81,19 @@ def _run(options: argparse.Namespace) -> int:
         f"\n  {check.cases} random cases (seed {options.seed}): {verdict}; the hardest needs "
         f"{100.0 * check.closest:.2f} % of the commanded force"
     )
+    for text in timed:
+        print(f"  {text}")
     return 0 if check.holds else EXIT_DOES_NOT_HOLD
+
+
+def _timed(cell: Cell, x: Array, limit: float) -> list[str]:
+    """How fast the path is within a force limit [N] on planned and on robust forces."""
+    found = []
+    for text, robust in (("planned forces", False), ("forces that hold in all cases", True)):
+        timing = time_path(cell.timing_model, x, TimingLimits(force=limit, robust=robust))
+        told = f"{timing.duration:.3f} s" if timing.ok else timing.reason
+        found.append(f"{text} below {limit:g} N: {told}")
+    return found
 
 
 def _both(values: Array) -> str:

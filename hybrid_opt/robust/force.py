@@ -109,12 +109,7 @@ class RobustModel:
             SettingsError: the pads do not face one another, so that some cases cannot be held.
             DualArmError: the function cannot be built.
         """
-        room = PATCH_OVERLAP * sum(contact.patch_radius for contact in workcell.contacts)
-        if pads_beside(workcell) >= room:
-            raise SettingsError(
-                f"the contacts lie {pads_beside(workcell):g} m beside one another; robust forces "
-                f"need less than {room:g} m, so that pressing harder holds whatever happens"
-            )
+        check_pads(workcell)
         self.workcell = workcell
         self._function = compile_function(case_squeeze_function(workcell), cache, lanes=0)
         self._slack = compile_function(case_slack_function(workcell), cache, lanes=0)
@@ -150,19 +145,13 @@ class RobustModel:
         """
         if leader not in (0, 1):
             raise SettingsError(f"leader {leader}: give 0 or 1, the index of an arm")
-        if not allowed_factor(self.workcell, uncertainty) > 1.0:
-            raise SettingsError(
-                "the uncertainty leaves no friction or no patch; make its shares or pad_position "
-                "smaller"
-            )
+        check_set(self.workcell, uncertainty)
         worst = self.least_squeeze(motion, worst_cases(self.workcell, uncertainty))
         follower = 1 - leader
         commanded = worst[:, :, follower].max(axis=0)
-        # The difference of both normal forces is the motion's, whatever the squeeze, and
-        # proportional to the mass.
         difference = worst[:, :, leader] - worst[:, :, follower]
-        lighter = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass) * difference
-        return commanded, commanded + np.maximum(difference, lighter).max(axis=0)
+        share = felt_share(uncertainty, difference)
+        return commanded, commanded + (share * difference).max(axis=0)
 
     def robust_force(
         self, motion: Motion, uncertainty: Uncertainty | None = None, leader: int = 0
@@ -249,6 +238,43 @@ class RobustModel:
             middle = (low + high) / 2.0
             low, high = (middle, high) if within(middle) else (low, middle)
         return low
+
+
+def felt_share(uncertainty: Uncertainty, difference: Array) -> Array:
+    """Of the difference of both normal forces under the largest mass, what the leading arm feels in
+    the worst case: all of it, or where the leader is relieved, that of the least mass.
+
+    The difference is the motion's, whatever the squeeze, and proportional to the mass.
+    """
+    lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
+    return np.where(difference > 0.0, 1.0, lightest)
+
+
+def check_pads(workcell: Workcell) -> None:
+    """Refuse pads that do not face one another.
+
+    Raises:
+        SettingsError: some cases cannot be held, however hard both press.
+    """
+    room = PATCH_OVERLAP * sum(contact.patch_radius for contact in workcell.contacts)
+    if pads_beside(workcell) >= room:
+        raise SettingsError(
+            f"the contacts lie {pads_beside(workcell):g} m beside one another; robust forces "
+            f"need less than {room:g} m, so that pressing harder holds whatever happens"
+        )
+
+
+def check_set(workcell: Workcell, uncertainty: Uncertainty) -> None:
+    """Refuse sets that nothing can hold.
+
+    Raises:
+        SettingsError: the set leaves no friction or no patch.
+    """
+    if not allowed_factor(workcell, uncertainty) > 1.0:
+        raise SettingsError(
+            "the uncertainty leaves no friction or no patch; make its shares or pad_position "
+            "smaller"
+        )
 
 
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:

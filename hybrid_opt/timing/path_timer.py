@@ -65,7 +65,8 @@ class PathTiming:
 
 class PathTimer:
     """Times paths of one workcell. Where it has no compiled passes it asks `time_path`, which is
-    slow: without a C compiler, and with the joint allocation of the contact forces.
+    slow: without a C compiler, with the joint allocation of the contact forces, and where robust
+    forces are limited.
 
     Attributes:
         workcell: the cell.
@@ -161,7 +162,7 @@ class PathTimer:
         """As `time_all`, with the answers of `path_limits` known already."""
         found = [self._path_failure(paths, row) for row in range(len(limits))]
         rows = [row for row, failure in enumerate(found) if failure is None]
-        if rows and self._passes is None:
+        if rows and (self._passes is None or any(limit.robust for limit in limits)):
             timings = [from_time_path(time_path(self._model, x[r], limits[r])) for r in rows]
         elif rows and self._passes is not None:
             options = np.array([_options(limits[row]) for row in rows])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_opt.robust.path_force import robust_path
 from hybrid_opt.timing import rows as rows_of
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel, contact_torque
 from hybrid_opt.timing.records import TimingLimits
@@ -77,7 +78,17 @@ class PointLimits:
         if self._limits.force is None:
             return []
         tangent = rows_of.tangent_direction(self.points, self._model.workcell, a, w)
-        return [rows_of.force_rows(self.points, self._model.workcell, self._limits.force, tangent)]
+        force = self._limits.force
+        cuts = [rows_of.force_rows(self.points, self._model.workcell, force, tangent)]
+        if self._limits.robust:
+            value, slope = self._robust(a, w)
+            cuts.append(rows_of.tangent_rows(value / force, slope / force, np.stack([a, w], 1)))
+        return cuts
+
+    def _robust(self, a: Array, w: Array) -> tuple[Array, Array]:
+        p = self.points
+        path = (p.pose[:, :6], p.pose_first[:, :6], p.pose_second[:, :6])
+        return robust_path(self._model.workcell).at(path, a, w)
 
     def cut(self, a: Array, w: Array) -> tuple[list[PointRows], float]:
         """Supporting lines of the convex limits that a timing exceeds, and the largest excess."""
@@ -96,8 +107,10 @@ class PointLimits:
                 direction = vector / np.maximum(length, 1e-12)
                 cuts.append(rows_of.norm_rows(first, second, limit, direction[:, None, :]))
         if self._limits.force is not None:
-            load = self._model.drive(p, np.sqrt(w), a)
-            excess = float(load["normal_force"].max()) / self._limits.force - 1.0
+            largest = float(self._model.drive(p, np.sqrt(w), a)["normal_force"].max())
+            if self._limits.robust:
+                largest = max(largest, float(self._robust(a, w)[0].max()))
+            excess = largest / self._limits.force - 1.0
             worst_excess = max(worst_excess, excess)
             # What the force limit leaves for the motion is small, so the whole of it counts.
             if excess > POINT_TOLERANCE * FORCE_SHARPNESS:

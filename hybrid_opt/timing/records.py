@@ -72,14 +72,19 @@ class TimingLimits:
         torque: whether joint torques (arm and contact wrench together) are limited.
         pressure: whether the centres of pressure have to stay within their patches.
         reference_speed: whether the box stays at or below the task's reference speeds.
+        robust: whether the force limit holds in every case of the workcell's uncertainty, the first
+            arm leading (`hybrid_opt.robust`), and not only for the planned forces.
     """
 
     force: float | None = None
     torque: bool = True
     pressure: bool = True
     reference_speed: bool = False
+    robust: bool = False
 
     def __post_init__(self) -> None:
+        if self.robust and self.force is None:
+            raise SettingsError("robust forces are limited by a force: give one")
         if self.force is not None and not 0.0 < self.force < float("inf"):
             raise SettingsError(f"force limit {self.force:g} N: give a finite positive force")
 

@@ -153,6 +153,18 @@ def tangent_direction(motion: PathMotion, workcell: Workcell, a: Array, w: Array
     return _unit(force - np.sum(force * motion.normal, axis=1, keepdims=True) * motion.normal)
 
 
+def tangent_rows(value: Array, gradient: Array, z: Array) -> PointRows:
+    """Supporting lines of convex values <= 1, touching them at z.
+
+    Args:
+        value: (n, k) at z.
+        gradient: (n, k, 2) by (u'', u'^2).
+        z: (n, 2).
+    """
+    bound = 1.0 - value + np.einsum("nkd,nd->nk", gradient, z)
+    return PointRows(gradient[..., 0], gradient[..., 1], bound)
+
+
 def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> PointRows:
     """Linearisation of value <= 1 about z, kept satisfiable at rest.
 
@@ -162,9 +174,9 @@ def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> 
         at_rest: (n, k) at u'' = u'^2 = 0, below one.
         z: (n, 2) the point of linearisation.
     """
-    bound = 1.0 - value + np.einsum("nkd,nd->nk", gradient, z)
+    lines = tangent_rows(value, gradient, z)
     # Rest is truly allowed; a linearisation from far away must not forbid it.
-    return PointRows(gradient[..., 0], gradient[..., 1], np.maximum(bound, (1.0 - at_rest) / 2.0))
+    return PointRows(lines.alpha, lines.beta, np.maximum(lines.bound, (1.0 - at_rest) / 2.0))
 
 
 def _unit(vectors: Array) -> Array:

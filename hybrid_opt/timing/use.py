@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybrid_opt.carry import Carry
+from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing.records import Excess, Place, TimingLimits
 from symbolic.array import Array
 from symbolic.functions.candidate import TIMING_TOLERANCE
@@ -53,12 +54,20 @@ def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict
     if limits_pressure(workcell, limits):
         ratios["pressure shift"] = carry.pressure_shift / radius
     if limits.force is not None:
-        ratios["normal force"] = carry.normal_force / limits.force
+        ratios["normal force"] = limited_force(carry, workcell, limits) / limits.force
     if limits.reference_speed:
         ratios["path speed"] = np.maximum(
             linear / task.reference_speed, angular / task.reference_angular_speed
         )
     return ratios
+
+
+def limited_force(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array:
+    """(n, 2) normal forces that the force limit holds for: planned, and robust ones where asked."""
+    if not limits.robust:
+        return carry.normal_force
+    commanded, leading = robust_model(workcell).hold(carry, workcell.uncertainty)
+    return np.maximum(carry.normal_force, np.stack([leading, commanded], axis=1))
 
 
 def limits_pressure(workcell: Workcell, limits: TimingLimits) -> bool:

@@ -28,6 +28,9 @@ CASE_SIZES = {
 the box frame [m]; acceleration beside the motion's, world frame [m/s^2]; displacements of both
 pads along the tangents of contact 1 [m]."""
 
+SQUARED_SPEED_FLOOR = 1e-12
+"""Of u'^2 [1/s^2]; what it adds to a force is far below rounding."""
+
 CASE_SIZE = sum(CASE_SIZES.values())
 
 
@@ -42,6 +45,23 @@ def case_squeeze_function(workcell: Workcell) -> ca.Function:
     held = least_squeeze(_balance_function(workcell)(*motion, case), friction, radius)
     names = ["pose", "rate", "second_rate", "case"]
     return ca.Function("case_squeeze", [*motion, case], [held.normal], names, ["normal_force"])
+
+
+def case_slopes_function(workcell: Workcell) -> ca.Function:
+    """Box pose and its derivatives by u (6,), u'', u'^2 and a case (15,), see `CASE_SIZES`, to
+    normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 2)), of each
+    force by u'' and by u'^2."""
+    path = [ca.MX.sym(name, 6) for name in ("pose", "first", "second")]
+    a, w, case = ca.MX.sym("a"), ca.MX.sym("w"), ca.MX.sym("case", CASE_SIZE)
+    pose, first, second = path
+    # A root has no slope at rest, what follows from its square has.
+    motion = (pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w)
+    friction, radius, *_ = _parts(case)
+    held = least_squeeze(_balance_function(workcell)(*motion, case), friction, radius)
+    slope = ca.densify(ca.jacobian(held.normal, ca.vertcat(a, w)).T)
+    names = ["pose", "first", "second", "a", "w", "case"]
+    outputs = ["normal_force", "slope"]
+    return ca.Function("case_slopes", [*path, a, w, case], [held.normal, slope], names, outputs)
 
 
 def case_slack_function(workcell: Workcell) -> ca.Function:

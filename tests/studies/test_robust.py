@@ -33,8 +33,17 @@ def stored(folder: Path, table: str) -> Path:
 
 
 def test_tells_forces_price_and_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(stored(tmp_path, TABLE)), "--cases", "200", "--points", "3"]) == 0
+    assert (
+        main(
+            [str(stored(tmp_path, TABLE)), "--cases", "200", "--points", "3", "--force-limit", "66"]
+        )
+        == 0
+    )
     lines = capsys.readouterr().out.splitlines()
+    assert "below 66 N" in lines[-2]
+    planned, sure = (float(line.split()[-2]) for line in lines[-2:])
+    assert planned < sure
+    lines = lines[:-2]
     nominal, robust = (np.array(line.split()[-4:-1:2], dtype=float) for line in lines[1:3])
     assert (robust > 1.1 * nominal).all()
     assert lines[8].split()[-2:] == lines[1].split()[-4:-1:2]
