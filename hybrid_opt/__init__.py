@@ -18,7 +18,14 @@ if TYPE_CHECKING:
     from hybrid_opt.branches import search_branches
     from hybrid_opt.carry import Carry
     from hybrid_opt.cell import Cell
-    from hybrid_opt.door import polish, save, search, time_every_way, time_path
+    from hybrid_opt.door import (
+        polish,
+        save,
+        search,
+        time_every_way,
+        time_path,
+        time_with_jerk,
+    )
     from hybrid_opt.evaluate.objectives import Objective
     from hybrid_opt.front import Front
     from hybrid_opt.job.plan import plan_job
@@ -31,7 +38,7 @@ if TYPE_CHECKING:
     from hybrid_opt.store.export.formats import export
     from hybrid_opt.store.export.options import BundleOptions
     from hybrid_opt.store.export.origin import Origin
-    from hybrid_opt.timing.records import Timing, TimingLimits
+    from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
     from symbolic.errors import DualArmError
     from symbolic.workcell.records import Workcell
 
@@ -41,6 +48,8 @@ __all__ = [
     "Cell",
     "DualArmError",
     "Front",
+    "JerkLimits",
+    "JerkTiming",
     "Job",
     "Objective",
     "Origin",
@@ -61,6 +70,7 @@ __all__ = [
     "search_branches",
     "time_every_way",
     "time_path",
+    "time_with_jerk",
 ]
 
 _HOMES = {
@@ -69,6 +79,8 @@ _HOMES = {
     "Cell": "hybrid_opt.cell",
     "DualArmError": "symbolic.errors",
     "Front": "hybrid_opt.front",
+    "JerkLimits": "hybrid_opt.timing.records",
+    "JerkTiming": "hybrid_opt.timing.records",
     "Job": "hybrid_opt.job.records",
     "Objective": "hybrid_opt.evaluate.objectives",
     "Origin": "hybrid_opt.store.export.origin",
@@ -89,6 +101,7 @@ _HOMES = {
     "search_branches": "hybrid_opt.branches",
     "time_every_way": "hybrid_opt.door",
     "time_path": "hybrid_opt.door",
+    "time_with_jerk": "hybrid_opt.door",
 }
 
 

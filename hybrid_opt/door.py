@@ -17,10 +17,12 @@ from hybrid_opt.polishing.polisher import polisher_for
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
+from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk
 from hybrid_opt.timing.overview import TimedTrajectory, timed_trajectory
-from hybrid_opt.timing.records import Timing, TimingLimits
+from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path as solve_timing
 from symbolic.array import Array
+from symbolic.errors import SettingsError
 
 
 def search(
@@ -84,6 +86,29 @@ def time_path(cell: Cell, carry: Carry | Array, limits: TimingLimits | None = No
         SettingsError: the carry does not fit the cell.
     """
     return solve_timing(cell.timing_model, _decision(carry), limits or TimingLimits())
+
+
+def time_with_jerk(
+    cell: Cell,
+    carry: Carry | Array,
+    limits: TimingLimits | None = None,
+    jerk: JerkLimits | None = None,
+) -> JerkTiming:
+    """A fast timing within limits on jerk as well, at rest without acceleration at both ends.
+
+    Args:
+        carry, limits: as for `time_path`.
+        jerk: largest jerks; None for those that the workcell states.
+
+    Raises:
+        SettingsError: the carry does not fit the cell, or no jerk is limited.
+    """
+    jerk = jerk or JerkLimits.of(cell.workcell)
+    if jerk is None:
+        raise SettingsError(
+            "the workcell limits no jerk: give ho.JerkLimits, or state jerk_max of its robots"
+        )
+    return solve_with_jerk(cell.timing_model, _decision(carry), limits or TimingLimits(), jerk)
 
 
 def time_every_way(

@@ -12,7 +12,7 @@ from hybrid_opt import metaheuristics
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.execution import ExecutorName
 from hybrid_opt.campaign.settings import FirstGeneration
-from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.metaheuristics.problem import ConstraintHandling
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
@@ -85,7 +85,8 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         action="extend",
         metavar="NAME",
         help=f"what to minimise, of {', '.join(OBJECTIVES)} "
-        f"(default: {' '.join(_DEFAULT.objectives)})",
+        f"(default: {' '.join(PAPER_OBJECTIVES)}, in a cell under the time law 'optimal' "
+        f"{' '.join(DRIVABLE_OBJECTIVES)})",
     )
     search.add_argument(
         "--first-generation",
@@ -113,7 +114,8 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         "--polish",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="improve every front further (default: yes for the paper's two objectives)",
+        help="improve every front further (default: yes for the paper's two objectives and for "
+        "drivable carries)",
     )
     after.add_argument(
         "--polish-points",
@@ -191,8 +193,13 @@ def add_wishes(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def campaign_settings(options: argparse.Namespace) -> CampaignSettings:
+def campaign_settings(
+    options: argparse.Namespace, objectives: tuple[str, ...] = PAPER_OBJECTIVES
+) -> CampaignSettings:
     """The settings that the options give.
+
+    Args:
+        objectives: what is minimised where the options do not say.
 
     Raises:
         SettingsError: a value is not allowed.
@@ -207,7 +214,7 @@ def campaign_settings(options: argparse.Namespace) -> CampaignSettings:
         evaluations=evaluations,
         replicas=replicas,
         seed=options.seed,
-        objectives=_once(options.objective, _DEFAULT.objectives),
+        objectives=_once(options.objective, objectives),
         constraint_handling=options.constraint_handling,
         first_generation=options.first_generation,
         populations=tuple(options.population or ()),
@@ -215,20 +222,18 @@ def campaign_settings(options: argparse.Namespace) -> CampaignSettings:
 
 
 def polish_settings(
-    options: argparse.Namespace, points: int | None = None
+    options: argparse.Namespace, usual: bool, points: int | None = None
 ) -> PolishSettings | None:
     """How the options want fronts polished, None for not at all.
 
     Args:
-        points: solves of one front where the options do not say.
+        usual: whether they are polished where the options do not say.
+        points: solves of one front likewise.
 
     Raises:
         SettingsError: a value is not allowed.
     """
-    wanted = options.polish
-    if wanted is None:
-        wanted = campaign_settings(options).objectives == PAPER_OBJECTIVES
-    if not wanted:
+    if not (usual if options.polish is None else options.polish):
         return None
     if options.polish_points is not None:
         points = options.polish_points

@@ -15,6 +15,7 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators import metrics
 from studies.terminal_summary import title
 from symbolic.array import Array
+from symbolic.workcell.records import Workcell
 
 POLISHED = ", polished"
 """After an algorithm's title."""
@@ -71,9 +72,19 @@ class DrivableFronts:
         return found
 
 
-def drivable_root(root: Path, objectives: Sequence[str]) -> Path:
-    """Where a study's drivable experiment lies: in a folder inside, unless it is the only one."""
-    return root if tuple(objectives) == DRIVABLE_OBJECTIVES else root / DRIVABLE
+def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
+    """Whether an experiment already is the search for carries as robots drive them."""
+    return workcell.task.time_law == "optimal" and tuple(objectives) == DRIVABLE_OBJECTIVES
+
+
+def drivable_root(root: Path, workcell: Workcell, objectives: Sequence[str]) -> Path:
+    """Where the drivable experiment of a study lies: in a folder inside, unless it is the only one.
+
+    Args:
+        root: the study's results folder.
+        workcell, objectives: of its first experiment.
+    """
+    return root if is_drivable(workcell, objectives) else root / DRIVABLE
 
 
 def drivable_fronts(root: Path) -> DrivableFronts:

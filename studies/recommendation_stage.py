@@ -39,7 +39,7 @@ from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
-from studies.drivable import DrivableFronts, drivable_fronts, drivable_root
+from studies.drivable import DrivableFronts, drivable_fronts, drivable_root, is_drivable
 from studies.recommendation_text import export_command
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -92,11 +92,12 @@ def recommend_from(root: Path, wish: ho.Wish, path: Path) -> StoredRecommendatio
         ResultsError: the folder is not complete or damaged, or the file cannot be written.
     """
     campaign = read_campaign(root)
-    drivable = drivable_fronts(drivable_root(root, campaign.objectives))
+    drivable = drivable_fronts(drivable_root(root, campaign.workcell, campaign.objectives))
     if len(drivable.x) == 0:
         return None
     cell = ho.Cell(drivable.results.workcell, DRIVABLE_OBJECTIVES)
-    others = {} if campaign.objectives == DRIVABLE_OBJECTIVES else _least_force(campaign)
+    alone = is_drivable(campaign.workcell, campaign.objectives)
+    others = {} if alone else _least_force(campaign)
     found = ho.recommend(cell, drivable.x, wish, others)
     source = drivable.sources[found.member]
     provenance = {

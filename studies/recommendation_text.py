@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation, StoredRival
+from hybrid_opt.timing.document import StoredJerk
+from hybrid_opt.timing.records import TimingStatus
 from symbolic.array import Array
 
 EXPORT_FORM = "ros2"
@@ -53,6 +55,7 @@ def recommendation_text(
         ("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}"),
         ("file", str(Path(folder) / found.file)),
         ("export", export_command(Path(folder) / found.file, found.force_limit)),
+        *([] if found.jerk is None else [("within jerk limits", _jerk(found.jerk))]),
         ("press with", f"{_of_robots(found.squeeze, robots)}, {found.squeeze_reason}"),
         ("payload", f"up to {found.payload_limit:.2f} kg on the same motion"),
         *[(rival.label, _rival(rival, found)) for rival in found.rivals],
@@ -83,6 +86,16 @@ def export_command(path: Path, force: float) -> str:
     return (
         f"python -m studies.export {shlex.quote(str(path))} --form {EXPORT_FORM} "
         f"--force-limit {force:.6g} --output {shlex.quote(str(output))}"
+    )
+
+
+def _jerk(jerk: StoredJerk) -> str:
+    """What the cell's limits on jerk cost."""
+    if jerk.status != TimingStatus.OK:
+        return f"not found: {jerk.status}"
+    return (
+        f"{jerk.duration:.2f} s ({_percent(jerk.duration / jerk.without)}), at rest without "
+        "acceleration at both ends; this is what the export drives"
     )
 
 

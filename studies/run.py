@@ -22,6 +22,7 @@ from hybrid_opt.campaign.experiment_stage import drivable_stage
 from hybrid_opt.campaign.layout import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.polishing.drivable.point import is_polishable
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
@@ -34,6 +35,8 @@ from studies.cli import (
     polish_settings,
     wish,
 )
+from studies.drivable import is_drivable
+from studies.jerk_costs import jerk_costs, jerk_text
 from studies.program import add_verbose, carry_out, run_program
 from studies.recommendation_stage import recommendation_stage
 from studies.recommendation_text import recommendation_text
@@ -42,6 +45,7 @@ from studies.summary_stage import summary_stage
 from studies.terminal_summary import terminal_summary
 from studies.timing_stage import timing_stage
 from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
 
 PAGE = "report.html"
 """The report in a results folder."""
@@ -75,23 +79,29 @@ class StudySettings:
     with_paper: bool = False
 
 
-def stages(study: StudySettings) -> tuple[Stage, ...]:
-    """The stages of a study, in order."""
+def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
+    """The stages of a study, in order.
+
+    Args:
+        alone: whether its first experiment is the drivable one already, so that it has no other.
+    """
     every = [search_stage()]
     if study.polish is not None:
         every.append(polish_stage(study.polish))
-    if study.drivable:
+    if study.drivable and not alone:
         inner = [] if study.drivable_polish is None else [polish_stage(study.drivable_polish)]
-        every.append(drivable_stage([search_stage(), *inner, summary_stage()]))
+        driven = [search_stage(), *inner, summary_stage(), timing_stage(last=True)]
+        every.append(drivable_stage(driven))
+    if study.drivable:
         every.append(recommendation_stage(study.wish))
-    every += [summary_stage(), timing_stage(study.wish.force)]
+    every += [summary_stage(), timing_stage(study.wish.force, last=alone)]
     if study.report:
         every.append(report_stage(study.with_paper))
     return tuple(every)
 
 
 def run_study(
-    workcell: Path,
+    workcell: Workcell,
     settings: CampaignSettings,
     execution: ExecutionSettings,
     progress: Progress,
@@ -100,7 +110,7 @@ def run_study(
     """Carry out all stages that are not done, and return the figures as text.
 
     Args:
-        workcell: the workcell file.
+        workcell: the cell, read from its file.
         settings: what to compute.
         execution: how.
         progress: where to show it.
@@ -109,13 +119,15 @@ def run_study(
     Raises:
         DualArmError: the workcell, a setting or the results folder is wrong, or work failed.
     """
-    cell, competition = decided_cell(load(workcell), settings, execution)
-    if study.drivable_polish is not None and not is_polishable(cell.task):
+    cell, competition = decided_cell(workcell, settings, execution)
+    alone = is_drivable(cell, settings.objectives)
+    polish = study.polish if alone else study.drivable_polish
+    if polish is not None and not is_polishable(cell.task):
         progress.note("the drivable carries of this cell cannot be polished: search alone")
-        study = replace(study, drivable_polish=None)
+        study = replace(study, drivable_polish=None, polish=None if alone else study.polish)
     with open_folder(settings, execution, cell) as folder:
         told = store_branches(folder.root, competition)
-        run_stages(folder, stages(study), progress)
+        run_stages(folder, stages(study, alone), progress)
         return told + study_text(folder.root, study.with_paper)
 
 
@@ -132,7 +144,8 @@ def study_text(root: Path, with_paper: bool) -> str:
     )
     beside = (root / DRIVABLE / SUMMARY).exists()
     drivable = read_summary(root / DRIVABLE) if beside else None
-    return terminal_summary(summary, with_paper, words, drivable)
+    costs = jerk_text(jerk_costs(root / DRIVABLE if beside else root))
+    return terminal_summary(summary, with_paper, words, drivable, costs)
 
 
 def main(
@@ -160,15 +173,19 @@ def main(
 
     def work() -> int:
         options = parser.parse_args(arguments)
-        cell: Path = options.workcell if workcell is None else workcell
-        settings = campaign_settings(options)
-        execution = execution_settings(options, Path("results") / cell.stem)
+        path: Path = options.workcell if workcell is None else workcell
+        cell = load(path)
+        driven = cell.task.time_law == "optimal"
+        settings = campaign_settings(options, DRIVABLE_OBJECTIVES if driven else PAPER_OBJECTIVES)
+        alone = is_drivable(cell, settings.objectives)
+        polishable = alone or (not driven and settings.objectives == PAPER_OBJECTIVES)
+        execution = execution_settings(options, Path("results") / path.stem)
         if execution.executor == "processes":
             warm_up(*WORKERS_LOAD)
         study = StudySettings(
-            polish=polish_settings(options),
+            polish=polish_settings(options, polishable, DRIVABLE_POLISH_POINTS if alone else None),
             drivable=options.drivable,
-            drivable_polish=polish_settings(options, DRIVABLE_POLISH_POINTS),
+            drivable_polish=polish_settings(options, True, DRIVABLE_POLISH_POINTS),
             wish=wish(options),
             report=options.report,
             with_paper=bool(workcell),

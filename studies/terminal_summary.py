@@ -60,6 +60,7 @@ def terminal_summary(
     with_paper: bool,
     recommendation: str = "",
     drivable: CampaignSummary | None = None,
+    jerk: str = "",
 ) -> str:
     """The figures of a summary.json as text.
 
@@ -68,6 +69,7 @@ def terminal_summary(
         with_paper: whether to print what the paper states, which is of its rack cell.
         recommendation: the words about the carry to run, which come first.
         drivable: figures of the drivable experiment beside this one.
+        jerk: the words about what limits on jerk cost.
     """
     settings = summary.settings
     parts = [
@@ -89,6 +91,7 @@ def terminal_summary(
             f"The drivable experiment\n{_drivable(drivable)}",
             bounds_sentence(drivable.bounds),
         ]
+    parts.append(jerk)
     if with_paper:
         parts.append(_paper(summary.algorithms))
     return "\n\n".join(part for part in parts if part)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
 from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.campaign.layout import SELECTED
+from hybrid_opt.campaign.layout import POLISHED_SUFFIX, SELECTED
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
@@ -21,22 +21,28 @@ TIMING = "timing"
 """Folder of the timings in a results folder, laid out as that of the selected trajectories."""
 
 
-def timing_stage(force_limit: float | None = None) -> Stage:
+def timing_stage(force_limit: float | None = None, last: bool = False) -> Stage:
     """The stage that writes `timing/`: one document per selected trajectory.
 
     Args:
         force_limit: normal force [N] of an additional, force-limited timing.
+        last: whether of replicas that were polished only the polished one is timed.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        _run(folder, progress, force_limit)
+        _run(folder, progress, force_limit, last)
 
     return Stage(TIMING, run, {"force_limit": force_limit})
 
 
-def _run(folder: CampaignFolder, progress: Progress, force_limit: float | None) -> None:
+def _run(folder: CampaignFolder, progress: Progress, force_limit: float | None, last: bool) -> None:
     selected = folder.root / SELECTED
     files = sorted(path.relative_to(selected) for path in selected.rglob("*.json"))
+    if last:
+        known = {str(path) for path in files}
+        files = [
+            path for path in files if f"{path.parent}{POLISHED_SUFFIX}/{path.name}" not in known
+        ]
     found = {file: read_trajectory(selected / file).x for file in files}
     job = Job(TimingModelSource(PackedCell.of(folder.archive)), _document)
     requests = [(x, force_limit) for x in found.values()]

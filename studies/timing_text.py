@@ -18,6 +18,9 @@ def timing_text(timed: TimedTrajectory) -> str:
         + text_table([head, *rows], left=(0, 1)),
         "\n".join(f"{name}: {timing.reason}" for name, timing in report.timings.items()),
     ]
+    if report.jerk is not None:
+        without, cost = report.jerk.without, 100.0 * report.jerk.cost
+        parts.append(f"Limits on jerk cost {number(cost, 1)} % of {number(without, 3)} s")
     if timed.margins:
         parts.append(_margins(timed.margins))
     if timed.curve is not None:

@@ -13,6 +13,7 @@ STAGES = "stages"
 FRONTS = "fronts"
 SELECTED = "selected"
 POLISHED = "polished"
+POLISHED_SUFFIX = "-polished"
 DRIVABLE = "drivable"
 RECOMMENDED = "recommended.json"
 RECOMMENDATION = "recommendation.json"
@@ -42,7 +43,7 @@ def polished_folder(root: Path, algorithm: str, replica: int) -> Path:
 
 def polished_selected_file(root: Path, algorithm: str, replica: int) -> Path:
     """Trajectory file of the solution selected from a replica's polished front."""
-    return root / SELECTED / f"{algorithm}-polished" / f"{replica:02d}.json"
+    return root / SELECTED / f"{algorithm}{POLISHED_SUFFIX}" / f"{replica:02d}.json"
 
 
 def reference_front_file(root: Path) -> Path:

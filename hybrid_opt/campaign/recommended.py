@@ -9,6 +9,7 @@ from hybrid_opt.recommending.recommendation import Recommendation
 from hybrid_opt.robust.price import RobustPrice
 from hybrid_opt.store.json_records import Figure
 from symbolic.array import Array
+from hybrid_opt.timing.document import StoredJerk
 
 
 @dataclass(frozen=True)
@@ -174,6 +175,7 @@ class StoredRecommendation:
         considered: carries that it was chosen from.
         durations: how long all fronts take at the same forces.
         price: of robustness, null where no set leaves friction and patches.
+        jerk: what the cell's limits on jerk make of it, None without any.
     """
 
     wish: StoredWish
@@ -194,6 +196,7 @@ class StoredRecommendation:
     considered: Count
     durations: ForceTable
     price: StoredPrice | None = None
+    jerk: StoredJerk | None = None
 
 
 @dataclass(frozen=True)
@@ -227,4 +230,5 @@ def stored_recommendation(found: Recommendation, told: Told) -> StoredRecommenda
         margins=tuple(StoredMargin(**vars(margin)) for margin in found.margins),
         unsure=tuple(StoredUnsure(**vars(doubt)) for doubt in found.unsure),
         warnings=found.warnings,
+        jerk=None if found.jerk is None else StoredJerk.of(found.jerk),
     )

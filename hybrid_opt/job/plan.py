@@ -25,7 +25,7 @@ from hybrid_opt.job.forces import held, pressing, without_force
 from hybrid_opt.job.limits import EXCESS, phase_use
 from hybrid_opt.job.profile import rise
 from hybrid_opt.job.records import Force, Job, Motion, Phase
-from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, smoothed
+from hybrid_opt.job.smooth import WIDEST, WIDTH, limits_of, rests_at_ends, smoothed
 from hybrid_opt.job.straight import (
     SAMPLES,
     Straight,
@@ -37,8 +37,9 @@ from hybrid_opt.job.straight import (
 )
 from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.squeeze import SqueezeSettings, chosen_squeeze
+from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.records import Timing
+from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.robot.arm import REACH_TOLERANCE
@@ -85,6 +86,7 @@ class JobModel:
         self.timing = TimingModel(compiled) if timing is None else timing
         self._posture: NumericFunction = compiled.evaluators["posture"]
         self._collisions = JobCollisions(compiled)
+        self._jerk = JerkLimits.of(compiled.workcell)
 
     def plan(
         self,
@@ -99,7 +101,8 @@ class JobModel:
             timing: of a carry of this workcell, one that robots can drive.
             squeeze: how hard to press; None for the defaults.
             smoothing: half the width of the window over which a timing whose acceleration jumps is
-                averaged [s]; zero leaves it as it is.
+                averaged [s]; zero leaves it as it is. Where the workcell limits jerk, any other
+                value asks for a timing within these limits instead.
             handling: in place of the workcell's own.
 
         Raises:
@@ -115,7 +118,7 @@ class JobModel:
         if not 0.0 <= smoothing <= WIDEST:
             raise SettingsError(f"smoothing over {smoothing:g} s: allowed is 0 to {WIDEST:g} s")
         if smoothing > 0.0 and not rests_at_ends(timing):
-            timing = smoothed(self.timing, timing, smoothing)
+            timing = self._without_jumps(timing, smoothing)
             carry = timing.carry
         assert carry is not None, "a smoothed timing has a carry"
         chosen = chosen_squeeze(self.workcell, squeeze or SqueezeSettings())
@@ -156,6 +159,17 @@ class JobModel:
         )
         refuse_excess(job)
         return job
+
+    def _without_jumps(self, timing: Timing, width: float) -> Timing:
+        """A timing of the same path within the same limits whose acceleration does not jump."""
+        if self._jerk is None:
+            return smoothed(self.timing, timing, width)
+        assert timing.carry is not None, "a timing that is to be driven has a carry"
+        x, limits = timing.carry.x, limits_of(timing)
+        found = time_with_jerk(self.timing, x, limits, self._jerk).timing
+        if found.carry is None:
+            raise JobError(f"no timing within the limits on jerk: {found.reason}")
+        return found
 
     def _handling(
         self, carry: Carry, places: tuple[Standing, Standing], handling: Handling
@@ -219,7 +233,9 @@ class JobModel:
     ) -> Iterator[Phase]:
         begin = 0.0
         for name, motion, force, proof in planned:
-            use = phase_use(self.workcell, motion, force)
+            # A carry that is to keep its jumps is told so elsewhere.
+            jumps = name == "carry" and not rests_at_ends(timing)
+            use = phase_use(self.workcell, motion, force, None if jumps else self._jerk)
             if name == "carry":
                 # The box's turning and the contacts, which no other phase uses more.
                 use = {key: excess.ratio for key, excess in timing.use.items()} | use

@@ -9,14 +9,13 @@ speeds are passed a little earlier or later, is mended by slowing down uniformly
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import JobError
-from hybrid_opt.timing.model import PathMotion, TimingModel
+from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.use import limit_use, worst
 from symbolic.array import Array
@@ -68,8 +67,8 @@ def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing
     assert carry is not None, "a timing that is to be driven has a carry"
     assert speed is not None, "a timing that was found has its speeds"
     u, rate, second = _averaged(speed, width)
-    motion = _between(model.path_motion(carry.x), u)
-    limits = _limits_of(timing, carry)
+    motion = model.path_motion(carry.x).between(u)
+    limits = limits_of(timing)
 
     def driven(factor: float) -> Carry:
         time = np.asarray(EVERY * STEP / factor * np.arange(len(u)))
@@ -128,21 +127,13 @@ def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
     return np.clip(u[keep], 0.0, 1.0), np.maximum(rate[keep], 0.0), second[keep]
 
 
-def _between(motion: PathMotion, u: Array) -> PathMotion:
-    """The geometry of a path between its samples, which are dense."""
-    values = {
-        field.name: CubicSpline(motion.parameter, getattr(motion, field.name))(u)
-        for field in fields(motion)
-        if field.name not in ("x", "parameter")
-    }
-    return PathMotion(x=motion.x, parameter=u, **values)
-
-
-def _limits_of(timing: Timing, carry: Carry) -> TimingLimits:
+def limits_of(timing: Timing) -> TimingLimits:
     """The limits that a timing was found for, as its use of them tells."""
+    assert timing.carry is not None, "a timing that is to be driven has a carry"
     force = timing.use.get("normal force")
     return TimingLimits(
-        force=None if force is None else float(carry.normal_force.max()) / force.ratio,
+        force=None if force is None else float(timing.carry.normal_force.max()) / force.ratio,
         torque="joint torque" in timing.use,
+        pressure="pressure shift" in timing.use,
         reference_speed="path speed" in timing.use,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from codegen.function import NumericFunction
 from hybrid_opt.carry import joints_of
@@ -12,6 +13,7 @@ from hybrid_opt.errors import JobError
 from hybrid_opt.job.profile import PEAK_RATE, at_even_steps, rise
 from hybrid_opt.job.records import Motion
 from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array
 from symbolic.physics.pose import rotation_from_rpy
 from symbolic.robot.arm import REACH_TOLERANCE
@@ -47,6 +49,11 @@ class Straight:
         """Of the longest way [m]."""
         ways = np.concatenate([self.box[None], self.held])
         return float(np.linalg.norm((ways[:, 1] - ways[:, 0])[:, :3], axis=1).max())
+
+    @property
+    def box_length(self) -> float:
+        """Of the box's way [m]."""
+        return float(np.linalg.norm((self.box[1] - self.box[0])[:3]))
 
     def at(self, share: Array) -> tuple[Array, Array, Array]:
         """Poses (n, 6) at shares (n,) of the way: box, and those that either pad holds."""
@@ -155,6 +162,7 @@ def timed(model: TimingModel, line: Straight, q: Array) -> Motion:
     q_rate = both("q_first") * v
     q_second = both("q_second") * w + both("q_first") * a
     rate, second_rate = v * way, a * way
+    third = CubicSpline(unit.time, q_second).derivative()(unit.time)
     limits = _Limits.of(model.workcell)
     duration = max(
         PEAK_RATE * line.length / line.speed,
@@ -162,6 +170,8 @@ def timed(model: TimingModel, line: Straight, q: Array) -> Motion:
         float((np.abs(q_second) / limits.joint_acceleration).max()) ** 0.5,
         float(np.linalg.norm(rate[:, :3], axis=1).max()) / limits.velocity,
         (float(np.linalg.norm(second_rate[:, :3], axis=1).max()) / limits.acceleration) ** 0.5,
+        float((np.abs(third) / limits.jerk.joints).max()) ** (1.0 / 3.0),
+        (float(np.abs(unit.third).max()) * line.box_length / limits.jerk.payload) ** (1.0 / 3.0),
     )
     T = max(at_even_steps(duration, TICK), TICK)
     moving = both("torque_by_acceleration") * a + both("torque_by_speed") * w
@@ -209,6 +219,7 @@ class _Limits:
     joint_acceleration: Array
     velocity: float
     acceleration: float
+    jerk: JerkLimits
 
     @classmethod
     def of(cls, workcell: Workcell) -> _Limits:
@@ -217,4 +228,5 @@ class _Limits:
             for name in ("velocity_max", "acceleration_max")
         ]
         payload = workcell.payload
-        return cls(joints[0], joints[1], payload.velocity_max, payload.acceleration_max)
+        jerk = JerkLimits.of(workcell) or JerkLimits(np.full(len(joints[0]), np.inf))
+        return cls(joints[0], joints[1], payload.velocity_max, payload.acceleration_max, jerk)

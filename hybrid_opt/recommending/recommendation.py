@@ -17,7 +17,8 @@ from hybrid_opt.recommending.squeeze import Commanded, commanded
 from hybrid_opt.recommending.unsure import Unsure, unsure_forces
 from hybrid_opt.recommending.wish import Wish
 from hybrid_opt.robust.squeeze import FACTOR, SqueezeSettings
-from hybrid_opt.timing.records import Timing, TimingLimits
+from hybrid_opt.timing.jerk import time_with_jerk
+from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
@@ -42,7 +43,8 @@ class Recommendation:
         member: its path's place in the front that it was chosen from.
         x: (n_var,) decision vector: the path, then the force limit [N].
         timing: as the independent timing drives it, every limit recomputed; its `carry` is what
-            robots drive.
+            robots drive where the cell limits no jerk.
+        jerk: the same path and force within the cell's limits on jerk as well, None without any.
         squeeze: how hard to press.
         margins: how wrong the cell's description may be.
         rivals: the hand-made path, and others, at the same force and in the same time.
@@ -54,6 +56,7 @@ class Recommendation:
     member: int
     x: Array
     timing: Timing
+    jerk: JerkTiming | None
     squeeze: Commanded
     margins: tuple[Margin, ...]
     rivals: tuple[Rival, ...]
@@ -78,6 +81,11 @@ class Recommendation:
             f"{second:.2f} N; press with {self.squeeze.peak.max():.1f} N ({self.squeeze.reason})",
             f"  {self.wish}",
         ]
+        if self.jerk is not None:
+            lines.append(
+                f"  within the limits on jerk: {self.jerk.timing.duration:.3f} s "
+                f"({100.0 * self.jerk.cost:+.1f} %)"
+            )
         lines += [
             f"  {rival.label}: {rival.duration_at_force:.3f} s at the same force, "
             f"{rival.force_at_duration:.2f} N in the same time"
@@ -123,6 +131,7 @@ def recommend(
     named = {HAND_MADE: cell.initial[:-1]} | dict(others or {})
     reference = Reference(paths, choice.index, choice.force, comparison_forces(points))
     beside = rivals(cell, named, reference)
+    jerk = _within_jerk(cell, timing.carry.x, choice.force)
     margins = robustness_margins(cell.timing_model, timing.carry)
     squeeze, doubt = _commanded(timing.carry)
     return Recommendation(
@@ -130,12 +139,25 @@ def recommend(
         member=choice.index,
         x=timing.carry.x,
         timing=timing,
+        jerk=jerk,
         squeeze=squeeze,
         margins=margins,
         rivals=beside,
         unsure=unsure_forces(timing.carry),
-        warnings=(*_warnings(beside, timing, choice.force), *_without_room(margins), *doubt),
+        warnings=(
+            *_warnings(beside, timing, choice.force),
+            *_too_long(wish, jerk),
+            *_without_room(margins),
+            *doubt,
+        ),
     )
+
+
+def _within_jerk(cell: Cell, x: Array, force: float) -> JerkTiming | None:
+    limits = JerkLimits.of(cell.workcell)
+    if limits is None:
+        return None
+    return time_with_jerk(cell.timing_model, x, TimingLimits(force=force), limits)
 
 
 def _driven(cell: Cell, x: Array, wanted: Iterable[Choice]) -> tuple[Choice, Timing]:
@@ -172,6 +194,17 @@ def _warnings(beside: Iterable[Rival], timing: Timing, force: float) -> Iterator
             yield (
                 f"the {rival.label} trajectory is faster than the whole front {where}; a longer "
                 "search or polish would help there"
+            )
+
+
+def _too_long(wish: Wish, jerk: JerkTiming | None) -> Iterator[str]:
+    """That limits on jerk take longer than was wished for."""
+    if jerk is not None and wish.duration is not None:
+        duration = jerk.timing.duration
+        if duration > wish.duration * (1.0 + BETTER):
+            yield (
+                f"within the limits on jerk it takes {duration:.3f} s instead of "
+                f"{wish.duration:g} s; wish for {wish.duration * wish.duration / duration:.2f} s"
             )
 
 

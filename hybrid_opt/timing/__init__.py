@@ -9,7 +9,7 @@ from hybrid_opt.timing.analysis import (
     force_limited_timing,
     judge_timing,
 )
-from hybrid_opt.timing.jerk import JerkLimits, JerkTiming, time_with_jerk
+from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.overview import (
     TimedTrajectory,
@@ -20,6 +20,8 @@ from hybrid_opt.timing.overview import (
 from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import (
     Excess,
+    JerkLimits,
+    JerkTiming,
     Place,
     Timing,
     TimingLimits,

@@ -12,7 +12,7 @@ import numpy as np
 from hybrid_opt.store.json_records import Figure, Range, Shape, read_record
 from hybrid_opt.timing.analysis import ForceCurve
 from hybrid_opt.timing.overview import TimedTrajectory
-from hybrid_opt.timing.records import Timing, TimingStatus
+from hybrid_opt.timing.records import JerkTiming, Timing, TimingStatus
 from hybrid_opt.timing.robustness import Margin
 from hybrid_opt.timing.use import joint_use
 from symbolic.array import Array
@@ -73,6 +73,34 @@ class StoredTiming:
 
 
 @dataclass(frozen=True)
+class StoredJerk:
+    """What limits on jerk make of a carry, see `hybrid_opt.timing.records.JerkTiming`.
+
+    Attributes:
+        status: of its timing.
+        duration: [s].
+        without: the same without limits on jerk [s].
+        joint_use, payload_use: largest jerks over their limits.
+    """
+
+    status: str
+    duration: Figure
+    without: float
+    joint_use: Figure
+    payload_use: Figure
+
+    def __post_init__(self) -> None:
+        """Refuse a status that no timing has."""
+        TimingStatus(self.status)
+
+    @classmethod
+    def of(cls, found: JerkTiming) -> StoredJerk:
+        """As it is stored."""
+        timing = found.timing
+        return cls(timing.status.value, timing.duration, found.without, *found.jerk_use)
+
+
+@dataclass(frozen=True)
 class StoredLimit:
     """One limit of a force curve: force [N], duration [s] (NaN without a timing), status."""
 
@@ -103,12 +131,14 @@ class TimingDocument:
         timings: by name, the search's first.
         margins: how wrong the cell's description may be.
         force_curve: duration against force limit, None where it was not asked for.
+        jerk: what the cell's limits on jerk make of a drivable carry, None without.
     """
 
     nominal_duration: Figure
     timings: Mapping[str, StoredTiming]
     margins: tuple[Margin, ...]
     force_curve: StoredCurve | None
+    jerk: StoredJerk | None = None
 
 
 def timing_document(timed: TimedTrajectory) -> TimingDocument:
@@ -118,6 +148,7 @@ def timing_document(timed: TimedTrajectory) -> TimingDocument:
         timings={name: _timing(timing) for name, timing in timed.report.timings.items()},
         margins=timed.margins,
         force_curve=None if timed.curve is None else _curve(timed.curve),
+        jerk=None if timed.report.jerk is None else StoredJerk.of(timed.report.jerk),
     )
 
 

@@ -19,19 +19,25 @@ which limits are imposed, and slowed down where it exceeds one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import BSpline, CubicSpline
+from scipy.interpolate import BSpline
 
 from hybrid_opt.timing.jerk_program import Point, convex_step
 from hybrid_opt.timing.model import PathMotion, TimingModel
 from hybrid_opt.timing.path_check import path_failure
-from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.records import (
+    JerkLimits,
+    JerkTiming,
+    Place,
+    Timing,
+    TimingLimits,
+    TimingStatus,
+)
 from hybrid_opt.timing.solve import LEAST_SPEED, time_path
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_use, worst
 from symbolic.array import Array
-from symbolic.errors import SettingsError
 
 PIECES = 60
 """Of the spline of squared speeds."""
@@ -50,50 +56,6 @@ FIRST_USE = 0.5
 """Largest use of a limit by the slow start that the rounds begin with."""
 
 
-@dataclass(frozen=True)
-class JerkLimits:
-    """Largest jerks.
-
-    Attributes:
-        joints: (all joints,) both arms' in order [rad/s^3].
-        payload: of the box's frame [m/s^3].
-    """
-
-    joints: Array
-    payload: float
-
-    def __post_init__(self) -> None:
-        """Check them.
-
-        Raises:
-            SettingsError: a limit is not positive.
-        """
-        if not (np.all(np.asarray(self.joints) > 0.0) and self.payload > 0.0):
-            raise SettingsError("jerk limits: give positive ones [rad/s^3, m/s^3]")
-
-
-@dataclass(frozen=True)
-class JerkTiming:
-    """A timing within jerk limits, and what they cost.
-
-    Attributes:
-        timing: without `grid_speed`: its u'' is not constant on stages.
-        jerk_use: largest joint jerk and payload jerk over their limits.
-        without: duration of the fastest timing without jerk limits [s].
-        rounds: programs solved.
-    """
-
-    timing: Timing
-    jerk_use: tuple[float, float]
-    without: float
-    rounds: int = 0
-
-    @property
-    def cost(self) -> float:
-        """Share of the duration that the jerk limits add."""
-        return self.timing.duration / self.without - 1.0
-
-
 def time_with_jerk(
     model: TimingModel, x: Array, limits: TimingLimits, jerk: JerkLimits
 ) -> JerkTiming:
@@ -108,7 +70,7 @@ def time_with_jerk(
     motion = model.path_motion(x)
     fastest = time_path(model, x, limits, motion)
     if path_failure(model, motion) is not None or not fastest.ok:
-        return JerkTiming(fastest, (np.nan, np.nan), fastest.duration)
+        return JerkTiming(fastest, jerk, (np.nan, np.nan), fastest.duration)
     problem = _Problem(model, motion, limits, jerk)
     coefficients, rounds = problem.solve()
     return replace(problem.judged(coefficients), without=fastest.duration, rounds=rounds)
@@ -123,7 +85,7 @@ class _Problem:
         self._model, self._limits, self._jerk = model, limits, jerk
         inner = np.linspace(0.0, 1.0, PIECES + 1)
         self._knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
-        self._geometry = _Geometry(motion)
+        self._motion = motion
         self._coarse = self._points(np.linspace(0.0, 1.0, PIECES * POINTS + 1))
         self._fine = self._points(np.linspace(0.0, 1.0, PIECES * POINTS * FINER + 1))
 
@@ -138,8 +100,7 @@ class _Problem:
             60.0 * (1.0 - 6.0 * s + 6.0 * s**2),
         )
         u = np.clip(s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 0.0, 1.0)
-        motion, q_third, box_third = self._geometry.at(u)
-        return Point.of(s, basis, warp, motion, (q_third, box_third))
+        return Point.of(s, basis, warp, self._motion.between(u), self._motion.third(u))
 
     def solve(self) -> tuple[Array, int]:
         """Coefficients of the squared speeds, and the rounds it took."""
@@ -199,23 +160,4 @@ class _Problem:
             joint = uses[1] >= uses[2]
             place = Place("joint jerk" if joint else "payload jerk", "", "", 0, 0.0)
         timing = replace(timing, status=status, place=place, slowed=factor)
-        return JerkTiming(timing, (uses[1], uses[2]), np.nan)
-
-
-class _Geometry:
-    """A path's geometry between its samples, with third derivatives."""
-
-    def __init__(self, motion: PathMotion) -> None:
-        u = motion.parameter
-        self._x = motion.x
-        self._splines = {
-            f.name: CubicSpline(u, getattr(motion, f.name))
-            for f in fields(motion)
-            if f.name not in ("x", "parameter")
-        }
-
-    def at(self, u: Array) -> tuple[PathMotion, Array, Array]:
-        """The geometry at places u (n,), and third derivatives of joints and box position by u."""
-        values = {name: spline(u) for name, spline in self._splines.items()}
-        third = [self._splines[name].derivative()(u) for name in ("q_second", "pose_second")]
-        return PathMotion(x=self._x, parameter=u, **values), third[0], third[1][:, :3]
+        return JerkTiming(timing, self._jerk, (uses[1], uses[2]), np.nan)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_opt.timing.model import PathMotion, TimingModel, contact_torque
-from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.records import JerkLimits, TimingLimits
 from hybrid_opt.timing.rows import squared_speed_limit
 from hybrid_opt.timing.use import limits_pressure
 from symbolic.array import Array
 from symbolic.physics.contact_forces import GRAVITY
 
-if TYPE_CHECKING:
-    from hybrid_opt.timing.jerk import JerkLimits
+Mask = NDArray[np.bool_]
 
 NEAR = 0.6
 """Torques and shifts that stay below this share of their limit get no rows."""
@@ -25,6 +25,9 @@ KEPT = 1e-4
 
 LEAST_SHARE = 0.05
 """Of its last value that a coefficient keeps at least."""
+
+FIRST_ROWS = 0.4
+"""Rows that the last coefficients use to more than this share enter a program at once."""
 
 
 @dataclass(frozen=True)
@@ -117,11 +120,11 @@ class Point:
 
 
 class _Rows:
-    """Rows b - A c in cones, collected: first the linear ones, then second-order cones of four."""
+    """Rows b - A c, at least zero or in second-order cones of four, collected."""
 
-    def __init__(self) -> None:
-        self._linear: list[tuple[Array, Array]] = []
-        self._cones: list[tuple[Array, Array]] = []
+    def __init__(self, k: int) -> None:
+        self._linear: list[tuple[Array, Array]] = [(np.zeros((0, k)), np.zeros(0))]
+        self._cones: list[tuple[Array, Array]] = [(np.zeros((0, 4, k)), np.zeros((0, 4)))]
 
     def below(self, A: Array, b: Array) -> None:
         """A c <= b, (n, k) and (n,)."""
@@ -133,46 +136,80 @@ class _Rows:
             (np.concatenate([head[:, None], -A], axis=1), np.column_stack([bound, b]))
         )
 
-    def assembled(self, k: int) -> tuple[Array, Array, int, int]:
-        """A, b, and how many linear rows and cones."""
-        A = [part for part, _ in self._linear] + [part.reshape(-1, k) for part, _ in self._cones]
-        b = [part for _, part in self._linear] + [part.reshape(-1) for _, part in self._cones]
-        count = sum(len(part) for _, part in self._linear)
-        return np.concatenate(A), np.concatenate(b), count, sum(len(p) for _, p in self._cones)
+    def assembled(self) -> _Program:
+        """All of them."""
+        linear, cones = (
+            [np.concatenate(parts) for parts in zip(*pairs, strict=True)]
+            for pairs in (self._linear, self._cones)
+        )
+        return _Program(linear[0], linear[1], cones[0], cones[1])
+
+
+@dataclass(frozen=True)
+class _Program:
+    """Linear rows (n, k), (n,) and cones (m, 4, k), (m, 4), of which few matter at a time."""
+
+    A: Array
+    b: Array
+    cone_A: Array
+    cone_b: Array
+
+    def used(self, c: Array, share: float) -> tuple[Mask, Mask]:
+        """Which linear rows and which cones c uses to more than a share."""
+        inside = self.cone_b - self.cone_A @ c
+        lengths = np.linalg.norm(inside[:, 1:], axis=1)
+        return np.asarray(self.A @ c > share * self.b), np.asarray(lengths > share * inside[:, 0])
+
+    def minimised(self, H: Array, g: Array, about: Array) -> Array | None:
+        """Least c^T H c / 2 + g.c; None without any. Rows that an answer violates are added."""
+        rows, cones = self.used(about, FIRST_ROWS)
+        while True:
+            c = self._solved(H, g, about, rows, cones)
+            if c is None:
+                return None
+            more_rows, more_cones = self.used(c, 1.0 + KEPT / 2.0)
+            fresh = (more_rows & ~rows).any() or (more_cones & ~cones).any()
+            if not fresh:
+                return c
+            rows, cones = rows | more_rows, cones | more_cones
+
+    def _solved(self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask) -> Array | None:
+        """The same with some of the rows; variables are scaled to be around one."""
+        # Not imported at the top: only jerk limits need it.
+        import clarabel
+        from scipy import sparse
+
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        kinds: list[Any] = [clarabel.NonnegativeConeT(int(rows.sum()))]
+        kinds += [clarabel.SecondOrderConeT(4)] * int(cones.sum())
+        A = np.concatenate([self.A[rows], self.cone_A[cones].reshape(-1, len(g))])
+        found = clarabel.DefaultSolver(
+            sparse.csc_matrix(np.triu(H * np.outer(scale, scale))),
+            g * scale,
+            sparse.csc_matrix(A * scale),
+            np.concatenate([self.b[rows], self.cone_b[cones].reshape(-1)]),
+            kinds,
+            settings,
+        ).solve()
+        answer = np.array(found.x) * scale
+        solved = str(found.status) in ("Solved", "AlmostSolved") and np.isfinite(answer).all()
+        return answer if solved else None
 
 
 def convex_step(
     model: TimingModel, at: Point, c: Array, limits: TimingLimits, jerk: JerkLimits
 ) -> Array | None:
     """Better coefficients than c (k,), which satisfy all limits at the points; None without any."""
-    # Not imported at the top: only jerk limits need it.
-    import clarabel
-    from scipy import sparse
-
-    rows = _Rows()
+    rows = _Rows(len(c))
     _motion_rows(model, at, limits, rows)
     _force_rows(model, at, limits, rows)
     _ratio_rows(model, at, c, limits, rows)
     _jerk_rows(at, c, jerk, rows)
     rows.below(-np.eye(len(c)), -LEAST_SHARE * c)
-    A, b, linear, cones = rows.assembled(len(c))
     gradient, H = at.objective(c)
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    kinds: list[Any] = [clarabel.NonnegativeConeT(linear)]
-    kinds += [clarabel.SecondOrderConeT(4)] * cones
-    # Scaled so that coefficients are around one.
-    D = c
-    found = clarabel.DefaultSolver(
-        sparse.csc_matrix(np.triu(H * np.outer(D, D))),
-        (gradient - H @ c) * D,
-        sparse.csc_matrix(A * D),
-        b,
-        kinds,
-        settings,
-    ).solve()
-    answer = np.array(found.x) * D
-    if str(found.status) not in ("Solved", "AlmostSolved") or not np.isfinite(answer).all():
+    answer = rows.assembled().minimised(H, gradient - H @ c, c)
+    if answer is None:
         return None
     # The quadratic model promises too much far away: c and the answer are both allowed, and so is
     # everything between them.
@@ -283,15 +320,17 @@ def _jerk_rows(at: Point, c: Array, jerk: JerkLimits, rows: _Rows) -> None:
     # Multiplied by sqrt(v) of the last round, so that rows are of order one.
     root = np.sqrt(v)
     head = (slope * root)[:, None] * at.value
-    by = at.joint_jerk_by / np.asarray(jerk.joints)[:, None] * root[:, None, None]
+    limited = np.isfinite(jerk.joints)
+    by = at.joint_jerk_by[:, limited] / jerk.joints[limited, None] * root[:, None, None]
     joints = by.shape[1]
     bound = np.repeat(level * root * (1.0 - KEPT), joints)
     below = np.repeat(head, joints, axis=0) * (1.0 - KEPT)
     for sign in (1.0, -1.0):
         rows.below(sign * by.reshape(-1, by.shape[2]) + below, bound)
-    rows.within(
-        at.box_jerk_by / jerk.payload * root[:, None, None],
-        np.zeros((len(v), 3)),
-        head * (1.0 - KEPT),
-        level * root * (1.0 - KEPT),
-    )
+    if np.isfinite(jerk.payload):
+        rows.within(
+            at.box_jerk_by / jerk.payload * root[:, None, None],
+            np.zeros((len(v), 3)),
+            head * (1.0 - KEPT),
+            level * root * (1.0 - KEPT),
+        )

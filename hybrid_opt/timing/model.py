@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from codegen.function import NumericFunction
 from hybrid_opt.carry import ArmMotion, Carry, joints_of
@@ -63,6 +64,24 @@ class PathMotion:
         """The given samples in the given order."""
         sampled = {f.name: getattr(self, f.name)[samples] for f in fields(self) if f.name != "x"}
         return PathMotion(self.x, **sampled)
+
+    def between(self, u: Array) -> PathMotion:
+        """The geometry at parameters u (n,) in [0, 1], by cubic splines through the samples."""
+        values = {name: spline(u) for name, spline in self._splines.items()}
+        return PathMotion(self.x, u, **values)
+
+    def third(self, u: Array) -> tuple[Array, Array]:
+        """Third derivatives by the parameter at u (n,): joints (n, joints), box position (n, 3)."""
+        joints, pose = (self._splines[name].derivative()(u) for name in ("q_second", "pose_second"))
+        return joints, pose[:, :3]
+
+    @cached_property
+    def _splines(self) -> dict[str, CubicSpline]:
+        return {
+            field.name: CubicSpline(self.parameter, getattr(self, field.name))
+            for field in fields(self)
+            if field.name not in ("x", "parameter")
+        }
 
 
 if TYPE_CHECKING:

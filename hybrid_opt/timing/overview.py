@@ -13,9 +13,10 @@ from hybrid_opt.timing.analysis import (
     force_limited_timing,
     judge_timing,
 )
+from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.point_limits import duration_at_speed_limits
-from hybrid_opt.timing.records import Timing, TimingLimits
+from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
@@ -30,6 +31,8 @@ class TimingReport:
         nominal_duration: at the reference speeds without ramps [s].
         fastest, closest: see the functions of those names.
         force_limited: with the given limit, None without one.
+        jerk: of a drivable carry within its force limit and the cell's limits on jerk; None under
+            other time laws, and without such limits.
     """
 
     judged: JudgedTiming
@@ -37,6 +40,7 @@ class TimingReport:
     fastest: Timing
     closest: Timing
     force_limited: Timing | None
+    jerk: JerkTiming | None = None
 
     @property
     def timings(self) -> dict[str, Timing]:
@@ -46,7 +50,11 @@ class TimingReport:
             "closest to reference": self.closest,
             "fastest": self.fastest,
         }
-        return named | ({"force limited": self.force_limited} if self.force_limited else {})
+        if self.force_limited is not None:
+            named["force limited"] = self.force_limited
+        if self.jerk is not None:
+            named["within jerk limits"] = self.jerk.timing
+        return named
 
 
 def report_timing(model: TimingModel, x: Array, force: float | None = None) -> TimingReport:
@@ -66,7 +74,15 @@ def report_timing(model: TimingModel, x: Array, force: float | None = None) -> T
         fastest=fastest_timing(model, x),
         closest=closest_to_reference_timing(model, x),
         force_limited=None if force is None else force_limited_timing(model, x, force),
+        jerk=_within_jerk(model, x),
     )
+
+
+def _within_jerk(model: TimingModel, x: Array) -> JerkTiming | None:
+    limits = JerkLimits.of(model.workcell)
+    if limits is None or model.workcell.task.time_law != "optimal":
+        return None
+    return time_with_jerk(model, x, TimingLimits(force=float(x[-1])), limits)
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+import numpy as np
+
 from hybrid_opt.carry import Carry
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.workcell.records import Workcell
 
 
 class TimingStatus(StrEnum):
@@ -90,6 +93,39 @@ class TimingLimits:
 
 
 @dataclass(frozen=True)
+class JerkLimits:
+    """Largest jerks.
+
+    Attributes:
+        joints: (all joints,) both arms' in order [rad/s^3], infinite where there is no limit.
+        payload: of the box's frame [m/s^3], likewise.
+    """
+
+    joints: Array
+    payload: float = float("inf")
+
+    def __post_init__(self) -> None:
+        """Check them.
+
+        Raises:
+            SettingsError: a limit is not positive.
+        """
+        if not (np.all(np.asarray(self.joints) > 0.0) and self.payload > 0.0):
+            raise SettingsError("jerk limits: give positive ones [rad/s^3, m/s^3]")
+
+    @classmethod
+    def of(cls, workcell: Workcell) -> JerkLimits | None:
+        """Those that a workcell states, None where it states none."""
+        joints = [
+            np.full(len(robot.torque_max), np.inf) if robot.jerk_max is None else robot.jerk_max
+            for robot in workcell.robots
+        ]
+        payload = workcell.payload.jerk_max
+        limits = cls(np.concatenate(joints), np.inf if payload is None else payload)
+        return limits if np.isfinite([*limits.joints, limits.payload]).any() else None
+
+
+@dataclass(frozen=True)
 class Excess:
     """How far a limit is used: the largest value over its limit, and where."""
 
@@ -142,3 +178,34 @@ class Timing:
     def duration(self) -> float:
         """Duration [s], infinite without a timing."""
         return self.carry.duration if self.carry is not None else float("inf")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JerkTiming:
+    """A timing within jerk limits, and what they cost.
+
+    Attributes:
+        timing: without `grid_speed`: its u'' is not constant on stages.
+        limits: the jerk limits.
+        jerk_use: largest joint jerk and payload jerk over their limits.
+        without: duration of the fastest timing without jerk limits [s].
+        rounds: programs solved.
+    """
+
+    timing: Timing
+    limits: JerkLimits
+    jerk_use: tuple[float, float]
+    without: float
+    rounds: int = 0
+
+    @property
+    def cost(self) -> float:
+        """Share of the duration that the jerk limits add."""
+        return self.timing.duration / self.without - 1.0
+
+    def __repr__(self) -> str:
+        return (
+            f"{self.timing!r}\njerk of joints {100.0 * self.jerk_use[0]:.1f} %, of the payload "
+            f"{100.0 * self.jerk_use[1]:.1f} % of their limits; without these {self.without:.3f} s "
+            f"({100.0 * self.cost:+.1f} %)"
+        )

@@ -81,7 +81,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         initial=carries[0],
         timings=tuple(timings),
         reach=reach,
-        drivable=gather_drivable(results.root, results.objectives, summary),
+        drivable=gather_drivable(results, summary),
     )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from hybrid_opt.campaign.layout import CONFIGURATION, RECOMMENDED
@@ -12,25 +10,23 @@ from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.evaluate.objectives import duration_unit
 from hybrid_opt.store.trajectory_file import read_trajectory
 from studies.drivable import ReplicaFront, drivable_fronts, drivable_root
+from studies.jerk_costs import jerk_costs
 from studies.report.records import DrivableFront, DrivableReport
 from symbolic.array import Array
 from symbolic.workcell.archive import archive_cell
 
 
-def gather_drivable(
-    root: Path, objectives: tuple[str, ...], summary: CampaignSummary
-) -> DrivableReport | None:
+def gather_drivable(study: CampaignResults, summary: CampaignSummary) -> DrivableReport | None:
     """The drivable experiment of a study; None where it has none.
 
     Args:
-        root: the study's results folder.
-        objectives: of its first experiment.
+        study: its first experiment.
         summary: of the study, which says whether a carry is recommended.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
     """
-    place = drivable_root(root, objectives)
+    place = drivable_root(study.root, study.workcell, study.objectives)
     if not (place / CONFIGURATION).exists():
         return None
     found, own = drivable_fronts(place), read_summary(place)
@@ -41,9 +37,10 @@ def gather_drivable(
     ]
     recommended = None
     if summary.recommendation is not None:
-        recommended = read_trajectory(root / RECOMMENDED).x
+        recommended = read_trajectory(study.root / RECOMMENDED).x
     workcell = found.results.workcell
-    return DrivableReport(workcell, archive_cell(workcell), own, tuple(shown), recommended)
+    archive, jerk = archive_cell(workcell), jerk_costs(place)
+    return DrivableReport(workcell, archive, own, tuple(shown), recommended, jerk)
 
 
 def _front(results: CampaignResults, front: ReplicaFront) -> DrivableFront:

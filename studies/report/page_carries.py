@@ -16,6 +16,7 @@ MAX_SAMPLES = 60
 """Samples of a trajectory on the page; its force peaks are kept besides."""
 
 DRIVEN = "as robots drive it"
+WITHIN_JERK = "within the limits on jerk"
 ASSUMED = "as the search assumed"
 
 LAWS = {"constant": "constant speed", "ramped": "ramped speed"}
@@ -29,11 +30,13 @@ class Shown:
         label: whose it is.
         x: (n_var,) decision vector.
         provenance: how it came about, stored with a saved file.
+        jerk: whether it is also shown within the cell's limits on jerk, where it has any.
     """
 
     label: str
     x: Array
     provenance: str
+    jerk: bool = False
 
 
 class PageCarries:
@@ -58,6 +61,8 @@ class PageCarries:
         assert judged.judgement is not None, "carries of a cell are judged"
         driven, problem = self._driven(shown.x)
         motions = [] if driven is None else [self._motion(DRIVEN, driven)]
+        if shown.jerk:
+            motions += self._within_jerk(shown.x)
         if not self._optimal:
             law = LAWS[self._cell.workcell.task.time_law]
             motions.append(self._motion(f"{ASSUMED}: {law}", judged))
@@ -106,6 +111,14 @@ class PageCarries:
             limits = ho.TimingLimits(force=float(x[-1]))
         timing = ho.time_path(self._cell, x, limits)
         return timing.carry, "" if timing.ok else f"robots cannot drive it: {timing.reason}"
+
+    def _within_jerk(self, x: Array) -> list[dict[str, Any]]:
+        """The carry within the cell's limits on jerk, where it has any."""
+        limits = ho.TimingLimits(force=float(x[-1]))
+        if ho.JerkLimits.of(self._cell.workcell) is None:
+            return []
+        carry = ho.time_with_jerk(self._cell, x, limits).timing.carry
+        return [] if carry is None else [self._motion(WITHIN_JERK, carry)]
 
     def _motion(self, name: str, carry: ho.Carry) -> dict[str, Any]:
         torque = 100.0 * np.abs(carry.torque).max(axis=0) / self._limit

@@ -10,6 +10,7 @@ import numpy as np
 import hybrid_opt as ho
 from hybrid_opt.display.scene import packed, scene_data
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from studies.drivable import is_drivable
 from studies.report.page_carries import PageCarries, Shown
 from studies.report.page_views import FrontView, drive_look
 from studies.report.records import AlgorithmRuns, DrawnCarry, DrivableReport, Front, ReportData
@@ -66,7 +67,7 @@ class PageData:
         if data.drivable is not None:
             views.append(self._drive_view(data.drivable))
             first = views[0]["groups"][0]["members"][0] if views[0]["groups"] else 0
-        if data.objectives != DRIVABLE_OBJECTIVES:
+        if not is_drivable(data.workcell, data.objectives):
             view, picked = self._search_view()
             views.append(view)
             first = first if data.drivable is not None else picked
@@ -102,7 +103,8 @@ class PageData:
         if drivable.recommended is not None:
             found = self._data.summary.recommendation
             source = "" if found is None else found.source
-            shown = Shown(f"{RECOMMENDED} ({source})", drivable.recommended, source)
+            title = f"{RECOMMENDED} ({source})"
+            shown = Shown(title, drivable.recommended, source, jerk=True)
             member = carries.add(shown)
             always.append(np.array([carries.point(member)]))
             view.add(RECOMMENDED, [member], always[0], CHOICE)

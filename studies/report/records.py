@@ -14,6 +14,7 @@ from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.timing import ForceCurve, TimingReport
 from hybrid_opt.timing.robustness import Margin, PayloadSensitivity
 from studies.drivable import ReplicaFront
+from studies.jerk_costs import JerkCosts
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.workcell.archive import CellArchive
@@ -151,6 +152,7 @@ class DrivableReport:
         summary: of that experiment.
         fronts: searched and polished.
         recommended: decision vector of the carry to run, None without one.
+        jerk: what limits on jerk cost the selected carries; empty without limits.
     """
 
     workcell: Workcell
@@ -158,6 +160,7 @@ class DrivableReport:
     summary: CampaignSummary
     fronts: tuple[DrivableFront, ...]
     recommended: Array | None
+    jerk: tuple[JerkCosts, ...]
 
 
 @dataclass(frozen=True)

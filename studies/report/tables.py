@@ -10,6 +10,8 @@ import numpy as np
 from hybrid_opt.campaign.recommended import ForceTable, StoredPrice
 from hybrid_opt.campaign.summary import FrontFigures
 from hybrid_opt.indicators.statistics import summarise
+from studies.drivable import is_drivable
+from studies.jerk_costs import HEAD, NOTE, JerkCosts
 from studies.report.records import AlgorithmRuns, DrawnCarry, ReportData
 from studies.report.table_text import NOTHING, Table, number
 from studies.terminal_summary import PAPER
@@ -26,6 +28,8 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
         tables.append(time_against_force(data.summary.recommendation.durations))
         if data.summary.recommendation.price is not None:
             tables.append(robust_price(data, data.summary.recommendation.price))
+    if data.drivable is not None and data.drivable.jerk:
+        tables.append(limits_on_jerk(data.drivable.jerk))
     tables.append(bounds(data))
     if data.summary.tests:
         tables.append(rank_tests(data))
@@ -206,10 +210,18 @@ def robust_price(data: ReportData, price: StoredPrice) -> Table:
     )
 
 
+def limits_on_jerk(costs: Sequence[JerkCosts]) -> Table:
+    """What the cell's limits on jerk cost the selected drivable carries."""
+    rows = tuple(each.cells for each in costs)
+    return Table(
+        "jerk", "What limits on jerk cost the selected drivable carries.", HEAD, rows, NOTE
+    )
+
+
 def bounds(data: ReportData) -> Table:
     """The bounds of the variables that the best fronts lie on."""
     experiments = [("search", data.summary.bounds)]
-    if data.drivable is not None and data.objectives != data.drivable.summary.objectives:
+    if data.drivable is not None and not is_drivable(data.workcell, data.objectives):
         experiments.append(("drivable", data.drivable.summary.bounds))
     rows = []
     for name, found in experiments:

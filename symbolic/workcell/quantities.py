@@ -35,6 +35,8 @@ SPEED = Quantity("m/s", 1e-3, 10.0, mistaken=_MILLIMETRES_PER_SECOND)
 ACCELERATION = Quantity("m/s^2", 1e-3, 100.0, mistaken=(("mm/s^2", 1e-3),))
 ANGULAR_SPEED = Quantity("rad/s", 1e-3, 20.0, mistaken=_DEGREES_PER_SECOND)
 ANGULAR_ACCELERATION = Quantity("rad/s^2", 1e-3, 200.0, mistaken=(("deg/s^2", math.pi / 180),))
+JERK = Quantity("m/s^3", 1e-1, 1e4, mistaken=(("mm/s^3", 1e-3),))
+ANGULAR_JERK = Quantity("rad/s^3", 1e-1, 2e4, mistaken=(("deg/s^3", math.pi / 180),))
 
 FRICTION = Quantity("", 1e-3, 5.0, mistaken=(("%", 1e-2),))
 PATCH_RADIUS = Quantity("m", 1e-4, 0.5, mistaken=_MILLIMETRES)

@@ -59,12 +59,21 @@ def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot,
         drop_links=described.drop_links,
         tool_load=_read_tool_load(table),
         redundant_joints=_read_redundant(table, model),
+        jerk_max=_read_jerk(table, len(limits["acceleration_max"])),
     )
     branch = SEARCHED
     if table.raw("start_branch", -1) != "search":
         branch = table.integer("start_branch", -1, MAX_START_BRANCH, -1)
     table.close()
     return robot, branch
+
+
+def _read_jerk(table: Table, joints: int) -> Array | None:
+    """The joints' largest jerks, where the file states them."""
+    if "jerk_max" not in table:
+        table.raw("jerk_max", None)
+        return None
+    return table.vector("jerk_max", (quantity.ANGULAR_JERK,) * joints, scalar_fills=True)
 
 
 def _read_redundant(table: Table, model: pin.Model | None) -> tuple[str, ...]:

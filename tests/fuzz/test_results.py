@@ -23,6 +23,7 @@ from hybrid_opt.polishing.settings import PolishSettings
 from studies.compare import compare
 from studies.report.data import gather_carries
 from studies.run import StudySettings, run_study
+from symbolic.workcell.file import load
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
 from tests.fuzz.promises import kept
 from tests.symbolic.cells import ROOT
@@ -42,7 +43,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         algorithms=("nsga2",), evaluations=60, replicas=1, seed=3, populations=(("nsga2", 20),)
     )
     study = StudySettings(PolishSettings(points=1), report=False)
-    run_study(TRANSFER, campaign, ExecutionSettings(root, jobs=1), Progress(shown=False), study)
+    execution = ExecutionSettings(root, jobs=1)
+    run_study(load(TRANSFER), campaign, execution, Progress(shown=False), study)
     return root
 
 

@@ -18,6 +18,7 @@ from studies.report.data import gather
 from studies.report.records import Front, ReportData
 from studies.run import StudySettings, run_study
 from studies.summary import front_indicators
+from symbolic.workcell.file import load
 from tests.symbolic.cells import ROOT
 
 TRANSFER = ROOT / "studies" / "workcells" / "transfer.toml"
@@ -29,7 +30,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("study") / "results"
     settings = CampaignSettings(evaluations=120, replicas=2, seed=3)
     execution, silent = ExecutionSettings(root, jobs=1), Progress(shown=False)
-    run_study(TRANSFER, settings, execution, silent, StudySettings(report=False))
+    run_study(load(TRANSFER), settings, execution, silent, StudySettings(report=False))
     return root
 
 

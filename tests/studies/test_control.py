@@ -17,6 +17,7 @@ from hybrid_opt.polishing.settings import PolishSettings
 from studies import control
 from studies.reference_front import ReferenceFront
 from studies.run import StudySettings, run_study
+from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
 
@@ -27,7 +28,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
         algorithms=("nsga2",), evaluations=120, replicas=2, seed=4, populations=(("nsga2", 20),)
     )
     run_study(
-        RACK,
+        load(RACK),
         settings,
         ExecutionSettings(root, jobs=1),
         Progress(shown=False),
@@ -82,6 +83,6 @@ def test_a_study_without_a_polish_is_told(
     settings = CampaignSettings(algorithms=("random",), evaluations=60, replicas=1)
     root = tmp_path / "results"
     execution = ExecutionSettings(root, jobs=1)
-    run_study(RACK, settings, execution, Progress(shown=False), StudySettings(report=False))
+    run_study(load(RACK), settings, execution, Progress(shown=False), StudySettings(report=False))
     assert control.main([str(root)]) == 2
     assert "not polished; run the study with --polish" in capsys.readouterr().err

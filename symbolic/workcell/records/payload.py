@@ -20,6 +20,7 @@ class Payload:
         inertia: (3, 3) about the centre of mass, box axes [kg m^2].
         velocity_max, acceleration_max: limits of the box's translation [m/s, m/s^2].
         angular_velocity_max, angular_acceleration_max: of its rotation [rad/s, rad/s^2].
+        jerk_max: of its translation [m/s^3], or None without a limit.
     """
 
     size: Array
@@ -30,6 +31,7 @@ class Payload:
     acceleration_max: float
     angular_velocity_max: float
     angular_acceleration_max: float
+    jerk_max: float | None = None
 
 
 @dataclass(frozen=True)

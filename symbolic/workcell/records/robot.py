@@ -52,6 +52,7 @@ class Robot:
         tool_load: mass and inertia of the tool; None where nothing is known of them.
         redundant_joints: names of the joints beyond six, whose paths are part of the decision
             vector; () where the arm has six.
+        jerk_max: (n,) [rad/s^3], or None without limits.
     """
 
     name: str
@@ -74,3 +75,4 @@ class Robot:
     drop_links: tuple[str, ...] = ()
     tool_load: ToolLoad | None = None
     redundant_joints: tuple[str, ...] = ()
+    jerk_max: Array | None = None

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from hybrid_opt.timing import TimingLimits, TimingStatus, time_path
-from hybrid_opt.timing.jerk import JerkLimits, JerkTiming, time_with_jerk
+from hybrid_opt.timing import (
+    JerkLimits,
+    JerkTiming,
+    TimingLimits,
+    TimingStatus,
+    time_path,
+    time_with_jerk,
+)
 from symbolic.errors import SettingsError
-from tests.hybrid_opt.timing.cells import hand_timing, initial
+from tests.hybrid_opt.timing import jerk_oracle
+from tests.hybrid_opt.timing.cells import (
+    hand_timing,
+    initial,
+    near_initial,
+    timing_of,
+    with_robots,
+)
+from tests.symbolic.cells import hand_cell, with_payload
 
 FORCE = 55.0
 JOINTS = 12
@@ -68,6 +83,73 @@ def test_tighter_jerk_costs_more_and_loose_jerk_next_to_nothing() -> None:
     assert timed(40.0).cost == pytest.approx(middle / free - 1.0)
     # The spline has no corners, so that it stays a little above the fastest timing of all.
     assert 0.995 * free < fast < 1.03 * free
+
+
+@pytest.mark.parametrize(
+    ("speed", "acceleration", "jerk"),
+    [(0.3, 1.0, 5.0), (1.0, 1.0, 5.0), (1.0, 5.0, 5.0), (0.2, 5.0, 4.0), (0.5, 2.0, 50.0)],
+)
+def test_a_straight_way_takes_the_time_of_the_s_curve(
+    speed: float, acceleration: float, jerk: float
+) -> None:
+    """Speed, acceleration and jerk of the box alone bind, in every combination."""
+    cell = with_robots(hand_cell(), velocity_max=100.0, acceleration_max=1e3, torque_max=100.0)
+    cell = with_payload(cell, velocity_max=speed, acceleration_max=acceleration)
+    way = np.concatenate([[0.0, 0.0, z, 0.0, 0.0, 0.0] for z in (0.845, 0.945, 1.045)])
+    limits = TimingLimits(torque=False, pressure=False)
+    only_box = JerkLimits(np.full(JOINTS, np.inf), jerk)
+    found = time_with_jerk(timing_of(cell), way, limits, only_box)
+    exact = jerk_oracle.s_curve(0.4, speed, acceleration, jerk)
+    assert exact * 0.9995 < found.timing.duration < exact * 1.005
+
+
+@pytest.mark.parametrize(
+    ("seed", "share", "joints", "payload"),
+    [
+        (0, None, 30.0, 20.0),
+        (1, 1.1, 50.0, 30.0),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                (2, None, 20.0, 100.0),
+                (3, 1.05, 80.0, 80.0),
+                (4, None, 200.0, 10.0),
+                (5, 1.2, 15.0, np.inf),
+            )
+        ),
+    ],
+)
+def test_no_transcription_in_time_finds_a_shorter_one(
+    seed: int, share: float | None, joints: float, payload: float
+) -> None:
+    """IPOPT over time with piecewise constant jerk, from a slow start, comes to the same."""
+    model = hand_timing()
+    (x,) = near_initial(np.random.default_rng(seed), 1)
+    motion = model.path_motion(x)
+    still = np.zeros(len(motion.parameter))
+    rest = float(model.drive(motion, still, still)["normal_force"].max())
+    limits = TimingLimits(None if share is None else share * rest, torque=False, pressure=False)
+    jerk = JerkLimits(np.full(JOINTS, joints), payload)
+    found = time_with_jerk(model, x, limits, jerk)
+    assert found.timing.ok
+    other = jerk_oracle.shortest_duration(model, x, limits, jerk, 2.0 * found.timing.duration)
+    assert found.timing.duration == pytest.approx(other, rel=1e-2)
+    assert found.cost > 0.01
+
+
+def test_a_workcell_states_limits() -> None:
+    cell = hand_cell()
+    assert JerkLimits.of(cell) is None
+    first, second = cell.robots
+    one = replace(cell, robots=(replace(first, jerk_max=np.full(6, 40.0)), second))
+    limits = JerkLimits.of(one)
+    assert limits is not None
+    np.testing.assert_array_equal(limits.joints, [40.0] * 6 + [np.inf] * 6)
+    assert limits.payload == np.inf
+    box = JerkLimits.of(with_payload(cell, jerk_max=30.0))
+    assert box is not None
+    assert box.payload == 30.0
+    assert np.isinf(box.joints).all()
 
 
 def test_a_path_that_no_timing_drives_says_so() -> None:

@@ -47,6 +47,7 @@ def robots(draw: st.DrawFn, name: str) -> dict[str, Any]:
     tool_names = draw(st.lists(NAMES, max_size=2, unique=True))
     optional = {
         "acceleration_max": st.one_of(numbers(0.1, 50), vectors(0.1, 50, 6)),
+        "jerk_max": st.one_of(numbers(1, 9000), vectors(1, 9000, 6)),
         "velocity_max": vectors(0.1, 10, 6),
         "torque_max": vectors(1, 500, 6),
         "position_lower": vectors(-6, -0.1, 6),
@@ -77,6 +78,7 @@ def payloads(draw: st.DrawFn) -> dict[str, Any]:
         "acceleration_max": numbers(0.1, 90.0),
         "angular_velocity_max": numbers(1.0, 19.0),
         "angular_acceleration_max": numbers(0.1, 190.0),
+        "jerk_max": numbers(1.0, 9000.0),
     }
     return {
         "size": size.tolist(),

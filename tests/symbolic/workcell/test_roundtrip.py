@@ -54,6 +54,9 @@ def assert_same_cell(cell: Workcell, data: dict[str, Any]) -> None:
                 assert getattr(robot, key).tolist() == entry[key]
         acceleration = np.broadcast_to(entry.get("acceleration_max", 5.0), 6)
         np.testing.assert_array_equal(robot.acceleration_max, acceleration)
+        assert (robot.jerk_max is None) == ("jerk_max" not in entry)
+        if robot.jerk_max is not None:
+            np.testing.assert_array_equal(robot.jerk_max, np.broadcast_to(entry["jerk_max"], 6))
         assert robot.min_manipulability == entry.get("min_manipulability", 0.005)
         for tool, tool_entry in zip(robot.tool, entry["tool"], strict=True):
             assert_same_body(tool, tool_entry)
@@ -64,6 +67,7 @@ def assert_same_cell(cell: Workcell, data: dict[str, Any]) -> None:
     if isinstance(payload.get("inertia"), list):
         assert cell.payload.inertia.tolist() == payload["inertia"]
     assert cell.payload.acceleration_max == payload.get("acceleration_max", 5.0)
+    assert cell.payload.jerk_max == payload.get("jerk_max")
     for contact, entry in zip(cell.contacts, data["contacts"], strict=True):
         np.testing.assert_allclose(contact.T_box_pad[:3, 3], entry["xyz"], atol=1e-15)
         assert (contact.friction, contact.patch_radius) == (
