@@ -14,7 +14,8 @@ so that with v a cubic spline all but the jerk, and what is not convex anyway, i
 in its coefficients. A jerk within J is |[...]| <= J / sqrt(v), whose right side is convex: its
 tangent at the last v lies below it, so every program allows less than the limits do, and the last
 v is among what it allows (the convex-concave procedure). The answer is judged between the points at
-which limits are imposed, and slowed down where it exceeds one.
+which limits are imposed; where it exceeds one, less of it is allowed there, and what still does
+after some times is slowed down.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import BSpline
 
+from hybrid_opt.carry import Carry
 from hybrid_opt.timing.jerk_program import Point, convex_step
 from hybrid_opt.timing.model import PathMotion, TimingModel
 from hybrid_opt.timing.path_check import path_failure
@@ -36,7 +38,7 @@ from hybrid_opt.timing.records import (
     TimingStatus,
 )
 from hybrid_opt.timing.solve import LEAST_SPEED, time_path
-from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_use, worst
+from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_ratios, limit_use, worst
 from symbolic.array import Array
 
 PIECES = 60
@@ -51,6 +53,9 @@ FINER = 10
 MAX_ROUNDS = 40
 SETTLED = 1e-4
 """Relative change of the duration at which rounds end."""
+
+TIGHTENED = 4
+"""Times that a timing is found anew with less of the limits where they were exceeded."""
 
 FIRST_USE = 0.5
 """Largest use of a limit by the slow start that the rounds begin with."""
@@ -72,8 +77,7 @@ def time_with_jerk(
     if path_failure(model, motion) is not None or not fastest.ok:
         return JerkTiming(fastest, jerk, (np.nan, np.nan), fastest.duration)
     problem = _Problem(model, motion, limits, jerk)
-    coefficients, rounds = problem.solve()
-    return replace(problem.judged(coefficients), without=fastest.duration, rounds=rounds)
+    return replace(problem.solve(), without=fastest.duration)
 
 
 class _Problem:
@@ -102,10 +106,23 @@ class _Problem:
         u = np.clip(s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 0.0, 1.0)
         return Point.of(s, basis, warp, self._motion.between(u), self._motion.third(u))
 
-    def solve(self) -> tuple[Array, int]:
-        """Coefficients of the squared speeds, and the rounds it took."""
+    def solve(self) -> JerkTiming:
+        """Rounds until nothing changes; then with less of the limits where the answer exceeds them
+        between the points, as often as that helps."""
         c = np.ones(len(self._knots) - 4)
-        c *= self._slow(c)
+        c, rounds = self._settled(self._slow(c) * c)
+        for _ in range(TIGHTENED):
+            excess = self._excess(c)
+            if excess.max() <= 1.0 + RECOMPUTED_TOLERANCE:
+                break
+            keep = self._coarse.keep / np.where(excess > 1.0, excess, 1.0)
+            self._coarse = replace(self._coarse, keep=keep)
+            c, more = self._settled(self._factor(c) ** 2 * c)
+            rounds += more
+        return replace(self._judged(c), rounds=rounds)
+
+    def _settled(self, c: Array) -> tuple[Array, int]:
+        """Rounds from coefficients that keep the limits, and how many."""
         duration = self._coarse.duration(c)
         for rounds in range(1, MAX_ROUNDS + 1):
             found = convex_step(self._model, self._coarse, c, self._limits, self._jerk)
@@ -116,6 +133,16 @@ class _Problem:
             if abs(duration / before - 1.0) < SETTLED:
                 break
         return c, rounds
+
+    def _excess(self, c: Array) -> Array:
+        """(coarse points,) largest use of a limit at the finer points around each."""
+        carry = self._carry(self._fine, c)
+        ratios = limit_ratios(carry, self._model.workcell, self._limits)
+        del ratios["friction"]
+        joint, box = self._jerks(self._fine, c)
+        use = np.max([*[ratio.max(axis=1) for ratio in ratios.values()], joint, box], axis=0)
+        between = use[1:].reshape(-1, FINER).max(axis=1)
+        return np.asarray(np.maximum(np.append(use[0], between), np.append(between, use[-1])))
 
     def _slow(self, c: Array) -> float:
         """Factor on the squared speeds at which everything is used little, as at rest."""
@@ -130,30 +157,39 @@ class _Problem:
         """Largest use of the timing's limits, joint jerk and payload jerk at the coarse points."""
         return self._judge(self._coarse, c)[1:]
 
-    def _judge(self, at: Point, c: Array) -> tuple[Timing, float, float, float]:
-        speed, acceleration = at.speed(c), at.acceleration(c)
-        carry = self._model.carry(at.motion, at.time(c), speed, acceleration)
-        use = limit_use(carry, self._model.workcell, self._limits, self._model.joint_names)
+    def _carry(self, at: Point, c: Array) -> Carry:
+        return self._model.carry(at.motion, at.time(c), at.speed(c), at.acceleration(c))
+
+    def _jerks(self, at: Point, c: Array) -> tuple[Array, Array]:
+        """(n,) largest joint jerk and payload jerk over their limits."""
         joint, box = at.jerk(c)
-        joint_use = float((np.abs(joint) / self._jerk.joints).max())
-        box_use = float(np.linalg.norm(box, axis=1).max() / self._jerk.payload)
+        of_joints = (np.abs(joint) / self._jerk.joints).max(axis=1)
+        return of_joints, np.linalg.norm(box, axis=1) / self._jerk.payload
+
+    def _judge(self, at: Point, c: Array) -> tuple[Timing, float, float, float]:
+        carry = self._carry(at, c)
+        use = limit_use(carry, self._model.workcell, self._limits, self._model.joint_names)
+        joint, box = (float(jerk.max()) for jerk in self._jerks(at, c))
         excess = worst(use)
         reason = f"{carry.duration:.3f} s; most used: {excess.place}"
         timing = Timing(TimingStatus.OK, reason, excess.place, carry, use)
-        return timing, excess.ratio, joint_use, box_use
+        return timing, excess.ratio, joint, box
 
-    def judged(self, c: Array) -> JerkTiming:
+    def _factor(self, c: Array) -> float:
+        """On the speeds, with which the timing exceeds no limit on the finer grid."""
+        if max(self._judge(self._fine, c)[1:]) <= 1.0 + RECOMPUTED_TOLERANCE:
+            return 1.0
+        low, high = 0.0, 1.0
+        for _ in range(14):
+            factor = 0.5 * (low + high)
+            exceeded = max(self._judge(self._fine, factor**2 * c)[1:]) > 1.0
+            low, high = (low, factor) if exceeded else (factor, high)
+        return low
+
+    def _judged(self, c: Array) -> JerkTiming:
         """The timing on the finer grid, slowed down where it exceeds a limit."""
-        factor = 1.0
-        timing, *uses = self._judge(self._fine, c)
-        if max(uses) > 1.0 + RECOMPUTED_TOLERANCE:
-            low, high = 0.0, 1.0
-            for _ in range(14):
-                factor = 0.5 * (low + high)
-                exceeded = max(self._judge(self._fine, factor**2 * c)[1:]) > 1.0
-                low, high = (low, factor) if exceeded else (factor, high)
-            factor = low
-            timing, *uses = self._judge(self._fine, factor**2 * c)
+        factor = self._factor(c)
+        timing, *uses = self._judge(self._fine, factor**2 * c)
         status = TimingStatus.OK if factor >= LEAST_SPEED else TimingStatus.NOT_CONVERGED
         place = timing.place
         if max(uses[1:]) > uses[0]:

@@ -40,6 +40,7 @@ class Point:
         squared_by, acceleration_by: (n, k) from coefficients to u'^2 and u''.
         motion: geometry by u.
         joint_jerk_by, box_jerk_by: (n, joints, k), (n, 3, k) jerk over sqrt(v).
+        keep: (n,) share of every limit that a program may use.
     """
 
     s: Array
@@ -49,6 +50,7 @@ class Point:
     motion: PathMotion
     joint_jerk_by: Array
     box_jerk_by: Array
+    keep: Array
 
     @classmethod
     def of(
@@ -79,6 +81,7 @@ class Point:
             motion,
             jerk(motion.q_first, motion.q_second, third[0]),
             jerk(*box, third[1]),
+            np.full(len(s), 1.0 - KEPT),
         )
 
     def duration(self, c: Array) -> float:
@@ -221,15 +224,15 @@ def convex_step(
 
 def _motion_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: _Rows) -> None:
     """Speeds and accelerations of joints and box."""
-    workcell, m, keep = model.workcell, at.motion, 1.0 - KEPT
+    workcell, m, keep = model.workcell, at.motion, at.keep
     ceiling = np.minimum(squared_speed_limit(m, workcell, limits), 1e6)
-    rows.below(at.squared_by / ceiling[:, None], np.full(len(at.s), keep))
+    rows.below(at.squared_by / ceiling[:, None], keep)
     limit = np.concatenate([robot.acceleration_max for robot in workcell.robots])
     by = (m.q_first / limit)[:, :, None] * at.acceleration_by[:, None, :]
     by = by + (m.q_second / limit)[:, :, None] * at.squared_by[:, None, :]
     flat = by.reshape(-1, by.shape[2])
     for sign in (1.0, -1.0):
-        rows.below(sign * flat, np.full(len(flat), keep))
+        rows.below(sign * flat, np.repeat(keep, len(limit)))
     payload = workcell.payload
     for first, second, most in (
         (m.pose_first[:, :3], m.pose_second[:, :3], payload.acceleration_max),
@@ -239,7 +242,7 @@ def _motion_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: _Row
             second[:, :, None] * at.squared_by[:, None]
         )
         n, k = len(at.s), at.value.shape[1]
-        rows.within(A / most, np.zeros((n, 3)), np.zeros((n, k)), np.full(n, keep))
+        rows.within(A / most, np.zeros((n, 3)), np.zeros((n, k)), keep)
 
 
 def _force_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: _Rows) -> None:
@@ -250,7 +253,7 @@ def _force_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: _Rows
 
     from symbolic.physics.contact_forces import normal_force_branches
 
-    workcell, m, force = model.workcell, at.motion, limits.force * (1.0 - KEPT)
+    workcell, m, force = model.workcell, at.motion, limits.force
     friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
     by_normal, by_tangent = (
         np.array(normal_force_branches(ca.DM(n), ca.DM(1 - n), friction)).reshape(-1)
@@ -266,7 +269,7 @@ def _force_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: _Rows
     rest = -weight - m.normal * still[:, None]
     for extra in (1.0, 0.0):  # N_1 = N_2 + F_n
         for share_n, share_t in zip(by_normal + extra, by_tangent, strict=True):
-            room = force - share_n * still
+            room = at.keep * force - share_n * still
             if share_t > 0.0:
                 rows.within(
                     share_t * across / force,
@@ -292,7 +295,7 @@ def _ratio_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, r
     chosen = value[:, near]
     for sign in (1.0, -1.0):
         # What is exceeded between rounds, because it is not convex, may stay as it is for one.
-        bound = np.maximum(1.0 - KEPT, sign * chosen) - sign * chosen + sign * (by @ c)
+        bound = np.maximum(at.keep[:, None], sign * chosen) - sign * chosen + sign * (by @ c)
         rows.below(sign * by.reshape(-1, by.shape[2]), bound.reshape(-1))
 
 
@@ -319,18 +322,15 @@ def _jerk_rows(at: Point, c: Array, jerk: JerkLimits, rows: _Rows) -> None:
     level, slope = 1.5 / np.sqrt(v), 0.5 * v**-1.5
     # Multiplied by sqrt(v) of the last round, so that rows are of order one.
     root = np.sqrt(v)
-    head = (slope * root)[:, None] * at.value
+    head = (at.keep * slope * root)[:, None] * at.value
+    level = at.keep * level * root
     limited = np.isfinite(jerk.joints)
     by = at.joint_jerk_by[:, limited] / jerk.joints[limited, None] * root[:, None, None]
     joints = by.shape[1]
-    bound = np.repeat(level * root * (1.0 - KEPT), joints)
-    below = np.repeat(head, joints, axis=0) * (1.0 - KEPT)
+    bound = np.repeat(level, joints)
+    below = np.repeat(head, joints, axis=0)
     for sign in (1.0, -1.0):
         rows.below(sign * by.reshape(-1, by.shape[2]) + below, bound)
     if np.isfinite(jerk.payload):
-        rows.within(
-            at.box_jerk_by / jerk.payload * root[:, None, None],
-            np.zeros((len(v), 3)),
-            head * (1.0 - KEPT),
-            level * root * (1.0 - KEPT),
-        )
+        box = at.box_jerk_by / jerk.payload * root[:, None, None]
+        rows.within(box, np.zeros((len(v), 3)), head, level)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -9,8 +12,9 @@ import pytest
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import PHASES, Job, Phase
 from hybrid_opt.job.sampling import sample_job
+from hybrid_opt.job.straight import lift_line, timed
 from hybrid_opt.robust.squeeze import SqueezeSettings
-from hybrid_opt.timing import TimingLimits, time_path
+from hybrid_opt.timing import JerkLimits, TimingLimits, time_path, time_with_jerk
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.physics.pose import pose_matrix
@@ -214,3 +218,51 @@ def test_a_failed_timing_has_no_job() -> None:
     failed = time_path(rack().timing_model, rack().initial, TimingLimits(force=30.0))
     with pytest.raises(SettingsError, match="no timing to export"):
         rack_jobs().plan(failed)
+
+
+def largest_jerk(phase: Phase) -> tuple[float, float]:
+    """Of joints [rad/s^3] and box [m/s^3], by differences of the accelerations."""
+    motion = phase.motion
+    moments = np.concatenate([[True], np.diff(motion.time) > 1e-9])
+    steps = np.diff(motion.time[moments])[:, None]
+    joints = np.diff(motion.q_second[moments], axis=0) / steps
+    box = np.diff(motion.second_rate[moments, :3], axis=0) / steps
+    return float(np.abs(joints).max()), float(np.linalg.norm(box, axis=1).max())
+
+
+def test_jerk_is_bounded_in_every_phase() -> None:
+    """Also around a carry whose timing switches accelerations in no time."""
+    timing = time_path(rack().timing_model, rack().initial, TimingLimits(force=55.0))
+    job = rack_jobs().plan(timing)
+    assert timing.duration < job.timing.duration < 1.06 * timing.duration
+    for phase in job.phases:
+        joints, box = largest_jerk(phase)
+        assert joints <= 50.0 * 1.01
+        assert box <= 50.0 * 1.01
+        assert phase.use["joint jerk"] == pytest.approx(joints / 50.0, rel=1e-6, abs=1e-9)
+    carry = job.phase("carry")
+    assert carry.use["joint jerk"] > 0.95
+    assert carry.use["normal force"] == pytest.approx(1.0, abs=0.01)
+    np.testing.assert_allclose(carry.motion.q_second[[0, -1]], 0.0, atol=1e-9)
+
+
+def test_straight_phases_take_the_time_that_jerk_asks_for() -> None:
+    job, model = rack_job(), copy(rack().timing_model)
+    first, second = model.workcell.robots
+    tight = replace(first, jerk_max=np.full(6, 0.5))
+    model.workcell = replace(model.workcell, robots=(tight, second))
+    old = job.phase("lift")
+    line = lift_line("lift", old.motion.pose[0], old.motion.pose[-1], 0.1)
+    motion = timed(model, line, old.motion.q)
+    assert motion.duration > old.duration
+    joints = np.diff(motion.q_second[:, :6], axis=0) / np.diff(motion.time)[:, None]
+    # Whole ticks round the duration up.
+    assert 0.9 * 0.5 < np.abs(joints).max() <= 0.5 * 1.005
+
+
+def test_a_carry_of_too_much_jerk_is_refused() -> None:
+    model = rack().timing_model
+    sharp = JerkLimits(np.full(12, 500.0), 500.0)
+    found = time_with_jerk(model, rack().initial, TimingLimits(force=55.0), sharp)
+    with pytest.raises(JobError, match="limit on joint jerk"):
+        rack_jobs().plan(found.timing)

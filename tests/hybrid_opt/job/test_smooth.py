@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.job.smooth import acceleration_at_ends, rests_at_ends, smoothed
-from hybrid_opt.timing import Timing, TimingLimits, time_path
+from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, time_path, time_with_jerk
 from symbolic.physics.path import path_basis
 from symbolic.workcell.decision import waypoints_of
 from tests.hybrid_opt.job.jobs import rack, rack_jobs, rack_timing
@@ -51,7 +51,11 @@ def test_a_time_optimal_timing_loses_its_jumps(width: float) -> None:
 
 
 def test_a_timing_at_rest_stays_as_it_is() -> None:
-    once = smoothed(rack().timing_model, rack_timing())
+    limits = JerkLimits.of(rack().workcell)
+    assert limits is not None
+    once = time_with_jerk(
+        rack().timing_model, rack().initial, TimingLimits(reference_speed=True), limits
+    ).timing
     assert rests_at_ends(once)
     assert rack_jobs().plan(once).timing is once
     assert rack_jobs().plan(rack_timing(), smoothing=0.0).timing is rack_timing()

@@ -64,6 +64,24 @@ def test_with_a_payload_the_same_motion_bears_it(drivable: ho.Cell, front: ho.Fr
     assert force_for_payload(drivable.workcell, 16.0) == found.force
 
 
+def test_limits_on_jerk_are_kept_and_what_they_cost_is_told(
+    drivable: ho.Cell, front: ho.Front
+) -> None:
+    found = ho.recommend(drivable, front.x, ho.Wish(duration=3.2))
+    assert found.jerk is not None
+    carry = found.jerk.timing.carry
+    assert carry is not None
+    assert found.jerk.without == found.timing.duration
+    assert 0.0 < found.jerk.cost < 0.2
+    jerk = np.diff(carry.side_by_side("q_second"), axis=0) / np.diff(carry.time)[:, None]
+    stated = [robot.jerk_max for robot in drivable.workcell.robots]
+    assert stated[0] is not None
+    assert np.abs(jerk).max() <= stated[0].min() * 1.01
+    assert carry.normal_force.max() <= found.force * 1.005
+    assert any("limits on jerk" in text for text in found.warnings)
+    assert f"{found.jerk.timing.duration:.3f} s" in repr(found)
+
+
 def test_the_hand_made_carry_stands_beside_it(drivable: ho.Cell, front: ho.Front) -> None:
     found = ho.recommend(drivable, front.x, ho.Wish(force=52.0))
     (rival,) = found.rivals

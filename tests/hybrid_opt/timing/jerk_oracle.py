@@ -17,6 +17,9 @@ from hybrid_opt.timing import JerkLimits, TimingLimits, TimingModel
 from symbolic.array import Array
 
 INTERVALS = 80
+STARTS = (1.0, 1.4, 2.0)
+"""Durations of the motions to begin with over the given one, until the solver arrives from one."""
+
 EVERY = 20
 """Of the model's samples that the splines go through."""
 
@@ -138,24 +141,26 @@ def shortest_duration(
         "ipopt.hessian_approximation": "exact",
     }
     solver = ca.nlpsol("jerk", "ipopt", {"x": z, "f": total, "g": g}, options)
-    t = np.linspace(0.0, 1.0, n + 1)
-    smooth = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
-    begin = np.array([smooth.deriv(k)(t) / slow**k if k else smooth(t) for k in range(3)])
-    third = smooth.deriv(3)((t[1:] + t[:-1]) / 2.0) / slow**3
     low_x = np.full(z.shape[0], -np.inf)
     high_x = np.full(z.shape[0], np.inf)
     low_x[0] = 1e-2
     low_x[1 + n :: 3], high_x[1 + n :: 3] = 0.0, 1.0
     low_x[2 + n :: 3] = 0.0
-    found = solver(
-        x0=np.concatenate([[slow], third, begin.T.ravel()]),
-        lbx=low_x,
-        ubx=high_x,
-        lbg=low,
-        ubg=high,
-    )
-    assert solver.stats()["success"], solver.stats()["return_status"]
-    return float(found["f"])
+    for factor in STARTS:
+        start = _smooth_start(factor * slow)
+        found = solver(x0=start, lbx=low_x, ubx=high_x, lbg=low, ubg=high)
+        if solver.stats()["success"]:
+            return float(found["f"])
+    raise AssertionError(solver.stats()["return_status"])
+
+
+def _smooth_start(duration: float) -> Array:
+    """The variables of a motion by the polynomial of degree five."""
+    t = np.linspace(0.0, 1.0, INTERVALS + 1)
+    smooth = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
+    states = [smooth.deriv(k)(t) / duration**k if k else smooth(t) for k in range(3)]
+    third = smooth.deriv(3)((t[1:] + t[:-1]) / 2.0) / duration**3
+    return np.concatenate([[duration], third, np.array(states).T.ravel()])
 
 
 def _normal_forces(model: TimingModel, path: _Path, u: ca.MX, w: ca.MX, a: ca.MX) -> ca.MX:

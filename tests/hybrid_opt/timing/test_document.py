@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -12,7 +13,13 @@ import pytest
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
-from hybrid_opt.timing import TimedTrajectory, timed_trajectory
+from hybrid_opt.timing import (
+    JerkLimits,
+    TimedTrajectory,
+    TimingLimits,
+    time_with_jerk,
+    timed_trajectory,
+)
 from hybrid_opt.timing.document import read_timing, timing_document
 from tests.hybrid_opt.timing.cells import hand_timing, initial
 
@@ -44,6 +51,20 @@ def test_figures_are_those_of_the_timings() -> None:
     assert document.force_curve is not None
     assert len(document.force_curve.points) == 3
     assert document.margins == timed().margins
+
+
+def test_what_limits_on_jerk_cost_is_stored(tmp_path: Path) -> None:
+    limits = JerkLimits(np.full(12, 40.0), 30.0)
+    found = time_with_jerk(hand_timing(), initial(), TimingLimits(), limits)
+    jerky = replace(timed(), report=replace(timed().report, jerk=found))
+    path = tmp_path / "timing.json"
+    write_json(path, to_json(timing_document(jerky)))
+    stored = read_timing(path)
+    assert stored.jerk is not None
+    assert (stored.jerk.duration, stored.jerk.without) == (found.timing.duration, found.without)
+    assert (stored.jerk.joint_use, stored.jerk.payload_use) == found.jerk_use
+    assert stored.timings["within jerk limits"].duration == stored.jerk.duration
+    assert timing_document(timed()).jerk is None
 
 
 @pytest.mark.parametrize(
