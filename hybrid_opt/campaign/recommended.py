@@ -8,8 +8,8 @@ from hybrid_opt.campaign.documents import Count, Pair, Vector
 from hybrid_opt.recommending.recommendation import Recommendation
 from hybrid_opt.robust.price import RobustPrice
 from hybrid_opt.store.json_records import Figure
-from symbolic.array import Array
 from hybrid_opt.timing.document import StoredJerk
+from symbolic.array import Array
 
 
 @dataclass(frozen=True)
