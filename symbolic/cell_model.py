@@ -48,7 +48,7 @@ def build_cell_model(workcell: Workcell) -> CellModel:
     """
     task = workcell.task
     first, second = (
-        build_robot_model(robot, task.redundant_of(i), task.extended_size)
+        build_robot_model(robot, task.redundant_of(i), task.extended_size, task.orientation)
         for i, robot in enumerate(workcell.robots)
     )
     robots = (first, second)

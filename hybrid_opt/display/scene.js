@@ -2,7 +2,7 @@
 /* The cell in three dimensions: nested joint frames, z up, orbit by pointer. */
 (function () {
   const COLOURS = { "robot 1": 0x3b6ea8, "robot 2": 0xa8733b, payload: 0xc9a227,
-    environment: 0x9aa3ab, ground: 0xdedfd8 };
+    environment: 0x9aa3ab, ground: 0xdedfd8, marked: 0xb00020 };
 
   function matrix(rows) {
     return new THREE.Matrix4().set(...rows);
@@ -65,22 +65,34 @@
       geometry.setIndex(new THREE.BufferAttribute(decode(solid.faces, Uint16Array), 1));
       const flat = geometry.toNonIndexed();
       flat.computeVertexNormals();
-      const colour = COLOURS[solid.ground ? "ground" : solid.group];
+      const colour = COLOURS[solid.ground && solid.group !== "marked" ? "ground" : solid.group];
       const mesh = new THREE.Mesh(flat, new THREE.MeshLambertMaterial({ color: colour }));
       if (solid.kind === "world") this.scene.add(mesh);
       else if (solid.kind === "box") this.box.add(mesh);
       else this.arms[solid.robot][solid.joint].moving.add(mesh);
     }
 
-    /* pose: x y z roll pitch yaw; q: all joints, the second arm's after the first's. */
+    /* pose: x y z and the orientation; q: all joints, the second arm's after the first's. */
     place(pose, q) {
       this.box.position.set(pose[0], pose[1], pose[2]);
-      this.box.rotation.set(pose[3], pose[4], pose[5], "ZYX");
+      this.turn(pose[3], pose[4], pose[5]);
       this.arms.flat().forEach((joint, k) => {
         if (joint.turns) joint.moving.quaternion.setFromAxisAngle(joint.axis, q[k]);
         else joint.moving.position.copy(joint.axis).multiplyScalar(q[k]);
       });
       this.render();
+    }
+
+    /* Roll, pitch, yaw, or a rotation vector that turns the reference. */
+    turn(a, b, c) {
+      const { vector, reference } = this.data.orientation;
+      if (!vector) {
+        this.box.rotation.set(a, b, c, "ZYX");
+        return;
+      }
+      const axis = new THREE.Vector3(a, b, c), angle = axis.length();
+      this.box.quaternion.setFromAxisAngle(axis.normalize(), angle)
+        .multiply(new THREE.Quaternion(...reference));
     }
 
     showPath(points) {

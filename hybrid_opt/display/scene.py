@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import zipfile
+from collections.abc import Collection
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -12,19 +13,27 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.display.solids import Solid, cell_solids, extent_points
 from hybrid_opt.errors import DisplayError
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
+from symbolic.workcell.orientation import Orientation
 
 _VIEWED = 12
 """About as many samples of a carry decide where its scene is looked at from."""
 
 
-def scene_data(geometry: CellGeometry, carry: Carry) -> dict[str, Any]:
-    """Shapes, joints and a good place to look from, as JSON values."""
+def scene_data(
+    geometry: CellGeometry, carry: Carry, marked: Collection[str] = ()
+) -> dict[str, Any]:
+    """Shapes, joints and a good place to look from, as JSON values.
+
+    Args:
+        marked: names of bodies that are shown in red.
+    """
     points = motion_points(geometry, carry.pose, carry.q)
     lower, upper = points.min(axis=0), points.max(axis=0)
     return {
@@ -37,7 +46,8 @@ def scene_data(geometry: CellGeometry, carry: Carry) -> dict[str, Any]:
             }
             for arm in geometry.arms
         ],
-        "solids": [_solid(solid) for solid in cell_solids(geometry)],
+        "orientation": _orientation(geometry.workcell.task.orientation),
+        "solids": [_solid(solid, solid.name in marked) for solid in cell_solids(geometry)],
         "view": {
             "centre": ((lower + upper) / 2.0).tolist(),
             "radius": float(np.linalg.norm(upper - lower)) / 2.0,
@@ -94,9 +104,15 @@ def packed(values: NDArray[Any], kind: type[np.generic]) -> str:
     ).decode("ascii")
 
 
-def _solid(solid: Solid) -> dict[str, Any]:
+def _orientation(orientation: Orientation) -> dict[str, Any]:
+    """How the page reads the last three numbers of a pose; the reference as x y z w."""
+    reference = Rotation.from_matrix(orientation.reference).as_quat()
+    return {"vector": orientation.is_vector, "reference": reference.tolist()}
+
+
+def _solid(solid: Solid, marked: bool) -> dict[str, Any]:
     return {
-        "group": solid.group,
+        "group": "marked" if marked else solid.group,
         "ground": solid.is_ground,
         "kind": solid.frame.kind,
         "robot": solid.frame.robot,

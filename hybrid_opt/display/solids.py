@@ -14,6 +14,7 @@ from symbolic.array import Array
 from symbolic.geometry.bodies import ArmGeometry, Frame
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import Capsule, Hull, Piece
+from symbolic.physics.pose import box_placement
 from symbolic.workcell.records import Box, Cylinder, Sphere
 
 SECTIONS = 24
@@ -97,21 +98,11 @@ def joint_placements(arm: ArmGeometry, q: Array) -> Array:
     return placed
 
 
-def box_placements(pose: Array) -> Array:
-    """(n, 4, 4) of the box in the world from poses (n, 6) [m, rad]."""
-    T = np.zeros((len(pose), 4, 4))
-    # Rz(yaw) Ry(pitch) Rx(roll), as `symbolic.physics.rotation` has it.
-    T[:, :3, :3] = Rotation.from_euler("xyz", pose[:, 3:]).as_matrix()
-    T[:, :3, 3] = pose[:, :3]
-    T[:, 3, 3] = 1.0
-    return T
-
-
 def frame_placements(geometry: CellGeometry, pose: Array, q: Array) -> dict[Frame, Array]:
     """(n, 4, 4) of every frame in the world along n samples: pose (n, 6), q (n, all joints)."""
     placed = {
         Frame("world"): np.broadcast_to(np.eye(4), (len(pose), 4, 4)),
-        Frame("box"): box_placements(pose),
+        Frame("box"): box_placement(geometry.workcell.task.orientation, pose),
     }
     first = 0
     for i, arm in enumerate(geometry.arms):

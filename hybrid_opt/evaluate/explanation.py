@@ -13,7 +13,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import COLLISION, REASONS, Evaluations
 from hybrid_opt.evaluate.sampled import reached_samples
 from symbolic.array import Array
-from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.physics.pose import box_placement, inverse
 from symbolic.robot.urdf import arm_model, link_frame
 from symbolic.workcell.records import Contact, Robot
 
@@ -117,12 +117,13 @@ def _explained(
         index = int(arm) - 1
         robot, held = workcell.robots[index], workcell.contacts[index]
         last = outputs[f"q_{arm}"][0, max(sample - 1, 0)]
-        missing = missing_reach(robot, held, outputs["pose"][0, sample], last)
+        T_world_box = box_placement(workcell.task.orientation, outputs["pose"][0, sample])
+        missing = missing_reach(robot, held, T_world_box, last)
         return Explanation(reason, position, sample, robot=robot.name, missing=missing)
     return Explanation(reason, position, sample)
 
 
-def missing_reach(robot: Robot, contact: Contact, pose: Array, q: Array) -> float:
+def missing_reach(robot: Robot, contact: Contact, T_world_box: Array, q: Array) -> float:
     """How far an arm's flange stays from where it would hold the box, at best [m].
 
     The distance where position and orientation together are nearest, joints within their limits;
@@ -130,13 +131,13 @@ def missing_reach(robot: Robot, contact: Contact, pose: Array, q: Array) -> floa
 
     Args:
         robot, contact: the arm and its contact.
-        pose: (6,) of the box [m, rad].
+        T_world_box: (4, 4), where the box is.
         q: (n,) posture to begin with.
     """
     model = arm_model(robot)
     data, flange = model.createData(), link_frame(model, robot.flange)
     T_box_flange = contact.T_box_pad @ inverse(robot.T_flange_pad)
-    target = inverse(robot.T_world_base) @ pose_matrix(pose[:3], pose[3:]) @ T_box_flange
+    target = inverse(robot.T_world_base) @ T_world_box @ T_box_flange
     least, distance = np.inf, np.inf
     for _ in range(STEPS):
         pin.framesForwardKinematics(model, data, q)

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
-from scipy.spatial.transform import Rotation
 
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import Job, Phase
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.physics.pose import box_rotation
 
 STIFFNESSES = (2e3, 1e4, 5e4, 2e5, 1e6)
 """From a soft Cartesian impedance to a stiff industrial arm [N/m]."""
@@ -188,8 +188,9 @@ def _skewed(job: Job, phase: Phase, late: int, delay: float, stiffness: float) -
     time = motion.time[keep]
     path = CubicHermiteSpline(time, motion.pose[keep], motion.rate[keep])
     now, before = path(time), path(np.clip(time - delay, 0.0, None))
-    rotation, point = _rotations(now), contact.T_box_pad[:3, 3]
-    moved = before[:, :3] + _rotations(before) @ point - now[:, :3] - rotation @ point
+    orientation, point = job.workcell.task.orientation, contact.T_box_pad[:3, 3]
+    rotation, earlier = box_rotation(orientation, now), box_rotation(orientation, before)
+    moved = before[:, :3] + earlier @ point - now[:, :3] - rotation @ point
     normal = rotation @ contact.T_box_pad[:3, 2]
     along = np.einsum("ni,ni->n", moved, normal)
     across = np.linalg.norm(moved - along[:, None] * normal, axis=1)
@@ -206,11 +207,6 @@ def _skewed(job: Job, phase: Phase, late: int, delay: float, stiffness: float) -
         margin=float((commanded + change[:, None] - needed).min()),
         late=late,
     )
-
-
-def _rotations(poses: Array) -> Array:
-    found: Array = Rotation.from_euler("xyz", poses[:, 3:]).as_matrix()
-    return found
 
 
 def require_stiffness(stiffness: float) -> None:

@@ -13,7 +13,7 @@ from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.squeeze import Squeeze, extra_force
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
-from symbolic.physics.pose import rotation_from_rpy
+from symbolic.physics.pose import box_rotation
 from symbolic.workcell.records import Workcell
 
 
@@ -78,7 +78,7 @@ def unit_squeeze(workcell: Workcell, pose: Array) -> Array:
     normal = first[:3, 2]
     apart = second[:3, 3] - first[:3, 3]
     beside = (apart - (apart @ normal) * normal) / 2.0
-    turned = np.array([rotation_from_rpy(row[3:]) for row in pose])
+    turned = box_rotation(workcell.task.orientation, pose)
     wrenches = np.array(
         [
             np.concatenate([sign * normal, np.cross(sign * beside, sign * normal)])

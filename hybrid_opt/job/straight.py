@@ -15,7 +15,7 @@ from hybrid_opt.job.records import Motion
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array
-from symbolic.physics.pose import rotation_from_rpy
+from symbolic.physics.pose import box_rotation
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.workcell.records import Workcell
 
@@ -78,7 +78,7 @@ def pad_line(
         ways: distances of the pads from the box at beginning and end [m].
         speed: largest [m/s].
     """
-    rotation = rotation_from_rpy(box[3:])
+    rotation = box_rotation(workcell.task.orientation, box)
     held = np.tile(box, (2, 2, 1))
     for arm, contact in enumerate(workcell.contacts):
         for end, distance in enumerate(ways):

@@ -21,6 +21,7 @@ from hybrid_opt.witness.pads import Pads
 from hybrid_opt.witness.reference import Reference
 from hybrid_opt.witness.scene import quaternion
 from symbolic.array import Array
+from symbolic.physics.pose import box_rotation
 from symbolic.workcell.records import Workcell
 
 LOOKED_AT = 5e-3
@@ -209,12 +210,12 @@ class _Run:
         """Put arms and box at their first poses; returns the box's (7,) as MuJoCo has it."""
         data, job = self._data, self._reference.job
         data.qpos[self._q], data.qvel[self._v] = self._ticks.q[0], self._ticks.q_rate[0]
-        rotation = Rotation.from_euler("xyz", job.start[3:])
+        rotation = box_rotation(self._workcell.task.orientation, job.start)
         # The arms grip where they were told: pads elsewhere on the box mean a box elsewhere.
         pairs = zip(self._workcell.contacts, self._reference.workcell.contacts, strict=True)
         displaced = np.mean([real.T_box_pad - told.T_box_pad for real, told in pairs], axis=0)
-        position = job.start[:3] - rotation.apply(displaced[:3, 3])
-        standing = np.concatenate([position, quaternion(rotation.as_matrix())])
+        position = job.start[:3] - rotation @ displaced[:3, 3]
+        standing = np.concatenate([position, quaternion(rotation)])
         data.qpos[self._box_q] = standing
         box = int(self._model.body("box").id)
         data.xfrc_applied[box, :3] = -self._workcell.payload.mass * disturbance

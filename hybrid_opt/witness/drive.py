@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
-from scipy.spatial.transform import Rotation
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.witness.scene import PAD_MASS, SimulationSettings, quaternion
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.physics.pose import box_rotation
 
 SAME_TIME = 1e-9
 """Samples closer than this stand for both sides of one instant [s]."""
@@ -106,7 +106,7 @@ def drive_of(
     clipped = np.clip(time, begin, end)
     moving = ((time > begin) & (time < end))[:, None]
     pose, rate = _pose(carry, clipped)
-    rotation: Array = Rotation.from_euler("xyz", pose[:, 3:]).as_matrix()
+    rotation = box_rotation(carry.workcell.task.orientation, pose)
     acceleration, omega, alpha = (
         moving * _interpolated(clipped, carry.time, values)
         for values in (carry.second_rate[:, :3], carry.angular_velocity, carry.angular_acceleration)

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from studies.plain.motion import rotation
+from studies.plain.motion import box_rotation
 from symbolic.array import Array
 from symbolic.robot.arm import (
     BEGIN_STEPS,
@@ -20,6 +20,7 @@ from symbolic.robot.arm import (
 from symbolic.robot.chain import held_joints
 from symbolic.robot.urdf import moving_joints
 from symbolic.robot.urdf_file import read_urdf
+from symbolic.workcell.orientation import Orientation
 from symbolic.workcell.records import Contact, Robot
 
 
@@ -42,10 +43,18 @@ class PlainArm:
     Args:
         robot, contact: the arm and what it holds the box by.
         redundant: indices of the joints that do not follow the box.
+        orientation: what the last three numbers of poses mean; roll, pitch, yaw by default.
     """
 
-    def __init__(self, robot: Robot, contact: Contact, redundant: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        contact: Contact,
+        redundant: tuple[int, ...] = (),
+        orientation: Orientation | None = None,
+    ) -> None:
         self.robot = robot
+        self.orientation = orientation or Orientation()
         self.contact = contact
         self.redundant = list(redundant)
         self.model = pin.buildReducedModel(*held_model(robot))
@@ -57,7 +66,7 @@ class PlainArm:
 
     def flange_target(self, pose: Array) -> pin.SE3:
         """Flange placement in the root that puts the pad on its contact."""
-        world_box = pin.SE3(rotation(pose[3:]), pose[:3])
+        world_box = pin.SE3(box_rotation(self.orientation, pose[3:]), pose[:3])
         world_pad = world_box * pin.SE3(self.contact.T_box_pad)
         return self.T_root_world * world_pad * self.T_flange_pad.inverse()
 

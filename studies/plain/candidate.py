@@ -51,6 +51,7 @@ class PlainEvaluator:
                 workcell.robots[i],
                 workcell.contacts[i],
                 tuple(joint for joint, _ in workcell.task.redundant_of(i)),
+                workcell.task.orientation,
             )
             for i in (0, 1)
         ]

@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from hybrid_opt.collision.checker import RESTING_TOLERANCE
 from studies.plain.arm import held_model
-from studies.plain.motion import rotation
+from studies.plain.motion import box_rotation
 from symbolic.array import Array
 from symbolic.geometry.meshes import convex_pieces
 from symbolic.geometry.pairs import build_geometry
@@ -103,7 +103,7 @@ class PlainCollisionChecker:
         return self.workcell.collision.tolerance + displaced
 
     def _move_payload(self, pose: Array) -> None:
-        world_box = pin.SE3(rotation(pose[3:]), pose[:3])
+        world_box = pin.SE3(box_rotation(self.workcell.task.orientation, pose[3:]), pose[:3])
         self.payload.move(world_box)
         self.shrunk.move(world_box)
 

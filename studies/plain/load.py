@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from studies.plain.motion import angular_rates, rotation
+from studies.plain.motion import box_rates, box_rotation
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
 
@@ -16,8 +16,9 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 def sample_load(workcell: Workcell, pose: Array, rate: Array, second: Array) -> dict[str, Array]:
     """Every load quantity of one sample, named as in `LOAD_OUTPUTS`."""
     payload, contacts = workcell.payload, workcell.contacts
-    R = rotation(pose[3:])
-    omega, alpha = angular_rates(pose[3:], rate[3:], second[3:])
+    orientation = workcell.task.orientation
+    R = box_rotation(orientation, pose[3:])
+    omega, alpha = box_rates(orientation, pose[3:], rate[3:], second[3:])
     to_com = R @ payload.centre_of_mass
     acceleration = second[:3] + np.cross(alpha, to_com) + np.cross(omega, np.cross(omega, to_com))
     force = payload.mass * (acceleration - GRAVITY)

@@ -12,14 +12,18 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
 from symbolic.physics.time_law import STEP_TIME_FLOOR
+from symbolic.workcell.orientation import Orientation
 from symbolic.workcell.records import Task
+
+NODES = 14
+"""Of Gauss's quadrature: exact to rounding up to a full turn."""
 
 
 def waypoints(task: Task, x: Array) -> Array:
     """All waypoints (n_waypoints, 6) of a decision vector, angles unwrapped."""
     free = iter(np.reshape(x[: task.n_box], (-1, 6)))
     rows = np.array([w.lower if w.is_fixed else next(free) for w in task.waypoints])
-    rows[:, 3:] = np.unwrap(rows[:, 3:], axis=0)
+    rows[:, 3:] = task.orientation.unwrapped(rows[:, 3:])
     return rows
 
 
@@ -89,9 +93,17 @@ def _powers(s: float, order: int) -> Array:
 
 
 def rotation(rpy: Array) -> Array:
-    """R_world_box (3, 3)."""
+    """R_world_box (3, 3) by roll, pitch, yaw."""
     matrix: Array = Rotation.from_euler("xyz", rpy).as_matrix()
     return matrix
+
+
+def box_rotation(orientation: Orientation, numbers: Array) -> Array:
+    """R_world_box (3, 3) by what the cell's numbers mean."""
+    if not orientation.is_vector:
+        return rotation(numbers)
+    turn: Array = Rotation.from_rotvec(numbers).as_matrix()
+    return turn @ orientation.reference
 
 
 def euler_axes(rpy: Array) -> tuple[Array, Array, Array]:
@@ -102,7 +114,7 @@ def euler_axes(rpy: Array) -> tuple[Array, Array, Array]:
 
 
 def angular_rates(rpy: Array, rate: Array, second: Array) -> tuple[Array, Array]:
-    """Angular velocity and acceleration (3,) in the world frame.
+    """Angular velocity and acceleration (3,) in the world frame of roll, pitch, yaw.
 
     Each axis is carried round by the turns outside it: d axis / dt = omega_outer x axis.
     """
@@ -116,6 +128,28 @@ def angular_rates(rpy: Array, rate: Array, second: Array) -> tuple[Array, Array]
         + np.cross(yaw_rate + pitch_rate, roll_rate)
     )
     return yaw_rate + pitch_rate + roll_rate, acceleration
+
+
+def vector_rates(vector: Array, rate: Array, second: Array) -> tuple[Array, Array]:
+    """Angular velocity and acceleration (3,) in the world frame of a rotation vector.
+
+    omega = integral of exp(s v) v' over s in [0, 1]; exp(s v) itself turns with the same integral
+    up to s (Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2, 2012, 10.7).
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    shares, weights = (nodes + 1.0) / 2.0, weights / 2.0
+    turned = Rotation.from_rotvec(np.outer(shares, vector))
+    moved = turned.apply(rate)
+    inner = Rotation.from_rotvec(np.outer(np.outer(shares, shares).ravel(), vector)).apply(rate)
+    own = shares[:, None] * np.einsum("j,ijk->ik", weights, inner.reshape(NODES, NODES, 3))
+    return weights @ moved, weights @ (turned.apply(second) + np.cross(own, moved))
+
+
+def box_rates(
+    orientation: Orientation, numbers: Array, rate: Array, second: Array
+) -> tuple[Array, Array]:
+    """Angular velocity and acceleration (3,) by what the cell's numbers mean."""
+    return (vector_rates if orientation.is_vector else angular_rates)(numbers, rate, second)
 
 
 def timed_motion(task: Task, x: Array) -> tuple[Array, Array, Array, Array]:
@@ -136,7 +170,7 @@ def _constant_time(task: Task, pose: Array) -> Array:
     time = [0.0]
     for here, there in pairwise(pose):
         step, middle = there - here, (here + there) / 2.0
-        turn, _ = angular_rates(middle[3:], step[3:], np.zeros(3))
+        turn, _ = box_rates(task.orientation, middle[3:], step[3:], np.zeros(3))
         needed = max(
             float(np.linalg.norm(step[:3])) / task.reference_speed,
             float(np.linalg.norm(turn)) / task.reference_angular_speed,
@@ -152,7 +186,7 @@ def _ramped(
     lever = task.reference_speed / task.reference_angular_speed
     slope, curvature = [], []
     for here, d, dd in zip(pose, first, second, strict=True):
-        omega, alpha = angular_rates(here[3:], d[3:], dd[3:])
+        omega, alpha = box_rates(task.orientation, here[3:], d[3:], dd[3:])
         linear, angular = float(np.linalg.norm(d[:3])), lever * float(np.linalg.norm(omega))
         if linear >= angular:
             slope.append(linear)

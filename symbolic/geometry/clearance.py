@@ -61,7 +61,7 @@ def screening_functions(
     """
     pose = ca.SX.sym("pose", 6)
     q = [ca.SX.sym(f"q_{i}", arm.joints) for i, arm in enumerate(geometry.arms, start=1)]
-    R, p = rotation_matrix(pose[3:]), pose[:3]
+    R, p = rotation_matrix(geometry.workcell.task.orientation, pose[3:]), pose[:3]
     first, second = (joint_placements[i](q[i]) for i in (0, 1))
     clearance = clearance_expressions(geometry, R, p, first, second, softness)
     placed = {WORLD: (ca.SX.eye(3), ca.SX.zeros(3)), BOX: (R, p)}

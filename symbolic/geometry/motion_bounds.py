@@ -11,7 +11,9 @@ where the chord D bounds |x(1) - x(0)| and the bend K bounds |x''|. For the bodi
 
 with r_j the largest distance of the body's points from the axis of joint j. Where a joint slides,
 r_j = 1 bounds the motion by it, and in x'' it counts with the joints that turn before it only: what
-slides along a fixed line does not bend.
+slides along a fixed line does not bend. Of the box |x''| <= r (sum_i |da_i|)^2, da_i the steps of
+its three numbers: for angles as for joints, and for a rotation vector v = v_0 + s d by Duhamel's
+formula, |exp(v)''| = 2 |integral of exp d exp d exp over a triangle of area 1/2| <= |d|^2.
 """
 
 from __future__ import annotations
@@ -65,7 +67,8 @@ def motion_function(
         q_1, q_2 = (
             ca.SX.sym(f"q_{i}_{end}", arm.joints) for i, arm in enumerate(geometry.arms, start=1)
         )
-        placed = {WORLD: (ca.SX.eye(3), ca.SX.zeros(3)), BOX: (rotation_matrix(pose[3:]), pose[:3])}
+        rotation = rotation_matrix(geometry.workcell.task.orientation, pose[3:])
+        placed = {WORLD: (ca.SX.eye(3), ca.SX.zeros(3)), BOX: (rotation, pose[:3])}
         for i, (arm, q) in enumerate(zip(geometry.arms, (q_1, q_2), strict=True)):
             for j, joint in enumerate(world_placements(arm.T_world_root, joint_placements[i](q))):
                 placed[Frame("link", i, j)] = joint

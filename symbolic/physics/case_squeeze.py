@@ -94,9 +94,10 @@ def _balance_function(workcell: Workcell) -> ca.Function:
     case = ca.SX.sym("case", CASE_SIZE)
     _, _, mass, centre, disturbance, displacement = _parts(case)
     payload, contacts = workcell.payload, workcell.contacts
-    rotation = rotation_matrix(pose[3:])
-    omega = angular_velocity(pose[3:], rate[3:])
-    alpha = angular_acceleration(pose[3:], rate[3:], second[3:])
+    turned = workcell.task.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], rate[3:])
+    alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
     share = mass / payload.mass
     nominal = ca.DM(payload.centre_of_mass)
     pulled = second[:3] + disturbance

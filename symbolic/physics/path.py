@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -72,7 +73,7 @@ def waypoint_matrix(task: Task, x: Expression) -> Expression:
     """All waypoints (6, n_waypoints) from the decision vector (paper Eq. 17), angles unwrapped.
 
     Args:
-        x: (n_var,) free waypoints in path order, each x, y, z, roll, pitch, yaw.
+        x: (n_var,) free waypoints in path order, each a pose.
     """
     columns = []
     taken = 0
@@ -82,7 +83,8 @@ def waypoint_matrix(task: Task, x: Expression) -> Expression:
         else:
             columns.append(x[6 * taken : 6 * taken + 6])
             taken += 1
-    for previous, current in zip(range(len(columns)), range(1, len(columns)), strict=False):
+    pairs = [] if task.orientation.is_vector else pairwise(range(len(columns)))
+    for previous, current in pairs:
         columns[current] = ca.vertcat(
             columns[current][:3], _unwrap(columns[previous][3:], columns[current][3:])
         )

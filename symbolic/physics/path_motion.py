@@ -113,9 +113,10 @@ def box_function(workcell: Workcell) -> ca.Function:
     """`BOX_OUTPUTS` of one sample from the box pose and its derivatives by u."""
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     payload = workcell.payload
-    rotation = rotation_matrix(pose[3:])
-    omega = angular_velocity(pose[3:], first[3:])
-    alpha = angular_acceleration(pose[3:], first[3:], second[3:])
+    turned = workcell.task.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], first[3:])
+    alpha = angular_acceleration(turned, pose[3:], first[3:], second[3:])
     offset = ca.mtimes(rotation, ca.DM(payload.centre_of_mass))
     inertia = ca.SX(ca.DM(payload.inertia))
     outputs = {
@@ -146,9 +147,10 @@ def arm_derivative_function(
     q, names = ca.SX.sym("q", n), ("pose", "first", "second")
     given = [ca.SX.sym(each, model.pose_size) for each in names]
     pose, first, second = (values[:6] for values in given)
-    rotation = rotation_matrix(pose[3:])
-    omega = angular_velocity(pose[3:], first[3:])
-    alpha = angular_acceleration(pose[3:], first[3:], second[3:])
+    turned = model.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], first[3:])
+    alpha = angular_acceleration(turned, pose[3:], first[3:], second[3:])
     lever = ca.mtimes(rotation, ca.DM(box_flange(robot, contact)[:3, 3]))
     to_root = ca.DM(robot.T_world_base[:3, :3].T)
     twist = ca.vertcat(

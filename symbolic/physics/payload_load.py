@@ -109,9 +109,10 @@ def paper_load_function(workcell: Workcell) -> ca.Function:
     pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
     friction, centre_of_mass = ca.SX.sym("friction", 2), ca.SX.sym("centre_of_mass", 3)
     payload, contacts = workcell.payload, workcell.contacts
-    rotation = rotation_matrix(pose[3:])
-    omega = angular_velocity(pose[3:], rate[3:])
-    alpha = angular_acceleration(pose[3:], rate[3:], second[3:])
+    turned = workcell.task.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], rate[3:])
+    alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
 
     offset = ca.mtimes(rotation, centre_of_mass)
     force = resultant_force(payload.mass, offset, omega, alpha, second[:3])
@@ -250,7 +251,7 @@ def _in_pad_axes(
     pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in sizes]
     first, second = (contact.T_box_pad for contact in workcell.contacts)
     in_box = ca.DM(first[:3, :3])
-    axes = ca.mtimes(rotation_matrix(pose[3:]), in_box)
+    axes = ca.mtimes(rotation_matrix(workcell.task.orientation, pose[3:]), in_box)
     arms = tuple(ca.mtimes(in_box.T, ca.DM(T[:3, 3]) - centre_of_mass) for T in (first, second))
     return inputs, axes, (ca.mtimes(axes.T, force), ca.mtimes(axes.T, moment)), (arms[0], arms[1])
 

@@ -1,4 +1,4 @@
-"""Numeric homogeneous transforms, with the project's angle convention."""
+"""Numeric homogeneous transforms, with the project's angle convention and a cell's own."""
 
 from __future__ import annotations
 
@@ -6,26 +6,55 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from symbolic.array import Array
+from symbolic.workcell.orientation import Orientation
 
 
 def rotation_from_rpy(rpy: ArrayLike) -> Array:
-    """Rotation Rz(yaw) Ry(pitch) Rx(roll), the convention of URDF.
+    """Rotations Rz(yaw) Ry(pitch) Rx(roll), the convention of URDF.
 
     Args:
-        rpy: (3,) roll, pitch, yaw [rad].
+        rpy: (..., 3) roll, pitch, yaw [rad].
 
     Returns:
-        (3, 3).
+        (..., 3, 3).
     """
-    roll, pitch, yaw = np.asarray(rpy, dtype=float)
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [0.0 - sp, cp * sr, cp * cr],
-        ]
-    )
+    angles = np.moveaxis(np.asarray(rpy, dtype=float), -1, 0)
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [0.0 - sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def rotation_from_vector(vector: ArrayLike) -> Array:
+    """Rotations exp(v) of rotation vectors (..., 3) [rad], by Rodrigues' formula: (..., 3, 3)."""
+    v = np.asarray(vector, dtype=float)
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    across = np.cross(v[..., None, :], np.eye(3))
+    # The rows of `across` are v x e_k: the transpose of the skew matrix of v.
+    skew = np.swapaxes(across, -1, -2)
+    bend = np.sinc(angle / (2.0 * np.pi)) ** 2 / 2.0
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * skew + bend * (skew @ skew))
+
+
+def box_rotation(orientation: Orientation, pose: ArrayLike) -> Array:
+    """R_world_box (..., 3, 3) of poses (..., 6) [m, rad] of a cell with this orientation."""
+    numbers = np.asarray(pose, dtype=float)[..., 3:6]
+    if orientation.is_vector:
+        return np.asarray(rotation_from_vector(numbers) @ orientation.reference)
+    return rotation_from_rpy(numbers)
+
+
+def box_placement(orientation: Orientation, pose: ArrayLike) -> Array:
+    """T_world_box (..., 4, 4) of poses (..., 6) [m, rad] of a cell with this orientation."""
+    given = np.asarray(pose, dtype=float)
+    T = np.zeros((*given.shape[:-1], 4, 4))
+    T[..., :3, :3] = box_rotation(orientation, given)
+    T[..., :3, 3] = given[..., :3]
+    T[..., 3, 3] = 1.0
+    return T
 
 
 def pose_matrix(xyz: ArrayLike, rpy: ArrayLike) -> Array:

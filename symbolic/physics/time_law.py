@@ -39,7 +39,7 @@ class TimedPath:
 
     Attributes:
         time: (1, n) [s], starts at 0.
-        pose: (6, n) x, y, z [m], roll, pitch, yaw [rad].
+        pose: (6, n) position [m] and orientation [rad] (`symbolic.workcell.orientation`).
         rate: (6, n) first time derivative of the pose.
         second_rate: (6, n) second time derivative of the pose.
     """
@@ -99,7 +99,7 @@ def _step_time_function(task: Task) -> ca.Function:
     start, end = ca.SX.sym("start", 6), ca.SX.sym("end", 6)
     step = end - start
     length = _smooth_norm(step[:3])
-    angle = _smooth_norm(angular_velocity((start[3:] + end[3:]) / 2.0, step[3:]))
+    angle = _smooth_norm(angular_velocity(task.orientation, (start[3:] + end[3:]) / 2.0, step[3:]))
     duration = ca.fmax(length / task.reference_speed, angle / task.reference_angular_speed)
     return ca.Function("step_time", [start, end], [ca.fmax(duration, STEP_TIME_FLOOR)])
 
@@ -154,8 +154,8 @@ def _length_rate_function(task: Task) -> ca.Function:
     """Arc length per unit of u and its derivative; rotation counts at the reference speeds."""
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     lever = task.reference_speed / task.reference_angular_speed
-    turn = angular_velocity(pose[3:], first[3:])
-    turn_rate = angular_acceleration(pose[3:], first[3:], second[3:])
+    turn = angular_velocity(task.orientation, pose[3:], first[3:])
+    turn_rate = angular_acceleration(task.orientation, pose[3:], first[3:], second[3:])
     linear, angular = _smooth_norm(first[:3]), lever * _smooth_norm(turn)
     linear_rate = ca.dot(first[:3], second[:3]) / linear
     angular_rate = lever**2 * ca.dot(turn, turn_rate) / angular

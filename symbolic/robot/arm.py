@@ -163,7 +163,7 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
     q, R, p = ca.SX.sym("q", n), ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
     residual, jacobian = ca.SX.sym("residual"), ca.SX.sym("jacobian", 6, n)
     start = ca.SX.sym("start", n)
-    rotation = rotation_matrix(pose[3:6])
+    rotation = rotation_matrix(model.orientation, pose[3:6])
     previous, change = state[:n], state[n : 2 * n]
 
     near = model.with_redundant(previous + (change + state[2 * n : 3 * n]), pose)
@@ -257,7 +257,8 @@ def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     if model.redundant:
         q_start, at = ca.SX.sym("start", n), ca.SX.sym("q", n)
         given = ca.SX.sym("pose", model.pose_size)
-        target = flange_target(robot, contact, given[:3], rotation_matrix(given[3:6]))
+        rotation = rotation_matrix(model.orientation, given[3:6])
+        target = flange_target(robot, contact, given[:3], rotation)
         away = (model.with_redundant(q_start, given) - q_start) / BEGIN_STEPS
         moved = newton_step(model, at + away, *target)
         move = _function(f"{name}_step", [q_start, at, given], [moved])
@@ -276,7 +277,8 @@ def prediction_function(
     """
     n = model.n_joints
     state, pose = ca.SX.sym("state", 3 * n + 1), ca.SX.sym("pose", model.pose_size)
-    R_target, p_target = flange_target(robot, contact, pose[:3], rotation_matrix(pose[3:6]))
+    rotation = rotation_matrix(model.orientation, pose[3:6])
+    R_target, p_target = flange_target(robot, contact, pose[:3], rotation)
     start = state[:n]
     q = model.with_redundant(start, pose)
     for _ in range(NEWTON_STEPS):
@@ -293,7 +295,7 @@ def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Fun
     """
     pose = ca.SX.sym("pose", 6)
     guesses = [ca.SX.sym(f"guess_{i + 1}", model.n_joints) for i, model in enumerate(models)]
-    rotation = rotation_matrix(pose[3:])
+    rotation = rotation_matrix(models[0].orientation, pose[3:])
     postures, residuals = [], []
     for robot, model, contact, q in zip(robots, models, contacts, guesses, strict=True):
         R_target, p_target = flange_target(robot, contact, pose[:3], rotation)

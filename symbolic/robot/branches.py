@@ -17,7 +17,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.physics.path import sample_basis, waypoint_matrix
-from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.physics.pose import box_placement, inverse
 from symbolic.physics.time_law import timed_path
 from symbolic.robot.arm import TRACK_OUTPUTS, box_flange, follow_function
 from symbolic.robot.model import RobotModel
@@ -219,7 +219,7 @@ def start_branches(
 def start_flange(workcell: Workcell, robot: Robot, contact: Contact) -> Array:
     """T_root_flange (4, 4) of an arm that holds the box at the first waypoint."""
     start = workcell.task.waypoints[0].lower
-    T_world_box = pose_matrix(start[:3], start[3:])
+    T_world_box = box_placement(workcell.task.orientation, start)
     return inverse(robot.T_world_base) @ T_world_box @ box_flange(robot, contact)
 
 

@@ -7,7 +7,7 @@ turned into it, so that a tilted or hanging arm gets its true torques.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import casadi
@@ -17,6 +17,7 @@ from symbolic.array import Array
 from symbolic.expression import Expression
 from symbolic.robot import bridge
 from symbolic.robot.urdf import arm_model, link_frame, turning_joints
+from symbolic.workcell.orientation import Orientation
 from symbolic.workcell.records import POSE_SIZE, Robot
 
 
@@ -39,6 +40,7 @@ class RobotModel:
         redundant: of each redundant joint of the arm its index in q and its place in the extended
             pose.
         pose_size: entries of the extended pose, 6 + m.
+        orientation: how its numbers 3 to 5 give the box's.
     """
 
     name: str
@@ -46,6 +48,7 @@ class RobotModel:
     flange: str
     redundant: tuple[tuple[int, int], ...] = ()
     pose_size: int = POSE_SIZE
+    orientation: Orientation = field(default_factory=Orientation)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -123,13 +126,17 @@ class RobotModel:
 
 
 def build_robot_model(
-    robot: Robot, redundant: tuple[tuple[int, int], ...] = (), pose_size: int = POSE_SIZE
+    robot: Robot,
+    redundant: tuple[tuple[int, int], ...] = (),
+    pose_size: int = POSE_SIZE,
+    orientation: Orientation | None = None,
 ) -> RobotModel:
     """Read a robot's URDF and prepare its functions.
 
     Args:
         robot: the arm.
-        redundant, pose_size: see `RobotModel`; `symbolic.workcell.records.Task` gives them.
+        redundant, pose_size, orientation: see `RobotModel`; `symbolic.workcell.records.Task` gives
+            them.
 
     Raises:
         RobotModelError: the URDF cannot be read, or does not describe a serial arm that ends in
@@ -137,7 +144,8 @@ def build_robot_model(
     """
     model = arm_model(robot)
     model.gravity.linear = gravity_in_root(robot.T_world_base)
-    return RobotModel(robot.name, model, robot.flange, redundant, pose_size)
+    turned = orientation or Orientation()
+    return RobotModel(robot.name, model, robot.flange, redundant, pose_size, turned)
 
 
 def gravity_in_root(T_world_base: Array) -> Array:

@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from symbolic.array import Array
 from symbolic.physics.path import path_basis
-from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.physics.pose import box_placement, inverse
 from symbolic.robot.arm import box_flange
 from symbolic.robot.urdf import FOLLOWING, arm_model, link_frame
 from symbolic.workcell.records import POSE_SIZE, Contact, Robot, Task
@@ -57,8 +57,10 @@ class PosturePath:
 class _Chain:
     """Numeric kinematics of an arm, some joints held."""
 
-    def __init__(self, robot: Robot, contact: Contact, held: Mapping[int, float]) -> None:
-        self.robot, self.held = robot, dict(held)
+    def __init__(
+        self, robot: Robot, contact: Contact, task: Task, held: Mapping[int, float]
+    ) -> None:
+        self.robot, self.orientation, self.held = robot, task.orientation, dict(held)
         self.model = arm_model(robot)
         self.data = self.model.createData()
         self.flange = link_frame(self.model, robot.flange)
@@ -78,7 +80,7 @@ class _Chain:
 
     def error(self, q: Array, pose: Array) -> Array:
         """(6,) what is missing to a box pose."""
-        T = self.to_root @ pose_matrix(pose[:3], pose[3:]) @ self.T_box_flange
+        T = self.to_root @ box_placement(self.orientation, pose) @ self.T_box_flange
         pin.framesForwardKinematics(self.model, self.data, q)
         here = self.data.oMf[self.flange]
         turn = pin.log3(T[:3, :3] @ here.rotation.T)
@@ -124,10 +126,10 @@ def posture_path(
     Returns:
         None where none is found.
     """
-    chain = _Chain(robot, contact, held)
+    chain = _Chain(robot, contact, task, held)
     points = np.array([waypoint.lower for waypoint in task.waypoints])
     points[list(task.free_indices)] = task.initial
-    points[:, 3:] = np.unwrap(points[:, 3:], axis=0)
+    points[:, 3:] = task.orientation.unwrapped(points[:, 3:])
     u = np.linspace(0.0, 1.0, BETWEEN * (len(points) - 1) + 1)
     poses = path_basis(len(points), u).position @ points[:, :POSE_SIZE]
     best, most = None, -np.inf

@@ -35,7 +35,7 @@ def closure_functions(model: CellModel, arm: int) -> dict[ClosureKey, ca.Functio
     n = own.n_joints
     pose, nu = ca.SX.sym("pose", own.pose_size), ca.SX.sym("nu", n)
     reference = ca.SX.sym("q_reference", n)
-    cell, rotation = model.workcell, rotation_matrix(pose[3:6])
+    cell, rotation = model.workcell, rotation_matrix(own.orientation, pose[3:6])
     target = flange_target(cell.robots[arm], cell.contacts[arm], pose[:3], rotation)
 
     joints = ca.SX.sym("q", n)

@@ -47,7 +47,7 @@ class Place:
     def scene(self) -> Scene:
         """The bodies, with the kinks of their distances rounded."""
         placed = [self.model.robots[arm].joint_placements(self.q[arm]) for arm in (0, 1)]
-        rotation = rotation_matrix(self.pose[3:])
+        rotation = rotation_matrix(self.model.workcell.task.orientation, self.pose[3:])
         softness = Softness(WIDTH)
         return Scene(self.model.geometry, rotation, self.pose[:3], (placed[0], placed[1]), softness)
 

@@ -150,12 +150,13 @@ def _margin_function(workcell: Workcell) -> ca.Function:
 def _split_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate (6,) of a sample to F_n, F_t (2,)."""
     pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
-    rotation = rotation_matrix(pose[3:])
+    turned = workcell.task.orientation
+    rotation = rotation_matrix(turned, pose[3:])
     force = resultant_force(
         workcell.payload.mass,
         ca.mtimes(rotation, ca.DM(workcell.payload.centre_of_mass)),
-        angular_velocity(pose[3:], rate[3:]),
-        angular_acceleration(pose[3:], rate[3:], second[3:]),
+        angular_velocity(turned, pose[3:], rate[3:]),
+        angular_acceleration(turned, pose[3:], rate[3:], second[3:]),
         second[:3],
     )
     normal = ca.mtimes(rotation, ca.DM(workcell.contacts[0].T_box_pad[:3, 2]))

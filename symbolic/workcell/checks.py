@@ -12,7 +12,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import RobotModelError
-from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.physics.pose import box_placement, inverse
 from symbolic.robot.machine import machine_problem
 from symbolic.robot.urdf import arm_model, link_frame, robot_urdf, turning_joints
 from symbolic.workcell.body_names import PAYLOAD_BODY, body_names
@@ -193,7 +193,7 @@ def check_reach(workcell: Workcell, problems: Problems) -> None:
         shoulder, length = stretched_length(robot)
         T_box_flange = contact.T_box_pad @ inverse(robot.T_flange_pad)
         for path, pose in poses:
-            flange = (pose_matrix(pose[:3], pose[3:]) @ T_box_flange)[:3, 3]
+            flange = (box_placement(workcell.task.orientation, pose) @ T_box_flange)[:3, 3]
             distance = float(np.linalg.norm(flange - shoulder))
             if distance > length + REACH_SLACK:
                 where = ", ".join(f"{entry:.3f}" for entry in flange)

@@ -14,11 +14,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.workcell.orientation import Orientation
 from symbolic.workcell.records import POSE_SIZE as POSE_SIZE
 from symbolic.workcell.records import Task
 
-COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Of a pose [m, rad]."""
+
+def components(orientation: Orientation) -> tuple[str, ...]:
+    """What the numbers of a pose are called [m, rad]."""
+    return ("x", "y", "z", *orientation.components)
 
 
 def waypoints_of(task: Task, x: Array) -> Array:
@@ -32,7 +35,7 @@ def extended_waypoints(task: Task, x: Array) -> Array:
     points = np.array([waypoint.lower for waypoint in task.waypoints])
     points = np.column_stack([points, *[joint.lower for joint in task.redundant]])
     points[task.free_entries] = x[: task.n_path]
-    points[:, 3:POSE_SIZE] = np.unwrap(points[:, 3:POSE_SIZE], axis=0)
+    points[:, 3:POSE_SIZE] = task.orientation.unwrapped(points[:, 3:POSE_SIZE])
     return points
 
 
@@ -75,7 +78,7 @@ def straight_line(task: Task) -> Array:
 
 def variable_names(task: Task) -> tuple[str, ...]:
     """What the decision variables (n_var,) are; waypoints count from 1, the start is none."""
-    names = [*COMPONENTS, *(joint.name for joint in task.redundant)]
+    names = [*components(task.orientation), *(joint.name for joint in task.redundant)]
     rows, columns = task.free_entries
     found = [f"waypoint {row}, {names[column]}" for row, column in zip(rows, columns, strict=True)]
     return tuple(found + ["force limit"] * (task.n_var - task.n_path))

@@ -9,9 +9,11 @@ from typing import cast
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.physics.pose import rotation_from_rpy
 from symbolic.workcell import quantities as quantity
-from symbolic.workcell.decision import COMPONENTS
-from symbolic.workcell.problems import shown
+from symbolic.workcell.decision import components
+from symbolic.workcell.orientation import Orientation, Rotation
+from symbolic.workcell.problems import Problems, shown
 from symbolic.workcell.reader import Table, checked_vector, read_only
 from symbolic.workcell.records import (
     Allocation,
@@ -28,6 +30,10 @@ MAX_SAMPLES = 2_000
 MAX_WAYPOINTS = 100
 TIME_LAWS = ("constant", "ramped", "optimal")
 ALLOCATIONS = ("paper", "joint")
+ROTATIONS = ("roll-pitch-yaw", "quaternion")
+
+MOST_TURN = 5.0
+"""Largest rotation vector of a waypoint [rad]: a full turn less what the spline may swing out."""
 
 GRAVITY = 9.81
 """[m/s^2], as in `symbolic.physics.contact_forces`, which needs CasADi."""
@@ -40,9 +46,10 @@ def read_task(table: Table) -> Task:
 
     The table stays open for `symbolic.workcell.redundancy`.
     """
-    problems = table.problems
+    problems, orientation = table.problems, _orientation(table)
+    names = components(orientation)
     start = _fixed(table, "start")
-    between = [waypoint for entry in table.tables("waypoints") for waypoint in _waypoints(entry)]
+    between = [w for entry in table.tables("waypoints") for w in _waypoints(entry, names)]
     goal = _fixed(table, "goal")
     waypoints = (start, *between, goal)
     if problems.clean(table.at("waypoints")):
@@ -65,12 +72,29 @@ def read_task(table: Table) -> Task:
         ),
         ramp_time=table.number("ramp_time", quantity.DURATION, 0.5),
         reference_force=table.vector("reference_force", (quantity.FORCE,) * 2, scalar_fills=True),
-        initial=_read_initial(table, [w for w in waypoints if not w.is_fixed]),
+        initial=_read_initial(table, [w for w in waypoints if not w.is_fixed], names),
         allowed_contacts=tuple(_allowed_contact(e) for e in table.tables("allowed_contacts")),
         allocation=cast("Allocation", table.choice("allocation", ALLOCATIONS, "paper")),
         force_limit=_force_limit(table),
+        orientation=orientation,
     )
+    if orientation.is_vector:
+        _check_vectors(task, problems)
     return task
+
+
+def _check_vectors(task: Task, problems: Problems) -> None:
+    """Every rotation vector that a waypoint allows stays well below a full turn, at which small
+    changes of it no longer turn the box about every axis."""
+    for k, waypoint in enumerate(task.waypoints):
+        farthest = np.maximum(np.abs(waypoint.lower[3:]), np.abs(waypoint.upper[3:]))
+        if np.linalg.norm(farthest) > MOST_TURN:
+            problems.add(
+                "task.rotation",
+                f"found a rotation of up to {np.linalg.norm(farthest):.2f} rad at pose {k} of the "
+                f"path, start and goal included; allowed are {MOST_TURN:g} rad from "
+                "task.rotation_reference",
+            )
 
 
 def with_force_limit(task: Task, payload: Payload, contacts: Sequence[Contact]) -> Task:
@@ -84,6 +108,20 @@ def with_force_limit(task: Task, payload: Payload, contacts: Sequence[Contact]) 
     still = payload.mass * GRAVITY / sum(contact.friction for contact in contacts)
     highest = max(float(task.reference_force.min()), ABOVE_STILL * still)
     return replace(task, force_limit=(ABOVE_STILL * still, highest))
+
+
+def _orientation(table: Table) -> Orientation:
+    """What the last three numbers of every pose of the task mean."""
+    rotation = cast("Rotation", table.choice("rotation", ROTATIONS, ROTATIONS[0]))
+    if rotation == "roll-pitch-yaw":
+        if "rotation_reference" in table:
+            table.raw("rotation_reference")
+            table.problems.add(
+                table.at("rotation_reference"), 'allowed with rotation = "quaternion" only'
+            )
+        return Orientation(rotation)
+    rpy = table.vector("rotation_reference", (quantity.ANGLE,) * 3, default=(0.0, 0.0, 0.0))
+    return Orientation(rotation, read_only(rotation_from_rpy(rpy)))
 
 
 def _force_limit(table: Table) -> tuple[float, float]:
@@ -104,7 +142,7 @@ def _fixed(table: Table, key: str) -> Waypoint:
     return Waypoint(pose, pose)
 
 
-def _waypoints(table: Table) -> list[Waypoint]:
+def _waypoints(table: Table, names: Sequence[str]) -> list[Waypoint]:
     """One fixed waypoint, or `count` free ones that share their bounds."""
     problems = table.problems
     if "fixed" in table:
@@ -123,9 +161,8 @@ def _waypoints(table: Table) -> list[Waypoint]:
     table.raw("fixed", ())
     table.close()
     if problems.clean(table.path):
-        for component, low, high in zip(COMPONENTS, lower, upper, strict=True):
+        for index, (component, low, high) in enumerate(zip(names, lower, upper, strict=True)):
             if low > high:
-                index = COMPONENTS.index(component)
                 problems.add(
                     f"{table.at('lower')}[{index}]",
                     f"found {low:g} for {component}, above its upper bound {high:g}; allowed is "
@@ -138,7 +175,7 @@ def _waypoints(table: Table) -> list[Waypoint]:
     return [Waypoint(lower, upper)] * count
 
 
-def _read_initial(table: Table, free: list[Waypoint]) -> Array:
+def _read_initial(table: Table, free: list[Waypoint], names: Sequence[str]) -> Array:
     """The hand-made free waypoints (n_free, 6); the centres of the bounds by default."""
     value = table.raw("initial", None)
     path, problems = table.at("initial"), table.problems
@@ -164,7 +201,7 @@ def _read_initial(table: Table, free: list[Waypoint]) -> Array:
         for column in outside:
             problems.add(
                 f"{path}[{row}][{column}]",
-                f"found {values[column]:g} for {COMPONENTS[column]}, outside its bounds; allowed "
+                f"found {values[column]:g} for {names[int(column)]}, outside its bounds; allowed "
                 f"is {waypoint.lower[column]:g} to {waypoint.upper[column]:g}",
             )
     return read_only(np.reshape(rows, (-1, 6)))

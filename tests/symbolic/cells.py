@@ -154,7 +154,7 @@ def start_posture(
     """Joints (6,) of both arms that hold the box at the first waypoint, near the seeds."""
     postures = []
     for robot, contact, seed in zip(cell.robots, cell.contacts, seeds, strict=True):
-        arm = PlainArm(robot, contact)
+        arm = PlainArm(robot, contact, orientation=cell.task.orientation)
         target = arm.flange_target(cell.task.waypoints[0].lower)
         q = np.asarray(seed, dtype=float)
         for _ in range(30):
@@ -172,9 +172,10 @@ def gofa_model() -> RobotModel:
 
 def hand_model(cell: Workcell) -> CellModel:
     """A hand-written cell with its start postures, found without the branch search."""
+    model = replace(gofa_model(), orientation=cell.task.orientation)
     return CellModel(
         workcell=cell,
-        robots=(gofa_model(), gofa_model()),
+        robots=(model, model),
         geometry=build_geometry(cell),
         branches=((), ()),
         start=start_posture(cell),

@@ -22,7 +22,7 @@ from hybrid_opt.store.export.ros2 import (
     wrench_message,
 )
 from symbolic.array import Array
-from symbolic.physics.pose import pose_matrix
+from symbolic.physics.pose import box_placement
 from symbolic.robot.urdf import arm_model, link_frame
 
 _TIME = "builtin_interfaces/Time"
@@ -95,6 +95,7 @@ class _Recording:
         self._begins = {sampled.span(index).start: phase.name for index, phase in phases}
         self._models = [arm_model(robot) for robot in self._cell.robots]
         self._data = [model.createData() for model in self._models]
+        self._boxes = box_placement(self._cell.task.orientation, sampled.pose)
 
     def messages(self, k: int, stamp: dict[str, int]) -> Iterator[Message]:
         """Those of sample k."""
@@ -113,7 +114,7 @@ class _Recording:
             "effort": sampled.effort[k].tolist(),
         }
         yield "/joint_states", "sensor_msgs/JointState", joints
-        box = pose_matrix(sampled.pose[k, :3], sampled.pose[k, 3:])
+        box = self._boxes[k]
         yield "/box_pose", "geometry_msgs/PoseStamped", {"header": world, "pose": _pose(box)}
         for arm, prefix in enumerate(self._prefixes):
             frame = pad_frame(prefix, arm)

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.sampling import SampledJob
@@ -19,6 +18,7 @@ from hybrid_opt.store.export.description import description, prefixes
 from hybrid_opt.store.export.options import BundleOptions
 from hybrid_opt.store.export.ros2_programs import LAUNCH, RUN
 from symbolic.array import Array
+from symbolic.physics.pose import box_rotation
 
 UPDATE_RATE = 1000
 """Of the controller manager [Hz]."""
@@ -174,7 +174,8 @@ def wrench_references(sampled: SampledJob) -> dict[str, Any]:
 def pad_wrench(sampled: SampledJob, arm: int) -> Array:
     """(n, 6) force and moment that a pad exerts on the box, along the pad's axes [N, N m]."""
     T_box_pad = sampled.job.workcell.contacts[arm].T_box_pad
-    R_world_pad = Rotation.from_euler("xyz", sampled.pose[:, 3:]).as_matrix() @ T_box_pad[:3, :3]
+    turned = box_rotation(sampled.job.workcell.task.orientation, sampled.pose)
+    R_world_pad = turned @ T_box_pad[:3, :3]
     both = sampled.wrench[:, arm].reshape(-1, 2, 3)
     return np.asarray(np.einsum("nji,nkj->nki", R_world_pad, both).reshape(-1, 6))
 

@@ -10,10 +10,11 @@ import numpy as np
 
 from hybrid_opt.job.sampling import SampledJob
 from symbolic.robot.urdf import arm_model, turning_joints
+from symbolic.workcell.decision import components
 
 JSON_FORMAT = "dual-arm-carry job"
 JSON_VERSION = 1
-_POSE = ("x [m]", "y [m]", "z [m]", "roll [rad]", "pitch [rad]", "yaw [rad]")
+_POSE_UNITS = ("m",) * 3 + ("rad",) * 3
 _WRENCH = ("fx [N]", "fy [N]", "fz [N]", "mx [N m]", "my [N m]", "mz [N m]")
 _JOINT_QUANTITIES = (
     ("q", "position", "rad", "m"),
@@ -28,7 +29,8 @@ def csv_text(sampled: SampledJob) -> str:
     """One row per time step, one column per quantity, named with its unit."""
     job = sampled.job
     robots = [robot.name for robot in job.workcell.robots]
-    header = ["time [s]", "phase", *(f"box {name}" for name in _POSE)]
+    names = zip(components(job.workcell.task.orientation), _POSE_UNITS, strict=True)
+    header = ["time [s]", "phase", *(f"box {name} [{unit}]" for name, unit in names)]
     columns = [sampled.pose]
     for quantity, word, unit, sliding in _JOINT_QUANTITIES:
         for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
@@ -52,6 +54,7 @@ def csv_text(sampled: SampledJob) -> str:
 def json_text(sampled: SampledJob) -> str:
     """Everything in one object, numbers in full precision."""
     job = sampled.job
+    orientation = job.workcell.task.orientation
     document = {
         "format": JSON_FORMAT,
         "version": JSON_VERSION,
@@ -63,7 +66,11 @@ def json_text(sampled: SampledJob) -> str:
                 job.phases, map(sampled.span, range(len(job.phases))), strict=True
             )
         ],
-        "box": {"pose": sampled.pose.tolist()},
+        "box": {
+            "pose": sampled.pose.tolist(),
+            "rotation": orientation.rotation,
+            "reference": orientation.reference.tolist(),
+        },
         "robots": [
             {
                 "name": robot.name,

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
+from symbolic.workcell.orientation import Orientation
 
 TimeLaw = Literal["constant", "ramped", "optimal"]
 Allocation = Literal["paper", "joint"]
 
 POSE_SIZE = 6
-"""x, y, z [m], roll, pitch, yaw [rad]."""
+"""x, y, z [m] and three numbers of the orientation [rad], see `symbolic.workcell.orientation`."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Waypoint:
     """A pose of the box path: fixed where lower equals upper, otherwise free within them.
 
     Attributes:
-        lower, upper: (6,) x, y, z [m], roll, pitch, yaw [rad].
+        lower, upper: (6,) poses [m, rad].
     """
 
     lower: Array
@@ -88,6 +89,7 @@ class Task:
             that carry the moments as well).
         force_limit: (2,) bounds of the force limit, the last decision variable of 'optimal' [N].
         redundant: the joints whose paths are decided beside the box's, see RedundantJoint.
+        orientation: what the last three numbers of every pose mean.
     """
 
     waypoints: tuple[Waypoint, ...]
@@ -102,6 +104,7 @@ class Task:
     allocation: Allocation = "paper"
     force_limit: tuple[float, float] = (0.0, np.inf)
     redundant: tuple[RedundantJoint, ...] = ()
+    orientation: Orientation = field(default_factory=Orientation)
 
     @property
     def extended_size(self) -> int:

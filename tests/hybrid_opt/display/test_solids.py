@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.display.solids import box_placements, cell_solids, joint_placements
+from hybrid_opt.display.solids import cell_solids, joint_placements
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.robot.urdf import arm_model
 from symbolic.workcell.file import load
@@ -37,13 +37,6 @@ def test_joint_placements_are_pinocchios(q: list[float]) -> None:
         for j in range(6):
             expected = robot.T_world_base @ reference.oMi[j + 1].homogeneous
             np.testing.assert_allclose(placed[j], expected, atol=1e-12)
-
-
-@given(st.lists(ANGLES, min_size=6, max_size=6))
-def test_box_placement_is_yaw_pitch_roll(pose: list[float]) -> None:
-    T = box_placements(np.array(pose)[None])[0]
-    np.testing.assert_allclose(T[:3, :3], pin.rpy.rpyToMatrix(*pose[3:]), atol=1e-12)
-    np.testing.assert_array_equal(T[:3, 3], pose[:3])
 
 
 def test_solids_have_the_bodies_volume_and_place(geometry: CellGeometry) -> None:

@@ -8,6 +8,7 @@ import pytest
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent, missing_reach
+from symbolic.physics.pose import box_placement
 from symbolic.workcell.decision import straight_line
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
@@ -54,11 +55,12 @@ def test_reasons_come_with_what_they_are_about(cell: Cell, found: tuple[Explanat
 
 def test_missing_reach_is_the_distance_beyond_the_stretched_arm(cell: Cell) -> None:
     robot, contact = cell.workcell.robots[0], cell.workcell.contacts[0]
-    carry = cell.carry(cell.initial)
-    held = missing_reach(robot, contact, carry.pose[0], carry.arms[0].q[0])
+    carry, orientation = cell.carry(cell.initial), cell.workcell.task.orientation
+    at = box_placement(orientation, carry.pose[0])
+    held = missing_reach(robot, contact, at, carry.arms[0].q[0])
     assert held == pytest.approx(0.0, abs=1e-6)
-    near, far = carry.pose[0].copy(), carry.pose[0].copy()
-    near[1], far[1] = -2.0, -3.0
-    lacks = [missing_reach(robot, contact, pose, carry.arms[0].q[0]) for pose in (near, far)]
+    near, far = at.copy(), at.copy()
+    near[1, 3], far[1, 3] = -2.0, -3.0
+    lacks = [missing_reach(robot, contact, T, carry.arms[0].q[0]) for T in (near, far)]
     assert lacks[0] > 0.5
     assert lacks[1] - lacks[0] == pytest.approx(1.0, abs=0.2)

@@ -17,6 +17,7 @@ from symbolic.geometry.placements import clean
 from symbolic.geometry.softness import EXACT, Softness
 from symbolic.physics.pose import pose_matrix
 from symbolic.physics.rotation import rotation_matrix
+from symbolic.workcell.orientation import Orientation
 from tests.symbolic.geometry.collision_cells import (
     functions_of,
     geometry_of,
@@ -205,6 +206,6 @@ def test_soft_operations_err_to_their_side(a: float, b: float, width: float) -> 
 
 def test_rotation_matrix_of_the_box_is_the_projects() -> None:
     rpy = ca.SX.sym("rpy", 3)
-    f = ca.Function("f", [rpy], [rotation_matrix(rpy)])
+    f = ca.Function("f", [rpy], [rotation_matrix(Orientation(), rpy)])
     angles = np.array([0.3, -0.5, 0.9])
     assert np.array(f(angles)) == pytest.approx(pose_matrix(np.zeros(3), angles)[:3, :3])

@@ -32,6 +32,7 @@ from symbolic.robot.arm import (
     track_function,
 )
 from symbolic.robot.newton import block_step
+from symbolic.workcell.orientation import Orientation
 from tests.symbolic.cells import call, gofa_model, hand_cell, start_posture
 
 CELL = hand_cell()
@@ -70,7 +71,8 @@ def random_posture(rng: np.random.Generator, margin: float = 0.2) -> Array:
 def test_flange_target_puts_the_pad_on_its_contact(arm: int) -> None:
     rng = np.random.default_rng(arm)
     position, rpy = ca.SX.sym("position", 3), ca.SX.sym("rpy", 3)
-    R, p = flange_target(CELL.robots[arm], CELL.contacts[arm], position, rotation_matrix(rpy))
+    rotation = rotation_matrix(Orientation(), rpy)
+    R, p = flange_target(CELL.robots[arm], CELL.contacts[arm], position, rotation)
     function = ca.Function("target", [position, rpy], [R, p])
     for _ in range(20):
         pose = np.concatenate([rng.uniform(-1, 1, 3), rng.uniform(-3, 3, 3)])

@@ -23,6 +23,7 @@ from symbolic.smooth.passage import DIRECTIONS, Passing, Separation, gap_functio
 from symbolic.smooth.place import Place, PlaceConstraint, row_function
 from symbolic.smooth.reach import Reach
 from symbolic.workcell.file import load
+from symbolic.workcell.orientation import Orientation
 from tests.symbolic.workcell.samples import RACK
 
 STILL = np.zeros(6)
@@ -73,7 +74,7 @@ def test_solved_joints_hold_the_box(seed: int) -> None:
     for arm, q in enumerate(joints_at(pose)):
         cell = model().workcell
         target = flange_target(
-            cell.robots[arm], cell.contacts[arm], pose[:3], rotation_matrix(pose[3:])
+            cell.robots[arm], cell.contacts[arm], pose[:3], rotation_matrix(Orientation(), pose[3:])
         )
         residual = pose_error(*target, *model().robots[arm].placement(q))[1]
         assert float(residual) < 1e-8
