@@ -4,11 +4,14 @@ Successive halving (Karnin, Koren and Somekh, ICML 2013): in every round all pai
 the same number of evaluations, and the better half goes on. A pair is as good as the hypervolume of
 the carries that it found so far; while it has none, as the least penalty. The rounds of a pair are
 one search: each begins with the best that the pair knows.
+
+Under the time law 'optimal' pairs compete by the carries that the same paths make from rest to rest
+under 'ramped': what arms reach and hit does not depend on the law, and that one is judged in lanes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from math import ceil, log2
 
@@ -17,12 +20,13 @@ import numpy as np
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations, concatenated
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import REFERENCE_POINT, front_rows, hypervolume
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.functions.candidate import CONSTRAINTS
-from symbolic.workcell.records import SEARCHED
+from symbolic.workcell.records import SEARCHED, TimeLaw
 
 SAMPLED = 32
 """Random candidates of which a pair has to hold one, where it does not hold the hand-made
@@ -69,10 +73,12 @@ class BranchCompetition:
     Attributes:
         pairs: their results.
         evaluations: of all pairs together.
+        time_law: under which they competed.
     """
 
     pairs: tuple[PairResult, ...]
     evaluations: int
+    time_law: TimeLaw
 
     @property
     def winner(self) -> tuple[int, int]:
@@ -84,7 +90,8 @@ class BranchCompetition:
         tried = sum(pair.rounds > 0 for pair in self.pairs)
         text = (
             f"start branches {first.branches[0]} and {first.branches[1]}, best of "
-            f"{tried} pairs in {self.evaluations} evaluations: hypervolume {first.hypervolume:.4f}"
+            f"{tried} pairs in {self.evaluations} evaluations under the time law {self.time_law}: "
+            f"hypervolume {first.hypervolume:.4f}"
         )
         others = [pair for pair in self.pairs[1:] if pair.rounds]
         if not others:
@@ -153,6 +160,8 @@ def search_branches(
             objectives.
         WorkcellError: no pair holds any trajectory that was tried.
     """
+    if cell.workcell.task.time_law == "optimal":
+        cell = _from_rest_to_rest(cell)
     if len(cell.objective_names) != len(REFERENCE_POINT):
         raise SettingsError("start branches compete by the hypervolume of two objectives")
     model, wanted = cell.compiled.model, cell.workcell.start_branch
@@ -184,7 +193,14 @@ def search_branches(
         left = sorted(left, key=_standing)[: ceil(len(left) / 2)]
     ranked = sorted([*pairs, *out], key=_standing)
     results = tuple(pair.result() for pair in ranked)
-    return BranchCompetition(results, sum(pair.evaluations for pair in results))
+    spent = sum(pair.evaluations for pair in results)
+    return BranchCompetition(results, spent, cell.workcell.task.time_law)
+
+
+def _from_rest_to_rest(cell: Cell) -> Cell:
+    """The cell under 'ramped', with the paper's objectives."""
+    task = replace(cell.workcell.task, time_law="ramped")
+    return Cell(replace(cell.workcell, task=task), PAPER_OBJECTIVES, cell.threads)
 
 
 def _standing(pair: _Pair) -> tuple[float, float, float]:

@@ -16,6 +16,8 @@ from hybrid_opt.store.json_records import read_record, to_json
 from symbolic.workcell.file import load
 from symbolic.workcell.records import SEARCHED, Workcell
 
+_ANEW = "start the study anew"
+
 SHARE = 2
 """The competition may spend as many evaluations as this many replicas."""
 
@@ -34,12 +36,23 @@ def decided_cell(
         return workcell, None
     stored = execution.output / BRANCHES
     if execution.resume and stored.exists():
-        competition = read_record(BranchCompetition, stored, "start the study anew")
+        competition = read_record(BranchCompetition, stored, _ANEW)
     else:
         cell = Cell(workcell, settings.objectives)
         rng = np.random.default_rng(settings.seed)
         competition = search_branches(cell, evaluations=SHARE * settings.evaluations, rng=rng)
     return load(workcell.source, decided=competition.winner), competition
+
+
+def read_branches(root: Path) -> BranchCompetition | None:
+    """How the start branches of a study in a results folder were decided; None where its workcell
+    decides them.
+
+    Raises:
+        ResultsError: the stored decision is damaged.
+    """
+    stored = root / BRANCHES
+    return read_record(BranchCompetition, stored, _ANEW) if stored.exists() else None
 
 
 def store_branches(root: Path, competition: BranchCompetition | None) -> str:

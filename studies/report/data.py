@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt.campaign.branch_choice import read_branches
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
@@ -82,6 +83,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         timings=tuple(timings),
         reach=reach,
         drivable=gather_drivable(results, summary),
+        branches=read_branches(results.root),
     )
 
 

@@ -95,10 +95,12 @@ def _lead(data: ReportData) -> str:
     payload, task = data.workcell.payload, data.workcell.task
     settings = data.summary.settings
     names = ", ".join(algorithm.title for algorithm in data.algorithms)
+    branches = "" if data.branches is None else str(data.branches)
+    chosen = f" {branches[0].upper()}{branches[1:]}." if branches else ""
     return (
         f"Two arms carry a box of {payload.mass:g} kg along {len(task.waypoints)} poses, "
         f"{len(task.free_indices)} of them free. {names}: {settings.replicas} replicas of "
-        f"{settings.evaluations} evaluations each, seed {settings.seed}."
+        f"{settings.evaluations} evaluations each, seed {settings.seed}.{chosen}"
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from hybrid_opt import carry
+from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.summary import CampaignSummary, PolishedFigures, ReplicaFigures
 from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.timing import ForceCurve, TimingReport
@@ -182,6 +183,7 @@ class ReportData:
         timings: of the hand-made and the selected trajectories, in the order of `carries`.
         reach: where the arms reach.
         drivable: the drivable experiment, None without one.
+        branches: how the start branches were decided, None where the workcell decides them.
     """
 
     root: Path
@@ -197,6 +199,7 @@ class ReportData:
     timings: tuple[TimedSelection, ...]
     reach: ReachMap
     drivable: DrivableReport | None = None
+    branches: BranchCompetition | None = None
 
     @property
     def solved(self) -> tuple[AlgorithmRuns, ...]:

@@ -10,14 +10,17 @@ import pytest
 
 from hybrid_opt.branches import BranchCompetition, search_branches
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
-from hybrid_opt.campaign.branch_choice import decided_cell, store_branches
+from hybrid_opt.campaign.branch_choice import decided_cell, read_branches, store_branches
 from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import front_rows, hypervolume
 from symbolic.errors import SettingsError
 from symbolic.workcell.archive import archive_cell, unpack_cell
 from symbolic.workcell.file import load
 from symbolic.workcell.records import SEARCHED
 from tests.symbolic.workcell.samples import RACK
+
+TRANSFER = RACK.with_name("transfer.toml")
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +85,19 @@ def test_one_objective_has_no_hypervolume_to_compete_by() -> None:
         search_branches(Cell(load(RACK), ("peak_force",)), rng=np.random.default_rng(0))
 
 
+def test_drivable_carries_choose_branches_under_the_ramped_law() -> None:
+    # As a drivable experiment of the transfer cell, whose own law is 'ramped'.
+    workcell = load(TRANSFER)
+    task = replace(workcell.task, time_law="optimal")
+    cell = Cell(replace(workcell, task=task, start_branch=(SEARCHED, -1)), DRIVABLE_OBJECTIVES)
+    found = search_branches(cell, evaluations=50, rng=np.random.default_rng(1))
+    assert found.time_law == "ramped"
+    assert "evaluations under the time law ramped: hypervolume" in str(found)
+    ramped = Cell(replace(workcell, start_branch=(SEARCHED, -1)))
+    assert found == search_branches(ramped, evaluations=50, rng=np.random.default_rng(1))
+    assert found.pairs[0].hypervolume > 0.0
+
+
 def test_a_decision_is_kept_and_travels_with_the_cell(
     tmp_path: Path, found: BranchCompetition
 ) -> None:
@@ -95,7 +111,8 @@ def test_a_decision_is_kept_and_travels_with_the_cell(
     assert told.startswith("Start branches 0 and 0")
     execution = ExecutionSettings(output=root, resume=True)
     decided, competition = decided_cell(load(path), CampaignSettings(), execution)
-    assert competition == found
+    assert competition == found == read_branches(root)
+    assert read_branches(tmp_path) is None
     assert decided.start_branch == found.winner
     assert decided.digest != load(path).digest
     unpacked = unpack_cell(archive_cell(decided), tmp_path / "unpacked")

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
+from hybrid_opt.branches import BranchCompetition, PairResult
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from studies.recommendation_text import recommendation_text
@@ -23,6 +24,8 @@ from studies.report.page_data import PageData
 from studies.report.records import ReportData
 
 HOSTILE = "</title></script><script>window.broken = 1</script><img src=x onerror=alert(1)>\"'&"
+WINNER = PairResult((2, 0), 2, 120, 0.5, 0.4, 0.6)
+SECOND = PairResult((1, 1), 1, 80, 0.2, 0.3, 0.7)
 SHORT = '<b>&"</script>'
 MAX_BYTES = 15_000_000
 
@@ -34,7 +37,8 @@ def with_hostile_names(data: ReportData) -> ReportData:
     workcell = replace(data.workcell, name=HOSTILE, robots=robots)
     algorithms = tuple(replace(entry, title=SHORT) for entry in data.algorithms)
     initial = replace(data.initial, label=SHORT)
-    return replace(data, workcell=workcell, algorithms=algorithms, initial=initial)
+    changed = replace(data, workcell=workcell, algorithms=algorithms, initial=initial)
+    return replace(changed, branches=BranchCompetition((WINNER, SECOND), 200, "constant"))
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +105,9 @@ def test_hostile_names_stay_text(data: ReportData, tmp_path: Path, text: str) ->
     ).read_text("utf-8")
     assert HOSTILE not in hostile
     assert html.escape(HOSTILE) in hostile
+    assert "Start branches 2 and 0, best of 2 pairs" in hostile
+    assert "hypervolume 0.4000, 0.1000 more than branches 1 and 1." in hostile
+    assert "Start branches" not in text
     clean, found = Elements(text), Elements(hostile)
     assert found.scripts == clean.scripts
     count = [sum(tag == "img" for tag, _ in elements.tags) for elements in (clean, found)]
