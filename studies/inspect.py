@@ -4,7 +4,8 @@ Prints the cell's facts, the postures at the start, the static bound, the verdic
 hand-made trajectory and on the straight line, the feasibility of random candidates by
 constraint, with the pairs, joints and robots that are in the way most, the bounds that a short
 polish ends on, and the number of collision pairs (--pairs lists them with the reasons for those
-left out); draws the cell and both arms' reach.
+left out); draws the cell, both arms' reach and the first collision of trajectories that fail;
+with --view writes a page that shows the hand-made one at any sample.
 """
 
 from __future__ import annotations
@@ -79,6 +80,8 @@ def as_text(found: Inspection, pairs: bool = False) -> str:
         lines[-1] += " (--pairs lists them, and why)"
     if found.files:
         lines += ["", "Pictures: " + ", ".join(found.files)]
+    if found.view:
+        lines += ["", f"View: {found.view} (open it in a browser)"]
     return "\n".join(lines)
 
 
@@ -134,13 +137,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--output",
         type=Path,
         metavar="DIR",
-        help="folder for the pictures (default: inspect/NAME of the workcell file)",
+        help="folder for pictures and view (default: inspect/NAME of the workcell file)",
     )
     parser.add_argument(
         "--polish",
         action=argparse.BooleanOptionalAction,
         default=True,
         help="polish the hand-made trajectory shortly, to see which bounds bind (default: yes)",
+    )
+    parser.add_argument(
+        "--view",
+        action="store_true",
+        help="write a page that plays the hand-made trajectory, from where it first fails",
     )
     parser.add_argument("--no-pictures", action="store_true", help="draw nothing")
     parser.add_argument("--pairs", action="store_true", help="list every pair of bodies")
@@ -154,6 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.seed,
         None if options.no_pictures else output,
         options.polish,
+        output / "view.html" if options.view else None,
     )
     print(json.dumps(asdict(found), indent=2) if options.json else as_text(found, options.pairs))
     return 0

@@ -8,15 +8,12 @@ from pathlib import Path
 import numpy as np
 
 import hybrid_opt as ho
-from hybrid_opt.carry import Carry, Judgement
+from hybrid_opt.carry import Judgement
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.explanation import explain, frequent
+from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.bounds import BindingBound, binding_bounds
-from studies.report.data import shown
-from studies.report.figures_cell import environment, reachable_regions
-from studies.report.reach import reach_map
-from studies.report.style import in_style, save, settled
+from studies.inspection_pictures import draw, show
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, own_pairs
 from symbolic.errors import SettingsError
@@ -85,6 +82,7 @@ class Inspection:
         active_pairs: pairs of bodies that are checked.
         excluded_pairs: pairs that are not, and why.
         files: pictures written.
+        view: the page that shows the hand-made trajectory, '' where none was asked for.
     """
 
     name: str
@@ -106,6 +104,7 @@ class Inspection:
     active_pairs: tuple[tuple[str, str], ...]
     excluded_pairs: tuple[tuple[str, str, str], ...]
     files: tuple[str, ...]
+    view: str
 
 
 def inspect(
@@ -114,6 +113,7 @@ def inspect(
     seed: int,
     output: Path | None,
     polish: bool = False,
+    view: Path | None = None,
 ) -> Inspection:
     """Look at a workcell.
 
@@ -123,6 +123,7 @@ def inspect(
         seed: of their randomness.
         output: folder for the pictures, None to draw none.
         polish: whether to polish the hand-made trajectory shortly, to see which bounds bind.
+        view: file for a page that shows the hand-made trajectory, None for none.
 
     Raises:
         SettingsError: no candidates.
@@ -141,6 +142,8 @@ def inspect(
     assert initial.judgement is not None
     assert line.judgement is not None
     failed = found[~found.feasible][:EXPLAINED]
+    explained = _explained(cell, {"initial": initial.x, "straight_line": line.x})
+    carries = {"initial": initial, "straight_line": line}
     return Inspection(
         name=workcell.name,
         facts=_facts(workcell),
@@ -150,7 +153,7 @@ def inspect(
         static_payload_limit=hold.payload_limit,
         initial=initial.judgement,
         straight_line=line.judgement,
-        explained=_explained(cell, {"initial": initial.x, "straight_line": line.x}),
+        explained={name: str(why) for name, why in explained.items()},
         candidates=candidates,
         seed=seed,
         feasible_share=float(found.feasible.mean()),
@@ -162,16 +165,17 @@ def inspect(
         excluded_pairs=tuple(
             (names[p.first], names[p.second], p.reason) for p in geometry.excluded
         ),
-        files=() if output is None else _draw(cell, initial, output),
+        files=() if output is None else draw(cell, carries, explained, output),
+        view="" if view is None else show(initial, explained.get("initial"), view),
     )
 
 
-def _explained(cell: Cell, candidates: dict[str, Array]) -> dict[str, str]:
+def _explained(cell: Cell, candidates: dict[str, Array]) -> dict[str, Explanation]:
     """What is in the way of those that fail, by their names."""
     found = {}
     for name, x in candidates.items():
         for explanation in explain(cell.evaluator, cell.evaluate(x)):
-            found[name] = str(explanation)
+            found[name] = explanation
     return found
 
 
@@ -247,22 +251,3 @@ def _facts(workcell: Workcell) -> dict[str, str]:
 
 def _vector(values: Array) -> str:
     return "(" + ", ".join(f"{value:g}" for value in values) + ")"
-
-
-def _draw(cell: Cell, initial: Carry, output: Path) -> tuple[str, ...]:
-    """The paper's Figures 4 and 5 as files."""
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SettingsError(f"--output {output}: cannot be made ({error.strerror})") from error
-    geometry = cell.geometry
-    carry = shown("", initial)
-    reach = reach_map(geometry, np.random.default_rng(0))
-    with in_style():
-        figures = {
-            "reachable_regions": settled(reachable_regions(geometry, reach, carry)),
-            "cell": settled(environment(geometry, carry)),
-        }
-    return tuple(
-        str(path) for name, figure in figures.items() for path in save(figure, output, name)
-    )

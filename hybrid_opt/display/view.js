@@ -28,17 +28,19 @@
   samples.forEach((sample, i) => points.set(sample.subarray(1, 4), 3 * i));
   scene.showPath(points);
 
-  let moment = 0, playing = false, last = 0;
+  let moment = data.begin, playing = false, last = 0;
 
   function show() {
-    let k = samples.findIndex((sample) => sample[0] >= moment);
+    let k = samples.findIndex((sample) => sample[0] >= moment - 1e-6);
     k = Math.max(1, k < 0 ? samples.length - 1 : k);
     const before = samples[k - 1], after = samples[k];
     const share = Math.min(1, (moment - before[0]) / Math.max(1e-9, after[0] - before[0]));
     const at = Array.from(before, (value, i) => value + share * (after[i] - value));
     scene.place(at.slice(1, 7), at.slice(7));
     $("scrub").value = String(Math.round((1000 * moment) / end));
-    $("moment").textContent = moment.toFixed(2) + " / " + end.toFixed(2) + " s";
+    const number = data.numbers[share < 0.5 ? k - 1 : k];
+    $("moment").textContent =
+      `${moment.toFixed(2)} / ${end.toFixed(2)} s, sample ${number}`;
   }
 
   function step(now) {

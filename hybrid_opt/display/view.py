@@ -20,6 +20,21 @@ MAX_SAMPLES = 200
 """Samples of a carry that are played."""
 
 
+@dataclass(frozen=True)
+class Look:
+    """A place of a carry worth looking at.
+
+    Attributes:
+        sample: number of the sample.
+        text: what is to be seen there.
+        bodies: names of those that are shown in red.
+    """
+
+    sample: int
+    text: str
+    bodies: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, repr=False)
 class CarryView:
     """A self-contained page that plays a carry; drag orbits, right-drag pans, the wheel zooms.
@@ -27,10 +42,12 @@ class CarryView:
     Attributes:
         carry: the carry.
         height: of the notebook's cell [px].
+        look: where it begins, None for the first sample.
     """
 
     carry: Carry
     height: int = 480
+    look: Look | None = None
 
     def page(self) -> str:
         """The page's text: no network, nothing but its own scripts.
@@ -42,12 +59,16 @@ class CarryView:
         rows = np.unique(np.linspace(0, len(carry) - 1, min(len(carry), MAX_SAMPLES)).astype(int))
         columns = [carry.time[:, None] - carry.time[0], carry.pose, carry.q]
         samples = np.concatenate(columns, axis=1)[rows]
-        document = scene_data(build_geometry(carry.workcell), carry) | {
+        look = self.look or Look(0, "")
+        document = scene_data(build_geometry(carry.workcell), carry, look.bodies) | {
             "samples": packed(samples, np.float32),
             "width": samples.shape[1],
+            "numbers": rows.tolist(),
+            "begin": float(carry.time[look.sample] - carry.time[0]),
         }
         return Template(_own("view.html")).substitute(
             title=html.escape(heading(carry)),
+            note=html.escape(look.text),
             data=embedded_json(document),
             three=three_js().replace("</script", "<\\/script"),
             scene=scene_js(),

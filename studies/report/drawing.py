@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 
 from hybrid_opt.display.solids import Solid, frame_placements
-from studies.report.style import ARMS, GROUND, OBSTACLE, PAYLOAD
+from studies.report.style import ARMS, GROUND, MARKED, OBSTACLE, PAYLOAD
 from symbolic.array import Array
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry
@@ -98,12 +98,14 @@ class CutCell:
     faces: tuple[Faces, ...]
 
     @classmethod
-    def of(cls, geometry: CellGeometry, solids: Sequence[Solid]) -> CutCell:
-        """The cell with some of its solids."""
-        return cls(geometry, cut_faces(solids))
+    def of(
+        cls, geometry: CellGeometry, solids: Sequence[Solid], marked: Collection[str] = ()
+    ) -> CutCell:
+        """The cell with some of its solids, those of the marked names in red."""
+        return cls(geometry, cut_faces(solids, marked))
 
 
-def cut_faces(solids: Sequence[Solid]) -> tuple[Faces, ...]:
+def cut_faces(solids: Sequence[Solid], marked: Collection[str] = ()) -> tuple[Faces, ...]:
     """The solids' triangles cut to `MAX_EDGE`, coloured by the party they belong to."""
     faces = []
     for solid in solids:
@@ -117,9 +119,8 @@ def cut_faces(solids: Sequence[Solid]) -> tuple[Faces, ...]:
         length = np.linalg.norm(normals, axis=1)
         keep = length > 0.0
         normals = normals[keep] / length[keep, None]
-        faces.append(
-            Faces(solid.frame, corners[keep], normals, to_rgb(_colour(solid)), solid.is_ground)
-        )
+        colour = to_rgb(MARKED if solid.name in marked else _colour(solid))
+        faces.append(Faces(solid.frame, corners[keep], normals, colour, solid.is_ground))
     return tuple(faces)
 
 

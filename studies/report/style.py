@@ -78,6 +78,7 @@ ARMS = ("#3b6ea8", "#a8733b")
 PAYLOAD = "#c9a227"
 OBSTACLE = "#9aa3ab"
 GROUND = "#e8e8e4"
+MARKED = "#b00020"
 
 
 def series(index: int) -> LineStyle:

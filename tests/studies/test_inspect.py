@@ -11,12 +11,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hybrid_opt.cell import Cell
+from hybrid_opt.display.solids import cell_solids
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
+from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.indicators.bounds import BindingBound
 from studies import inspection
 from studies.inspect import as_text, main
 from studies.inspection import Inspection, Optimum, inspect
+from studies.inspection_pictures import show
+from studies.report.figures_meeting import meeting_place
 from symbolic.workcell.decision import straight_line
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
@@ -31,7 +36,8 @@ def transfer() -> Workcell:
 
 @pytest.fixture(scope="module")
 def found(transfer: Workcell, tmp_path_factory: pytest.TempPathFactory) -> Inspection:
-    return inspect(transfer, 1500, 7, tmp_path_factory.mktemp("pictures"))
+    folder = tmp_path_factory.mktemp("pictures")
+    return inspect(transfer, 1500, 7, folder, view=folder / "new" / "view.html")
 
 
 def test_the_second_cell_is_worth_searching(found: Inspection) -> None:
@@ -90,10 +96,45 @@ def test_one_branch_of_each_arm_is_chosen(found: Inspection) -> None:
 
 def test_pictures_are_drawn(found: Inspection) -> None:
     names = sorted(Path(file).name for file in found.files)
-    assert names == [f"{n}.{s}" for n in ("cell", "reachable_regions") for s in ("pdf", "png")]
+    drawn = ("cell", "collision_straight_line", "reachable_regions")
+    assert names == [f"{n}.{s}" for n in drawn for s in ("pdf", "png")]
     for file in found.files:
         if file.endswith(".png"):
             assert np.asarray(Image.open(file).convert("L")).std() > 10.0
+
+
+def test_the_view_plays_the_hand_made_trajectory(found: Inspection) -> None:
+    page = Path(found.view).read_text("utf-8")
+    assert "Transfer over a wall" in page
+    assert '<div id="note"></div>' in page
+    assert '"begin":0.0' in page
+    assert f"View: {found.view}" in as_text(found)
+
+
+def test_the_view_of_a_carry_that_fails_begins_there(
+    transfer: Workcell, found: Inspection, tmp_path: Path
+) -> None:
+    cell = Cell(transfer)
+    (why,) = explain(cell.evaluator, cell.evaluate(straight_line(transfer.task)))
+    assert str(why) == found.explained["straight_line"]
+    carry = cell.carry(straight_line(transfer.task))
+    page = Path(show(carry, why, tmp_path / "view.html")).read_text("utf-8")
+    assert f'<div id="note">{why}</div>' in page
+    assert f'"begin":{float(carry.time[why.sample])!r}' in page
+    assert page.count('"group":"marked"') == 2
+
+
+def test_bodies_meet_where_the_picture_looks(transfer: Workcell) -> None:
+    cell = Cell(transfer)
+    (why,) = explain(cell.evaluator, cell.evaluate(straight_line(transfer.task)))
+    assert why.pair is not None
+    carry, geometry = cell.carry(straight_line(transfer.task)), cell.geometry
+    at = carry.pose[why.sample], carry.q[why.sample]
+    place = meeting_place(geometry, cell_solids(geometry), why.pair, *at)
+    # The wall, that the payload meets, is 40 mm thick, 0.5 m wide and 0.87 m high.
+    assert why.pair == ("payload", "wall")
+    assert np.all(np.abs(place - [0.0, 0.0, 0.435]) < [0.021, 0.26, 0.44])
+    assert np.all(np.abs(place - at[0][:3]) < [0.2, 0.2, 0.2])
 
 
 def test_the_straight_line_is_straight(transfer: Workcell) -> None:
