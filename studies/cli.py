@@ -133,6 +133,12 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
     )
     add_wishes(after)
     after.add_argument(
+        "--simulate",
+        action="store_true",
+        help="have the selected carries driven in the simulated cell, which needs MuJoCo: "
+        "pip install 'dual-arm-carry[sim]' (default: off)",
+    )
+    after.add_argument(
         "--report",
         action=argparse.BooleanOptionalAction,
         default=True,

@@ -22,10 +22,12 @@ from hybrid_opt.campaign.experiment_stage import drivable_stage
 from hybrid_opt.campaign.layout import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
+from hybrid_opt.campaign.simulated import read_simulations
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.polishing.drivable.point import is_polishable
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
+from hybrid_opt.witness.outcome import mujoco_module
 from hybrid_opt.work.processes import warm_up
 from studies.cli import (
     DRIVABLE_POLISH_POINTS,
@@ -41,6 +43,8 @@ from studies.program import add_verbose, carry_out, run_program
 from studies.recommendation_stage import recommendation_stage
 from studies.recommendation_text import recommendation_text
 from studies.report.stage import add_report_options, follow_report_options, report_stage
+from studies.simulation_stage import simulation_stage
+from studies.simulation_text import simulation_text
 from studies.summary_stage import summary_stage
 from studies.terminal_summary import terminal_summary
 from studies.timing_stage import timing_stage
@@ -67,6 +71,7 @@ class StudySettings:
         drivable: whether carries are also searched for as robots drive them.
         drivable_polish: how their fronts are polished, None for not at all.
         wish: what is asked of the recommended one of them.
+        simulate: whether the selected carries are driven in the simulated cell.
         report: whether figures, tables and the page are written.
         with_paper: whether the figures stand beside those that the paper states.
     """
@@ -75,6 +80,7 @@ class StudySettings:
     drivable: bool = True
     drivable_polish: PolishSettings | None = None
     wish: Wish = field(default_factory=Wish)
+    simulate: bool = False
     report: bool = True
     with_paper: bool = False
 
@@ -95,6 +101,8 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
     if study.drivable:
         every.append(recommendation_stage(study.wish))
     every += [summary_stage(), timing_stage(study.wish.force, last=alone)]
+    if study.simulate:
+        every.append(simulation_stage())
     if study.report:
         every.append(report_stage(study.with_paper))
     return tuple(every)
@@ -145,7 +153,9 @@ def study_text(root: Path, with_paper: bool) -> str:
     beside = (root / DRIVABLE / SUMMARY).exists()
     drivable = read_summary(root / DRIVABLE) if beside else None
     costs = jerk_text(jerk_costs(root / DRIVABLE if beside else root))
-    return terminal_summary(summary, with_paper, words, drivable, costs)
+    told = terminal_summary(summary, with_paper, words, drivable, costs)
+    simulations = read_simulations(root)
+    return f"{told}\n\n{simulation_text(simulations)}" if simulations else told
 
 
 def main(
@@ -173,6 +183,8 @@ def main(
 
     def work() -> int:
         options = parser.parse_args(arguments)
+        if options.simulate:
+            mujoco_module()  # told before hours of work
         path: Path = options.workcell if workcell is None else workcell
         cell = load(path)
         driven = cell.task.time_law == "optimal"
@@ -187,6 +199,7 @@ def main(
             drivable=options.drivable,
             drivable_polish=polish_settings(options, True, DRIVABLE_POLISH_POINTS),
             wish=wish(options),
+            simulate=options.simulate,
             report=options.report,
             with_paper=bool(workcell),
         )

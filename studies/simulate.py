@@ -15,6 +15,7 @@ from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.solve import time_path
+from hybrid_opt.witness.account import driven_carry
 from hybrid_opt.witness.cell_scene import ArmSettings
 from hybrid_opt.witness.controller import CONTROLS
 from hybrid_opt.witness.scene import SimulationSettings
@@ -48,7 +49,11 @@ def _parser() -> argparse.ArgumentParser:
         "carriage that follows the plan exactly (pads)",
     )
     parser.add_argument(
-        "--timing", choices=("closest", "fastest"), default="closest", help="how it is driven"
+        "--timing",
+        choices=("search", "closest", "fastest"),
+        default="search",
+        help="how it is driven: as what it was searched for (within its force limit, or closest to "
+        "the reference speeds where it has none), closest to them, or as fast as can be",
     )
     parser.add_argument("--force-limit", type=force, metavar="N", help="fastest below this force")
     add_leader(parser)
@@ -132,6 +137,8 @@ def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
         timing = time_path(model, x, TimingLimits(force=options.force_limit))
     elif options.timing == "fastest":
         timing = time_path(model, x, TimingLimits())
+    elif options.timing == "search":
+        return driven_carry(cell, x)
     else:
         timing = closest_to_reference_timing(model, x)
     if not timing.ok or timing.carry is None:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.cases import random_cases
-from hybrid_opt.robust.force import RobustModel
+from hybrid_opt.witness.account import BISECTIONS, HIGH, LOW, account_of
 from hybrid_opt.witness.arms import ArmOutcome, CellWitness
 from hybrid_opt.witness.cases import workcell_of_case
 from hybrid_opt.witness.cell_scene import ArmSettings
@@ -22,12 +22,6 @@ from studies.report.animation import Film, write_animation
 from studies.simulate_pads import threshold_text, worst_friction
 from symbolic.array import Array
 
-LOW, HIGH, BISECTIONS = 0.9, 1.5, 8
-"""Factors between which a threshold is looked for, to about 0.2 %."""
-
-SHOWN_FACTOR = 1.1
-"""Of the force in the run that is described and filmed where nothing is uncertain."""
-
 
 def simulate_arms(
     cell: Cell, carry: Carry, settings: ArmSettings, options: argparse.Namespace
@@ -35,33 +29,29 @@ def simulate_arms(
     """The threshold of a carry and random cases, printed; returns the cell as MJCF.
 
     Raises:
-        WitnessError: the box holds at the lower or slips at the upper factor.
+        WitnessError: with --sweep, the box holds at the lower or slips at the upper factor.
     """
     control, leader = options.controller, options.leader - 1
     witness = CellWitness(cell.workcell, settings)
     reference = carry_reference(cell, carry, leader=leader)
-    print(
-        threshold_text(witness.threshold(reference, control, LOW, HIGH, BISECTIONS), settings.slip)
-    )
+    found = account_of(cell, carry, witness, control, leader)
+    threshold = found.threshold
+    print(f"  {found.problem}" if threshold is None else threshold_text(threshold, settings.slip))
     if options.sweep:
         for factor in (0.5, 2.0):
             step = factor * settings.time_step
             period = max(step, settings.control_period)
             other = replace(settings, time_step=step, control_period=period)
-            found = CellWitness(cell.workcell, other).threshold(
+            swept = CellWitness(cell.workcell, other).threshold(
                 reference, control, LOW, HIGH, BISECTIONS
             )
-            print(f"  with a time step of {step:g} s: {found.factor:.4f}")
-    pressed, factor = reference, SHOWN_FACTOR
-    if not cell.workcell.uncertainty.is_empty:
-        force = RobustModel(cell.workcell).robust_force(carry, leader=leader)
-        peak = force.peak
-        pressed, factor = carry_reference(cell, carry, force.commanded, leader), 1.0
-        print(f"  robust forces up to {peak[0]:.2f} / {peak[1]:.2f} N:")
-    outcome = witness.simulate(pressed, control, factor)
-    _tell(outcome, carry)
-    if not cell.workcell.uncertainty.is_empty:
-        _cases(cell, pressed, settings, options)
+            print(f"  with a time step of {step:g} s: {swept.factor:.4f}")
+    robust = found.pressed.robust
+    if robust is not None:
+        print(f"  robust forces up to {robust.peak[0]:.2f} / {robust.peak[1]:.2f} N:")
+    _tell(found.shown, carry)
+    if robust is not None:
+        _cases(cell, found.pressed.reference, settings, options)
         rubs_less = CellWitness(
             workcell_of_case(cell.workcell, worst_friction(cell.workcell)), settings
         )
@@ -69,7 +59,7 @@ def simulate_arms(
         word = "hold" if least.holds else "slip"
         print(f"  least forces with the set's worst friction: {word}")
     if options.film:
-        _film(cell, outcome, Path(options.film))
+        _film(cell, found.shown, Path(options.film))
     return witness.text
 
 

@@ -13,6 +13,7 @@ from hybrid_opt.campaign.branch_choice import read_branches
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
+from hybrid_opt.campaign.simulated import read_simulations
 from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, ReplicaFigures
 from hybrid_opt.carry import Carry
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
@@ -84,6 +85,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         reach=reach,
         drivable=gather_drivable(results, summary),
         branches=read_branches(results.root),
+        simulations=read_simulations(results.root),
     )
 
 

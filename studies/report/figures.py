@@ -13,6 +13,7 @@ from studies.report import (
     figures_fronts,
     figures_robust,
     figures_search,
+    figures_simulation,
 )
 from studies.report.records import DrawnCarry, ReportData
 from studies.report.style import in_style, settled
@@ -153,6 +154,13 @@ def _carry_figures(data: ReportData) -> Iterator[ReportFigure]:
             lambda: figures_carry.duration_against_force(data),
         )
     yield from _price_figure(data)
+    if data.simulations:
+        yield ReportFigure(
+            "simulated_forces",
+            "Normal forces in the simulated cell, arms under force control, beside those that were "
+            "predicted for how the carries were pressed there.",
+            lambda: figures_simulation.simulated_forces(data),
+        )
 
 
 def _price_figure(data: ReportData) -> Iterator[ReportFigure]:

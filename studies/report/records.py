@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hybrid_opt import carry
 from hybrid_opt.branches import BranchCompetition
+from hybrid_opt.campaign.simulated import StoredSimulation
 from hybrid_opt.campaign.summary import CampaignSummary, PolishedFigures, ReplicaFigures
 from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.timing import ForceCurve, TimingReport
@@ -184,6 +185,7 @@ class ReportData:
         reach: where the arms reach.
         drivable: the drivable experiment, None without one.
         branches: how the start branches were decided, None where the workcell decides them.
+        simulations: of the carries that were driven in the simulated cell, empty without.
     """
 
     root: Path
@@ -200,6 +202,7 @@ class ReportData:
     reach: ReachMap
     drivable: DrivableReport | None = None
     branches: BranchCompetition | None = None
+    simulations: tuple[StoredSimulation, ...] = ()
 
     @property
     def solved(self) -> tuple[AlgorithmRuns, ...]:

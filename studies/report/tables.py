@@ -14,6 +14,7 @@ from studies.drivable import is_drivable
 from studies.jerk_costs import HEAD, NOTE, JerkCosts
 from studies.report.records import AlgorithmRuns, DrawnCarry, ReportData
 from studies.report.table_text import NOTHING, Table, number
+from studies.simulation_text import HEADINGS, MEANING, simulation_rows
 from studies.terminal_summary import PAPER
 
 
@@ -30,6 +31,8 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
             tables.append(robust_price(data, data.summary.recommendation.price))
     if data.drivable is not None and data.drivable.jerk:
         tables.append(limits_on_jerk(data.drivable.jerk))
+    if data.simulations:
+        tables.append(simulation(data))
     tables.append(bounds(data))
     if data.summary.tests:
         tables.append(rank_tests(data))
@@ -215,6 +218,18 @@ def limits_on_jerk(costs: Sequence[JerkCosts]) -> Table:
     rows = tuple(each.cells for each in costs)
     return Table(
         "jerk", "What limits on jerk cost the selected drivable carries.", HEAD, rows, NOTE
+    )
+
+
+def simulation(data: ReportData) -> Table:
+    """What the simulated cell says of the selected carries."""
+    return Table(
+        "simulation",
+        "The selected carries in the simulated cell.",
+        HEADINGS,
+        tuple(simulation_rows(data.simulations)),
+        f"MuJoCo, both arms with their links' masses, controller "
+        f"{data.simulations[0].controller!r}. {MEANING}",
     )
 
 

@@ -1,0 +1,114 @@
+"""simulated/*.json as records: what the simulated cell says of a study's carries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from hybrid_opt.campaign.documents import Pair
+from hybrid_opt.campaign.layout import SIMULATED
+from hybrid_opt.store.json_records import Figure, Shape, read_record
+from hybrid_opt.witness.account import Account
+from symbolic.array import Array
+
+MOST_SAMPLES = 240
+"""Of the forces that are stored."""
+
+
+@dataclass(frozen=True)
+class StoredSimulation:
+    """What the simulated cell says of one carry.
+
+    Attributes:
+        label: of the carry.
+        trajectory: SHA-256 of its file.
+        controller: of the arms.
+        duration: [s].
+        slips, holds: multiples of the planned forces right below and above the threshold, null
+            where there is none.
+        pad, begins: where it slips first, 0 for nowhere, and when [s].
+        problem: why there is no threshold.
+        robust: whether the run that is shown presses with robust forces.
+        factor: of the forces there.
+        arrives: whether the box held and ended at its goal.
+        slip, misses: largest slip, and distance from the goal [m].
+        time: (n,) [s].
+        predicted, simulated: (n, 2) normal force of each robot: reference, and measured [N].
+    """
+
+    label: str
+    trajectory: str
+    controller: str
+    duration: float
+    slips: Figure
+    holds: Figure
+    pad: int
+    begins: Figure
+    problem: str
+    robust: bool
+    factor: float
+    arrives: bool
+    slip: float
+    misses: float
+    time: Annotated[Array, Shape((None,))]
+    predicted: Annotated[Array, Shape((None, 2))]
+    simulated: Annotated[Array, Shape((None, 2))]
+
+    def __post_init__(self) -> None:
+        """Refuse curves of different lengths."""
+        if not len(self.time) == len(self.predicted) == len(self.simulated):
+            raise ValueError("its curves have different lengths")
+
+    @property
+    def threshold(self) -> float:
+        """In the middle of both multiples, NaN where there is none."""
+        return (self.slips + self.holds) / 2.0
+
+    @property
+    def largest_error(self) -> Pair:
+        """(2,) largest difference of both forces of each robot over the reference."""
+        return np.asarray(np.abs(self.simulated / self.predicted - 1.0).max(axis=0))
+
+
+def stored_simulation(
+    found: Account, label: str, trajectory: str, controller: str
+) -> StoredSimulation:
+    """An account as a study stores it: from the beginning of the carry on."""
+    nan, threshold, shown = float("nan"), found.threshold, found.shown
+    begin = float(found.pressed.reference.motion.time[2])
+    rows = np.flatnonzero(shown.time >= begin)
+    even = np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).round().astype(int)
+    rows = rows[even] if len(rows) else np.array([len(shown.time) - 1])
+    return StoredSimulation(
+        label=label,
+        trajectory=trajectory,
+        controller=controller,
+        duration=float(found.pressed.reference.motion.time[-1] - begin),
+        slips=nan if threshold is None else threshold.slips.factor,
+        holds=nan if threshold is None else threshold.holds.factor,
+        pad=0 if threshold is None else threshold.slips.pad + 1,
+        begins=nan if threshold is None else threshold.slips.time[-1],
+        problem=found.problem,
+        robust=found.pressed.robust is not None,
+        factor=found.pressed.factor,
+        arrives=shown.arrives,
+        slip=float(shown.slip.max()),
+        misses=shown.misses,
+        time=shown.time[rows] - begin,
+        predicted=shown.normal_force_reference[rows],
+        simulated=shown.normal_force[rows],
+    )
+
+
+def read_simulations(root: Path) -> tuple[StoredSimulation, ...]:
+    """What was simulated of a study's carries, in the order of their files.
+
+    Raises:
+        ResultsError: a file is damaged.
+    """
+    files = sorted((root / SIMULATED).glob("*.json"))
+    remedy = "delete it and continue with --resume --simulate"
+    return tuple(read_record(StoredSimulation, path, remedy) for path in files)
