@@ -56,21 +56,21 @@ def simulation_stage() -> Stage:
 
 
 def _run(folder: CampaignFolder, progress: Progress) -> None:
-    wanted = _carries(folder.root)
+    wanted = wanted_carries(folder.root)
     (folder.root / SIMULATED).mkdir(exist_ok=True)
     kept = {one.name for one in wanted}
     for path in (folder.root / SIMULATED).glob("*.json"):
         if path.stem not in kept:
             path.unlink()
-    left = [one for one in wanted if not _is_done(folder.root, one)]
+    left = [one for one in wanted if not is_done(folder.root, one)]
     with progress.stage("simulation", len(wanted), "carries") as advance:
         for _ in range(len(wanted) - len(left)):
             advance(1)
-        ledger = _Written(left, folder.root, lambda: advance(1))
+        ledger = Written(left, folder.root, lambda: advance(1))
         executor_for(folder.execution).run(Job(_nothing, _simulated), ledger)
 
 
-class _Written(ListLedger[Simulated, StoredSimulation]):
+class Written(ListLedger[Simulated, StoredSimulation]):
     """Writes every answer as it comes, so that what is interrupted goes on from there."""
 
     def __init__(self, wanted: list[Simulated], root: Path, done: Callable[[], None]) -> None:
@@ -87,7 +87,7 @@ def _file(root: Path, name: str) -> Path:
     return root / SIMULATED / f"{name}.json"
 
 
-def _is_done(root: Path, one: Simulated) -> bool:
+def is_done(root: Path, one: Simulated) -> bool:
     """Whether this very trajectory was simulated."""
     try:
         stored = read_record(StoredSimulation, _file(root, one.name), "")
@@ -96,7 +96,7 @@ def _is_done(root: Path, one: Simulated) -> bool:
     return stored.trajectory == one.digest and stored.controller == CONTROL
 
 
-def _carries(root: Path) -> list[Simulated]:
+def wanted_carries(root: Path) -> list[Simulated]:
     """The carries that a report shows: hand-made, best of each algorithm, recommended."""
     files = {"0-hand-made": ("hand-made", root / SELECTED / HAND_MADE)}
     for number, (name, found) in enumerate(read_summary(root).algorithms.items(), start=1):

@@ -1,4 +1,4 @@
-"""Predicted beside simulated normal forces of the carries that were driven in the simulated cell."""
+"""Predicted beside simulated normal forces of carries in the simulated cell."""
 
 from __future__ import annotations
 

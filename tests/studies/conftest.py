@@ -12,6 +12,7 @@ import pytest
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
 from hybrid_opt.campaign.documents import PolishEffort
 from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.campaign.simulated import StoredSimulation
 from hybrid_opt.campaign.summary import PolishedFigures
 from hybrid_opt.indicators.metrics import non_dominated
 from studies.report.data import gather
@@ -59,7 +60,34 @@ def hybrid_data(data: ReportData) -> ReportData:
         )
         for algorithm in data.algorithms
     )
-    return replace(data, algorithms=algorithms)
+    simulations = tuple(simulation(label) for label in (data.initial.label, "recommended"))
+    return replace(data, algorithms=algorithms, simulations=simulations)
+
+
+def simulation(label: str) -> StoredSimulation:
+    """What a simulated cell might say of a carry: forces of 50 N, a hundredth off at most."""
+    time = np.linspace(0.0, 2.0, 21)
+    predicted = np.full((21, 2), 50.0)
+    simulated = predicted + np.outer(np.sin(time), [0.5, -0.5])
+    return StoredSimulation(
+        label=label,
+        trajectory="0",
+        controller="leader",
+        duration=2.0,
+        slips=1.0,
+        holds=1.004,
+        pad=2,
+        begins=0.5,
+        problem="",
+        robust=True,
+        factor=1.0,
+        arrives=True,
+        slip=1e-4,
+        misses=2e-4,
+        time=time,
+        predicted=predicted,
+        simulated=simulated,
+    )
 
 
 @pytest.fixture

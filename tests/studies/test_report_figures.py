@@ -40,7 +40,12 @@ NAMES = (
     "motion_nsga2",
     "motion_mopso",
     "duration_against_force",
+    "robust_price",
+    "simulated_forces",
 )
+
+HYBRID = ("polish", "simulated_forces")
+"""What `hybrid_data` has besides."""
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +94,7 @@ def test_the_report_has_every_figure(drawn: dict[str, tuple[ReportFigure, Figure
 
 def test_without_a_polish_there_is_no_figure_of_it(data: ReportData) -> None:
     names = [entry.name for entry in report_figures(data)]
-    assert tuple(names) == tuple(name for name in NAMES if name != "polish")
+    assert tuple(names) == tuple(name for name in NAMES if name not in HYBRID)
 
 
 def test_without_a_feasible_candidate_the_rest_is_drawn(data: ReportData) -> None:

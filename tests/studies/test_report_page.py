@@ -28,6 +28,15 @@ WINNER = PairResult((2, 0), 2, 120, 0.5, 0.4, 0.6)
 SECOND = PairResult((1, 1), 1, 80, 0.2, 0.3, 0.7)
 SHORT = '<b>&"</script>'
 MAX_BYTES = 15_000_000
+TABLES = (
+    "table1_quality",
+    "time_against_force",
+    "robust_price",
+    "simulation",
+    "bounds",
+    "timing",
+    "margins",
+)
 
 
 def with_hostile_names(data: ReportData) -> ReportData:
@@ -209,7 +218,7 @@ def test_every_file_of_the_report_is_written(report: Path, text: str) -> None:
     assert figures == {path.stem for path in (report.parent / "figures").glob("*.pdf")}
     assert text.count("<figure>") == len(figures)
     tables = sorted(path.name for path in (report.parent / "tables").iterdir())
-    for name in ("table1_quality", "time_against_force", "bounds", "timing", "margins"):
+    for name in TABLES:
         assert [f"{name}.{suffix}" for suffix in ("csv", "md", "tex")] == [
             entry for entry in tables if entry.startswith(f"{name}.")
         ]
