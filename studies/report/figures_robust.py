@@ -42,7 +42,7 @@ def robust_price(data: ReportData, price: StoredPrice) -> Figure:
             linewidth=0.8,
             label=f"largest set: {price.largest_factor:.2f}",
         )
-    axes.set_xlabel("multiple of the set")
+    axes.set_xlabel("multiple of the set [-]")
     axes.set_ylabel("peak normal force [N]")
     axes.legend(loc="upper left")
     return figure

@@ -32,7 +32,6 @@ TABLES = (
     "table1_quality",
     "time_against_force",
     "robust_price",
-    "simulation",
     "bounds",
     "timing",
     "margins",
