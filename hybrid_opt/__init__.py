@@ -2,9 +2,10 @@
 
 `Cell` is the only resource. `search` and `polish` make a `Front`, a front gives a `Carry`,
 `time_path` makes a `Timing` of it, `recommend` says which to run, `plan_job` plans the whole job
-around that, and `export` writes it for robots. Rooms, in the order of the data: evaluate,
-collision, metaheuristics, indicators, polishing, timing, robust, recommending, job, store; work and
-campaign carry out whole studies; display is how objects look in a notebook.
+around that, and `export` writes it for robots. `propose` makes the file of a cell that has no carry
+yet. Rooms, in the order of the data: evaluate, collision, proposing, metaheuristics, indicators,
+polishing, timing, robust, recommending, job, store; work and campaign carry out whole studies;
+display is how objects look in a notebook.
 
 Names are imported when they are first used, so that `import hybrid_opt` takes no time.
 """
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from hybrid_opt.job.records import Job
     from hybrid_opt.metaheuristics.carries import SearchSettings
     from hybrid_opt.polishing.settings import PolishSettings
+    from hybrid_opt.proposing.proposal import Proposal, ProposeSettings, propose
     from hybrid_opt.recommending.recommendation import Recommendation, recommend
     from hybrid_opt.recommending.wish import Wish
     from hybrid_opt.robust.squeeze import SqueezeSettings
@@ -54,6 +56,8 @@ __all__ = [
     "Objective",
     "Origin",
     "PolishSettings",
+    "Proposal",
+    "ProposeSettings",
     "Recommendation",
     "SearchSettings",
     "SqueezeSettings",
@@ -64,6 +68,7 @@ __all__ = [
     "export",
     "plan_job",
     "polish",
+    "propose",
     "recommend",
     "save",
     "search",
@@ -85,6 +90,8 @@ _HOMES = {
     "Objective": "hybrid_opt.evaluate.objectives",
     "Origin": "hybrid_opt.store.export.origin",
     "PolishSettings": "hybrid_opt.polishing.settings",
+    "Proposal": "hybrid_opt.proposing.proposal",
+    "ProposeSettings": "hybrid_opt.proposing.proposal",
     "SqueezeSettings": "hybrid_opt.robust.squeeze",
     "Recommendation": "hybrid_opt.recommending.recommendation",
     "SearchSettings": "hybrid_opt.metaheuristics.carries",
@@ -95,6 +102,7 @@ _HOMES = {
     "export": "hybrid_opt.store.export.formats",
     "plan_job": "hybrid_opt.job.plan",
     "polish": "hybrid_opt.door",
+    "propose": "hybrid_opt.proposing.proposal",
     "recommend": "hybrid_opt.recommending.recommendation",
     "save": "hybrid_opt.door",
     "search": "hybrid_opt.door",

@@ -25,3 +25,7 @@ class WitnessError(DualArmError):
 
 class JobError(DualArmError):
     """The box cannot be gripped, lifted, set down or let go as the workcell asks."""
+
+
+class ProposalError(DualArmError):
+    """No carry was found for a problem; the text says what is in the way."""

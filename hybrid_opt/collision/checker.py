@@ -40,6 +40,7 @@ class CollisionChecker:
         geometry: the cell's bodies and pairs.
         judge: FCL's objects, with counters.
         resting_tolerance: see `RESTING_TOLERANCE`.
+        functions: of the cell, by name.
         free_beyond: (n_pairs,) bounds above these call a pair free [m].
         resting_places: per allowed contact and fixed pose that touches: pair, box centre (3,),
             departure [m].
@@ -60,7 +61,7 @@ class CollisionChecker:
         self.geometry = geometry
         self.resting_tolerance = resting_tolerance
         self.judge = Judge(geometry, resting_tolerance)
-        self._functions = functions
+        self.functions = functions
         self.free_beyond = geometry.tolerance + FCL_RESOLUTION
         self._pairs = [(pair.first, pair.second) for pair in geometry.active]
         self._names = geometry.pair_names
@@ -82,7 +83,7 @@ class CollisionChecker:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, joints) joint positions [rad].
         """
-        found = self._functions["clearance"].batch(pose, q_1, q_2)["clearance"]
+        found = self.functions["clearance"].batch(pose, q_1, q_2)["clearance"]
         return found.reshape(len(pose), len(self._pairs))
 
     def check(
@@ -165,11 +166,21 @@ class CollisionChecker:
             for row, pair in zip(rows, pairs, strict=True)
         ]
 
+    def enters(self, pose: Array, pair: int) -> bool:
+        """Whether the box at (6,) enters a body of the environment deeper than one that rests may.
+
+        Args:
+            pair: of payload and body.
+        """
+        still = [np.zeros((1, arm.joints)) for arm in self.geometry.arms]
+        self._place(pose[None], *still)
+        return self._judge_pair(0, pair, resting=True)
+
     def motion(
         self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]
     ) -> MotionBounds:
         """Bounds of every pair's motion between configurations (pose, q_1, q_2), each (n, 6)."""
-        bounds = self._functions["motion"].batch(*start, *end)
+        bounds = self.functions["motion"].batch(*start, *end)
         shape = (len(start[0]), len(self._pairs))
         return MotionBounds(bounds["chord"].reshape(shape), bounds["bend"].reshape(shape))
 
@@ -229,7 +240,7 @@ class CollisionChecker:
         return best, where
 
     def _place(self, pose: Array, q_1: Array, q_2: Array) -> None:
-        poses = self._functions["piece_poses"].batch(pose, q_1, q_2)
+        poses = self.functions["piece_poses"].batch(pose, q_1, q_2)
         self.judge.set_placements(poses["quaternions"], poses["positions"])
 
     def _first_hit(self, local: int, pairs: list[int], resting: frozenset[int]) -> int:

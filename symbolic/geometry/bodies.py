@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -194,20 +195,43 @@ class MeshReader:
                 have too many triangles.
         """
         # Not imported at the top: trimesh takes long to start, and most cells have no meshes.
-        from symbolic.geometry.meshes import MOST_CELL_FACES, cut, read_mesh
+        from symbolic.geometry.meshes import MOST_CELL_FACES
 
         key = (mesh.path, tuple(mesh.scale))
         if key not in self._known:
-            found = read_mesh(mesh.path, mesh.scale)
-            self._triangles += len(found.faces)
+            hulls, faces = _cut_file(*key, _state(mesh.path))
+            self._triangles += faces
             if self._triangles > MOST_CELL_FACES:
                 raise CollisionModelError(
-                    f"{mesh.path}: with its {len(found.faces)} triangles the cell's meshes have "
+                    f"{mesh.path}: with its {faces} triangles the cell's meshes have "
                     f"{self._triangles}; allowed are {MOST_CELL_FACES} together: simplify the "
                     "largest"
                 )
-            self._known[key] = cut(found, mesh.path)
+            self._known[key] = hulls
         return self._known[key]
+
+
+def _state(path: Path) -> tuple[int, int]:
+    """Changes where a file does; zero where it cannot be asked, which reading it then tells."""
+    try:
+        found = path.stat()
+    except OSError:
+        return (0, 0)
+    return (found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=64)
+def _cut_file(
+    path: Path, scale: tuple[float, ...], state: tuple[int, int]
+) -> tuple[tuple[Hull, ...], int]:
+    """The convex pieces of a mesh file and its number of triangles.
+
+    Kept beyond one cell: what tries a cell out reads its robots several times.
+    """
+    from symbolic.geometry.meshes import cut, read_mesh
+
+    mesh = read_mesh(path, np.array(scale))
+    return cut(mesh, path), len(mesh.faces)
 
 
 def shape_pieces(

@@ -81,7 +81,7 @@ def test_a_link_that_sweeps_through_a_plate_is_found() -> None:
     middle = (start + end) / 2.0
     flange = judge.geometry.index("left/link_5")
     pose, _, still = passing(np.array([0.5]))
-    poses = judge._functions["piece_poses"].batch(pose, middle[None], still)
+    poses = judge.functions["piece_poses"].batch(pose, middle[None], still)
     first = sum(len(body.pieces) for body in judge.geometry.bodies[:flange])
     centre = poses["positions"][0, first]
     T = pose_matrix(centre, [0.0, 0.0, 0.0])

@@ -1,0 +1,128 @@
+"""Bounds around a carry in which a wanted share of random candidates is feasible."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symbolic.array import Array
+
+WIDEST = 8.0
+"""Largest factor of the half-widths."""
+
+NARROWEST = 0.02
+"""Least factor."""
+
+DRAWN = 64
+"""Candidates per round of the bisection."""
+
+CONFIRMED = 250
+"""Candidates by which the share of the final bounds is measured."""
+
+ROUNDS = 7
+"""Rounds of the bisection."""
+
+CENTRING = 3
+"""Times that bounds may move to where feasible candidates lie."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of a decision vector.
+
+    Attributes:
+        centre: (n_var,) the carry that they surround.
+        lower, upper: (n_var,) [m, rad].
+        share: of random candidates that is feasible.
+        candidates: by which it was measured.
+    """
+
+    centre: Array
+    lower: Array
+    upper: Array
+    share: float
+    candidates: int
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How bounds are measured.
+
+    Attributes:
+        feasible: (n,) verdicts on decision vectors (n, n_var).
+        unit: (n_var,) half-widths that are scaled together [m, rad].
+        limits: (2, n_var) what no bounds exceed.
+        rng: the randomness.
+        low, high: share that is wanted.
+        out_of_time: whether to come to an end.
+    """
+
+    feasible: Callable[[Array], NDArray[np.bool_]]
+    unit: Array
+    limits: Array
+    rng: np.random.Generator
+    low: float
+    high: float
+    out_of_time: Callable[[], bool]
+
+
+def find_bounds(centre: Array, sampling: Sampling) -> Bounds:
+    """Bounds around a feasible carry.
+
+    Their common factor is bisected. In between they move to the middle of the feasible candidates
+    found, which makes room for wider ones.
+
+    Args:
+        centre: (n_var,) feasible.
+        sampling: how they are measured.
+    """
+    aim = float(np.sqrt(sampling.low * sampling.high))
+    scale = 0.5
+    for _ in range(CENTRING):
+        scale, good = _bisected(centre, scale, aim, sampling)
+        if len(good) < 6 or sampling.out_of_time():
+            break
+        moved = np.round(good.mean(axis=0), 4)
+        if not bool(sampling.feasible(moved[None])[0]):
+            break
+        centre = moved
+    for _ in range(ROUNDS):
+        x = _drawn(centre, scale, sampling, CONFIRMED)
+        share = float(sampling.feasible(x).mean())
+        if sampling.low <= share <= sampling.high or sampling.out_of_time():
+            break
+        scale *= 0.8 if share < sampling.low else 1.2
+        scale = float(np.clip(scale, NARROWEST, WIDEST))
+    return Bounds(centre, *_box(centre, scale, sampling), share, len(x))
+
+
+def _bisected(centre: Array, scale: float, aim: float, sampling: Sampling) -> tuple[float, Array]:
+    """The factor at which about the wanted share is feasible, and feasible candidates near it."""
+    low, high = NARROWEST, WIDEST
+    good = np.empty((0, len(centre)))
+    for _ in range(ROUNDS):
+        x = _drawn(centre, scale, sampling, DRAWN)
+        fine = sampling.feasible(x)
+        share = float(fine.mean())
+        if share >= aim:
+            low, good = scale, x[fine]
+        else:
+            high = scale
+        if abs(share - aim) < 0.35 * aim or sampling.out_of_time():
+            break
+        scale = float(np.sqrt(low * high)) if high < WIDEST else min(2.0 * scale, WIDEST)
+    return scale, good
+
+
+def _box(centre: Array, scale: float, sampling: Sampling) -> tuple[Array, Array]:
+    half = scale * sampling.unit
+    least, most = sampling.limits
+    return np.maximum(centre - half, least), np.minimum(centre + half, most)
+
+
+def _drawn(centre: Array, scale: float, sampling: Sampling, count: int) -> Array:
+    low, high = _box(centre, scale, sampling)
+    return sampling.rng.uniform(low, high, (count, len(centre)))

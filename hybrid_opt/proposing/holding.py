@@ -1,0 +1,315 @@
+"""The ways in which an arm can hold the box: spins of its pad, postures, and where they lead."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_opt.proposing.judge import PoseJudge
+from hybrid_opt.proposing.kinematics import (
+    REACHED,
+    ArmKinematics,
+    box_poses,
+    box_to_last_joint,
+    spun,
+)
+from symbolic.array import Array
+from symbolic.physics.pose import pose_matrix
+from symbolic.workcell.records import Workcell
+
+STARTS = 768
+"""Random starts of the search for postures."""
+
+SEARCH_STEPS = 50
+"""Newton steps of it."""
+
+SEARCH_DAMPING = 1e-3
+"""Of these steps."""
+
+GUIDE_POSES = 25
+"""Poses of a guide that postures are followed along."""
+
+GUIDES = np.array(
+    [[0, 0, 0], [0, 0, 0.2], [0, 0, 0.4], [0.25, 0, 0], [-0.25, 0, 0], [0, 0.25, 0], [0, -0.25, 0]]
+)
+"""How far guides bow out from the straight line at its middle [m]; collisions do not count."""
+
+SAME_POSTURE = 0.05
+"""Postures nearer than this in every joint are one [rad], of an arm of six joints."""
+
+SAME_REDUNDANT = 0.3
+"""The same of an arm with redundant joints."""
+
+SPIN_OF_FILE = 0.1
+"""What it is worth to keep the spin of the file."""
+
+MOST_HOLDS = 24
+"""Ways to hold of one arm that are kept, the best first."""
+
+LIMIT_MARGIN = 0.02
+"""Distance to joint limits of a first path [rad]."""
+
+MANIPULABILITY_MARGIN = 1.1
+"""Its least manipulability, in that of the cell."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """One way for one arm to hold the box.
+
+    Attributes:
+        spin: beside that of the file [rad].
+        q_start, q_goal: (joints,) postures at both ends of the carry, joined by a guide.
+        score: larger is better.
+    """
+
+    spin: float
+    q_start: Array
+    q_goal: Array
+    score: float
+
+
+@dataclass
+class HoldSearch:
+    """What came of looking for ways to hold with one arm.
+
+    Attributes:
+        holds: the best first.
+        reached: postures that reach the contact at the start.
+        within: of these within limits and away from singularities.
+        free: of these free of collisions.
+        led: of these that a guide leads to the goal.
+        joints: how often each joint was beyond its limits, by index.
+        pairs: pairs in the way at the start, or where `led` is 0 at the goal.
+        kept: largest share of the straight line that a free posture follows.
+    """
+
+    holds: list[Hold] = field(default_factory=list)
+    reached: int = 0
+    within: int = 0
+    free: int = 0
+    led: int = 0
+    joints: Counter[int] = field(default_factory=Counter)
+    pairs: Counter[tuple[str, str]] = field(default_factory=Counter)
+    kept: float = 0.0
+
+
+@dataclass(frozen=True)
+class Task:
+    """What an arm has to hold.
+
+    Attributes:
+        workcell: the cell.
+        start, goal: (6,) box poses.
+        spins: of the pad beside that of the file [rad].
+        judge: of collisions.
+    """
+
+    workcell: Workcell
+    start: Array
+    goal: Array
+    spins: Array
+    judge: PoseJudge
+
+
+def find_holds(
+    task: Task, arm: int, kinematics: ArmKinematics, rng: np.random.Generator
+) -> HoldSearch:
+    """The ways in which an arm can hold the box from start to goal, the other arm left out."""
+    found = HoldSearch()
+    spins = task.spins
+    T_box_joint = [
+        box_to_last_joint(
+            task.workcell, kinematics.geometry, spun(task.workcell.contacts[arm], spin), arm
+        )
+        for spin in spins
+    ]
+    q, which = _start_postures(task, arm, kinematics, T_box_joint, rng, found)
+    if not len(q):
+        return found
+    pose = np.tile(task.start, (len(q), 1))
+    hit = task.judge.arm_colliding(arm, pose, q)
+    for row in np.flatnonzero(hit)[:MOST_HOLDS].tolist():
+        _count(task, arm, task.start, q[row], found)
+    q, which = q[~hit], which[~hit]
+    found.free = len(q)
+    if not len(q):
+        return found
+    for spin, T in enumerate(T_box_joint):
+        rows = np.flatnonzero(which == spin)
+        if len(rows):
+            _lead(task, arm, kinematics, (float(spins[spin]), T, q[rows]), rng, found)
+    found.holds.sort(key=lambda hold: -hold.score)
+    compared = kinematics.geometry.joints - spins_the_pad(task.workcell, arm, kinematics)
+    found.holds = _diverse(found.holds, compared)[:MOST_HOLDS]
+    return found
+
+
+def _start_postures(
+    task: Task,
+    arm: int,
+    kinematics: ArmKinematics,
+    T_box_joint: Sequence[Array],
+    rng: np.random.Generator,
+    found: HoldSearch,
+) -> tuple[Array, NDArray[np.intp]]:
+    """Distinct postures at the start and the index of each one's spin."""
+    T_world_box = pose_matrix(task.start[:3], task.start[3:])
+    which = np.arange(STARTS) % len(T_box_joint)
+    targets = np.array([T_world_box @ T for T in T_box_joint])[which]
+    centre = (kinematics.lower + kinematics.upper) / 2.0
+    half = (kinematics.upper - kinematics.lower) / 2.0
+    half = np.where(kinematics.geometry.turning, np.minimum(half, np.pi), half)
+    q = centre + half * rng.uniform(-1.0, 1.0, (STARTS, len(half)))
+    solved = kinematics.solve(q, targets, SEARCH_STEPS, SEARCH_DAMPING)
+    good = solved.residual <= REACHED
+    q, which, measure = solved.q[good], which[good], solved.manipulability[good]
+    if not len(q):
+        return q, which
+    q = q + np.vstack([kinematics.central(row[None, None])[0] for row in q])
+    found.reached = len(q)
+    beyond = (q < kinematics.lower + LIMIT_MARGIN) | (q > kinematics.upper - LIMIT_MARGIN)
+    for joint in np.flatnonzero(beyond.any(axis=0)).tolist():
+        found.joints[joint] = int(beyond[:, joint].sum())
+    least = task.workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
+    fine = ~beyond.any(axis=1) & (measure >= least)
+    q, which = q[fine], which[fine]
+    kept: list[int] = []
+    same = SAME_REDUNDANT if kinematics.redundant else SAME_POSTURE
+    for k in range(len(q)):
+        rivals = [j for j in kept if which[j] == which[k]]
+        if not rivals or np.abs(q[rivals] - q[k]).max(axis=1).min() > same:
+            kept.append(k)
+    found.within = len(kept)
+    return q[kept], which[kept]
+
+
+def _lead(
+    task: Task,
+    arm: int,
+    kinematics: ArmKinematics,
+    group: tuple[float, Array, Array],
+    rng: np.random.Generator,
+    found: HoldSearch,
+) -> None:
+    """Follow postures of one spin along guides to the goal; add those that arrive."""
+    spin, T_box_joint, q = group
+    waiting = np.arange(len(q))
+    for bow in GUIDES:
+        if not len(waiting):
+            return
+        poses = box_poses(task.start, task.goal, GUIDE_POSES)
+        poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
+        targets = np.array([pose_matrix(p[:3], p[3:]) @ T_box_joint for p in poses])
+        arrived, path, score = _followed(task, arm, kinematics, targets, q[waiting], rng, found)
+        if kinematics.redundant and len(arrived) < len(waiting):
+            other = _resolved(task, arm, kinematics, targets, q[waiting], found)
+            more = np.setdiff1d(other[0], arrived)
+            path[:, more], score[more] = other[1][:, more], other[2][more]
+            arrived = np.union1d(arrived, more)
+        ends = path[-1, arrived]
+        hit = np.zeros(len(arrived), dtype=bool)
+        if len(arrived):
+            hit = task.judge.arm_colliding(arm, np.tile(task.goal, (len(ends), 1)), ends)
+        for row in np.flatnonzero(hit).tolist():
+            _count(task, arm, task.goal, ends[row], found)
+        for row in np.flatnonzero(~hit).tolist():
+            at = arrived[row]
+            value = float(score[at]) + SPIN_OF_FILE * (spin == 0.0)
+            found.holds.append(Hold(spin, path[0, at], path[-1, at], value))
+        found.led += int((~hit).sum())
+        waiting = np.setdiff1d(waiting, waiting[arrived])
+
+
+def _followed(
+    task: Task,
+    arm: int,
+    kinematics: ArmKinematics,
+    targets: Array,
+    q: Array,
+    rng: np.random.Generator,
+    found: HoldSearch,
+) -> tuple[NDArray[np.intp], Array, Array]:
+    """Rows that arrive, joint paths (m, n, joints) and scores (n,)."""
+    redundant, least = list(kinematics.redundant), task.workcell.robots[arm].min_manipulability
+    ends = None
+    if redundant:  # half of them keep their redundant joints, half move them elsewhere
+        ends = q[:, redundant].copy()
+        low, high = kinematics.lower[redundant], kinematics.upper[redundant]
+        moving = rng.random(len(q)) < 0.5
+        drawn = rng.uniform(low + LIMIT_MARGIN, high - LIMIT_MARGIN, ends.shape)
+        ends[moving] = np.clip(drawn, ends - 2.0, ends + 2.0)[moving]
+    path, kept, measure = kinematics.follow(q, targets, ends)
+    path = path + kinematics.central(path)
+    room = np.minimum(path - kinematics.lower, kinematics.upper - path).min(axis=2)
+    fine = (room >= LIMIT_MARGIN) & (measure >= MANIPULABILITY_MARGIN * least)
+    share = np.minimum(kept, np.where(fine.all(axis=0), len(targets), np.argmin(fine, axis=0)))
+    found.kept = max(found.kept, float(share.max(initial=0)) / len(targets))
+    comfort = np.minimum(room.min(axis=0), 0.6) / 0.6
+    away = np.minimum(measure.min(axis=0) / (4.0 * least), 1.0)
+    return np.flatnonzero(share == len(targets)), path, comfort + away
+
+
+def _resolved(
+    task: Task,
+    arm: int,
+    kinematics: ArmKinematics,
+    targets: Array,
+    q: Array,
+    found: HoldSearch,
+) -> tuple[NDArray[np.intp], Array, Array]:
+    """As `_followed`, the redundant joints where the others are best off; only the ends count,
+    because what is planned between them need not follow the same path."""
+    least = task.workcell.robots[arm].min_manipulability
+    path, kept, measure = kinematics.follow(q, targets, resolved=True)
+    room = np.minimum(path - kinematics.lower, kinematics.upper - path).min(axis=2)
+    found.kept = max(found.kept, float(kept.max(initial=0)) / len(targets))
+    fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= MANIPULABILITY_MARGIN * least)
+    comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
+    away = np.minimum(measure.min(axis=0) / (4.0 * least), 1.0)
+    return np.flatnonzero((kept == len(targets)) & fine), path, comfort + away
+
+
+def _count(task: Task, arm: int, pose: Array, q: Array, found: HoldSearch) -> None:
+    absent = np.zeros(task.judge.geometry.arms[1 - arm].joints)
+    q_1, q_2 = (q, absent) if arm == 0 else (absent, q)
+    pair = task.judge.first_pair(pose, q_1, q_2, arm)
+    if pair is not None:
+        found.pairs[pair] += 1
+
+
+def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
+    """Of ways that differ in the spin and a joint about the same axis alone the best, then those
+    unlike all before them first.
+
+    Args:
+        compared: joints that make a difference, from the first.
+    """
+    first: list[Hold] = []
+    later: list[Hold] = []
+    for hold in holds:
+        apart = [
+            float(np.abs((other.q_start - hold.q_start)[:compared]).max())
+            for other in (*first, *later)
+        ]
+        nearest = min(apart, default=np.inf)
+        if nearest > 4 * SAME_REDUNDANT:
+            first.append(hold)
+        elif nearest > SAME_POSTURE:
+            later.append(hold)
+    return first + later
+
+
+def spins_the_pad(workcell: Workcell, arm: int, kinematics: ArmKinematics) -> bool:
+    """Whether the arm's last joint turns the pad about its normal, as a spin does."""
+    geometry = kinematics.geometry
+    T_joint_pad = geometry.T_joint_box @ workcell.contacts[arm].T_box_pad
+    axis = geometry.axes[-1]
+    aside = T_joint_pad[:3, 3] - (T_joint_pad[:3, 3] @ axis) * axis
+    parallel = abs(float(T_joint_pad[:3, 2] @ axis)) > 1.0 - 1e-6
+    last_follows = geometry.joints - 1 not in kinematics.redundant
+    return bool(geometry.turning[-1] and last_follows and parallel and np.linalg.norm(aside) < 1e-4)

@@ -1,0 +1,267 @@
+"""A complete workcell with a first carry, from robots, payload, start, goal and environment alone.
+
+In this order: both arms' ways to hold the box are compared (spins of the pads, postures), pairs of
+them ranked; a planner looks for a free path of the box with both arms over the closed chain; the
+fewest via-points are taken whose spline is free; the evaluator judges that carry, and random ones
+around it until the bounds hold the wanted share of feasible ones. What is written was judged again
+as it is read from the file.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_opt.carry import Judgement
+from hybrid_opt.errors import ProposalError
+from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
+from hybrid_opt.proposing.completion import Found, changes, decision_bounds
+from hybrid_opt.proposing.pairing import Pair
+from hybrid_opt.proposing.planner import Budget, Leave, freedom, plan
+from hybrid_opt.proposing.problem import Problem, read_problem
+from hybrid_opt.proposing.reasons import no_path
+from hybrid_opt.proposing.setup import Setup, prepare
+from hybrid_opt.proposing.trial import BranchLostError, Trial
+from hybrid_opt.proposing.via_points import MOST_VIA_POINTS, fit, shortened
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.workcell.records import POSE_SIZE
+
+ROUNDS = ((2000, 6), (6000, 10), (20000, 16), (60000, 24))
+"""Configurations that may be looked at for a path, and pairs of ways to hold that get so many."""
+
+STRAYS = ((0.0, 0.15), (0.0, 0.05), (0.3, 0.15), (0.3, 0.05))
+"""Tilts [rad] and ranges [m] of a planner's path, see `hybrid_opt.proposing.planner.Leave`."""
+
+ASIDE = 0.8
+"""How far beside start and goal a path may run [m]."""
+
+PLANNING = 0.7
+"""Share of the time after which no path is looked for any more."""
+
+SPINS = 12
+"""Spins of a pad that are tried."""
+
+
+@dataclass(frozen=True)
+class ProposeSettings:
+    """How a carry is looked for.
+
+    Attributes:
+        seconds: for all of it.
+        feasible: least and largest share of random candidates within the bounds that is feasible.
+        clock: what seconds are counted by.
+    """
+
+    seconds: float = 120.0
+    feasible: tuple[float, float] = (0.02, 0.20)
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.seconds <= 1e6:
+            raise SettingsError(f"seconds: found {self.seconds:g}; allowed is 1 to 1e6")
+        low, high = self.feasible
+        if not 0.0 < low < high <= 1.0:
+            raise SettingsError(
+                f"feasible: found {low:g} and {high:g}; allowed are shares 0 < least < largest <= 1"
+            )
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A workcell with a certified carry.
+
+    Attributes:
+        problem: where it comes from.
+        found: what was found, as values of the workcell.
+        judgement: the evaluator's verdict on the carry, certified between its samples.
+        feasible_share: of random candidates within the bounds.
+        candidates: by which that was measured.
+        seconds: that it took.
+    """
+
+    problem: Problem
+    found: Found
+    judgement: Judgement
+    feasible_share: float
+    candidates: int
+    seconds: float
+
+    def text(self, folder: Path) -> str:
+        """The workcell file, for a folder: the problem file's text, completed.
+
+        Raises:
+            SettingsError: it is written in a way that cannot be completed.
+        """
+        return self.problem.completed(changes(self.problem, self.found), folder)
+
+    def __str__(self) -> str:
+        forces = ", ".join(f"{value:.4f}" for value in self.judgement.objectives.values())
+        spins = " and ".join(f"{np.degrees(spin):.0f}" for spin in self.found.spins)
+        return (
+            f"a carry through {len(self.found.via)} via-points, certified; objectives {forces}; "
+            f"spins {spins} deg, start branches {self.found.branches[0]} and "
+            f"{self.found.branches[1]}; {100.0 * self.feasible_share:.1f} % of "
+            f"{self.candidates} random candidates feasible; {self.seconds:.1f} s"
+        )
+
+
+def propose(
+    path: str | Path,
+    *,
+    rng: np.random.Generator,
+    settings: ProposeSettings | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+) -> Proposal:
+    """Propose a complete workcell for a problem file.
+
+    Args:
+        path: a workcell file in which what is proposed may be missing (docs/your-own-cell.md).
+        rng: its only randomness. The same state gives the same proposal where time does not run
+            out.
+        settings: None for the defaults.
+        tell: called with what is being done.
+
+    Raises:
+        WorkcellError: the file is wrong.
+        ProposalError: no carry was found; the text says what is in the way.
+        SettingsError: OMPL is not installed.
+    """
+    search = _Search(read_problem(path), rng, settings or ProposeSettings(), tell)
+    return search.run()
+
+
+@dataclass
+class _Search:
+    """One proposal on its way."""
+
+    problem: Problem
+    rng: np.random.Generator
+    settings: ProposeSettings
+    tell: Callable[[str], None]
+    begun: float = 0.0
+    refusals: list[str] = field(default_factory=list)
+
+    @property
+    def spent(self) -> float:
+        """Seconds so far."""
+        return self.settings.clock() - self.begun
+
+    @property
+    def out_of_time(self) -> bool:
+        """Whether to come to an end."""
+        return self.spent > self.settings.seconds
+
+    @property
+    def too_late(self) -> bool:
+        """Whether it is too late for another path: bounds and verdicts take time as well."""
+        return self.spent > PLANNING * self.settings.seconds
+
+    def run(self) -> Proposal:
+        self.begun = self.settings.clock()
+        setups = self._setups()
+        for effort, most in ROUNDS:
+            for setup in setups:
+                for number, pair in enumerate(setup.pairs[:most]):
+                    for stray in STRAYS:
+                        if self.too_late:
+                            raise self._failed(no_path(setups[0].pairs, self.refusals))
+                        self.tell(f"paths of pair {number + 1} of {len(setup.pairs)}, {effort}")
+                        found = self._carry(setup, pair, stray, effort)
+                        if found is not None:
+                            return found
+        raise self._failed(no_path(setups[0].pairs, self.refusals))
+
+    def _setups(self) -> list[Setup]:
+        """The cell with all ways to hold; several where bases are to be found."""
+        self.tell("ways to hold the box")
+        spins = 2.0 * np.pi * np.arange(SPINS) / SPINS
+        try:
+            return [prepare(self.problem, {}, spins, self.rng)]
+        except ProposalError as error:
+            raise self._failed(str(error)) from error
+
+    def _failed(self, reasons: str) -> ProposalError:
+        spent = f"{self.spent:.0f} s"
+        return ProposalError(f"{self.problem.source}: no carry found in {spent}: {reasons}")
+
+    def _carry(
+        self, setup: Setup, pair: Pair, stray: tuple[float, float], effort: int
+    ) -> Proposal | None:
+        """A carry in one way of holding, or None."""
+        task = setup.workcell.task
+        lower, upper = np.full((2, task.extended_size), np.nan)
+        ends = np.array([pair.start.extended, pair.goal.extended])
+        lower[:POSE_SIZE] = ends[:, :POSE_SIZE].min(axis=0) - ASIDE
+        upper[:POSE_SIZE] = ends[:, :POSE_SIZE].max(axis=0) + ASIDE
+        lower[POSE_SIZE:] = [joint.lower.min() for joint in task.redundant]
+        upper[POSE_SIZE:] = [joint.upper.max() for joint in task.redundant]
+        room = freedom(ends[0], ends[1], Leave(lower, upper, *stray))
+        seed = int(self.rng.integers(1, 2**31))
+        budget = Budget(effort, lambda: self.too_late)
+        corners = plan(pair.chain, (pair.start, pair.goal), room, budget, seed)
+        if corners is None:
+            return None
+        self.tell("via-points")
+        dense = shortened(pair.chain, corners, self.rng)
+        for count in range(1, MOST_VIA_POINTS + 1):
+            via = fit(pair.chain, dense, count, self.rng)
+            if via is not None and not self.too_late:
+                proposal = self._judged(setup, pair, np.round(via, 4))
+                if proposal is not None:
+                    return proposal
+        return None
+
+    def _judged(self, setup: Setup, pair: Pair, via: Array) -> Proposal | None:
+        """The proposal with these via-points, or None where the evaluator refuses it."""
+        self.tell("the evaluator's verdict")
+        ends = np.round([pair.start.extended, pair.goal.extended], 4)
+        waypoints = np.vstack([ends[0], via, ends[1]])
+        spins = (pair.holds[0].spin, pair.holds[1].spin)
+        found = Found(setup.workcell, spins, (-1, -1), waypoints, setup.given)
+        begin = (pair.start.q[0], pair.start.q[1])
+        try:
+            trial = self._trial(found, begin)
+        except BranchLostError:
+            self.refusals.append("the start posture is not among the arm's start branches")
+            return None
+        judgement, why = trial.verdict()
+        if not judgement.feasible:
+            self.refusals.append(why)
+            return None
+        self.tell("bounds")
+        bounds = self._bounds(trial)
+        moved = replace(found, branches=trial.branches, bounds=bounds).around(bounds.centre)
+        self.tell("the evaluator's verdict on the file")
+        try:
+            last = self._trial(moved, trial.start_of(bounds.centre))
+        except BranchLostError:
+            self.refusals.append("the start posture is not among the arm's start branches")
+            return None
+        judgement, why = last.verdict()
+        if not judgement.feasible:
+            self.refusals.append(why)
+            return None
+        return Proposal(
+            self.problem,
+            replace(moved, branches=last.branches),
+            judgement,
+            bounds.share,
+            bounds.candidates,
+            self.spent,
+        )
+
+    def _trial(self, found: Found, begin: tuple[Array, Array]) -> Trial:
+        return Trial(self.problem.workcell(changes(self.problem, found)), begin)
+
+    def _bounds(self, trial: Trial) -> Bounds:
+        unit, limits = decision_bounds(trial.workcell)
+        low, high = self.settings.feasible
+        sampling = Sampling(
+            trial.feasible, unit, limits, self.rng, low, high, lambda: self.out_of_time
+        )
+        return find_bounds(trial.initial, sampling)

@@ -1,0 +1,112 @@
+"""What is in the way of a carry, in words."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from hybrid_opt.evaluate.explanation import missing_reach
+from hybrid_opt.proposing.holding import HoldSearch, Task
+from hybrid_opt.proposing.judge import PoseJudge
+from hybrid_opt.proposing.pairing import Pair
+from symbolic.array import Array
+from symbolic.robot.urdf import arm_model
+
+TOLD = 3
+"""So many pairs or joints are named."""
+
+
+def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
+    """What the box alone meets at the start or the goal, '' where it meets nothing."""
+    found = []
+    for name, pose in (("start", start), ("goal", goal)):
+        for body, deep in judge.resting(pose):
+            told = f"payload meets {body} at the {name}"
+            allowed = "raise it, or let it rest there by [[task.allowed_contacts]]"
+            found.append(told if deep else f"{told}, by less than 1 mm: {allowed}")
+    return "; ".join(found)
+
+
+def holds_missing(task: Task, searches: Sequence[HoldSearch]) -> str:
+    """Why an arm has no way to hold the box, '' where both have one."""
+    found = [
+        _arm_missing(task, arm, search) for arm, search in enumerate(searches) if not search.holds
+    ]
+    return "; ".join(found)
+
+
+def _arm_missing(task: Task, arm: int, search: HoldSearch) -> str:
+    robot = task.workcell.robots[arm]
+    if not search.reached:
+        missing = min(_missing(task, arm, pose) for pose in (task.start,))
+        return f"{robot.name} lacks {missing:.3f} m to its contact at the start"
+    names = list(arm_model(robot).names)[1:]
+    if not search.within:
+        joints = ", ".join(names[joint] for joint, _ in search.joints.most_common(TOLD))
+        told = f"beyond limits are most often {joints}" if joints else "all are near singular"
+        return f"{robot.name} has no usable posture at the start: {told}"
+    if not search.free:
+        return f"{robot.name} collides at the start in every posture: {_pairs(search.pairs)}"
+    if search.pairs and search.kept >= 1.0:
+        return (
+            f"{robot.name} collides in every posture that leads from the start to the goal: "
+            f"{_pairs(search.pairs)}"
+        )
+    missing = _missing(task, arm, task.goal)
+    if missing > 1e-3:
+        return f"{robot.name} lacks {missing:.3f} m to its contact at the goal"
+    return (
+        f"{robot.name} follows at most {100.0 * search.kept:.0f} % of the way to the goal in any "
+        "posture within its limits and away from singular ones"
+    )
+
+
+def _missing(task: Task, arm: int, pose: Array) -> float:
+    """Reach that an arm lacks to a pose, from several postures [m]."""
+    robot, contact = task.workcell.robots[arm], task.workcell.contacts[arm]
+    rng = np.random.default_rng(0)
+    low = np.maximum(robot.position_lower, -np.pi)
+    high = np.minimum(robot.position_upper, np.pi)
+    postures = rng.uniform(low, high, (8, len(low)))
+    return min(missing_reach(robot, contact, pose, q) for q in postures)
+
+
+def no_pair(task: Task, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
+    """Which bodies of the two arms meet where each alone is free."""
+    met: Counter[tuple[str, str]] = Counter()
+    for end, pose in enumerate((task.start, task.goal)):
+        for a in searches[0].holds[:8]:
+            for b in searches[1].holds[:8]:
+                joints = [(hold.q_start, hold.q_goal)[end] for hold in (a, b)]
+                pair = judge.first_pair(pose, joints[0], joints[1])
+                if pair is not None:
+                    met[pair] += 1
+    return f"both arms' postures collide at the start or the goal: {_pairs(met)}"
+
+
+def no_path(pairs: Iterable[Pair], refusals: Sequence[str]) -> str:
+    """What the planner met most often, and what the evaluator said of its paths."""
+    met: Counter[tuple[str, str]] = Counter()
+    refused: Counter[str] = Counter()
+    for pair in pairs:
+        met += pair.chain.judge.met
+        refused += pair.chain.refused
+    told = []
+    if met:
+        told.append(f"most often in the way: {_pairs(met)}")
+    if refused:
+        told.append(", ".join(name for name, _ in refused.most_common(TOLD)))
+    if refusals:
+        (text, count), *_ = Counter(refusals).most_common(1)
+        told.append(f"the evaluator refused {len(refusals)} carries, {count} because {text}")
+    return "; ".join(told)
+
+
+def _pairs(met: Counter[tuple[str, str]]) -> str:
+    total = max(sum(met.values()), 1)
+    return ", ".join(
+        f"{' – '.join(pair)} ({100.0 * count / total:.0f} %)"
+        for pair, count in met.most_common(TOLD)
+    )

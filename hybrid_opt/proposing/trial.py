@@ -1,0 +1,126 @@
+"""A proposed cell before anything is compiled: the evaluator with CasADi's interpreter inside."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.interpreted import InterpretedFunction
+from codegen.source import dense
+from hybrid_opt.carry import Judgement
+from hybrid_opt.evaluate.certification import LostPathError
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.explanation import explain
+from symbolic.array import Array
+from symbolic.cell_model import build_cell_model
+from symbolic.functions.cell import cell_functions
+from symbolic.robot.branches import StartBranch
+from symbolic.workcell.decision import initial_decision
+from symbolic.workcell.records import Workcell
+
+SAME_BRANCH = 0.02
+"""Largest difference of joints, full turns apart, of the posture that a path began with and the
+branch that stands for it [rad or m]."""
+
+COARSE = 9
+"""Every so many samples are judged first: most candidates that collide do so there."""
+
+CHUNK = 32
+"""Candidates whose samples are held at once."""
+
+
+class Trial:
+    """A workcell's evaluator without a compiler.
+
+    Attributes:
+        workcell: the cell, its start branches as they were found.
+        branches: per robot its start branch among the ranked ones.
+        evaluator: what judges.
+    """
+
+    def __init__(self, workcell: Workcell, start: tuple[Array, Array]) -> None:
+        """Build the model and find the start branches.
+
+        Args:
+            start: postures (joints,) of both arms that the carry begins with.
+
+        Raises:
+            BranchLostError: a posture is not among the start branches.
+            DualArmError: the cell cannot be modelled.
+        """
+        model = build_cell_model(replace(workcell, start_branch=(-1, -1)))
+        found = [_branch(model.branches[i], start[i]) for i in (0, 1)]
+        self.branches = (found[0], found[1])
+        begin = [np.array(model.branches[i][found[i]].q) for i in (0, 1)]
+        self.workcell = replace(workcell, start_branch=self.branches)
+        model = replace(model, workcell=self.workcell, start=(begin[0], begin[1]))
+        functions = {
+            name: InterpretedFunction(dense(function))
+            for name, function in cell_functions(model).items()
+        }
+        self.evaluator = CandidateEvaluator(self.workcell, functions=functions)
+
+    @property
+    def initial(self) -> Array:
+        """(n_var,) the proposed carry."""
+        return initial_decision(self.workcell.task)
+
+    def start_of(self, x: Array) -> tuple[Array, Array]:
+        """Both arms' postures (joints,) with which a decision vector (n_var,) begins."""
+        outputs = self.evaluator.outputs(x[None])
+        return outputs["q_1"][0, 0], outputs["q_2"][0, 0]
+
+    def verdict(self) -> tuple[Judgement, str]:
+        """Whether the proposed carry is feasible, certified between its samples, and if not why."""
+        verdicts = self.evaluator.evaluate(self.initial[None])
+        judgement = verdicts.judgement(0, self.evaluator.objective_names)
+        if not judgement.feasible:
+            return judgement, str(explain(self.evaluator, verdicts)[0])
+        try:
+            certificate = self.evaluator.certificate(self.initial)
+        except LostPathError as error:
+            return replace(judgement, feasible=False, reason="reach"), str(error)
+        if certificate.is_free:
+            return judgement, ""
+        place = f"not proven free at {100.0 * certificate.at_parameter:.0f} % of the path"
+        return replace(judgement, feasible=False, reason="between_samples"), place
+
+    def feasible(self, x: Array) -> NDArray[np.bool_]:
+        """(n,) whether decision vectors (n, n_var) are feasible on the task's samples."""
+        parts = [self._feasible(x[k : k + CHUNK]) for k in range(0, len(x), CHUNK)]
+        return np.concatenate(parts)
+
+    def _feasible(self, x: Array) -> NDArray[np.bool_]:
+        outputs = self.evaluator.outputs(x)
+        fine = np.all(outputs["violation"] <= 0.0, axis=1) & np.isfinite(outputs["time"]).all(
+            axis=tuple(range(1, outputs["time"].ndim))
+        )
+        last = outputs["q_1"].shape[1] - 1
+        coarse = np.arange(last, -1, -COARSE)[::-1]
+        for rows in (coarse, np.arange(last + 1)):
+            for k in np.flatnonzero(fine).tolist():
+                pose, q_1, q_2, time = (
+                    np.ascontiguousarray(outputs[name][k][rows])
+                    for name in ("pose", "q_1", "q_2", "time")
+                )
+                found = self.evaluator.checker.check(pose, q_1, q_2, time)
+                fine[k] = not found.colliding.any()
+        return np.asarray(fine)
+
+
+class BranchLostError(Exception):
+    """A posture is not among the start branches of its arm."""
+
+
+def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
+    """Index of the branch that is a posture."""
+    apart = [
+        float(np.abs(np.remainder(branch.q - q + np.pi, 2.0 * np.pi) - np.pi).max())
+        for branch in branches
+    ]
+    best = int(np.argmin(apart)) if apart else 0
+    if not apart or apart[best] > SAME_BRANCH:
+        raise BranchLostError
+    return best

@@ -1,0 +1,84 @@
+"""Propose a complete workcell: from robots, payload, start, goal and environment to a first carry.
+
+The problem file is a workcell file in which `task.initial`, `[[task.waypoints]]`,
+`[[task.redundant]]`, the pads' `spin` and the robots' `start_branch` are missing. The proposed file
+is the same text, completed: a carry that the evaluator certifies, and bounds around it that a
+search can start with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+import hybrid_opt as ho
+from studies.options import number, seed
+from studies.program import add_verbose, carried_out, run_program
+from symbolic.errors import SettingsError
+from symbolic.replacing import replace_file
+
+PROGRAM = "python -m studies.propose"
+
+
+def _teller() -> Callable[[str], None]:
+    """Prints what is being done and when, every word once in a row."""
+    begun, last = time.monotonic(), [""]
+
+    def tell(text: str) -> None:
+        if text != last[0]:
+            print(f"{time.monotonic() - begun:6.1f} s  {text}", file=sys.stderr, flush=True)
+            last[0] = text
+
+    return tell
+
+
+@carried_out(PROGRAM, "interrupted; nothing was written")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; returns the exit code."""
+    parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
+    parser.add_argument("problem", type=Path, metavar="PROBLEM", help="the problem file")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        metavar="FILE",
+        help="the workcell file (default: NAME-proposed.toml beside the problem file)",
+    )
+    parser.add_argument(
+        "--time",
+        type=number(1.0, 1e6),
+        default=ho.ProposeSettings().seconds,
+        metavar="S",
+        help="seconds that it may take (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--seed", type=seed, default=1, metavar="N", help="of its randomness (default: 1)"
+    )
+    parser.add_argument("--quiet", action="store_true", help="do not say what is being done")
+    add_verbose(parser)
+    options = parser.parse_args(arguments)
+    problem = options.problem
+    output = options.output or problem.with_name(f"{problem.stem}-proposed.toml")
+    if output.resolve() == problem.resolve():
+        raise SettingsError(f"{output} is the problem file; name another one by --output")
+    if not output.parent.is_dir():
+        raise SettingsError(
+            f"{output.parent} is no folder; make it, or name another one by --output"
+        )
+    proposal = ho.propose(
+        problem,
+        rng=np.random.default_rng(options.seed),
+        settings=ho.ProposeSettings(seconds=options.time),
+        tell=(lambda text: None) if options.quiet else _teller(),
+    )
+    replace_file(output, proposal.text(output.parent).encode())
+    print(f"{output}: {proposal}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run_program(main))
