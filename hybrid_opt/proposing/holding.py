@@ -120,166 +120,152 @@ def find_holds(
     task: Task, arm: int, kinematics: ArmKinematics, rng: np.random.Generator
 ) -> HoldSearch:
     """The ways in which an arm can hold the box from start to goal, the other arm left out."""
-    found = HoldSearch()
-    spins = task.spins
+    finder = _Finder(task, arm, kinematics, rng)
+    found = finder.found
     T_box_joint = [
         box_to_last_joint(
             task.workcell, kinematics.geometry, spun(task.workcell.contacts[arm], spin), arm
         )
-        for spin in spins
+        for spin in task.spins
     ]
-    q, which = _start_postures(task, arm, kinematics, T_box_joint, rng, found)
+    q, which = finder.start_postures(T_box_joint)
     if not len(q):
         return found
-    pose = np.tile(task.start, (len(q), 1))
-    hit = task.judge.arm_colliding(arm, pose, q)
-    for row in np.flatnonzero(hit)[:MOST_HOLDS].tolist():
-        _count(task, arm, task.start, q[row], found)
+    hit = finder.colliding(task.start, q)
     q, which = q[~hit], which[~hit]
     found.free = len(q)
-    if not len(q):
-        return found
     for spin, T in enumerate(T_box_joint):
         rows = np.flatnonzero(which == spin)
         if len(rows):
-            _lead(task, arm, kinematics, (float(spins[spin]), T, q[rows]), rng, found)
+            finder.lead(float(task.spins[spin]), T, q[rows])
     found.holds.sort(key=lambda hold: -hold.score)
     compared = kinematics.geometry.joints - spins_the_pad(task.workcell, arm, kinematics)
     found.holds = _diverse(found.holds, compared)[:MOST_HOLDS]
     return found
 
 
-def _start_postures(
-    task: Task,
-    arm: int,
-    kinematics: ArmKinematics,
-    T_box_joint: Sequence[Array],
-    rng: np.random.Generator,
-    found: HoldSearch,
-) -> tuple[Array, NDArray[np.intp]]:
-    """Distinct postures at the start and the index of each one's spin."""
-    T_world_box = pose_matrix(task.start[:3], task.start[3:])
-    which = np.arange(STARTS) % len(T_box_joint)
-    targets = np.array([T_world_box @ T for T in T_box_joint])[which]
-    centre = (kinematics.lower + kinematics.upper) / 2.0
-    half = (kinematics.upper - kinematics.lower) / 2.0
-    half = np.where(kinematics.geometry.turning, np.minimum(half, np.pi), half)
-    q = centre + half * rng.uniform(-1.0, 1.0, (STARTS, len(half)))
-    solved = kinematics.solve(q, targets, SEARCH_STEPS, SEARCH_DAMPING)
-    good = solved.residual <= REACHED
-    q, which, measure = solved.q[good], which[good], solved.manipulability[good]
-    if not len(q):
-        return q, which
-    q = q + np.vstack([kinematics.central(row[None, None])[0] for row in q])
-    found.reached = len(q)
-    beyond = (q < kinematics.lower + LIMIT_MARGIN) | (q > kinematics.upper - LIMIT_MARGIN)
-    for joint in np.flatnonzero(beyond.any(axis=0)).tolist():
-        found.joints[joint] = int(beyond[:, joint].sum())
-    least = task.workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
-    fine = ~beyond.any(axis=1) & (measure >= least)
-    q, which = q[fine], which[fine]
-    kept: list[int] = []
-    same = SAME_REDUNDANT if kinematics.redundant else SAME_POSTURE
-    for k in range(len(q)):
-        rivals = [j for j in kept if which[j] == which[k]]
-        if not rivals or np.abs(q[rivals] - q[k]).max(axis=1).min() > same:
-            kept.append(k)
-    found.within = len(kept)
-    return q[kept], which[kept]
+class _Finder:
+    """The search for one arm's ways to hold.
 
+    Attributes:
+        found: what came of it so far.
+    """
 
-def _lead(
-    task: Task,
-    arm: int,
-    kinematics: ArmKinematics,
-    group: tuple[float, Array, Array],
-    rng: np.random.Generator,
-    found: HoldSearch,
-) -> None:
-    """Follow postures of one spin along guides to the goal; add those that arrive."""
-    spin, T_box_joint, q = group
-    waiting = np.arange(len(q))
-    for bow in GUIDES:
-        if not len(waiting):
-            return
-        poses = box_poses(task.start, task.goal, GUIDE_POSES)
-        poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
-        targets = np.array([pose_matrix(p[:3], p[3:]) @ T_box_joint for p in poses])
-        arrived, path, score = _followed(task, arm, kinematics, targets, q[waiting], rng, found)
-        if kinematics.redundant and len(arrived) < len(waiting):
-            other = _resolved(task, arm, kinematics, targets, q[waiting], found)
-            more = np.setdiff1d(other[0], arrived)
-            path[:, more], score[more] = other[1][:, more], other[2][more]
-            arrived = np.union1d(arrived, more)
-        ends = path[-1, arrived]
-        hit = np.zeros(len(arrived), dtype=bool)
-        if len(arrived):
-            hit = task.judge.arm_colliding(arm, np.tile(task.goal, (len(ends), 1)), ends)
-        for row in np.flatnonzero(hit).tolist():
-            _count(task, arm, task.goal, ends[row], found)
-        for row in np.flatnonzero(~hit).tolist():
-            at = arrived[row]
-            value = float(score[at]) + SPIN_OF_FILE * (spin == 0.0)
-            found.holds.append(Hold(spin, path[0, at], path[-1, at], value))
-        found.led += int((~hit).sum())
-        waiting = np.setdiff1d(waiting, waiting[arrived])
+    def __init__(
+        self, task: Task, arm: int, kinematics: ArmKinematics, rng: np.random.Generator
+    ) -> None:
+        self.task, self.arm, self.kinematics, self.rng = task, arm, kinematics, rng
+        self.found = HoldSearch()
+        self._least = task.workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
 
+    def start_postures(self, T_box_joint: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
+        """Distinct postures at the start and the index of each one's spin."""
+        kinematics, found, start = self.kinematics, self.found, self.task.start
+        T_world_box = pose_matrix(start[:3], start[3:])
+        which = np.arange(STARTS) % len(T_box_joint)
+        targets = np.array([T_world_box @ T for T in T_box_joint])[which]
+        centre = (kinematics.lower + kinematics.upper) / 2.0
+        half = (kinematics.upper - kinematics.lower) / 2.0
+        half = np.where(kinematics.geometry.turning, np.minimum(half, np.pi), half)
+        q = centre + half * self.rng.uniform(-1.0, 1.0, (STARTS, len(half)))
+        solved = kinematics.solve(q, targets, SEARCH_STEPS, SEARCH_DAMPING)
+        good = solved.residual <= REACHED
+        q, which, measure = solved.q[good], which[good], solved.manipulability[good]
+        if not len(q):
+            return q, which
+        q = q + np.vstack([kinematics.central(row[None, None])[0] for row in q])
+        found.reached = len(q)
+        beyond = (q < kinematics.lower + LIMIT_MARGIN) | (q > kinematics.upper - LIMIT_MARGIN)
+        for joint in np.flatnonzero(beyond.any(axis=0)).tolist():
+            found.joints[joint] = int(beyond[:, joint].sum())
+        fine = ~beyond.any(axis=1) & (measure >= self._least)
+        q, which = q[fine], which[fine]
+        kept: list[int] = []
+        same = SAME_REDUNDANT if kinematics.redundant else SAME_POSTURE
+        for k in range(len(q)):
+            rivals = [j for j in kept if which[j] == which[k]]
+            if not rivals or np.abs(q[rivals] - q[k]).max(axis=1).min() > same:
+                kept.append(k)
+        found.within = len(kept)
+        return q[kept], which[kept]
 
-def _followed(
-    task: Task,
-    arm: int,
-    kinematics: ArmKinematics,
-    targets: Array,
-    q: Array,
-    rng: np.random.Generator,
-    found: HoldSearch,
-) -> tuple[NDArray[np.intp], Array, Array]:
-    """Rows that arrive, joint paths (m, n, joints) and scores (n,)."""
-    redundant, least = list(kinematics.redundant), task.workcell.robots[arm].min_manipulability
-    ends = None
-    if redundant:  # half of them keep their redundant joints, half move them elsewhere
-        ends = q[:, redundant].copy()
-        low, high = kinematics.lower[redundant], kinematics.upper[redundant]
-        moving = rng.random(len(q)) < 0.5
-        drawn = rng.uniform(low + LIMIT_MARGIN, high - LIMIT_MARGIN, ends.shape)
-        ends[moving] = np.clip(drawn, ends - 2.0, ends + 2.0)[moving]
-    path, kept, measure = kinematics.follow(q, targets, ends)
-    path = path + kinematics.central(path)
-    room = np.minimum(path - kinematics.lower, kinematics.upper - path).min(axis=2)
-    fine = (room >= LIMIT_MARGIN) & (measure >= MANIPULABILITY_MARGIN * least)
-    share = np.minimum(kept, np.where(fine.all(axis=0), len(targets), np.argmin(fine, axis=0)))
-    found.kept = max(found.kept, float(share.max(initial=0)) / len(targets))
-    comfort = np.minimum(room.min(axis=0), 0.6) / 0.6
-    away = np.minimum(measure.min(axis=0) / (4.0 * least), 1.0)
-    return np.flatnonzero(share == len(targets)), path, comfort + away
+    def colliding(self, pose: Array, q: Array) -> NDArray[np.bool_]:
+        """(n,) of postures (n, joints) that hold the box at a pose; counts what they meet."""
+        judge, arm = self.task.judge, self.arm
+        if not len(q):
+            return np.zeros(0, dtype=bool)
+        hit = judge.arm_colliding(arm, np.tile(pose, (len(q), 1)), q)
+        absent = np.zeros(judge.geometry.arms[1 - arm].joints)
+        for row in np.flatnonzero(hit)[:MOST_HOLDS].tolist():
+            q_1, q_2 = (q[row], absent) if arm == 0 else (absent, q[row])
+            pair = judge.first_pair(pose, q_1, q_2, arm)
+            if pair is not None:
+                self.found.pairs[pair] += 1
+        return hit
 
+    def lead(self, spin: float, T_box_joint: Array, q: Array) -> None:
+        """Follow postures of one spin along guides to the goal; add those that arrive."""
+        start, goal = self.task.start, self.task.goal
+        waiting = np.arange(len(q))
+        for bow in GUIDES:
+            if not len(waiting):
+                return
+            poses = box_poses(start, goal, GUIDE_POSES)
+            poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
+            targets = np.array([pose_matrix(p[:3], p[3:]) @ T_box_joint for p in poses])
+            arrived, path, score = self._followed(targets, q[waiting])
+            if self.kinematics.redundant and len(arrived) < len(waiting):
+                also, other, scores = self._resolved(targets, q[waiting])
+                more = np.setdiff1d(also, arrived)
+                path[:, more], score[more] = other[:, more], scores[more]
+                arrived = np.union1d(arrived, more)
+            hit = self.colliding(goal, path[-1, arrived])
+            for at in arrived[~hit].tolist():
+                value = float(score[at]) + SPIN_OF_FILE * (spin == 0.0)
+                self.found.holds.append(Hold(spin, path[0, at], path[-1, at], value))
+            self.found.led += int((~hit).sum())
+            waiting = np.setdiff1d(waiting, waiting[arrived])
 
-def _resolved(
-    task: Task,
-    arm: int,
-    kinematics: ArmKinematics,
-    targets: Array,
-    q: Array,
-    found: HoldSearch,
-) -> tuple[NDArray[np.intp], Array, Array]:
-    """As `_followed`, the redundant joints where the others are best off; only the ends count,
-    because what is planned between them need not follow the same path."""
-    least = task.workcell.robots[arm].min_manipulability
-    path, kept, measure = kinematics.follow(q, targets, resolved=True)
-    room = np.minimum(path - kinematics.lower, kinematics.upper - path).min(axis=2)
-    found.kept = max(found.kept, float(kept.max(initial=0)) / len(targets))
-    fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= MANIPULABILITY_MARGIN * least)
-    comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
-    away = np.minimum(measure.min(axis=0) / (4.0 * least), 1.0)
-    return np.flatnonzero((kept == len(targets)) & fine), path, comfort + away
+    def _followed(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """Rows that arrive, joint paths (m, n, joints) and scores (n,)."""
+        kinematics, redundant = self.kinematics, list(self.kinematics.redundant)
+        ends = None
+        if redundant:  # half of them keep their redundant joints, half move them elsewhere
+            ends = q[:, redundant].copy()
+            low, high = kinematics.lower[redundant], kinematics.upper[redundant]
+            moving = self.rng.random(len(q)) < 0.5
+            drawn = self.rng.uniform(low + LIMIT_MARGIN, high - LIMIT_MARGIN, ends.shape)
+            ends[moving] = np.clip(drawn, ends - 2.0, ends + 2.0)[moving]
+        path, kept, measure = kinematics.follow(q, targets, ends)
+        path = path + kinematics.central(path)
+        room = self._room(path)
+        fine = (room >= LIMIT_MARGIN) & (measure >= self._least)
+        until = np.where(fine.all(axis=0), len(targets), np.argmin(fine, axis=0))
+        share = np.minimum(kept, until)
+        self.found.kept = max(self.found.kept, float(share.max(initial=0)) / len(targets))
+        arrived = np.flatnonzero(share == len(targets))
+        return arrived, path, self._score(room, measure)
 
+    def _resolved(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """As `_followed`, the redundant joints where the others are best off; only the ends count,
+        because what is planned between them need not follow the same path."""
+        path, kept, measure = self.kinematics.follow(q, targets, resolved=True)
+        room = self._room(path)
+        self.found.kept = max(self.found.kept, float(kept.max(initial=0)) / len(targets))
+        fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= self._least)
+        arrived = np.flatnonzero((kept == len(targets)) & fine)
+        return arrived, path, self._score(room, measure)
 
-def _count(task: Task, arm: int, pose: Array, q: Array, found: HoldSearch) -> None:
-    absent = np.zeros(task.judge.geometry.arms[1 - arm].joints)
-    q_1, q_2 = (q, absent) if arm == 0 else (absent, q)
-    pair = task.judge.first_pair(pose, q_1, q_2, arm)
-    if pair is not None:
-        found.pairs[pair] += 1
+    def _room(self, path: Array) -> Array:
+        """(m, n) least distance to a joint limit of joint paths (m, n, joints)."""
+        beyond = np.minimum(path - self.kinematics.lower, self.kinematics.upper - path)
+        return np.asarray(beyond.min(axis=2))
+
+    def _score(self, room: Array, measure: Array) -> Array:
+        """(n,) how far from limits and singular postures."""
+        comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
+        away = np.minimum(measure.min(axis=0) / (4.0 * self._least), 1.0)
+        return np.asarray(comfort + away)
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
