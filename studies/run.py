@@ -129,6 +129,9 @@ def run_study(
     """
     cell, competition = decided_cell(workcell, settings, execution)
     alone = is_drivable(cell, settings.objectives)
+    if not cell.has_facing_pads:
+        progress.note("the polish knows two round pads that face one another: search alone")
+        study = replace(study, polish=None, drivable_polish=None)
     polish = study.polish if alone else study.drivable_polish
     if polish is not None and not is_polishable(cell.task):
         progress.note("the drivable carries of this cell cannot be polished: search alone")

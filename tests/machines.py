@@ -16,7 +16,7 @@ from symbolic.physics.pose import inverse, pose_matrix
 from symbolic.robot.chain import held_joints
 from symbolic.robot.urdf import link_frame, moving_joints, reduced_model
 from symbolic.robot.urdf_file import read_urdf
-from symbolic.workcell.sections import pad_rotation
+from symbolic.workcell.contacts import face_normal, pad_rotation
 
 SIZE = (0.30, 0.40, 0.25)
 
@@ -205,7 +205,7 @@ def single_cell(arm: Arm, folder: Path, locked: dict[str, float] | None = None) 
     robots = []
     for name, side in (("left", 1), ("right", -1)):
         T_box_pad = np.eye(4)
-        T_box_pad[:3, :3] = pad_rotation(1, side, 0.0)
+        T_box_pad[:3, :3] = pad_rotation(face_normal(1, side), 0.0)
         T_box_pad[1, 3] = side * SIZE[1] / 2
         pad = pose_matrix(np.array([0.0, 0.0, 0.05]), np.zeros(3))
         T_world_base = T_box_pad @ inverse(pad) @ inverse(T_root_flange)

@@ -12,7 +12,7 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.geometry.bodies import BOX, PAYLOAD, CollisionBody
 from symbolic.geometry.pairs import CellGeometry, pair_tolerance
-from symbolic.geometry.pieces import SMALLEST_SIZE, Capsule, ConvexShape, Hull, Piece, reach
+from symbolic.geometry.pieces import SMALLEST_SIZE, Capsule, ConvexShape, Hull, Piece, reach, shrunk
 from symbolic.workcell.records import Box, Cylinder, Sphere
 
 FCL_RESOLUTION = 1e-5
@@ -27,7 +27,7 @@ class Judge:
     Attributes:
         calls: FCL queries made so far.
         updates: placements of pieces handed to FCL so far.
-        resting_shape: the payload smaller by the resting tolerance on every side.
+        resting_shapes: the payload's pieces, smaller by the resting tolerance on every side.
     """
 
     def __init__(self, geometry: CellGeometry, resting_tolerance: float) -> None:
@@ -42,15 +42,12 @@ class Judge:
             for body, first in zip(geometry.bodies, firsts[:-1], strict=True)
         ]
         payload = geometry.index(PAYLOAD)
-        size = np.asarray(geometry.workcell.payload.size) - 2.0 * resting_tolerance
-        self.resting_shape = Box(np.maximum(size, SMALLEST_SIZE))
-        shrunk = Piece(self.resting_shape, np.eye(4))
+        smaller = tuple(shrunk(p, resting_tolerance) for p in geometry.bodies[payload].pieces)
+        self.resting_shapes = tuple(piece.shape for piece in smaller)
         self.shrunk_payload = len(self._bodies)
         """Index of the payload made smaller by the resting tolerance on every side."""
         self._bodies.append(
-            _Objects(
-                CollisionBody("shrunk payload", "payload", BOX, (shrunk,)), int(firsts[payload])
-            )
+            _Objects(CollisionBody("shrunk payload", "payload", BOX, smaller), int(firsts[payload]))
         )
         self._quaternions = self._positions = np.zeros((0, 0, 0))
 

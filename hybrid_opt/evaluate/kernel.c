@@ -13,7 +13,7 @@ typedef struct {
 typedef struct { long long pair; double place[3], departure; } resting_place;
 
 /* The cell's shapes: piece k of body b for first_piece[b] <= k < first_piece[b + 1]; a further
-   body is the payload that may rest, whose one piece is placed as the payload. */
+   body is the payload that may rest, whose pieces are placed as the payload's. */
 typedef struct {
   const long long *pairs, *first_piece;
   const shape* shapes;
@@ -170,9 +170,9 @@ static int prejudge(const judge_data* judge, long long pair, int k, int l) {
   /* A resting payload may come nearer than the tolerance; it only must not intersect. */
   double apart = judge->apart + (resting ? 0.0 : judge->tolerance[pair]);
   long long begin = resting ? judge->resting_piece : first[bodies[0]];
-  long long end = resting ? begin + 1 : first[bodies[0] + 1];
+  long long end = begin + first[bodies[0] + 1] - first[bodies[0]];
   for (long long i = begin; i < end; ++i) {
-    placed a = piece_place(resting ? judge->payload_piece : i, l);
+    placed a = piece_place(resting ? judge->payload_piece + i - begin : i, l);
     for (long long j = first[bodies[1]]; j < first[bodies[1] + 1]; ++j) {
       placed b = piece_place(j, l);
       int one = prejudge_shapes(judge->shapes + i, &a, judge->shapes + j, &b, judge->vertices,

@@ -71,7 +71,7 @@ def judge_arrays(checker: CollisionChecker) -> dict[str, NDArray[Any]]:
     geometry = checker.geometry
     bodies = [body.pieces for body in geometry.bodies]
     shapes = [piece.shape for pieces in bodies for piece in pieces]
-    table, vertices = shape_table([*shapes, checker.judge.resting_shape])
+    table, vertices = shape_table([*shapes, *checker.judge.resting_shapes])
     return {
         "pairs": np.array([(p.first, p.second) for p in geometry.active], dtype=np.int64),
         "first_piece": np.cumsum([0] + [len(pieces) for pieces in bodies], dtype=np.int64),

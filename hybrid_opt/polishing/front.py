@@ -39,9 +39,15 @@ class FrontPolisher(Polisher):
         """Load or build the smooth problem's functions.
 
         Raises:
-            SettingsError: the evaluator's objectives are not both peak forces.
+            SettingsError: the evaluator's objectives are not both peak forces, or its pads are not
+                two round ones that face one another.
             DualArmError: the functions cannot be built.
         """
+        if not evaluator.workcell.has_facing_pads:
+            raise SettingsError(
+                "the polish knows the forces of two round pads that face one another, and no "
+                "others: switch it off"
+            )
         if evaluator.objective_names != PAPER_OBJECTIVES:
             raise SettingsError(
                 f"the polish minimises {' and '.join(PAPER_OBJECTIVES)}; the objectives are "

@@ -254,8 +254,11 @@ def check_pads(workcell: Workcell) -> None:
     """Refuse pads that do not face one another.
 
     Raises:
-        SettingsError: some cases cannot be held, however hard both press.
+        SettingsError: some cases cannot be held, however hard both press, or there are others than
+            two round pads with opposite normals.
     """
+    if not workcell.has_facing_pads:
+        raise SettingsError("robust forces need two round pads that face one another")
     room = PATCH_OVERLAP * sum(contact.patch_radius for contact in workcell.contacts)
     if pads_beside(workcell) >= room:
         raise SettingsError(

@@ -40,6 +40,7 @@ from hybrid_opt.timing.records import (
 from hybrid_opt.timing.solve import LEAST_SPEED, time_path
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_ratios, limit_use, worst
 from symbolic.array import Array
+from symbolic.errors import SettingsError
 
 PIECES = 60
 """Of the spline of squared speeds."""
@@ -70,8 +71,14 @@ def time_with_jerk(
         x: (n_var,) decision vector.
 
     Raises:
-        SettingsError: x does not fit the workcell.
+        SettingsError: x does not fit the workcell, or the force is limited of pads that are not two
+            round ones facing one another.
     """
+    if limits.force is not None and not model.workcell.has_facing_pads:
+        raise SettingsError(
+            "jerk limits beside a force limit need two round pads that face one another: leave "
+            "one of the limits out"
+        )
     motion = model.path_motion(x)
     fastest = time_path(model, x, limits, motion)
     if path_failure(model, motion) is not None or not fastest.ok:

@@ -74,11 +74,16 @@ class PointLimits:
         still = np.zeros(len(self._index))
         return rows_of.join([*cuts, *self._force_cut(still, still)])
 
+    @property
+    def _convex_force(self) -> float | None:
+        """The force limit where the normal forces are convex, in closed form."""
+        return self._limits.force if self._model.workcell.has_facing_pads else None
+
     def _force_cut(self, a: Array, w: Array) -> list[PointRows]:
-        if self._limits.force is None:
+        if self._convex_force is None:
             return []
         tangent = rows_of.tangent_direction(self.points, self._model.workcell, a, w)
-        force = self._limits.force
+        force = self._convex_force
         cuts = [rows_of.force_rows(self.points, self._model.workcell, force, tangent)]
         if self._limits.robust:
             value, slope = self._robust(a, w)
@@ -106,11 +111,11 @@ class PointLimits:
             if excess > POINT_TOLERANCE:
                 direction = vector / np.maximum(length, 1e-12)
                 cuts.append(rows_of.norm_rows(first, second, limit, direction[:, None, :]))
-        if self._limits.force is not None:
+        if self._convex_force is not None:
             largest = float(self._model.drive(p, np.sqrt(w), a)["normal_force"].max())
             if self._limits.robust:
                 largest = max(largest, float(self._robust(a, w)[0].max()))
-            excess = largest / self._limits.force - 1.0
+            excess = largest / self._convex_force - 1.0
             worst_excess = max(worst_excess, excess)
             # What the force limit leaves for the motion is small, so the whole of it counts.
             if excess > POINT_TOLERANCE * FORCE_SHARPNESS:
@@ -123,7 +128,8 @@ class PointLimits:
         columns: list[Array] = []
         p, workcell = self.points, self._model.workcell
         pressure = limits_pressure(workcell, self._limits)
-        if not (self._limits.torque or pressure):
+        force = None if workcell.has_facing_pads else self._limits.force
+        if not (self._limits.torque or pressure or force):
             return np.zeros((len(a), 0))
         load = self._model.drive(p, np.sqrt(w), a)
         if self._limits.torque:
@@ -133,6 +139,8 @@ class PointLimits:
         if pressure:
             radius = np.array([contact.patch_radius for contact in workcell.contacts])
             columns.append(load["pressure_shift"] / radius)
+        if force:
+            columns.append(load["normal_force"] / force)
         return np.concatenate(columns, axis=1)
 
     def linearise(self, ratios: Array, near: NDArray[np.bool_], a: Array, w: Array) -> PointRows:

@@ -14,15 +14,22 @@ import numpy as np
 import pinocchio
 
 from hybrid_opt.errors import WitnessError
-from hybrid_opt.witness.scene import contact_points, mjcf_text, placed, solver_options
+from hybrid_opt.witness.scene import (
+    contact_points,
+    mjcf_text,
+    piece_geom,
+    placed,
+    plates,
+    presses_on_box,
+    solver_options,
+)
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import Frame, arm_geometry, collision_bodies
-from symbolic.geometry.pieces import Capsule, Hull, Piece
 from symbolic.physics.contact_forces import GRAVITY
 from symbolic.robot.machine import common_joints
 from symbolic.robot.urdf import arm_model
-from symbolic.workcell.records import Box, Cylinder, Sphere, Workcell
+from symbolic.workcell.records import Workcell
 
 SOFTNESS = "0.7 0.7 0.001"
 """Of contacts: at 0.7 MuJoCo's regularisation lets a pad give by some hundredths of a millimetre.
@@ -113,9 +120,19 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
     for body in collision_bodies(workcell):
         touch = SOLID if body.group == "environment" else UNTOUCHED
         if body.frame.kind != "box":
-            geoms = [_geom(piece, touch, meshes) for piece in body.pieces]
+            look = f'{touch} group="1" density="0"'
+            geoms = [piece_geom(piece, look, meshes) for piece in body.pieces]
             shown.setdefault(body.frame, []).extend(geoms)
     payload = workcell.payload
+    look = 'friction="0 0 0" rgba="0.8 0.6 0.3 1"'
+    if presses_on_box(workcell):
+        size = mjcf_text(payload.size / 2.0)
+        solid = f'<geom type="box" size="{size}" contype="0" conaffinity="3" {look}/>'
+    else:
+        held = next(body for body in collision_bodies(workcell) if body.frame.kind == "box")
+        touch = f'contype="0" conaffinity="2" {look} density="0"'
+        solid = "\n".join(piece_geom(piece, touch, meshes) for piece in held.pieces)
+        solid += plates(workcell, 'contype="0" conaffinity="1" group="3" density="0"')
     about = payload.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     arms = "\n".join(_arm(workcell, settings, i, shown) for i in (0, 1))
     return f"""
@@ -135,8 +152,7 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
       <freejoint name="box"/>
       <inertial pos="{mjcf_text(payload.centre_of_mass)}" mass="{payload.mass!r}"
         fullinertia="{mjcf_text(about)}"/>
-      <geom type="box" size="{mjcf_text(payload.size / 2.0)}" contype="0" conaffinity="3"
-        friction="0 0 0" rgba="0.8 0.6 0.3 1"/>
+      {solid}
     </body>
   </worldbody>
 </mujoco>"""
@@ -183,23 +199,3 @@ def _inertial(inertia: pinocchio.Inertia) -> str:
         f'<inertial pos="{mjcf_text(inertia.lever)}" mass="{mass!r}" '
         f'fullinertia="{mjcf_text(about)}"/>'
     )
-
-
-def _geom(piece: Piece, touch: str, meshes: list[str]) -> str:
-    """A piece as a geom; a hull's mesh is added to the assets."""
-    shape = piece.shape
-    match shape:
-        case Box():
-            kind = f'type="box" size="{mjcf_text(np.asarray(shape.size) / 2.0)}"'
-        case Cylinder():
-            kind = f'type="cylinder" size="{mjcf_text([shape.radius, shape.length / 2.0])}"'
-        case Sphere():
-            kind = f'type="sphere" size="{float(shape.radius)!r}"'
-        case Capsule():
-            kind = f'type="capsule" size="{mjcf_text([shape.radius, shape.length / 2.0])}"'
-        case Hull():
-            name = f"hull_{len(meshes) + 1}"
-            # Its own vertices, about their own frame: MuJoCo moves a mesh to its centre otherwise.
-            meshes.append(f'<mesh name="{name}" vertex="{mjcf_text(shape.vertices)}"/>')
-            kind = f'type="mesh" mesh="{name}"'
-    return f'<geom {kind} {placed(piece.pose)} {touch} group="1" density="0"/>'

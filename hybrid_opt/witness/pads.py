@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hybrid_opt.witness.scene import rim
 from hybrid_opt.witness.simulate import RIM_POINTS
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
@@ -34,9 +35,8 @@ class Pads:
         self._pad_of_geom = np.full(model.ngeom, -1)
         for i, body in enumerate(self._bodies):
             self._pad_of_geom[(model.geom_bodyid == body) & (model.geom_contype == 1)] = i
-        around = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
-        circle = np.column_stack([np.cos(around), np.sin(around), np.zeros(RIM_POINTS)])
-        self._rims = np.array([contact.patch_radius * circle for contact in workcell.contacts])
+        rims = np.array([rim(contact, RIM_POINTS) for contact in workcell.contacts])
+        self._rims = np.concatenate([rims, np.zeros((2, RIM_POINTS, 1))], axis=2)
         self._contact_time = float(model.geom_solref[self._pad_of_geom >= 0, 0].max())
         self._change = np.zeros((3, model.nv))
 

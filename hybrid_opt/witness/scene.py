@@ -15,8 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.geometry.pieces import Capsule, Hull, Piece
 from symbolic.physics.contact_forces import GRAVITY
-from symbolic.workcell.records import Contact, Workcell
+from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.workcell.records import Box, Contact, Cylinder, Sphere, Workcell
 
 CARRIAGE_MASS = 1e5
 """[kg], and [kg m^2] about every axis: what the box does to the carriage within a step is lost in
@@ -33,6 +35,9 @@ TILT_DAMPING_TIME = 2e-3
 
 POINT_RADIUS = 2e-3
 """Of the spheres [m]."""
+
+PLATE_REACH, PLATE_THICKNESS = 3.0, 0.01
+"""Half the side of a plate under a pad over the patch's radius, and its thickness [m]."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,11 @@ def scene_text(
     gravity = np.array(GRAVITY) - np.asarray(disturbance)
     payload, inertia = workcell.payload, workcell.payload.inertia
     about = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    touched = 'contype="0" conaffinity="1"'
+    if presses_on_box(workcell):
+        faces = f'<geom type="box" size="{mjcf_text(payload.size / 2.0)}" {touched}/>'
+    else:
+        faces = plates(workcell, touched)
     pads = "\n".join(
         _pad_text(contact, f"pad_{i + 1}", settings, slides=i != leader)
         for i, contact in enumerate(workcell.contacts)
@@ -109,7 +119,7 @@ def scene_text(
       <freejoint name="box"/>
       <inertial pos="{mjcf_text(payload.centre_of_mass)}" mass="{payload.mass!r}"
         fullinertia="{mjcf_text(about)}"/>
-      <geom type="box" size="{mjcf_text(payload.size / 2.0)}" contype="0" conaffinity="1"/>
+      {faces}
     </body>
   </worldbody>
 </mujoco>"""
@@ -123,20 +133,86 @@ def solver_options(time_step: float, noslip_iterations: int, gravity: Array) -> 
 
 
 def contact_points(contact: Contact, points: int, T_body_pad: Array) -> str:
-    """Spheres on the rim of a patch that touch its plane, as geoms of the body that holds it."""
-    angles = 2.0 * np.pi * np.arange(points) / points
-    in_pad = np.column_stack(
-        [
-            contact.patch_radius * np.cos(angles),
-            contact.patch_radius * np.sin(angles),
-            np.full(points, -POINT_RADIUS),
-        ]
-    )
+    """Spheres on the rims of a robot's patches that touch their planes, as geoms of the body that
+    holds its pads.
+
+    Args:
+        points: per patch; at least the corners of a rectangular one.
+        T_body_pad: (4, 4) of the first pad.
+    """
+    T_body_box = T_body_pad @ inverse(contact.T_box_pad)
+    places = []
+    for pad in (contact, *contact.further):
+        around = rim(pad, points)
+        in_pad = np.column_stack([around, np.full(len(around), -POINT_RADIUS)])
+        T = T_body_pad if pad is contact else T_body_box @ pad.T_box_pad
+        places.append(in_pad @ T[:3, :3].T + T[:3, 3])
     return "\n".join(
         f'<geom type="sphere" size="{POINT_RADIUS!r}" contype="1" conaffinity="0" priority="1" '
         f'friction="{contact.friction!r} 0 0" pos="{mjcf_text(place)}"/>'
-        for place in in_pad @ T_body_pad[:3, :3].T + T_body_pad[:3, 3]
+        for place in np.concatenate(places)
     )
+
+
+def rim(contact: Contact, points: int) -> Array:
+    """(n, 2) places on a patch's rim in its pad's plane [m]: evenly around, or evenly along the
+    sides of a rectangle, corners included."""
+    if contact.half_sides is None:
+        angles = 2.0 * np.pi * np.arange(points) / points
+        return contact.patch_radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [1.0, 1.0]])
+    per_side = -(-points // 4)
+    along = np.arange(4 * per_side) / per_side
+    signs = [np.interp(along, np.arange(5), corners[:, k]) for k in (0, 1)]
+    return np.column_stack(signs) * contact.half_sides
+
+
+def presses_on_box(workcell: Workcell) -> bool:
+    """Whether all pads press on faces of a box."""
+    size = workcell.payload.size
+    return workcell.payload.shape is None and all(
+        abs(pad.T_box_pad[:3, 2] @ (pad.T_box_pad[:3, 3] + pad.T_box_pad[:3, 2] * size / 2.0))
+        < 1e-9
+        and np.abs(pad.T_box_pad[:3, 2]).max() > 1.0 - 1e-9
+        for pad in workcell.pads
+    )
+
+
+def plates(workcell: Workcell, touched: str) -> str:
+    """A flat plate under each pad, as geoms of the box: what pads press on where it is no box.
+
+    The planner takes patches for flat; a pad is moulded to what it holds.
+
+    Args:
+        touched: attributes that say what may touch them.
+    """
+    text = []
+    for pad in workcell.pads:
+        T = pad.T_box_pad @ pose_matrix([0.0, 0.0, PLATE_THICKNESS / 2.0], [0.0, 0.0, 0.0])
+        reach = PLATE_REACH * pad.patch_radius
+        size = mjcf_text([reach, reach, PLATE_THICKNESS / 2.0])
+        text.append(f'<geom type="box" size="{size}" {placed(T)} {touched} friction="0 0 0"/>')
+    return "\n".join(text)
+
+
+def piece_geom(piece: Piece, touch: str, meshes: list[str]) -> str:
+    """A piece as a geom; a hull's mesh is added to the assets."""
+    shape = piece.shape
+    match shape:
+        case Box():
+            kind = f'type="box" size="{mjcf_text(np.asarray(shape.size) / 2.0)}"'
+        case Cylinder():
+            kind = f'type="cylinder" size="{mjcf_text([shape.radius, shape.length / 2.0])}"'
+        case Sphere():
+            kind = f'type="sphere" size="{float(shape.radius)!r}"'
+        case Capsule():
+            kind = f'type="capsule" size="{mjcf_text([shape.radius, shape.length / 2.0])}"'
+        case Hull():
+            name = f"hull_{len(meshes) + 1}"
+            # Its own vertices, about their own frame: MuJoCo moves a mesh to its centre otherwise.
+            meshes.append(f'<mesh name="{name}" vertex="{mjcf_text(shape.vertices)}"/>')
+            kind = f'type="mesh" mesh="{name}"'
+    return f"<geom {kind} {placed(piece.pose)} {touch}/>"
 
 
 def tilt_names(pad: str) -> tuple[str, str]:

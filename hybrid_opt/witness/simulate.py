@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.witness.drive import Drive
 from hybrid_opt.witness.outcome import Outcome, Threshold, bisected, mujoco_module
-from hybrid_opt.witness.scene import CARRIAGE_MASS, SimulationSettings, scene_text, tilt_names
+from hybrid_opt.witness.scene import CARRIAGE_MASS, SimulationSettings, rim, scene_text, tilt_names
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
 
@@ -22,7 +22,7 @@ LOOKED_AT = 1e-3
 """Time between two looks at the slip [s]."""
 
 RIM_POINTS = 8
-"""Places on each patch's rim where the slip is measured."""
+"""Places on the rim of each robot's first patch where the slip is measured."""
 
 
 class Witness:
@@ -51,14 +51,9 @@ class Witness:
         self._mujoco = mujoco_module()
         self._disturbance = disturbance
         self._models: dict[int, Any] = {}
-        around = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
-        circle = np.stack([np.cos(around), np.sin(around)])
-        pads = [contact.T_box_pad for contact in workcell.contacts]
-        radii = [contact.patch_radius for contact in workcell.contacts]
-        self._normal = pads[0][:3, 2]
-        self._rims = np.array(
-            [T[:3, 3] + (r * T[:3, :2] @ circle).T for T, r in zip(pads, radii, strict=True)]
-        )
+        pads = [(contact.T_box_pad, rim(contact, RIM_POINTS)) for contact in workcell.contacts]
+        self._normals = np.array([T[:3, 2] for T, _ in pads])[:, None]
+        self._rims = np.array([T[:3, 3] + around @ T[:3, :2].T for T, around in pads])
 
     def simulate(self, drive: Drive, factor: float = 1.0) -> Outcome:
         """One carry with the pressing force times a factor, up to its end or to a slip."""
@@ -120,4 +115,5 @@ class Witness:
         turned = drive.rotation[k].T @ R_world_box
         offset = drive.rotation[k].T @ (pose[:3] - drive.position[k])
         moved = self._rims @ turned.T + offset - self._rims
-        return moved - (moved @ self._normal)[..., None] * self._normal, turned
+        along = (moved * self._normals).sum(axis=2, keepdims=True)
+        return moved - along * self._normals, turned

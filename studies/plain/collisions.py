@@ -20,6 +20,7 @@ from studies.plain.motion import box_rotation
 from symbolic.array import Array
 from symbolic.geometry.meshes import convex_pieces
 from symbolic.geometry.pairs import build_geometry
+from symbolic.geometry.pieces import ConvexShape, Hull, Piece, shrunk
 from symbolic.workcell.records import Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
 
 PAYLOAD = "payload"
@@ -59,9 +60,9 @@ class PlainCollisionChecker:
         self.workcell = workcell
         self.arms = [_Arm(robot) for robot in workcell.robots]
         self.bodies = {name: solids for arm in self.arms for name, solids in arm.bodies.items()}
-        self.payload = _solid(Box(workcell.payload.size))
-        self.shrunk = _solid(Box(workcell.payload.size - 2.0 * RESTING_TOLERANCE))
-        self.bodies[PAYLOAD] = [self.payload]
+        self.payload = _solids(workcell.payload.solid, pin.SE3.Identity())
+        self.shrunk = _shrunk_solids(workcell.payload.solid)
+        self.bodies[PAYLOAD] = self.payload
         for body in workcell.environment:
             self.bodies[body.name] = _solids(body.shape, pin.SE3(body.pose))
             for solid in self.bodies[body.name]:
@@ -88,7 +89,7 @@ class PlainCollisionChecker:
         resting = first == PAYLOAD and second in allowed
         tolerance = self._tolerance(PAYLOAD in pair)
         hit = False
-        for a in [self.shrunk] if resting else self.bodies[first]:
+        for a in self.shrunk if resting else self.bodies[first]:
             for b in self.bodies[second]:
                 result = fcl.CollisionResult()
                 fcl.collide(a.object, b.object, fcl.CollisionRequest(), result)
@@ -104,8 +105,8 @@ class PlainCollisionChecker:
 
     def _move_payload(self, pose: Array) -> None:
         world_box = pin.SE3(box_rotation(self.workcell.task.orientation, pose[3:]), pose[:3])
-        self.payload.move(world_box)
-        self.shrunk.move(world_box)
+        for solid in (*self.payload, *self.shrunk):
+            solid.move(world_box)
 
     def _resting_places(self) -> list[tuple[str, Array, float]]:
         """Body, place and departure of every allowed contact that a fixed pose makes."""
@@ -116,7 +117,7 @@ class PlainCollisionChecker:
             self._move_payload(waypoint.lower)
             for allowed in task.allowed_contacts:
                 solids = self.bodies[allowed.body]
-                gap = min(fcl.distance(self.payload.object, solid.object) for solid in solids)
+                gap = min(fcl.distance(a.object, b.object) for a in self.payload for b in solids)
                 if gap <= self._tolerance(True) + RESTING_TOLERANCE:
                     places.append((allowed.body, waypoint.lower[:3], allowed.departure))
         return places
@@ -178,15 +179,32 @@ def _urdf_shape(item: pin.GeometryObject) -> Shape | coal.Capsule:
     return Mesh(Path(item.meshPath), np.asarray(item.meshScale))
 
 
+def _shrunk_solids(shape: Box | Cylinder | Mesh) -> list[_Solid]:
+    """A payload smaller by the resting tolerance; how a hull shrinks is a fact of its piece."""
+    less = 2.0 * RESTING_TOLERANCE
+    match shape:
+        case Box():
+            return [_solid(Box(shape.size - less))]
+        case Cylinder():
+            return [_solid(Cylinder(shape.radius - less / 2.0, shape.length - less))]
+    hulls = convex_pieces(shape.path, shape.scale)
+    return [
+        _hull(shrunk(Piece(hull, np.eye(4)), less / 2.0).shape, pin.SE3.Identity())
+        for hull in hulls
+    ]
+
+
 def _solids(shape: Shape | coal.Capsule, placement: pin.SE3) -> list[_Solid]:
     if not isinstance(shape, Mesh):
         return [_solid(shape, placement)]
-    solids = []
-    for hull in convex_pieces(shape.path, shape.scale):
-        counted = np.array([[len(face), *face] for face in hull.faces])
-        solid = fcl.Convex(np.array(hull.vertices), len(hull.faces), counted.ravel())
-        solids.append(_Solid(fcl.CollisionObject(solid), placement))
-    return solids
+    return [_hull(hull, placement) for hull in convex_pieces(shape.path, shape.scale)]
+
+
+def _hull(hull: ConvexShape, placement: pin.SE3) -> _Solid:
+    assert isinstance(hull, Hull)
+    counted = np.array([[len(face), *face] for face in hull.faces])
+    solid = fcl.Convex(np.array(hull.vertices), len(hull.faces), counted.ravel())
+    return _Solid(fcl.CollisionObject(solid), placement)
 
 
 def _solid(

@@ -19,7 +19,7 @@ from symbolic.robot.machine import ArmLinks, arm_links, one_machine
 from symbolic.robot.urdf import arm_model, link_frame, resolve_mesh, robot_urdf
 from symbolic.robot.urdf_file import UrdfMesh
 from symbolic.workcell.problems import shown
-from symbolic.workcell.records import Box, Mesh, Robot, Shape, Workcell
+from symbolic.workcell.records import Mesh, Robot, Shape, Workcell
 
 Group = Literal["robot 1", "robot 2", "payload", "environment"]
 MOST_CORNERS = 100_000
@@ -117,8 +117,8 @@ def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
     if one_machine(workcell.robots):  # what a joint of both arms moves belongs to the first
         mount = f"{workcell.robots[0].name}/{links[1].mount}"
         bodies = [replace(b, carries=(1,)) if b.name == mount else b for b in bodies]
-    payload = Piece(Box(np.asarray(workcell.payload.size)), np.eye(4))
-    bodies.append(CollisionBody(PAYLOAD, "payload", BOX, (payload,)))
+    payload = shape_pieces(workcell.payload.solid, np.eye(4), "the payload", meshes)
+    bodies.append(CollisionBody(PAYLOAD, "payload", BOX, payload))
     bodies += [b for i in (0, 1) for b in _standing_bodies(workcell.robots, i, links, meshes)]
     for obstacle in workcell.environment:
         owner = f"environment body {obstacle.name!r}"

@@ -30,9 +30,10 @@ from symbolic.geometry.pieces import (
     ball,
     farthest_from_axis,
     farthest_from_point,
+    shrunk,
     swept_cylinder,
 )
-from symbolic.workcell.records import Box, Workcell
+from symbolic.workcell.records import Workcell
 
 MOST_ENTERED = 1e-3
 """Depth by which a tool may be drawn into the payload, as pads that give way are [m]."""
@@ -145,15 +146,12 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
 def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]) -> None:
     """The tools touch the payload that they hold, and do not enter it."""
     payload = next(body for body in bodies if body.frame.kind == "box")
-    box = payload.pieces[0].shape
-    assert isinstance(box, Box)
-    inner = Box(np.maximum(box.size - 2.0 * MOST_ENTERED, 1e-6))
+    cores = [shrunk(piece, MOST_ENTERED) for piece in payload.pieces]
     for body in bodies:
         if not body.is_tool:
             continue
-        core = Piece(inner, payload.pieces[0].pose)
-        held = core.moved(arms[body.frame.robot].T_joint_box)
-        if coal_distance((held,), body.pieces) <= 0.0:
+        held = tuple(core.moved(arms[body.frame.robot].T_joint_box) for core in cores)
+        if coal_distance(held, body.pieces) <= 0.0:
             raise CollisionModelError(
                 f"the tool part {body.name!r} enters the payload by more than "
                 f"{1e3 * MOST_ENTERED:g} mm where the robot holds it; move or shorten the part, or "

@@ -125,6 +125,34 @@ def reach(shape: ConvexShape, directions: Array) -> Array:
     return np.asarray(found, dtype=float)
 
 
+def shrunk(piece: Piece, by: float) -> Piece:
+    """The piece smaller by a length on every side; a hull by at least that. Of pieces that are too
+    thin little is left."""
+    shape = piece.shape
+    left = SMALLEST_SIZE
+    match shape:
+        case Box():
+            smaller: ConvexShape = Box(np.maximum(np.asarray(shape.size) - 2.0 * by, left))
+        case Cylinder():
+            length = max(shape.length - 2.0 * by, left)
+            smaller = Cylinder(max(shape.radius - by, left), length)
+        case Sphere():
+            smaller = Sphere(max(shape.radius - by, left))
+        case Capsule():
+            smaller = Capsule(max(shape.radius - by, left), shape.length)
+        case Hull():
+            # Towards a point of the inside every face moves by its distance from there, in share.
+            centre = shape.vertices.mean(axis=0)
+            corners = shape.vertices[shape.faces]
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            areas = np.linalg.norm(normals, axis=1)
+            flat = areas < SMALLEST_SIZE**2
+            rooms = np.einsum("nd,nd->n", corners[:, 0] - centre, normals)[~flat] / areas[~flat]
+            share = max(1.0 - by / float(rooms.min()), 1e-3)
+            smaller = Hull(centre + share * (shape.vertices - centre), shape.faces)
+    return Piece(smaller, piece.pose)
+
+
 def box_corners(size: Array) -> Array:
     """(8, 3) corners of a cuboid of the given edge lengths, centred at its frame."""
     return np.array(list(product((-0.5, 0.5), repeat=3))) * np.asarray(size)

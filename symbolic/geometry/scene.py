@@ -21,7 +21,7 @@ from symbolic.geometry.directions import (
     slanted_matters,
 )
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.geometry.pieces import Capsule, Piece, SphereChain, support
+from symbolic.geometry.pieces import Capsule, Piece, SphereChain, bounding_box, support
 from symbolic.geometry.placements import clean, world_placements
 from symbolic.geometry.softness import Softness
 from symbolic.workcell.records import Box, Cylinder, Sphere
@@ -218,11 +218,16 @@ class Scene:
         )
 
     def _box_bound(self, link: int, payload: int) -> ca.SX:
-        """A chain of spheres against the payload's box."""
-        (piece,) = self.geometry.bodies[payload].pieces
-        assert isinstance(piece.shape, Box)
-        half = np.asarray(piece.shape.size) / 2.0
+        """A chain of spheres against the payload's box, or the one that holds its pieces."""
+        pieces = self.geometry.bodies[payload].pieces
+        box = pieces[0] if len(pieces) == 1 else bounding_box(pieces, np.eye(3))
+        if not isinstance(box.shape, Box):
+            box = bounding_box(pieces, np.eye(3))
+        assert isinstance(box.shape, Box)
+        half = np.asarray(box.shape.size) / 2.0
         R, p = self._placed[Frame("box")]
+        if box.centre.any():
+            p = p + ca.mtimes(R, ca.DM(box.centre))
         centres, radius = self._chain(link)
         squared = []
         for centre in centres:

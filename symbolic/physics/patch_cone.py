@@ -35,9 +35,7 @@ from functools import cache
 import casadi as ca
 
 from symbolic.expression import Expression
-
-WRENCH_SIZE = 6
-"""A scaled contact wrench: N, T (2), q (2), M as above."""
+from symbolic.physics.closure import WRENCH_SIZE
 
 BARRIER_DEGREE = 3.0
 """A path-following minimiser of s f + barrier is within this over s of the least f, per patch."""

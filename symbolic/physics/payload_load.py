@@ -2,7 +2,8 @@
 
 Joins rotation, force allocation and centre of pressure (paper Section 4.4). With the allocation
 `joint` the paper's result is kept wherever its shifts stay within the patches and leave no moment,
-and `symbolic.physics.joint_allocation` takes over where not.
+and `symbolic.physics.joint_allocation` takes over where not. For pads that do not face one another,
+or are not round, or more than two, the paper has no result: `symbolic.physics.grasp` alone answers.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import numpy as np
 
 from symbolic.expression import Expression
 from symbolic.physics.contact_forces import allocate, required_force
+from symbolic.physics.grasp import Grasp, grasp_wrenches
+from symbolic.physics.grasp_world import GRASP_OUTPUTS, box_load_function, grasp_world_function
 from symbolic.physics.joint_allocation import JointAllocation, allocate_jointly, balance_of
 from symbolic.physics.pressure import pressure_shift, required_moment
 from symbolic.physics.rotation import angular_acceleration, angular_velocity, rotation_matrix
@@ -37,24 +40,13 @@ LOAD_OUTPUTS = (
 
 angular_velocity, angular_acceleration (3,): world frame [rad/s, rad/s^2]. normal_force,
 tangential_force (2,) [N]. contact_force (6,): forces of robots 1 and 2 on the box, world [N].
-pressure_shift (2,): lengths of the shifts [m]; shift_vector (6,): both shifts, world [m].
+pressure_shift (2,): lengths of the shifts [m]; shift_vector (6,): both shifts, world [m]. Of a
+robot with several pads: the sums of their normal forces and of the lengths of their tangential
+ones, the longest shift, and the first pad's shift.
 required_moment, point_moment_residual, moment_residual (3,): about the centre of mass, world
 [N m]. wrench_1, wrench_2 (6,): force and moment that each robot exerts on the box, about the
 nominal contact point, world axes [N, N m].
 """
-
-_ALLOCATED = (
-    "normal_force",
-    "tangential_force",
-    "contact_force",
-    "pressure_shift",
-    "shift_vector",
-    "point_moment_residual",
-    "moment_residual",
-    "wrench_1",
-    "wrench_2",
-)
-"""The outputs that depend on the allocation."""
 
 RESIDUAL_TOLERANCE = 1e-9
 """Moment that counts as carried, as a share of the force times the distance of the contacts."""
@@ -101,7 +93,9 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
     """
     if workcell.task.allocation == "paper":
         return paper_load_function(workcell)
-    return _joint_load_function(workcell)
+    if workcell.has_facing_pads:
+        return _joint_load_function(workcell)
+    return _grasp_load_function(workcell)
 
 
 def paper_load_function(workcell: Workcell) -> ca.Function:
@@ -158,8 +152,10 @@ def _joint_load_function(workcell: Workcell) -> ca.Function:
     suffices = _suffices_function(workcell)(
         paper["pressure_shift"], paper["moment_residual"], force
     )
-    kept = [paper[name] for name in _ALLOCATED]
-    passed = [ca.MX.sym(name, value.shape[0]) for name, value in zip(_ALLOCATED, kept, strict=True)]
+    kept = [paper[name] for name in GRASP_OUTPUTS]
+    passed = [
+        ca.MX.sym(name, value.shape[0]) for name, value in zip(GRASP_OUTPUTS, kept, strict=True)
+    ]
     asked = [inputs["pose"], force, paper["required_moment"], inputs["friction"]]
     asked.append(inputs["centre_of_mass"])
     unused = [ca.MX.sym("unused", value.shape[0]) for value in asked]
@@ -170,13 +166,52 @@ def _joint_load_function(workcell: Workcell) -> ca.Function:
         ca.Function("anew", [*unused, *passed], anew(*unused)),
     )
     chosen = choice(suffices, *asked, *kept)
-    outputs = paper | dict(zip(_ALLOCATED, chosen, strict=True))
+    outputs = paper | dict(zip(GRASP_OUTPUTS, chosen, strict=True))
     return ca.Function(
         "uncertain_load",
         list(inputs.values()),
         [outputs[name] for name in LOAD_OUTPUTS],
         list(sizes),
         list(LOAD_OUTPUTS),
+    )
+
+
+def _grasp_load_function(workcell: Workcell) -> ca.Function:
+    """The least forces of pads anywhere, see `symbolic.physics.grasp`."""
+    sizes = {"pose": 6, "rate": 6, "second_rate": 6, "friction": 2, "centre_of_mass": 3}
+    inputs = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
+    names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
+    found = _required_function(workcell)(*[inputs[name] for name in sizes if name != "friction"])
+    outputs = dict(zip(names, found, strict=True))
+    asked = (inputs["pose"], outputs["force"], outputs["required_moment"])
+    centre, friction = inputs["centre_of_mass"], inputs["friction"]
+    load = box_load_function(workcell)(*asked, centre)
+    wrenches = grasp_wrenches(Grasp(workcell), load, friction)
+    held = grasp_world_function(workcell)(*asked, centre, wrenches)
+    outputs |= dict(zip(GRASP_OUTPUTS, held, strict=True))
+    return ca.Function(
+        "uncertain_load",
+        list(inputs.values()),
+        [outputs[name] for name in LOAD_OUTPUTS],
+        list(sizes),
+        list(LOAD_OUTPUTS),
+    )
+
+
+def _required_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate and centre of mass to the angular velocity and acceleration, and to
+    the force and moment about the centre of mass that the motion asks for, (3,) each, world."""
+    pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
+    centre_of_mass = ca.SX.sym("centre_of_mass", 3)
+    turned = workcell.task.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], rate[3:])
+    alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
+    offset = ca.mtimes(rotation, centre_of_mass)
+    force = resultant_force(workcell.payload.mass, offset, omega, alpha, second[:3])
+    moment = required_moment(ca.SX(ca.DM(workcell.payload.inertia)), rotation, omega, alpha)
+    return ca.Function(
+        "required", [pose, rate, second, centre_of_mass], [omega, alpha, force, moment]
     )
 
 
@@ -192,7 +227,7 @@ def _suffices_function(workcell: Workcell) -> ca.Function:
 
 
 def _joint_sample_function(workcell: Workcell) -> ca.Function:
-    """pose, force, moment (world), friction and centre of mass to the outputs `_ALLOCATED`."""
+    """pose, force, moment (world), friction and centre of mass to the outputs `GRASP_OUTPUTS`."""
     sizes = (("pose", 6), ("force", 3), ("moment", 3), ("friction", 2), ("centre_of_mass", 3))
     pose, force, moment, friction, centre_of_mass = inputs = [ca.MX.sym(*entry) for entry in sizes]
     radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
@@ -210,7 +245,7 @@ def _balance_function(workcell: Workcell) -> ca.Function:
 
 def _world_function(workcell: Workcell) -> ca.Function:
     """As `_balance_function`, then the fields of a `JointAllocation`, to the outputs
-    `_ALLOCATED`."""
+    `GRASP_OUTPUTS`."""
     inputs, axes, needed, arms = _in_pad_axes(workcell)
     held = JointAllocation(*[ca.SX.sym(each.name, 2) for each in fields(JointAllocation)])
     forces = [
@@ -239,7 +274,9 @@ def _world_function(workcell: Workcell) -> ca.Function:
         "wrench_2": ca.vertcat(second, moment_2),
     }
     wrenches = [getattr(held, each.name) for each in fields(held)]
-    return ca.Function("joint_world", [*inputs, *wrenches], [outputs[name] for name in _ALLOCATED])
+    return ca.Function(
+        "joint_world", [*inputs, *wrenches], [outputs[name] for name in GRASP_OUTPUTS]
+    )
 
 
 def _in_pad_axes(

@@ -74,3 +74,9 @@ def inverse(T_a_b: Array) -> Array:
     """The transform T_b_a of a rigid T_a_b, without a general matrix inversion."""
     rotation = T_a_b[:3, :3].T
     return transform(rotation, -rotation @ T_a_b[:3, 3])
+
+
+def skew(vector: ArrayLike) -> Array:
+    """The matrix (3, 3) whose product with another vector is the cross product of (3,) with it."""
+    x, y, z = np.asarray(vector, dtype=float)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -12,10 +12,12 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import RobotModelError
+from symbolic.physics.closure import is_closed
 from symbolic.physics.pose import box_placement, inverse
 from symbolic.robot.machine import machine_problem
 from symbolic.robot.urdf import arm_model, link_frame, robot_urdf, turning_joints
 from symbolic.workcell.body_names import PAYLOAD_BODY, body_names
+from symbolic.workcell.contacts import SHAPE_KEYS
 from symbolic.workcell.patterns import matching
 from symbolic.workcell.problems import Problems, suggestion
 from symbolic.workcell.records import Robot, Workcell
@@ -54,18 +56,45 @@ def _check_unique(entries: list[tuple[str, str]], problems: Problems) -> None:
 
 
 def check_contacts(workcell: Workcell, problems: Problems) -> None:
-    """The two contacts squeeze the box: they lie on opposite faces."""
-    if not problems.clean("contacts", "payload.size"):
+    """The pads can hold the payload whatever the motion asks, as the allocation takes them."""
+    if not problems.clean("contacts", *SHAPE_KEYS):
         return
-    first, second = (contact.T_box_pad[:3, 2] for contact in workcell.contacts)
-    if not np.allclose(first, -second, atol=1e-9):
+    joint = workcell.task.allocation == "joint"
+    if workcell.has_facing_pads:
+        if joint and problems.clean("task.allocation"):
+            _check_overlap(workcell, problems)
+    elif not joint:
+        if problems.clean("task.allocation"):
+            problems.add("contacts[1].xyz", _paper_problem(workcell))
+    elif not is_closed(workcell):
         problems.add(
-            "contacts[1].xyz",
-            f"lies on the {_face_name(second)} face, contacts[0] on the {_face_name(first)} face; "
-            "allowed are opposite faces, the force model holds for opposite normals only",
+            "contacts",
+            "the pads do not close their grasp: no squeeze within their friction cones holds the "
+            "payload against whatever the motion asks; allowed is enough friction (with 5 % to "
+            "spare) along the lines between them: turn them towards one another, raise friction "
+            "or add a pad (further)",
         )
-    elif workcell.task.allocation == "joint" and problems.clean("task.allocation"):
-        _check_overlap(workcell, problems)
+
+
+def _paper_problem(workcell: Workcell) -> str:
+    """Why the paper's allocation has no forces for a cell's pads."""
+    hint = "task.allocation = 'joint' takes any"
+    first, second = (contact.T_box_pad[:3, 2] for contact in workcell.contacts)
+    if any(contact.further for contact in workcell.contacts):
+        return f"belongs to more than two pads; allowed are two: {hint}"
+    if any(contact.half_sides for contact in workcell.contacts):
+        return f"belongs to a rectangular patch; allowed are round ones: {hint}"
+    faces = [_face_name(normal) for normal in (first, second)]
+    if all(faces):
+        return (
+            f"lies on the {faces[1]} face, contacts[0] on the {faces[0]} face; allowed are "
+            f"opposite faces, the paper's allocation holds for opposite normals only: {hint}"
+        )
+    turned = np.degrees(np.arccos(np.clip(-first @ second, -1.0, 1.0)))
+    return (
+        f"has a normal {turned:.4g} degrees off the opposite of contacts[0]; allowed are opposite "
+        f"normals, the paper's allocation holds for these only: {hint}"
+    )
 
 
 def pads_beside(workcell: Workcell) -> float:
@@ -91,7 +120,13 @@ def _check_overlap(workcell: Workcell, problems: Problems) -> None:
 def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
     """Displaced pads keep some of their patches, and these face one another."""
     displaced = workcell.uncertainty.pad_position
-    if not displaced or not problems.clean("uncertainty", "contacts", "payload.size"):
+    if not displaced or not problems.clean("uncertainty", "contacts", *SHAPE_KEYS):
+        return
+    if not workcell.has_facing_pads:
+        problems.add(
+            "uncertainty.pad_position",
+            "needs two round pads that face one another; leave it out for others",
+        )
         return
     radii = [contact.patch_radius for contact in workcell.contacts]
     room = min(min(radii), (sum(radii) - pads_beside(workcell) / PATCH_OVERLAP) / 2.0)
@@ -104,7 +139,10 @@ def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
 
 
 def _face_name(inward_normal: Array) -> str:
+    """'+x' and so on; '' of a normal along no axis."""
     axis = int(np.argmax(np.abs(inward_normal)))
+    if abs(inward_normal[axis]) < 1.0 - 1e-9:
+        return ""
     return f"{'-' if inward_normal[axis] > 0 else '+'}{'xyz'[axis]}"
 
 
@@ -188,7 +226,7 @@ def check_reach(workcell: Workcell, problems: Problems) -> None:
     parts = ("urdf", "chain", "locked_joints", "drop_links", "flange", "base", "pad")
     for index, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         needed = [f"robots[{index}].{part}" for part in parts]
-        if not problems.clean("payload.size", f"contacts[{index}]", *needed):
+        if not problems.clean(*SHAPE_KEYS, f"contacts[{index}]", *needed):
             continue
         shoulder, length = stretched_length(robot)
         T_box_flange = contact.T_box_pad @ inverse(robot.T_flange_pad)

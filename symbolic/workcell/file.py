@@ -13,14 +13,16 @@ from symbolic.robot.urdf import resolve_mesh, robot_urdf
 from symbolic.robot.xacro_file import description_content
 from symbolic.workcell.branches import with_branches
 from symbolic.workcell.checks import check_all
+from symbolic.workcell.contacts import check_count, read_contact
 from symbolic.workcell.handling import read_handling
 from symbolic.workcell.identity import reading_of
+from symbolic.workcell.payload import read_payload
 from symbolic.workcell.problems import Problems
 from symbolic.workcell.reader import Table
-from symbolic.workcell.records import SEARCHED, Body, Mesh, Robot, Workcell
+from symbolic.workcell.records import SEARCHED, Body, Mesh, Payload, Robot, Workcell
 from symbolic.workcell.redundancy import read_redundant, with_redundancy
 from symbolic.workcell.robots import read_robot
-from symbolic.workcell.sections import read_body, read_collision, read_contact, read_payload
+from symbolic.workcell.sections import read_body, read_collision
 from symbolic.workcell.task import read_task, with_force_limit
 from symbolic.workcell.uncertainty import read_uncertainty
 
@@ -69,8 +71,9 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     problems, folder = table.problems, source.parent
     name = table.text("name")
     robots = [read_robot(entry, folder, stored) for entry in table.tables("robots", exactly=2)]
-    payload = read_payload(table.table("payload"))
-    contacts = [read_contact(entry, payload.size) for entry in table.tables("contacts", exactly=2)]
+    payload = read_payload(table.table("payload"), folder)
+    contacts = [read_contact(entry, payload) for entry in table.tables("contacts", exactly=2)]
+    check_count(contacts, problems)
     task_table = table.table("task")
     task = read_task(task_table)
     redundant = read_redundant(task_table, len(task.waypoints))
@@ -84,7 +87,7 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
         return None
     arms = [robot for robot, _ in robots]
     try:
-        identity = "" if problems.found else digest(content, arms, environment)
+        identity = "" if problems.found else digest(content, arms, environment, payload)
     except OutsideError as error:
         problems.add("file", str(error))
         identity = ""
@@ -106,12 +109,17 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     return replace(workcell, reading=reading_of(workcell, identity)) if identity else workcell
 
 
-def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Body]) -> str:
+def digest(
+    content: bytes,
+    robots: Sequence[Robot],
+    environment: Sequence[Body],
+    payload: Payload | None = None,
+) -> str:
     """SHA-256 over a workcell file and the content of every file it names.
 
     Where the files stand does not matter, only what is in them: the file's own bytes, per robot
     its URDF (a xacro file as it expands), the meshes the URDF names and its SRDF, and the meshes
-    of tools and environment, in order.
+    of tools, environment and payload, in order.
 
     Raises:
         OutsideError: one of them cannot be read, or together they are too large.
@@ -119,7 +127,7 @@ def digest(content: bytes, robots: Sequence[Robot], environment: Sequence[Body])
     outer = hashlib.sha256(hashlib.sha256(content).digest())
     room = outside.CELL_BYTES
     # Fixed-length inner digests keep the parts apart.
-    for part in _named(robots, environment):
+    for part in _named(robots, environment, payload):
         room -= len(part)
         if room < 0:
             raise OutsideError(
@@ -139,7 +147,9 @@ def _content(path: Path | None, most: int) -> bytes:
         raise OutsideError(f"names {path.name}, which {error}") from error
 
 
-def _named(robots: Sequence[Robot], environment: Sequence[Body]) -> Iterator[bytes]:
+def _named(
+    robots: Sequence[Robot], environment: Sequence[Body], payload: Payload | None
+) -> Iterator[bytes]:
     """The content of every file that a workcell names, nothing for a missing one."""
     for robot in robots:
         yield description_content(robot.urdf, robot.xacro_arguments, robot.package_dirs)
@@ -152,3 +162,5 @@ def _named(robots: Sequence[Robot], environment: Sequence[Body]) -> Iterator[byt
     for body in (*(body for robot in robots for body in robot.tool), *environment):
         if isinstance(body.shape, Mesh):
             yield _content(body.shape.path, outside.MESH_BYTES)
+    if payload is not None and isinstance(payload.shape, Mesh):
+        yield _content(payload.shape.path, outside.MESH_BYTES)

@@ -40,6 +40,7 @@ ANGULAR_JERK = Quantity("rad/s^3", 1e-1, 2e4, mistaken=(("deg/s^3", math.pi / 18
 
 FRICTION = Quantity("", 1e-3, 5.0, mistaken=(("%", 1e-2),))
 PATCH_RADIUS = Quantity("m", 1e-4, 0.5, mistaken=_MILLIMETRES)
+PATCH_SIDE = Quantity("m", 2e-4, 1.0, mistaken=_MILLIMETRES)
 
 SHARE = Quantity("", 0.0, 0.9, mistaken=(("%", 1e-2),))
 DISPLACEMENT = Quantity("m", 0.0, 0.5, mistaken=_MILLIMETRES)

@@ -12,6 +12,7 @@ from symbolic.array import Array
 from symbolic.robot.machine import common_joints
 from symbolic.robot.urdf import FOLLOWING, arm_model, turning_joints
 from symbolic.workcell import quantities as quantity
+from symbolic.workcell.contacts import SHAPE_KEYS
 from symbolic.workcell.problems import Problems
 from symbolic.workcell.reader import Table, read_only
 from symbolic.workcell.records import RedundantJoint, Robot, Workcell
@@ -70,7 +71,7 @@ def with_redundancy(
 ) -> Workcell:
     """The workcell with its redundant joints, chosen and placed where its file says nothing."""
     needed = [f"robots[{i}].{part}" for i in (0, 1) for part in _NEEDED]
-    if not problems.clean(*needed, "task", "contacts", "payload.size"):
+    if not problems.clean(*needed, "task", "contacts", *SHAPE_KEYS):
         return workcell
     models = [arm_model(robot) for robot in workcell.robots]
     names = [tuple(model.names)[1:] for model in models]

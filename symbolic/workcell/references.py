@@ -165,6 +165,7 @@ def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]
                 yield str(robot["srdf"]), None
             yield from _meshes(robot.get("tool", []))
         yield from _meshes(data.get("environment", []))
+        yield from _meshes([data.get("payload", {})])
     except (KeyError, TypeError, AttributeError) as error:
         raise BundleError(f"the stored workcell lacks or misuses the key {error}") from error
 

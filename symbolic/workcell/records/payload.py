@@ -7,20 +7,23 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.workcell.records.shapes import Box, Cylinder, Mesh
 
 
 @dataclass(frozen=True)
 class Payload:
-    """The carried box.
+    """What is carried, called the box.
 
     Attributes:
-        size: (3,) edge lengths along the box axes [m].
+        size: (3,) edge lengths along the box axes [m]; of another shape those of a box about the
+            frame that holds it.
         mass: [kg].
         centre_of_mass: (3,) in the box frame [m].
         inertia: (3, 3) about the centre of mass, box axes [kg m^2].
         velocity_max, acceleration_max: limits of the box's translation [m/s, m/s^2].
         angular_velocity_max, angular_acceleration_max: of its rotation [rad/s, rad/s^2].
         jerk_max: of its translation [m/s^3], or None without a limit.
+        shape: its geometry in the box frame; None for a box of its size.
     """
 
     size: Array
@@ -32,6 +35,12 @@ class Payload:
     angular_velocity_max: float
     angular_acceleration_max: float
     jerk_max: float | None = None
+    shape: Cylinder | Mesh | None = None
+
+    @property
+    def solid(self) -> Box | Cylinder | Mesh:
+        """Its geometry in the box frame."""
+        return Box(self.size) if self.shape is None else self.shape
 
 
 @dataclass(frozen=True)
@@ -39,15 +48,21 @@ class Contact:
     """The frictional contact between one robot's pad and the box.
 
     Attributes:
-        T_box_pad: (4, 4), the pad frame in the box frame; its origin lies on a face of the
-            box and its z axis is the inward normal of that face.
+        T_box_pad: (4, 4), the pad frame in the box frame; its z axis is the contact normal, which
+            points into the box.
         friction: Coulomb coefficient.
-        patch_radius: radius of the contact patch [m].
+        patch_radius: radius of a round contact patch, half the diagonal of a rectangular one [m].
+        half_sides: half the sides of a rectangular patch along the pad's x and y axes [m]; None
+            for a round one.
+        further: other pads of the same robot, rigidly beside the first, as on a fork; with its
+            friction and its kind of patch.
     """
 
     T_box_pad: Array
     friction: float
     patch_radius: float
+    half_sides: tuple[float, float] | None = None
+    further: tuple[Contact, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from symbolic.workcell.handling import Handling
 from symbolic.workcell.identity import Reading, digest_of
 from symbolic.workcell.records.payload import Contact, Payload, Uncertainty
@@ -73,6 +75,24 @@ class Workcell:
     reading: Reading | None = None
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     handling: Handling = field(default_factory=Handling)
+
+    @property
+    def has_facing_pads(self) -> bool:
+        """Whether two round pads with opposite normals hold the payload: what the paper's
+        allocation and all closed forms are for."""
+        first, second = (contact.T_box_pad[:3, 2] for contact in self.contacts)
+        facing = np.allclose(first, -second, atol=1e-9)
+        return facing and not any(c.further or c.half_sides for c in self.contacts)
+
+    @property
+    def pads(self) -> tuple[Contact, ...]:
+        """All pads: those of the first robot, then those of the second."""
+        return tuple(pad for contact in self.contacts for pad in (contact, *contact.further))
+
+    @property
+    def pad_robots(self) -> tuple[int, ...]:
+        """Per pad the index of the robot that holds it."""
+        return tuple(i for i, c in enumerate(self.contacts) for _ in range(1 + len(c.further)))
 
     @cached_property
     def digest(self) -> str:

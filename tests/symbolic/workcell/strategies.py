@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from symbolic.workcell.sections import solid_box_inertia
+from symbolic.workcell.payload import solid_box_inertia
 from tests.symbolic.workcell.samples import GOFA
 
 

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.workcell.contacts import face_normal, pad_rotation
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Body, Box, Cylinder, Sphere, Workcell
-from symbolic.workcell.sections import pad_rotation
 from tests.symbolic.workcell.samples import GOFA, sample_data, write
 from tests.symbolic.workcell.strategies import cells, numbers, vectors
 
@@ -142,7 +142,7 @@ def test_written_cells_are_read_back(data: dict[str, Any]) -> None:
 
 @given(st.integers(0, 2), st.sampled_from([-1, 1]), numbers(-6, 6))
 def test_pad_rotation(axis: int, side: int, spin: float) -> None:
-    rotation = pad_rotation(axis, side, spin)
+    rotation = pad_rotation(face_normal(axis, side), spin)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
     inward = np.zeros(3)

@@ -1,0 +1,166 @@
+"""The least contact forces of pads anywhere on a payload: any normals, any of the patches.
+
+The least of the sum of all squared contact forces, as `symbolic.physics.joint_allocation` has it
+for pads that face one another. The barrier method starts from an internal squeeze
+(`symbolic.physics.closure`), pressed as hard as the load asks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.physics.central_path import Pace, least_effort
+from symbolic.physics.closure import WRENCH_SIZE, closing_squeeze, state_to_box, tangential
+from symbolic.physics.patches import Patch, RectangularPatch, RoundPatch, least
+from symbolic.workcell.records import Contact, Workcell
+
+LOAD_SIZE = 6
+"""Force and moment about the box frame's origin, along the box's axes [N, N m]."""
+
+ROUND_PACE, RECTANGULAR_PACE, MANY_CORNERS_PACE = Pace(26, 0.2), Pace(40, 0.35), Pace(60, 0.45)
+"""With round patches alone; with some rectangular ones; with more than three of these. The more
+corners, the nearer to the central path the steps have to keep."""
+
+SCALE_FLOOR = 1e-9
+"""Force scale [N] where nothing has to be carried."""
+
+START_FLOOR = 1e-3
+"""Squeeze over the scale to start from where nothing has to be carried."""
+
+START_SHARE = 0.5
+"""Of the way to the cones' boundary that the load takes a start from the squeeze."""
+
+BEYOND = 1e12
+"""Normal force over the load's scale that says that friction does not close the grasp."""
+
+MOMENT_ARM = 0.1
+"""Of moments in the load's scale [m]: about half a payload, so that they count like forces."""
+
+
+class Grasp:
+    """The pads of one workcell, as the allocation's program. Compared by identity.
+
+    Attributes:
+        robots: per pad the index of its robot.
+        patches, cell_sizes, pace: see `symbolic.physics.central_path.Program`.
+    """
+
+    def __init__(self, workcell: Workcell) -> None:
+        """Find the squeeze to start from.
+
+        Raises:
+            SettingsError: no squeeze holds the payload whatever is asked.
+        """
+        pads = workcell.pads
+        squeeze = closing_squeeze(pads)
+        if squeeze is None:
+            raise SettingsError(
+                "the pads do not close their grasp: no internal squeeze lies within their friction "
+                "cones; raise the friction or turn them towards one another"
+            )
+        self.robots = workcell.pad_robots
+        self.patches = tuple(_patch(pad) for pad in pads)
+        self.cell_sizes = (("load", LOAD_SIZE), ("friction", 2))
+        rectangles = sum(pad.half_sides is not None for pad in pads)
+        many = MANY_CORNERS_PACE if rectangles > 3 else RECTANGULAR_PACE
+        self.pace = many if rectangles else ROUND_PACE
+        self._pads = pads
+        self._squeeze = squeeze.states
+        # The least states that balance a load, whether they lie within the cones or not.
+        spread = np.linalg.pinv(np.hstack([state_to_box(pad) for pad in pads]))
+        ends = np.cumsum([patch.state_size for patch in self.patches])[:-1]
+        self._spread = tuple(np.split(spread, ends))
+        in_units = [
+            state_to_box(replace(pad, friction=1.0, patch_radius=1.0, half_sides=None))
+            for pad in pads
+        ]
+        to_last = np.asarray(np.linalg.inv(in_units[-1]), dtype=float)
+        self._load_to_last = _sparse(to_last)
+        self._pads_to_last = [_sparse(to_last @ matrix) for matrix in in_units[:-1]]
+
+    def left(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+        """See `symbolic.physics.central_path.Program`."""
+        load, friction = cell
+        rest = ca.mtimes(self._load_to_last, load)
+        for i, (wrench, to_last) in enumerate(zip(wrenches, self._pads_to_last, strict=True)):
+            rest -= ca.mtimes(to_last, self.units(i, friction) * wrench)
+        return rest / self.units(len(self.patches) - 1, friction)
+
+    def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+        """Half the sum of all squared forces."""
+        friction, total = cell[1], 0.0
+        for wrench, robot in zip(wrenches, self.robots, strict=True):
+            total += wrench[0] ** 2 + friction[robot] ** 2 * ca.sumsqr(wrench[1:3])
+        return 0.5 * total
+
+    def start(self, cell: list[ca.SX]) -> list[ca.SX]:
+        """The least states that balance the load, and as much of the squeeze as takes them into
+        the cones."""
+        load, friction = cell
+        asked = [ca.mtimes(ca.DM(spread), load) for spread in self._spread]
+        asked = self._at(friction, asked)
+        given = self.squeezed(friction)
+        shares = [p.lowest(s, a) for p, s, a in zip(self.patches, given, asked, strict=True)]
+        pressed = ca.fmax(-least(shares), 0.0) / START_SHARE + START_FLOOR
+        return [a + pressed * s for a, s in zip(asked, given, strict=True)]
+
+    def squeezed(self, friction: ca.SX) -> list[ca.SX]:
+        """The squeeze to start from, as states at friction coefficients (2,) of the robots; it may
+        lie beyond the cones where they are far below the nominal ones."""
+        return self._at(friction, [ca.SX(ca.DM(state)) for state in self._squeeze])
+
+    def units(self, i: int, friction: ca.SX) -> ca.SX:
+        """(6,) what the entries of pad i's scaled wrench are multiples of."""
+        mu, r = friction[self.robots[i]], self._pads[i].patch_radius
+        return ca.vertcat(1.0, mu, mu, r, r, mu * r)
+
+    def _at(self, friction: ca.SX, states: list[ca.SX]) -> list[ca.SX]:
+        """States at the nominal friction with what they carry, at another."""
+        moved = []
+        for pad, robot, state in zip(self._pads, self.robots, states, strict=True):
+            factor = np.zeros(state.shape[0])
+            factor[tangential(state.shape[0])] = 1.0
+            by_friction = pad.friction / friction[robot]
+            moved.append(state * (ca.DM(factor) * by_friction + ca.DM(1.0 - factor)))
+        return moved
+
+
+def grasp_wrenches(grasp: Grasp, load: ca.MX, friction: ca.MX) -> ca.MX:
+    """Per pad (6,) side by side: N, T (2,) [N], the first moment N d (2,) and M [N m], of least
+    effort, in its pad's axes. Friction that does not close the grasp gives normal forces beyond
+    any limit.
+
+    Args:
+        load: (6,) force and moment about the box frame's origin, along the box's axes.
+        friction: (2,) Coulomb coefficients of the robots' pads.
+    """
+    size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
+    found = least_effort(grasp, load / size, friction)
+    return _in_newtons(grasp)(found, size, friction)
+
+
+def _in_newtons(grasp: Grasp) -> ca.Function:
+    n = len(grasp.patches)
+    found, size, friction = ca.SX.sym("w", WRENCH_SIZE * n), ca.SX.sym("s"), ca.SX.sym("mu", 2)
+    units = ca.vertcat(*[grasp.units(i, friction) for i in range(n)])
+    squeezed = zip(grasp.patches, grasp.squeezed(friction), strict=True)
+    closes = least([patch.slack(state) for patch, state in squeezed]) > 0.0
+    beyond = ca.repmat(ca.DM([BEYOND, 0, 0, 0, 0, 0]), n, 1)
+    return ca.Function(
+        "in_newtons", [found, size, friction], [size * ca.if_else(closes, units * found, beyond)]
+    )
+
+
+def _patch(contact: Contact) -> Patch:
+    return RoundPatch() if contact.half_sides is None else RectangularPatch(*contact.half_sides)
+
+
+def _sparse(matrix: Array) -> ca.DM:
+    """Without what is zero but for rounding."""
+    small = np.abs(matrix) < 1e-14 * np.abs(matrix).max()
+    return ca.sparsify(ca.DM(np.where(small, 0.0, matrix)))
