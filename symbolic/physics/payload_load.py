@@ -48,6 +48,9 @@ required_moment, point_moment_residual, moment_residual (3,): about the centre o
 nominal contact point, world axes [N, N m].
 """
 
+SIZES = {"pose": 6, "rate": 6, "second_rate": 6, "friction": 2, "centre_of_mass": 3}
+"""Inputs of `uncertain_load_function` and how many entries each has."""
+
 RESIDUAL_TOLERANCE = 1e-9
 """Moment that counts as carried, as a share of the force times the distance of the contacts."""
 
@@ -100,8 +103,8 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
 
 def paper_load_function(workcell: Workcell) -> ca.Function:
     """`uncertain_load_function` by the paper's allocation, whatever the workcell's own is."""
-    pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
-    friction, centre_of_mass = ca.SX.sym("friction", 2), ca.SX.sym("centre_of_mass", 3)
+    inputs = {name: ca.SX.sym(name, size) for name, size in SIZES.items()}
+    pose, rate, second, friction, centre_of_mass = inputs.values()
     payload, contacts = workcell.payload, workcell.contacts
     turned = workcell.task.orientation
     rotation = rotation_matrix(turned, pose[3:])
@@ -133,19 +136,12 @@ def paper_load_function(workcell: Workcell) -> ca.Function:
         "wrench_1": ca.vertcat(forces.force_1, ca.cross(shift.shift_1, forces.force_1)),
         "wrench_2": ca.vertcat(forces.force_2, ca.cross(shift.shift_2, forces.force_2)),
     }
-    return ca.Function(
-        "uncertain_load",
-        [pose, rate, second, friction, centre_of_mass],
-        [ca.densify(outputs[name]) for name in LOAD_OUTPUTS],
-        ["pose", "rate", "second_rate", "friction", "centre_of_mass"],
-        list(LOAD_OUTPUTS),
-    )
+    return _named(inputs, {name: ca.densify(value) for name, value in outputs.items()})
 
 
 def _joint_load_function(workcell: Workcell) -> ca.Function:
     """The paper's result where the patches suffice for it, and the joint allocation elsewhere."""
-    sizes = {"pose": 6, "rate": 6, "second_rate": 6, "friction": 2, "centre_of_mass": 3}
-    inputs = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
+    inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
     found = paper_load_function(workcell)(*inputs.values())
     paper = dict(zip(LOAD_OUTPUTS, found, strict=True))
     force = paper["contact_force"][:3] + paper["contact_force"][3:]
@@ -167,21 +163,14 @@ def _joint_load_function(workcell: Workcell) -> ca.Function:
     )
     chosen = choice(suffices, *asked, *kept)
     outputs = paper | dict(zip(GRASP_OUTPUTS, chosen, strict=True))
-    return ca.Function(
-        "uncertain_load",
-        list(inputs.values()),
-        [outputs[name] for name in LOAD_OUTPUTS],
-        list(sizes),
-        list(LOAD_OUTPUTS),
-    )
+    return _named(inputs, outputs)
 
 
 def _grasp_load_function(workcell: Workcell) -> ca.Function:
     """The least forces of pads anywhere, see `symbolic.physics.grasp`."""
-    sizes = {"pose": 6, "rate": 6, "second_rate": 6, "friction": 2, "centre_of_mass": 3}
-    inputs = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
+    inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
     names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
-    found = _required_function(workcell)(*[inputs[name] for name in sizes if name != "friction"])
+    found = _required_function(workcell)(*[inputs[name] for name in SIZES if name != "friction"])
     outputs = dict(zip(names, found, strict=True))
     asked = (inputs["pose"], outputs["force"], outputs["required_moment"])
     centre, friction = inputs["centre_of_mass"], inputs["friction"]
@@ -189,11 +178,16 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
     wrenches = grasp_wrenches(Grasp(workcell), load, friction)
     held = grasp_world_function(workcell)(*asked, centre, wrenches)
     outputs |= dict(zip(GRASP_OUTPUTS, held, strict=True))
+    return _named(inputs, outputs)
+
+
+def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
+    """`uncertain_load_function` from its inputs and outputs."""
     return ca.Function(
         "uncertain_load",
         list(inputs.values()),
         [outputs[name] for name in LOAD_OUTPUTS],
-        list(sizes),
+        list(inputs),
         list(LOAD_OUTPUTS),
     )
 
