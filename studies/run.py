@@ -23,7 +23,7 @@ from hybrid_opt.campaign.layout import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.campaign.simulated import read_simulations
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, PAPER_OBJECTIVES
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, FORCE_PAIRS, PAPER_OBJECTIVES
 from hybrid_opt.polishing.drivable.point import is_polishable
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
@@ -193,7 +193,7 @@ def main(
         driven = cell.task.time_law == "optimal"
         settings = campaign_settings(options, DRIVABLE_OBJECTIVES if driven else PAPER_OBJECTIVES)
         alone = is_drivable(cell, settings.objectives)
-        polishable = alone or (not driven and settings.objectives == PAPER_OBJECTIVES)
+        polishable = alone or (not driven and settings.objectives in FORCE_PAIRS)
         execution = execution_settings(options, Path("results") / path.stem)
         if execution.executor == "processes":
             warm_up(*WORKERS_LOAD)

@@ -41,6 +41,12 @@ class Objective:
 PAPER_OBJECTIVES = ("peak_force_1", "peak_force_2")
 """The paper's pair: peak normal force of each robot."""
 
+ROBUST_OBJECTIVES = ("robust_force_1", "robust_force_2")
+"""The paper's pair for every case of the workcell's uncertainty."""
+
+FORCE_PAIRS = (PAPER_OBJECTIVES, ROBUST_OBJECTIVES)
+"""Both robots' peak forces: what the polish of forces minimises."""
+
 DRIVABLE_OBJECTIVES = ("duration", "peak_force")
 """How long a carry takes and how hard it presses: the pair of the time law 'optimal'."""
 
@@ -108,7 +114,19 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _robust_force(outputs: Outputs, workcell: Workcell) -> Array:
-    """Larger peak over the reference force of what the workcell's uncertainty asks of either arm.
+    """Larger of both `_robust_forces`."""
+    return np.asarray(_robust_forces(outputs, workcell).max(axis=1), dtype=float)
+
+
+def _robust_force_of(robot: int) -> Callable[[Outputs, Workcell], Array]:
+    def evaluate(outputs: Outputs, workcell: Workcell) -> Array:
+        return _robust_forces(outputs, workcell)[:, robot]
+
+    return evaluate
+
+
+def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
+    """(n, 2) peaks over the reference force of what the workcell's uncertainty asks of each arm.
 
     Arm 1 leads, the force of arm 2 is commanded (`hybrid_opt.robust`).
     """
@@ -120,7 +138,7 @@ def _robust_force(outputs: Outputs, workcell: Workcell) -> Array:
     commanded, leading = robust_model(workcell).hold(BoxMotion(*flat), workcell.uncertainty)
     both = np.stack([leading, commanded], axis=1).reshape(n, samples, 2)
     uses: Array = both.max(axis=1) / workcell.task.reference_force
-    return np.asarray(uses.max(axis=1), dtype=float)
+    return uses
 
 
 def _time_average(values: Array, time: Array) -> Array:
@@ -161,6 +179,16 @@ OBJECTIVES: dict[str, Objective] = {
         Objective("peak_torque_use", "peak joint torque / maximum", _peak_torque_use, _TORQUES),
         Objective("force_imbalance", "peak |N1 - N2| / reference", _force_imbalance, _FORCE),
         Objective("robust_force", "peak force that holds in all cases / reference", _robust_force),
+        Objective(
+            "robust_force_1",
+            "peak force of robot 1 that holds in all cases / reference",
+            _robust_force_of(0),
+        ),
+        Objective(
+            "robust_force_2",
+            "peak force of robot 2 that holds in all cases / reference",
+            _robust_force_of(1),
+        ),
         Objective(
             "friction_use",
             "peak friction use at the reference squeeze",

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
+from hybrid_opt.evaluate.objectives import FORCE_PAIRS
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
@@ -39,8 +39,8 @@ class FrontPolisher(Polisher):
         """Load or build the smooth problem's functions.
 
         Raises:
-            SettingsError: the evaluator's objectives are not both peak forces, or its pads are not
-                two round ones that face one another.
+            SettingsError: the evaluator's objectives are not both peak forces, planned or robust,
+                or its pads are not two round ones that face one another.
             DualArmError: the functions cannot be built.
         """
         if not evaluator.workcell.has_facing_pads:
@@ -48,9 +48,10 @@ class FrontPolisher(Polisher):
                 "the polish knows the forces of two round pads that face one another, and no "
                 "others: switch it off"
             )
-        if evaluator.objective_names != PAPER_OBJECTIVES:
+        if evaluator.objective_names not in FORCE_PAIRS:
+            named = " or ".join(" and ".join(pair) for pair in FORCE_PAIRS)
             raise SettingsError(
-                f"the polish minimises {' and '.join(PAPER_OBJECTIVES)}; the objectives are "
+                f"the polish minimises {named}; the objectives are "
                 f"{', '.join(evaluator.objective_names)}: switch the polish off for them"
             )
         super().__init__(evaluator, settings)
@@ -67,7 +68,7 @@ class FrontPolisher(Polisher):
 
 
 class ForceRun(PolishRun[Attempt]):
-    """The polish of the paper's two objectives."""
+    """The polish of both peak forces."""
 
     def __init__(
         self,

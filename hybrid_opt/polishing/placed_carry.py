@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.functions import RowFunctions
 from hybrid_opt.polishing.grid import Grid, dipped
+from hybrid_opt.polishing.robust_samples import RobustSamples
 from symbolic.array import Array
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.smooth.reach import Reach
@@ -34,7 +35,8 @@ class PlacedCarry:
         lowered: the same with the dips that are to be expected beside each place.
         manipulability: (reached, 2) |det J| over its least value.
         split: (n, 2) on samples: normal component, tangential magnitude of the required force [N].
-        peak: (2,) peak normal forces over their references.
+        force: (n, 2) on samples: the normal forces that are minimised, planned or robust ones [N].
+        peak: (2,) their peaks over their references.
         shift: (n, 2) on samples: shifts of the centres of pressure over their patches' radii.
     """
 
@@ -47,6 +49,7 @@ class PlacedCarry:
     lowered: Array
     manipulability: Array
     split: Array
+    force: Array
     peak: Array
     shift: Array
     _distances: Distances = field(repr=False)
@@ -87,8 +90,15 @@ class Distances:
 class CarryReader:
     """Evaluates candidates of one cell on the places of a grid."""
 
-    def __init__(self, evaluator: CandidateEvaluator, grid: Grid, rows: RowFunctions) -> None:
-        self._evaluator, self._grid, self._rows = evaluator, grid, rows
+    def __init__(
+        self,
+        evaluator: CandidateEvaluator,
+        grid: Grid,
+        rows: RowFunctions,
+        robust: RobustSamples | None = None,
+    ) -> None:
+        """robust: what gives the forces that are minimised, None for the planned ones."""
+        self._evaluator, self._grid, self._rows, self._robust = evaluator, grid, rows, robust
         self._radii = [contact.patch_radius for contact in evaluator.workcell.contacts]
 
     def read(self, x: Array) -> PlacedCarry:
@@ -118,6 +128,7 @@ class CarryReader:
             for arm in (0, 1)
         ]
         force = found["normal_force"]
+        minimised = force if self._robust is None else self._robust.forces(found)
         held = (pose[:reached], q_1[:reached], q_2[:reached])
         bounds = evaluator.checker.bounds(*held)
         near = bounds.min(axis=0, initial=np.inf) < DIPS_BELOW
@@ -135,7 +146,8 @@ class CarryReader:
             split=np.column_stack(
                 [force[:, 0] - force[:, 1], found["tangential_force"].sum(axis=1)]
             ),
-            peak=force.max(axis=0) / task.reference_force,
+            force=minimised,
+            peak=minimised.max(axis=0) / task.reference_force,
             shift=found["pressure_shift"] / self._radii,
             _distances=Distances(
                 bounds,

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.polishing.constraints.active import ActiveSet
 from hybrid_opt.polishing.constraints.kind import Surroundings
 from hybrid_opt.polishing.constraints.learned import Learned
@@ -26,6 +27,7 @@ from hybrid_opt.polishing.layout import Row
 from hybrid_opt.polishing.placed_carry import CarryReader, PlacedCarry
 from hybrid_opt.polishing.program import SmoothCell, SmoothProgram
 from hybrid_opt.polishing.residuals import UNKNOWN, Residuals
+from hybrid_opt.polishing.robust_samples import RobustSamples
 from hybrid_opt.polishing.settings import PolishSettings, TrustSettings
 from hybrid_opt.polishing.solvers import Answer
 from hybrid_opt.polishing.targets import Target, level
@@ -96,13 +98,16 @@ class PolishSolver:
         self, evaluator: CandidateEvaluator, functions: PolishFunctions, settings: PolishSettings
     ) -> None:
         grid = Grid(evaluator.workcell.task)
-        self._cell = SmoothCell(evaluator.workcell, functions, grid)
+        robust = None
+        if evaluator.objective_names == ROBUST_OBJECTIVES:
+            robust = RobustSamples(evaluator.workcell)
+        self._cell = SmoothCell(evaluator.workcell, functions, grid, robust)
         self._settings = settings
         wide = replace(settings.solve, barrier=settings.solve.wide_barrier)
         self._wide = replace(settings, solve=wide)
         self._solve = {"ipopt": ipopt, "dense": dense}[settings.solve.solver]
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
-        self._reader = CarryReader(evaluator, grid, functions.rows)
+        self._reader = CarryReader(evaluator, grid, functions.rows, robust)
 
     def solve(self, task: SolveTask) -> Solution:
         """Improve towards the task's target."""

@@ -30,6 +30,7 @@ from hybrid_opt.polishing.layout import Layout, PlaceRow, Row
 from hybrid_opt.polishing.place_values import Places, PlaceValues
 from hybrid_opt.polishing.placed_carry import PlacedCarry
 from hybrid_opt.polishing.residuals import Residuals, residuals
+from hybrid_opt.polishing.robust_samples import RobustSamples
 from hybrid_opt.polishing.sample_values import SampleValues
 from hybrid_opt.polishing.solvers import Answer
 from hybrid_opt.polishing.targets import Target, needed_level
@@ -77,9 +78,17 @@ class SmoothCell:
         free: rows and columns of the variables among the extended waypoints.
         blocks: how samples are divided among functions.
         coefficients: see `branch_coefficients`.
+        robust: robust forces where they are minimised, None for the planned ones.
     """
 
-    def __init__(self, workcell: Workcell, functions: PolishFunctions, grid: Grid) -> None:
+    def __init__(
+        self,
+        workcell: Workcell,
+        functions: PolishFunctions,
+        grid: Grid,
+        robust: RobustSamples | None = None,
+    ) -> None:
+        self.robust = robust
         self.workcell, self.task = workcell, workcell.task
         self.functions, self.grid = functions, grid
         self.unit = UnitBox.of(workcell.task)
@@ -145,6 +154,7 @@ class SmoothProgram:
         self._patches = SampleValues("pressure", cell.blocks, cell.functions.samples, pressed)
         self._places = place_values(cell, layout.place_rows, carry)
         self._index_rows()
+        self._correct_forces(x)
 
         phi = (carry.peak - target.anchor) / target.span + SLACK
         xi, low, high = (cell.unit.scaled(v) for v in (x, cell.task.lower, cell.task.upper))
@@ -180,6 +190,23 @@ class SmoothProgram:
         self._pressed_column = self._patches.column[sample]
         self._scale = np.array([row.constraint.scale for row in self.layout.place_rows])
 
+    def _correct_forces(self, x: Array) -> None:
+        """What the rows' planned forces lack at the candidate to be robust ones, and their slopes:
+        see `hybrid_opt.polishing.robust_samples`."""
+        self._x, robust, layout = x, self._cell.robust, self.layout
+        self._lacking = np.zeros(len(layout.force_rows))
+        self._lacking_slope = np.zeros((len(layout.force_rows), len(x)))
+        if robust is None:
+            return
+        split, slope = self._forces.first(x)
+        at, sample = self._force_column, [row.sample for row in layout.force_rows]
+        force, by_x = robust.first(x)
+        unit = self._cell.task.reference_force[self._owner] * self._target.span[self._owner]
+        self._lacking = force[sample, self._owner] / unit
+        self._lacking -= np.einsum("rk,rk->r", self._mix, split[at])
+        self._lacking_slope = by_x[sample, self._owner] / unit[:, None]
+        self._lacking_slope -= np.einsum("rk,rkx->rx", self._mix, slope[at])
+
     def _fixed_part(self) -> Array:
         """The Jacobian's constant columns, of the peaks and the level."""
         layout = self.layout
@@ -209,8 +236,9 @@ class SmoothProgram:
         at = self._force_column
         first, second = self._mix.T
         values[layout.forces] += first * split[at, 0] + second * split[at, 1]
+        values[layout.forces] += self._lacking + self._lacking_slope @ (x - self._x)
         jacobian[layout.forces, layout.decision] = (
-            first[:, None] * slope[at, 0] + second[:, None] * slope[at, 1]
+            first[:, None] * slope[at, 0] + second[:, None] * slope[at, 1] + self._lacking_slope
         ) * half
         if len(self._pressed):
             margin, slope = self._patches.first(x)

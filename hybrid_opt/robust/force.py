@@ -16,6 +16,7 @@ from codegen.cache import Cache
 from hybrid_opt.carry import Carry
 from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.cases import nominal_case, random_cases, worst_cases
+from hybrid_opt.robust.ruling import ruling_cases
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.physics.case_squeeze import case_slack_function, case_squeeze_function
@@ -148,10 +149,8 @@ class RobustModel:
         check_set(self.workcell, uncertainty)
         worst = self.least_squeeze(motion, worst_cases(self.workcell, uncertainty))
         follower = 1 - leader
-        commanded = worst[:, :, follower].max(axis=0)
-        difference = worst[:, :, leader] - worst[:, :, follower]
-        share = felt_share(uncertainty, difference)
-        return commanded, commanded + (share * difference).max(axis=0)
+        force = ruling_cases(worst, uncertainty, leader).force
+        return force[:, follower], force[:, leader]
 
     def robust_force(
         self, motion: Motion, uncertainty: Uncertainty | None = None, leader: int = 0
@@ -238,16 +237,6 @@ class RobustModel:
             middle = (low + high) / 2.0
             low, high = (middle, high) if within(middle) else (low, middle)
         return low
-
-
-def felt_share(uncertainty: Uncertainty, difference: Array) -> Array:
-    """Of the difference of both normal forces under the largest mass, what the leading arm feels in
-    the worst case: all of it, or where the leader is relieved, that of the least mass.
-
-    The difference is the motion's, whatever the squeeze, and proportional to the mass.
-    """
-    lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
-    return np.where(difference > 0.0, 1.0, lightest)
 
 
 def check_pads(workcell: Workcell) -> None:

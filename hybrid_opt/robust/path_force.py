@@ -12,7 +12,8 @@ from codegen.build import compile_function
 from codegen.cache import Cache
 from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.cases import worst_cases
-from hybrid_opt.robust.force import check_pads, check_set, felt_share
+from hybrid_opt.robust.force import check_pads, check_set
+from hybrid_opt.robust.ruling import ruling_cases
 from symbolic.array import Array
 from symbolic.physics.case_squeeze import case_slopes_function
 from symbolic.workcell.records import Workcell
@@ -54,19 +55,9 @@ class RobustPath:
         out = self._function.batch(*rows)
         force = out["normal_force"].reshape(k, n, 2)
         slope = out["slope"].reshape(k, n, 2, 2)
-        follower, every = 1 - leader, np.arange(n)
-        worst = force[:, :, follower].argmax(axis=0)
-        commanded, by = force[worst, every, follower], slope[worst, every, follower]
-        difference = force[:, :, leader] - force[:, :, follower]
-        share = felt_share(self._set, difference)
-        most = (share * difference).argmax(axis=0)
-        step = slope[most, every, leader] - slope[most, every, follower]
-        ruling = share[most, every]
-        values, slopes = np.empty((n, 2)), np.empty((n, 2, 2))
-        values[:, follower], slopes[:, follower] = commanded, by
-        values[:, leader] = commanded + ruling * difference[most, every]
-        slopes[:, leader] = by + ruling[:, None] * step
-        return values, slopes
+        every, ruling = np.arange(n), ruling_cases(force, self._set, leader)
+        slopes = ruling.slopes(slope[ruling.commanded, every], slope[ruling.felt, every])
+        return ruling.force, slopes
 
 
 robust_path = kept_per_workcell(RobustPath)

@@ -47,6 +47,18 @@ def case_squeeze_function(workcell: Workcell) -> ca.Function:
     return ca.Function("case_squeeze", [*motion, case], [held.normal], names, ["normal_force"])
 
 
+def case_gradient_function(workcell: Workcell) -> ca.Function:
+    """As `case_squeeze_function`, and slope (NumPy shape (2, 18)), of each force by pose, rate and
+    second_rate."""
+    motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.MX.sym("case", CASE_SIZE)
+    force = case_squeeze_function(workcell)(*motion, case)
+    slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in motion]).T)
+    names = ["pose", "rate", "second_rate", "case"]
+    outputs = ["normal_force", "slope"]
+    return ca.Function("case_gradient", [*motion, case], [force, slope], names, outputs)
+
+
 def case_slopes_function(workcell: Workcell) -> ca.Function:
     """Box pose and its derivatives by u (6,), u'', u'^2 and a case (15,), see `CASE_SIZES`, to
     normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 2)), of each

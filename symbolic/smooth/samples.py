@@ -92,6 +92,19 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[SampleKey, 
     return functions
 
 
+def motion_function(task: Task) -> ca.Function:
+    """x (n_var,) to motion (n, 18), box pose, rate and second rate at every sample, and slope
+    (18 n, n_var), of its entries row by row; NumPy shapes."""
+    x = ca.MX.sym("x", task.n_var)
+    path = timed_path(task, sample_basis(task), waypoint_matrix(task, x))
+    motion = ca.vertcat(path.pose, path.rate, path.second_rate)
+    flat = ca.Function("motion_values", [x], [motion]).expand()
+    y = ca.SX.sym("x", task.n_var)
+    value = flat(y)
+    slope = ca.densify(ca.jacobian(ca.vec(value), y).T)
+    return ca.Function("motion", [y], [value, slope], ["x"], ["motion", "slope"])
+
+
 def _window_functions(
     workcell: Workcell,
     sample: ca.Function,

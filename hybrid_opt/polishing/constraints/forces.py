@@ -60,7 +60,8 @@ class Forces(Kind[ForceRow]):
 
     def _peaks(self, carry: PlacedCarry) -> set[int]:
         """Samples at and beside local maxima of either robot's normal force."""
-        force = self._values(carry).max(axis=2)
+        is_planned = self.around.cell.robust is None
+        force = self._values(carry).max(axis=2) if is_planned else carry.force
         inner = force[1:-1]
         high = (inner >= force[:-2]) & (inner >= force[2:])
         high &= inner >= self.near_settings.peak_share * inner.max(axis=0)
@@ -68,7 +69,12 @@ class Forces(Kind[ForceRow]):
         return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
 
     def _other_branches(self, carry: PlacedCarry) -> list[ForceRow]:
-        """Force rows of other branches than the tight cones' that rule, or nearly do."""
+        """Force rows of other branches than the tight cones' that rule, or nearly do.
+
+        Robust forces have one row at a sample, of the case that rules there.
+        """
+        if self.around.cell.robust is not None:
+            return []
         force = self._values(carry)
         share = 1.0 - self.near_settings.branch_share
         near = force >= share * force.max(axis=2, keepdims=True)

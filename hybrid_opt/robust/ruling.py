@@ -1,0 +1,60 @@
+"""Which of the worst cases decide what both robots press with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symbolic.array import Array
+from symbolic.workcell.records import Uncertainty
+
+
+@dataclass(frozen=True)
+class RulingCases:
+    """Which of the worst cases decide the forces; n samples.
+
+    Attributes:
+        leader: index of the arm that keeps its place.
+        force: (n, 2) what is commanded of the force-controlled arm, and the largest that the other
+            feels [N].
+        commanded: (n,) the case that decides the first.
+        felt: (n,) the case in which the leading arm feels most beyond it.
+        share: (n,) of the difference of both forces there that it feels.
+    """
+
+    leader: int
+    force: Array
+    commanded: NDArray[np.intp]
+    felt: NDArray[np.intp]
+    share: Array
+
+    def slopes(self, commanded: Array, felt: Array) -> Array:
+        """(n, 2, m) derivatives of `force` from those of both robots' forces (n, 2, m) in the cases
+        `commanded` and `felt`."""
+        follower = 1 - self.leader
+        found = np.empty_like(commanded)
+        found[:, follower] = commanded[:, follower]
+        step = felt[:, self.leader] - felt[:, follower]
+        found[:, self.leader] = commanded[:, follower] + self.share[:, None] * step
+        return found
+
+
+def ruling_cases(worst: Array, uncertainty: Uncertainty, leader: int) -> RulingCases:
+    """The cases that decide among the least normal forces (k, n, 2) [N] of the worst ones.
+
+    The difference of both forces is the motion's, whatever the squeeze, and proportional to the
+    mass: the leading arm feels all of it under the largest mass, or where it is relieved by it,
+    what the least mass leaves.
+    """
+    follower, every = 1 - leader, np.arange(worst.shape[1])
+    difference = worst[:, :, leader] - worst[:, :, follower]
+    lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
+    share = np.where(difference > 0.0, 1.0, lightest)
+    commanded = worst[:, :, follower].argmax(axis=0)
+    felt = (share * difference).argmax(axis=0)
+    force = np.empty(worst.shape[1:])
+    force[:, follower] = worst[commanded, every, follower]
+    force[:, leader] = force[:, follower] + (share * difference)[felt, every]
+    return RulingCases(leader, force, commanded, felt, share[felt, every])
