@@ -1,4 +1,4 @@
-"""The cell of two Pandas that ships: redundant elbows between columns."""
+"""The cell of two Pandas that ships: redundant elbows that pass portals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.locked import LockedEvaluator
-from studies.redundancy import locks
+from studies.redundancy import compare, locks
 from studies.run import main
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
@@ -34,14 +34,22 @@ def test_the_hand_made_trajectory_is_feasible_and_the_bounds_searchable(cell: Ce
     judged = cell.evaluate(cell.initial)
     assert judged.feasible.all()
     share = cell.evaluate(cell.random(1000, np.random.default_rng(1))).feasible.mean()
-    assert 0.02 <= share <= 0.5
+    assert 0.02 <= share <= 0.2
 
 
 @pytest.mark.slow
-def test_constant_elbows_are_in_the_way(cell: Cell) -> None:
+def test_constant_elbows_ask_for_another_path_of_the_box(cell: Cell) -> None:
     x = cell.initial[None, : cell.workcell.task.n_box]
     tried = [LockedEvaluator(cell.evaluator, np.array(p)) for p in locks(cell.workcell.task, 16)]
     assert not any(one.evaluate(x).feasible.all() for one in tried)
+    others = cell.random(400, np.random.default_rng(1))[:, : cell.workcell.task.n_box]
+    assert 2 <= sum(one.evaluate(others).feasible.any() for one in tried) <= 8
+
+
+@pytest.mark.slow
+def test_elbows_that_move_beat_the_best_lock(cell: Cell) -> None:
+    (found,) = compare(cell, 16, 1, 300, 1)
+    assert found.free > max(found.locked) > 0.3
 
 
 @pytest.mark.slow
