@@ -18,7 +18,7 @@ from symbolic.physics.path_limits import (
     ratio_functions,
     sample_limits_function,
 )
-from symbolic.workcell.records import Workcell
+from symbolic.workcell.records import POSE_SIZE, Workcell
 
 DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
 """Names of the functions."""
@@ -29,7 +29,9 @@ TANGENT_FLOOR = 1e-9
 
 @dataclass(frozen=True)
 class DrivenLayout:
-    """Where the quantities at a driven point lie in their vector; `joints` counts both arms'.
+    """Where the quantities at a driven point lie in their vector.
+
+    `joints` counts both arms', `pose` the entries of the extended pose.
 
     Blocks, in order:
     speed (joints + 2): squared speeds over their squared limits: joints, payload, its turning.
@@ -41,6 +43,7 @@ class DrivenLayout:
     """
 
     joints: int
+    pose: int = POSE_SIZE
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -68,13 +71,13 @@ class DrivenLayout:
 
     @property
     def variables(self) -> int:
-        """Box pose and both derivatives, the joints, u'' and u'^2."""
-        return 18 + self.joints + 2
+        """Extended pose and both derivatives, the joints, u'' and u'^2."""
+        return 3 * self.pose + self.joints + 2
 
 
 def driven_layout(workcell: Workcell) -> DrivenLayout:
     """The layout for a workcell's arms."""
-    return DrivenLayout(limit_layout(workcell).joints)
+    return DrivenLayout(limit_layout(workcell).joints, workcell.task.extended_size)
 
 
 def driven_functions(model: CellModel) -> dict[str, ca.Function]:
@@ -87,7 +90,7 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     """
     layout = driven_layout(model.workcell)
     names = [*PATH_OUTPUTS, "a", "w"]
-    sizes = [6, 6, 6, *[len(start) for start in model.start], 1, 1]
+    sizes = [layout.pose] * 3 + [*[len(start) for start in model.start], 1, 1]
     inputs = [ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)]
     value, y = _value(model, inputs), ca.vertcat(*inputs)
     assert value.shape == (layout.size, 1)

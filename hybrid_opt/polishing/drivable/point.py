@@ -49,9 +49,9 @@ class DriveTask:
 
 
 def is_polishable(task: Task) -> bool:
-    """Whether drivable carries of a task can be polished: the paper's allocation of forces, and no
-    redundant joints."""
-    return task.allocation == "paper" and task.n_path == 6 * len(task.free_indices)
+    """Whether drivable carries of a task can be polished: with the paper's allocation of forces,
+    whose branches are what the program's rows are made of."""
+    return task.allocation == "paper"
 
 
 class DrivableSolver:
@@ -63,8 +63,8 @@ class DrivableSolver:
         driver, task = evaluator.driver, evaluator.workcell.task
         if driver is None or functions.driven is None or not is_polishable(task):
             raise SettingsError(
-                "the polish of drivable carries needs the time law 'optimal', the paper's "
-                "allocation of forces, and arms of six joints: switch the polish off"
+                "the polish of drivable carries needs the time law 'optimal' and the paper's "
+                "allocation of forces: switch the polish off"
             )
         grid = Grid(task)
         self._cell = SmoothCell(evaluator.workcell, functions, grid)

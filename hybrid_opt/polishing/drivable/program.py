@@ -26,7 +26,7 @@ from hybrid_opt.polishing.layout import PlaceRow
 from hybrid_opt.polishing.place_values import PlaceValues
 from hybrid_opt.polishing.residuals import Residuals
 from symbolic.array import Array
-from symbolic.workcell.decision import waypoints_of
+from symbolic.workcell.decision import extended_waypoints
 
 NEAR = 0.85
 """Limits used this far have a row from the start."""
@@ -126,7 +126,7 @@ class JointProgram:
         if not self.place_rows:
             self.geometry, self._geometry_slope = np.zeros(0), np.zeros((0, self.n_path))
             return
-        value, slope = self._places.first(waypoints_of(self._grid.workcell.task, at.x))
+        value, slope = self._places.first(extended_waypoints(self._grid.workcell.task, at.x))
         self.geometry = (self._required - value) / self._place_scale
         self._geometry_slope = -slope * self._half / self._place_scale[:, None]
 
@@ -163,7 +163,7 @@ class JointProgram:
             return self.geometry
         x = self._at.x.copy()
         x[: self.n_path] += self._half * d[: self.n_path]
-        value, _ = self._places.first(waypoints_of(self._grid.workcell.task, x))
+        value, _ = self._places.first(extended_waypoints(self._grid.workcell.task, x))
         lacking = (self._required - value) / self._place_scale
         foretold = self.geometry + self._geometry_slope @ d[: self.n_path]
         return np.asarray(lacking - foretold)
@@ -177,10 +177,11 @@ class JointProgram:
 
     def predicted(self, d: Array) -> Array:
         """(points, kinds) linear prediction of the timing's rows after a step."""
-        local = np.zeros((len(self._local), 20))
-        local[:, :18] = self._carry_over @ d[: self.n_path]
+        moving = self._grid.moving
+        local = np.zeros((len(self._local), moving + 2))
+        local[:, :moving] = self._carry_over @ d[: self.n_path]
         omega = d[self.n_path : -1]
-        local[:, 18:] = (self._local * omega[self._column][:, None, :]).sum(axis=2)
+        local[:, moving:] = (self._local * omega[self._column][:, None, :]).sum(axis=2)
         change = np.matmul(self._values.slope, local[:, :, None])[:, :, 0]
         phi = np.where(self._grid.kinds.is_force, d[-1], 0.0)
         return np.asarray(self.rows + change @ self._mix.T - phi)
@@ -197,9 +198,9 @@ class JointProgram:
         point, kind = np.nonzero(chosen)
         local = np.matmul(self._mix[kind][:, None, :], self._values.slope[point])[:, 0]
         A = np.zeros((len(point) + len(self.geometry) + self._has_duration, self.n))
-        m = len(point)
-        A[:m, : self.n_path] = np.matmul(local[:, None, :18], self._carry_over[point])[:, 0]
-        by_speed = np.matmul(local[:, None, 18:], self._local[point])[:, 0]
+        m, moving = len(point), self._grid.moving
+        A[:m, : self.n_path] = np.matmul(local[:, None, :moving], self._carry_over[point])[:, 0]
+        by_speed = np.matmul(local[:, None, moving:], self._local[point])[:, 0]
         rows = np.arange(m)
         for side in (0, 1):
             columns = self.n_path + self._column[point, side]
@@ -253,12 +254,10 @@ class JointProgram:
             return H
         at, local = self._values.curvature(multipliers.timing @ self._mix)
         over, speeds = self._carry_over[at], self._local[at]
-        x = slice(0, self.n_path)
-        H[x, x] += np.einsum(
-            "pia,pij->aj", over, np.matmul(local[:, :18, :18], over), optimize=True
-        )
-        mixed = np.swapaxes(over, 1, 2) @ local[:, :18, 18:] @ speeds
-        own = np.swapaxes(speeds, 1, 2) @ local[:, 18:, 18:] @ speeds
+        x, m = slice(0, self.n_path), self._grid.moving
+        H[x, x] += np.einsum("pia,pij->aj", over, np.matmul(local[:, :m, :m], over), optimize=True)
+        mixed = np.swapaxes(over, 1, 2) @ local[:, :m, m:] @ speeds
+        own = np.swapaxes(speeds, 1, 2) @ local[:, m:, m:] @ speeds
         columns = self.n_path + self._column[at]
         for side in (0, 1):
             by_speed = np.zeros((self.n, self.n_path))

@@ -19,11 +19,8 @@ from symbolic.physics.contact_forces import normal_force_branches
 from symbolic.physics.path import path_basis
 from symbolic.smooth.driven import driven_layout
 from symbolic.smooth.keys import ClosureKey
-from symbolic.workcell.decision import waypoints_of
+from symbolic.workcell.decision import extended_waypoints
 from symbolic.workcell.records import Workcell
-
-LOCAL = 20
-"""What a point depends on: box pose and both derivatives (6 each), u'' and u'^2."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +67,8 @@ class StageGrid:
         workcell: the cell.
         stages: pieces of constant u''.
         sample: (points,) grid point of each point.
-        carry_over: (points, 18, n_path) from the free waypoints to pose and both derivatives.
+        moving: entries of the extended pose and its two derivatives, 3 (6 + m).
+        carry_over: (points, moving, n_path) from the path's variables to them.
         kinds: the inequalities of a point.
     """
 
@@ -80,18 +78,18 @@ class StageGrid:
         basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, stages + 1))
         self.sample = (np.arange(stages)[:, None] + np.array([0, 1])).reshape(-1)
         self._bases = (basis.position, basis.first, basis.second)
-        free = list(task.free_indices)
-        parts = [np.kron(b[self.sample][:, free], np.eye(6)) for b in self._bases]
-        n_points, n_path = len(self.sample), 6 * len(free)
-        self.carry_over = np.stack(
-            [part.reshape(n_points, 6, n_path) for part in parts], axis=1
-        ).reshape(n_points, 18, n_path)
+        rows, columns = task.free_entries
+        self.pose, self.moving = task.extended_size, 3 * task.extended_size
+        self.carry_over = np.zeros((len(self.sample), self.moving, task.n_path))
+        for k, basis_of in enumerate(self._bases):
+            at = (k * self.pose + columns, np.arange(task.n_path))
+            self.carry_over[:, at[0], at[1]] = basis_of[self.sample][:, rows]
         self.kinds = RowKinds.of(workcell)
         self.layout = driven_layout(workcell)
 
     def path(self, x: Array) -> tuple[Array, Array, Array]:
-        """Pose and both derivatives (stages + 1, 6) of a decision vector."""
-        waypoints = waypoints_of(self.workcell.task, x)
+        """Extended pose and both derivatives (stages + 1, 6 + m) of a decision vector."""
+        waypoints = extended_waypoints(self.workcell.task, x)
         first, second, third = (np.ascontiguousarray(b @ waypoints) for b in self._bases)
         return first, second, third
 
@@ -103,7 +101,8 @@ class StageValues:
     Attributes:
         grid: what the path shares with others.
         value: (points, quantities).
-        slope: (points, quantities, LOCAL) by what a point depends on, the joints following.
+        slope: (points, quantities, moving + 2) by the extended pose and its derivatives, u'' and
+            u'^2, the joints following.
     """
 
     grid: StageGrid
@@ -140,11 +139,11 @@ class StageValues:
         out = functions.first.batch(*inputs)
         full = out["slope"]
         follow = tuple(found["follow"][s] for found in held)
-        slope = np.concatenate([full[:, :, :18], full[:, :, -2:]], axis=2)
-        start = 18
+        slope = np.concatenate([full[:, :, : grid.moving], full[:, :, -2:]], axis=2)
+        start = grid.moving
         for along in follow:
             n = along.shape[2]
-            slope[:, :, :6] += full[:, :, start : start + n] @ np.swapaxes(along, 1, 2)
+            slope[:, :, : grid.pose] += full[:, :, start : start + n] @ np.swapaxes(along, 1, 2)
             start += n
         pull = tuple(found["pull"][s] for found in held)
         return cls(
@@ -169,26 +168,28 @@ class StageValues:
             weight: (points, quantities).
 
         Returns:
-            The points (m,) with any weight, and (m, LOCAL, LOCAL) of each.
+            The points (m,) with any weight, and (m, moving + 2, moving + 2) of each.
         """
         at = np.flatnonzero(np.abs(weight).max(axis=1) > 0.0)
         n, variables = len(at), self.grid.layout.variables
-        spread = np.zeros((n, LOCAL, variables))
-        spread[:, np.arange(18), np.arange(18)] = 1.0
-        spread[:, [18, 19], [variables - 2, variables - 1]] = 1.0
-        start = 18
+        pose, moving = self.grid.pose, self.grid.moving
+        local = moving + 2
+        spread = np.zeros((n, local, variables))
+        spread[:, np.arange(moving), np.arange(moving)] = 1.0
+        spread[:, [moving, moving + 1], [variables - 2, variables - 1]] = 1.0
+        start = moving
         for along in self._follow:
             stop = start + along.shape[2]
-            spread[:, :6, start:stop] = along[at]
+            spread[:, :pose, start:stop] = along[at]
             start = stop
-        repeated = [np.repeat(values[at], LOCAL, axis=0) for values in self._inputs]
+        repeated = [np.repeat(values[at], local, axis=0) for values in self._inputs]
         change = self._functions.second.batch(
-            *repeated, np.repeat(weight[at], LOCAL, axis=0), spread.reshape(-1, variables)
-        )["change"].reshape(n, LOCAL, variables)
+            *repeated, np.repeat(weight[at], local, axis=0), spread.reshape(-1, variables)
+        )["change"].reshape(n, local, variables)
         total = change @ np.swapaxes(spread, 1, 2)
         # How the joints' own curvature along the path adds to it, see `symbolic.smooth.closure`.
         slope = np.einsum("pk,pkv->pv", weight[at], self._full[at])
-        start = 18
+        start = moving
         for arm, along in enumerate(self._follow):
             n_joints = along.shape[2]
             by_joints = slope[:, start : start + n_joints]
@@ -196,7 +197,7 @@ class StageValues:
             closed = self._functions.closures[ClosureKey(arm, "second")].batch(
                 self._inputs[0][at], self._inputs[3 + arm][at], nu
             )["hessian"]
-            follow = np.concatenate([np.tile(np.eye(6), (n, 1, 1)), along[at]], axis=2)
-            total[:, :6, :6] += follow @ closed @ np.swapaxes(follow, 1, 2)
+            follow = np.concatenate([np.tile(np.eye(pose), (n, 1, 1)), along[at]], axis=2)
+            total[:, :pose, :pose] += follow @ closed @ np.swapaxes(follow, 1, 2)
             start += n_joints
         return at, (total + np.swapaxes(total, 1, 2)) / 2.0

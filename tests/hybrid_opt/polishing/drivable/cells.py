@@ -23,7 +23,11 @@ from tests.symbolic.workcell.samples import RACK
 @cache
 def drivable_rack() -> Workcell:
     """Timed as robots drive it."""
-    cell = load(RACK)
+    return driven(load(RACK))
+
+
+def driven(cell: Workcell) -> Workcell:
+    """A cell of the rack's payload and robots, timed as robots drive it."""
     still = cell.payload.mass * 9.81 / 2.0
     task = replace(cell.task, time_law="optimal", force_limit=(1.001 * still, 117.68))
     return replace(cell, task=task)
@@ -51,7 +55,12 @@ def polisher(rounds: int = 40) -> DrivablePolisher:
 
 def start(force: float, seed: int = 0) -> Array:
     """(n_var,) the hand-made path, moved a little, with a force limit [N]."""
-    x = initial_decision(drivable_rack().task)
+    return start_in(drivable_rack(), force, seed)
+
+
+def start_in(cell: Workcell, force: float, seed: int) -> Array:
+    """The same in another cell."""
+    x = initial_decision(cell.task)
     x[:-1] += 0.004 * np.random.default_rng(seed).normal(size=len(x) - 1)
     x[-1] = force
-    return np.clip(x, drivable_rack().task.lower, drivable_rack().task.upper)
+    return np.clip(x, cell.task.lower, cell.task.upper)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hybrid_opt.polishing.drivable.front import DrivablePolisher
 from hybrid_opt.polishing.drivable.program import Iterate, JointProgram, Multipliers
 from hybrid_opt.polishing.drivable.stages import StageGrid, StageValues
 from hybrid_opt.polishing.drivable.timed import Goal
+from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.layout import PlaceRow
 from hybrid_opt.polishing.placed_carry import CarryReader
@@ -17,7 +19,6 @@ from symbolic.smooth.reach import Reach
 from symbolic.workcell.decision import initial_decision
 from tests.hybrid_opt.polishing.drivable.cells import (
     drivable_rack,
-    evaluator,
     functions,
     polisher,
     start,
@@ -27,18 +28,25 @@ FORCE = 52.0
 ROWS = (PlaceRow(Reach(0), 150), PlaceRow(Reach(1), 250))
 
 
+PolishedCell = tuple[DrivablePolisher, PolishFunctions]
+
+
 class Programs:
     """Programs about points near one timed path."""
 
-    def __init__(self, x: Array, duration: float | None = None) -> None:
-        task = drivable_rack().task
-        grid = Grid(task)
-        self.cell = SmoothCell(drivable_rack(), functions(), grid)
+    def __init__(
+        self, x: Array, duration: float | None = None, of: PolishedCell | None = None
+    ) -> None:
+        """of: another cell than the rack."""
+        owner, self.functions = of or (polisher(), functions())
+        workcell = owner.evaluator.workcell
+        grid = Grid(workcell.task)
+        self.cell = SmoothCell(workcell, self.functions, grid)
         self.half = self.cell.unit.half[:-1]
         self.x, self.duration = x, duration
-        self.timed = polisher().drivable.judge.timed(x[:-1], Goal("duration", FORCE))
-        self.carry = CarryReader(evaluator(), grid, functions().rows).read(x)
-        self.stages = StageGrid(drivable_rack(), 100)
+        self.timed = owner.drivable.judge.timed(x[:-1], Goal("duration", FORCE))
+        self.carry = CarryReader(owner.evaluator, grid, self.functions.rows).read(x)
+        self.stages = StageGrid(workcell, 100)
 
     def at(self, d: Array | None = None) -> JointProgram:
         """The program after a step d of the scaled variables from the path."""
@@ -47,7 +55,7 @@ class Programs:
             n = len(self.half)
             x[:n] += self.half * d[:n]
             squared[1:-1] *= 1.0 + d[n:-1]
-        driven = functions().driven
+        driven = self.functions.driven
         assert driven is not None
         values = StageValues.at(self.stages, driven, x, squared, self.timed.joints)
         places = (ROWS, place_values(self.cell, ROWS, self.carry), np.array([0.01, 0.01]))
@@ -75,7 +83,11 @@ def test_the_compiled_timing_satisfies_the_program() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_rows_have_exact_slopes(seed: int) -> None:
-    programs = Programs(start(FORCE, seed))
+    assert_slopes(Programs(start(FORCE, seed)), seed)
+
+
+def assert_slopes(programs: Programs, seed: int) -> None:
+    """Rows by differences along a random direction."""
     program = programs.at()
     d, h = direction(program, seed), 1e-6
     difference = (programs.at(h * d).rows - programs.at(-h * d).rows) / (2.0 * h)
@@ -100,7 +112,11 @@ def test_slopes_exist_where_the_box_does_not_turn() -> None:
 
 @pytest.mark.parametrize("duration", [None, 3.0])
 def test_the_lagrangian_has_exact_curvature(duration: float | None) -> None:
-    programs = Programs(start(FORCE), duration)
+    assert_curvature(Programs(start(FORCE), duration), duration)
+
+
+def assert_curvature(programs: Programs, duration: float | None) -> None:
+    """Gradients by differences along a random direction."""
     program = programs.at()
     chosen = program.near()
     rng = np.random.default_rng(3)
