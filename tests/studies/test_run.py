@@ -20,9 +20,12 @@ from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.indicators import metrics
 from hybrid_opt.store.replay import replay
 from hybrid_opt.store.trajectory_file import read_trajectory
+from hybrid_opt.timing.document import read_timing
 from studies import rack, recommend, run
 from studies.cli import campaign_parser, campaign_settings
 from studies.recommendation_text import recommendation_text
+from symbolic.workcell.archive import archive_cell, unpack_cell
+from symbolic.workcell.drivable import drivable_archive
 from symbolic.workcell.file import load
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
 
@@ -221,6 +224,30 @@ def test_wrong_options_get_one_message(
 def test_a_missing_workcell_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run.main([str(tmp_path / "no.toml"), "--output", str(tmp_path / "a")]) == 2
     assert "no.toml: 1 problem" in capsys.readouterr().err
+
+
+def test_a_cell_whose_own_law_is_optimal_has_one_experiment(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drivable = unpack_cell(drivable_archive(archive_cell(load(Path(CELL)))), tmp_path / "cell")
+    root = tmp_path / "results"
+    options = ["--algorithm", "nsga2", "--no-report", "--quiet", "--output", str(root), *SMALL]
+    assert run.main([str(drivable.source), *options]) == 0
+    results, summary = read_campaign(root), read_summary(root)
+    assert results.objectives == ("duration", "peak_force")
+    assert not (root / "drivable").exists()
+    assert summary.recommendation is not None
+    assert (root / summary.recommendation.file).exists()
+    assert [rival.label for rival in summary.recommendation.rivals] == ["hand-made"]
+    # What limits on jerk cost: recommended, stored and told.
+    assert summary.recommendation.jerk is not None
+    selected = read_timing(root / "timing" / "nsga2" / "00.json").jerk
+    assert selected is not None
+    assert selected.duration > selected.without
+    assert max(selected.joint_use, selected.payload_use) == pytest.approx(1.0, abs=0.01)
+    printed = capsys.readouterr().out
+    assert "within jerk limits" in printed
+    assert re.search(r"limits on jerk +carries +without", printed)
 
 
 def test_help_explains_every_option_with_its_default() -> None:
