@@ -33,7 +33,7 @@ from tests.hybrid_opt.polishing.drivable.transcription import (
 pytestmark = pytest.mark.slow
 
 COARSE = 0.02
-"""Of the duration: what grids of 25 and of 100 stages differ by."""
+"""Of the duration: what grids of 20 and of 100 stages differ by."""
 
 GAIN = 0.005
 """Share that the transcription may find to gain on a polished carry."""

@@ -22,7 +22,7 @@ from symbolic.cell_model import CellModel
 from symbolic.physics.pose import inverse
 from symbolic.workcell.records import Workcell
 
-STAGES = 25
+STAGES = 20
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,12 @@ class Transcription:
             "print_time": False,
             "ipopt.max_iter": 600,
             "ipopt.tol": 1e-4,
-            "ipopt.mu_init": 1e-3,
+            "ipopt.mu_strategy": "adaptive",
+            # The rest is creeping along directions in which nothing matters.
+            "ipopt.acceptable_tol": 1e-2,
+            "ipopt.acceptable_iter": 10,
+            "ipopt.acceptable_constr_viol_tol": 1e-6,
+            "ipopt.acceptable_obj_change_tol": 1e-6,
         }
         goal = total if duration is None else limit / 50.0
         solver = ca.nlpsol("joint", "ipopt", {"x": z, "f": goal, "g": g}, options)
