@@ -17,8 +17,8 @@ from hybrid_opt.recommending.squeeze import Commanded, commanded
 from hybrid_opt.recommending.unsure import Unsure, unsure_forces
 from hybrid_opt.recommending.wish import Wish
 from hybrid_opt.robust.squeeze import FACTOR, SqueezeSettings
-from hybrid_opt.timing.jerk import time_with_jerk
-from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
+from hybrid_opt.timing.jerk import drive_with_jerk
+from hybrid_opt.timing.records import JerkTiming, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
@@ -131,7 +131,7 @@ def recommend(
     named = {HAND_MADE: cell.initial[:-1]} | dict(others or {})
     reference = Reference(paths, choice.index, choice.force, comparison_forces(points))
     beside = rivals(cell, named, reference)
-    jerk = _within_jerk(cell, timing.carry.x, choice.force)
+    jerk = drive_with_jerk(cell.timing_model, timing.carry.x)
     margins = robustness_margins(cell.timing_model, timing.carry)
     squeeze, doubt = _commanded(timing.carry)
     return Recommendation(
@@ -151,13 +151,6 @@ def recommend(
             *doubt,
         ),
     )
-
-
-def _within_jerk(cell: Cell, x: Array, force: float) -> JerkTiming | None:
-    limits = JerkLimits.of(cell.workcell)
-    if limits is None:
-        return None
-    return time_with_jerk(cell.timing_model, x, TimingLimits(force=force), limits)
 
 
 def _driven(cell: Cell, x: Array, wanted: Iterable[Choice]) -> tuple[Choice, Timing]:

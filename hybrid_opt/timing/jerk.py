@@ -87,6 +87,15 @@ def time_with_jerk(
     return replace(problem.solve(), without=fastest.duration)
 
 
+def drive_with_jerk(model: TimingModel, x: Array) -> JerkTiming | None:
+    """A drivable carry x (n_var,) within its own force limit and the cell's limits on jerk; None
+    where the cell limits no jerk, and where its pads are not two round ones facing one another."""
+    limits = JerkLimits.of(model.workcell)
+    if limits is None or not model.workcell.has_facing_pads:
+        return None
+    return time_with_jerk(model, x, TimingLimits(force=float(x[-1])), limits)
+
+
 class _Problem:
     """One path with one set of limits."""
 

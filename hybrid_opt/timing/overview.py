@@ -13,10 +13,10 @@ from hybrid_opt.timing.analysis import (
     force_limited_timing,
     judge_timing,
 )
-from hybrid_opt.timing.jerk import time_with_jerk
+from hybrid_opt.timing.jerk import drive_with_jerk
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.point_limits import duration_at_speed_limits
-from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
+from hybrid_opt.timing.records import JerkTiming, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
@@ -74,15 +74,8 @@ def report_timing(model: TimingModel, x: Array, force: float | None = None) -> T
         fastest=fastest_timing(model, x),
         closest=closest_to_reference_timing(model, x),
         force_limited=None if force is None else force_limited_timing(model, x, force),
-        jerk=_within_jerk(model, x),
+        jerk=drive_with_jerk(model, x) if model.workcell.task.time_law == "optimal" else None,
     )
-
-
-def _within_jerk(model: TimingModel, x: Array) -> JerkTiming | None:
-    limits = JerkLimits.of(model.workcell)
-    if limits is None or model.workcell.task.time_law != "optimal":
-        return None
-    return time_with_jerk(model, x, TimingLimits(force=float(x[-1])), limits)
 
 
 @dataclass(frozen=True)

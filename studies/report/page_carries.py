@@ -10,6 +10,7 @@ import numpy as np
 import hybrid_opt as ho
 from hybrid_opt.display.scene import packed
 from hybrid_opt.store.trajectory_figures import trajectory_figures
+from hybrid_opt.timing.jerk import drive_with_jerk
 from symbolic.array import Array
 
 MAX_SAMPLES = 60
@@ -114,10 +115,8 @@ class PageCarries:
 
     def _within_jerk(self, x: Array) -> list[dict[str, Any]]:
         """The carry within the cell's limits on jerk, where it has any."""
-        limits = ho.TimingLimits(force=float(x[-1]))
-        if ho.JerkLimits.of(self._cell.workcell) is None:
-            return []
-        carry = ho.time_with_jerk(self._cell, x, limits).timing.carry
+        found = drive_with_jerk(self._cell.timing_model, x)
+        carry = None if found is None else found.timing.carry
         return [] if carry is None else [self._motion(WITHIN_JERK, carry)]
 
     def _motion(self, name: str, carry: ho.Carry) -> dict[str, Any]:
