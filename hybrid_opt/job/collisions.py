@@ -87,11 +87,11 @@ class JobCollisions:
         judge = Judge(self.geometry, RESTING_TOLERANCE)
         payload = self.geometry.index(PAYLOAD)
         below = self._fixed_bodies(payload)
+        still = [np.zeros((1, len(robot.torque_max))) for robot in self._workcell.robots]
 
         def gaps(drop: float) -> Array:
             lowered = _lowered(pose, drop)
-            still = np.zeros((1, 6))
-            placed = self._functions["piece_poses"].batch(lowered[None], still, still)
+            placed = self._functions["piece_poses"].batch(lowered[None], *still)
             judge.set_placements(placed["quaternions"], placed["positions"])
             return np.array([judge.separation(0, payload, body) for body in below])
 

@@ -20,7 +20,7 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.certification import SampledPath, certificates
 from hybrid_opt.job.carry_motion import carry_motion
-from hybrid_opt.job.collisions import JobCollisions, Standing
+from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.job.forces import held, pressing, without_force
 from hybrid_opt.job.limits import EXCESS, phase_use
 from hybrid_opt.job.profile import rise
@@ -50,17 +50,33 @@ from symbolic.workcell.records import Workcell
 PATH_SAMPLES = 201
 """Of the carry's joints, from which Newton's method reaches every place between."""
 
+_SAME_POSTURE = 7
+"""Decimals of joint positions [rad, m] within which carries end in the same posture."""
+
+_MOST_KNOWN = 8
+"""Different ends of carries whose handling is remembered."""
+
 FIRST_POINTS = 11
 """Grid that the proof of a straight motion starts from."""
 
 
 @dataclass(frozen=True)
 class _Part:
-    """A phase before its forces are known; `line` is None for the carry."""
+    """A phase before its forces are known."""
 
     name: str
     motion: Motion
-    line: Straight | None = None
+    proof: Certificate
+
+
+@dataclass(frozen=True)
+class _Around:
+    """What happens around carries that begin and end alike, and what judges them."""
+
+    before: tuple[_Part, ...]
+    after: tuple[_Part, ...]
+    stands_on: tuple[tuple[str, ...], tuple[str, ...]]
+    checker: CollisionChecker
 
 
 class JobModel:
@@ -87,6 +103,7 @@ class JobModel:
         self._posture: NumericFunction = compiled.evaluators["posture"]
         self._collisions = JobCollisions(compiled)
         self._jerk = JerkLimits.of(compiled.workcell)
+        self._known: dict[tuple[Handling, bytes], _Around] = {}
 
     def plan(
         self,
@@ -94,6 +111,7 @@ class JobModel:
         squeeze: SqueezeSettings | None = None,
         smoothing: float = WIDTH,
         handling: Handling | None = None,
+        within_jerk: bool = True,
     ) -> Job:
         """The whole job around a timed carry.
 
@@ -104,6 +122,8 @@ class JobModel:
                 averaged [s]; zero leaves it as it is. Where the workcell limits jerk, any other
                 value asks for a timing within these limits instead.
             handling: in place of the workcell's own.
+            within_jerk: whether the carry is timed within the workcell's limits on jerk, which
+                takes about a second; else it is averaged as without them.
 
         Raises:
             SettingsError: the timing failed, or the squeeze is not possible.
@@ -117,21 +137,22 @@ class JobModel:
             )
         if not 0.0 <= smoothing <= WIDEST:
             raise SettingsError(f"smoothing over {smoothing:g} s: allowed is 0 to {WIDEST:g} s")
+        jerk = self._jerk if within_jerk else None
         if smoothing > 0.0 and not rests_at_ends(timing):
-            timing = self._without_jumps(timing, smoothing)
+            timing = self._without_jumps(timing, smoothing, jerk)
             carry = timing.carry
         assert carry is not None, "a smoothed timing has a carry"
         chosen = chosen_squeeze(self.workcell, squeeze or SqueezeSettings())
         handling = handling or self.workcell.handling
-        places = (
-            self._collisions.standing(carry.pose[0], handling.lift_height),
-            self._collisions.standing(carry.pose[-1], handling.set_down_height),
-        )
-        before, after = self._handling(carry, places, handling)
-        loaded = [*before[1:], _Part("carry", carry_motion(self.timing, carry)), *after[:-1]]
+        around = self._around(carry, handling)
+        before, after = around.before, around.after
+        loaded = [
+            *before[1:],
+            _Part("carry", carry_motion(self.timing, carry), self._proof(around.checker, carry)),
+            *after[:-1],
+        ]
         forces = held(self.timing, chosen, [part.motion for part in loaded])
-        checker = self._collisions.checker(places)
-        free = [self._free(checker, part.line, part.motion) for part in (before[0], after[-1])]
+        first, last = before[0], after[-1]
         press, release = (
             (name, *_pressed(motion, force, end, handling.pressing_rate))
             for name, motion, force, end in (
@@ -140,79 +161,95 @@ class JobModel:
             )
         )
         planned = [
-            (before[0].name, before[0].motion, without_force(before[0].motion), free[0]),
-            (*press, free[0]),
+            (first.name, first.motion, without_force(first.motion), first.proof),
+            (*press, first.proof),
             *(
-                (part.name, part.motion, force, self._proof(checker, part, carry))
+                (part.name, part.motion, force, part.proof)
                 for part, force in zip(loaded, forces, strict=True)
             ),
-            (*release, free[1]),
-            (after[-1].name, after[-1].motion, without_force(after[-1].motion), free[1]),
+            (*release, last.proof),
+            (last.name, last.motion, without_force(last.motion), last.proof),
         ]
         job = Job(
             self.workcell,
             timing,
-            tuple(self._phases(planned, timing)),
+            tuple(self._phases(planned, timing, jerk)),
             chosen,
-            (places[0].bodies, places[1].bodies),
+            around.stands_on,
             self.timing.joint_names,
         )
         refuse_excess(job)
         return job
 
-    def _without_jumps(self, timing: Timing, width: float) -> Timing:
+    def _without_jumps(self, timing: Timing, width: float, jerk: JerkLimits | None) -> Timing:
         """A timing of the same path within the same limits whose acceleration does not jump."""
-        if self._jerk is None:
+        if jerk is None:
             return smoothed(self.timing, timing, width)
         assert timing.carry is not None, "a timing that is to be driven has a carry"
         x, limits = timing.carry.x, limits_of(timing)
-        found = time_with_jerk(self.timing, x, limits, self._jerk).timing
+        found = time_with_jerk(self.timing, x, limits, jerk).timing
         if found.carry is None:
             raise JobError(f"no timing within the limits on jerk: {found.reason}")
         return found
 
-    def _handling(
-        self, carry: Carry, places: tuple[Standing, Standing], handling: Handling
-    ) -> tuple[list[_Part], list[_Part]]:
-        """What moves before the carry, in order, and after it."""
+    def _around(self, carry: Carry, handling: Handling) -> _Around:
+        """What happens around a carry; known where another one has the same ends."""
+        pose, q = carry.pose[[0, -1]], carry.q[[0, -1]].round(_SAME_POSTURE)
+        key = handling, pose.tobytes() + q.tobytes()
+        if key not in self._known:
+            if len(self._known) >= _MOST_KNOWN:
+                self._known.clear()
+            self._known[key] = self._handling(pose, q, handling)
+        return self._known[key]
+
+    def _handling(self, pose: Array, known: Array, handling: Handling) -> _Around:
+        """What moves before a carry, in order, and after it.
+
+        Args:
+            pose: (2, 6) of the box where the carry begins and ends.
+            known: (2, joints) about where the joints are then [rad].
+        """
         cell, speed = self.workcell, handling.pressing_speed
+        places = (
+            self._collisions.standing(pose[0], handling.lift_height),
+            self._collisions.standing(pose[1], handling.set_down_height),
+        )
+        checker = self._collisions.checker(places)
         before: list[_Part] = []
         after: list[_Part] = []
-        q = carry.q[0]
+        q = known[0]
         if places[0].height > 0.0:
-            line = lift_line("lift", places[0].pose, carry.pose[0], handling.lifting_speed)
-            before.append(self._part(line, q, at_end=True))
+            line = lift_line("lift", places[0].pose, pose[0], handling.lifting_speed)
+            before.append(self._part(checker, line, q, at_end=True))
             q = before[0].motion.q[0]
         ways = (handling.stand_off, 0.0)
         line = pad_line(cell, "approach", places[0].pose, ways, speed)
-        before.insert(0, self._part(line, q, at_end=True))
-        q = carry.q[-1]
+        before.insert(0, self._part(checker, line, q, at_end=True))
+        q = known[1]
         if places[1].height > 0.0:
-            line = lift_line("set_down", carry.pose[-1], places[1].pose, handling.lifting_speed)
-            after.append(self._part(line, q, at_end=False))
+            line = lift_line("set_down", pose[1], places[1].pose, handling.lifting_speed)
+            after.append(self._part(checker, line, q, at_end=False))
             q = after[0].motion.q[-1]
         line = pad_line(cell, "retreat", places[1].pose, ways[::-1], speed)
-        after.append(self._part(line, q, at_end=False))
-        return before, after
+        after.append(self._part(checker, line, q, at_end=False))
+        stands_on = (places[0].bodies, places[1].bodies)
+        return _Around(tuple(before), tuple(after), stands_on, checker)
 
-    def _part(self, line: Straight, known: Array, at_end: bool) -> _Part:
+    def _part(self, checker: CollisionChecker, line: Straight, known: Array, at_end: bool) -> _Part:
         q = followed(self.workcell, self._posture, line, known, at_end)
-        return _Part(line.name, timed(self.timing, line, q), line)
+        motion = timed(self.timing, line, q)
+        return _Part(line.name, motion, self._free(checker, line, motion))
 
-    def _proof(self, checker: CollisionChecker, part: _Part, carry: Carry) -> Certificate:
-        if part.line is not None:
-            return self._free(checker, part.line, part.motion)
+    def _proof(self, checker: CollisionChecker, carry: Carry) -> Certificate:
+        """The continuous verdict on the carry."""
         u = np.linspace(0.0, 1.0, PATH_SAMPLES)
         q = np.column_stack([np.interp(u, carry.parameter, column) for column in carry.q.T])
         task = self.workcell.task
         path = SampledPath(task, extended_waypoints(task, carry.x), *joints_of(self.workcell, q))
         return certificates(checker, self._posture, [path])[0]
 
-    def _free(
-        self, checker: CollisionChecker, line: Straight | None, motion: Motion
-    ) -> Certificate:
+    def _free(self, checker: CollisionChecker, line: Straight, motion: Motion) -> Certificate:
         """The continuous verdict on a straight motion."""
-        assert line is not None, "what moves beside the carry moves on a line"
         share = rise(1.0, SAMPLES).value
 
         def at(u: Array) -> tuple[Array, Array, Array]:
@@ -229,13 +266,16 @@ class JobModel:
         return certify(checker, at, np.linspace(0.0, 1.0, FIRST_POINTS))
 
     def _phases(
-        self, planned: Sequence[tuple[str, Motion, Force, Certificate]], timing: Timing
+        self,
+        planned: Sequence[tuple[str, Motion, Force, Certificate]],
+        timing: Timing,
+        jerk: JerkLimits | None,
     ) -> Iterator[Phase]:
         begin = 0.0
         for name, motion, force, proof in planned:
             # A carry that is to keep its jumps is told so elsewhere.
             jumps = name == "carry" and not rests_at_ends(timing)
-            use = phase_use(self.workcell, motion, force, None if jumps else self._jerk)
+            use = phase_use(self.workcell, motion, force, None if jumps else jerk)
             if name == "carry":
                 # The box's turning and the contacts, which no other phase uses more.
                 use = {key: excess.ratio for key, excess in timing.use.items()} | use

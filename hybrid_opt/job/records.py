@@ -16,6 +16,10 @@ PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat"
 """Every phase of a job in order; without a height there is no lift or no set-down."""
 
 
+_STATIC = ("friction", "path speed", "joint position", "least normal force")
+"""Uses that say nothing of how hard a phase drives the cell."""
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """How box and arms move in a phase at n samples; world frame, both arms' joints side by side.
@@ -88,6 +92,12 @@ class Phase:
     def duration(self) -> float:
         """[s]."""
         return self.motion.duration
+
+    @property
+    def most_used(self) -> str:
+        """The limit of arms and box that its motion and its forces use most."""
+        use = {name: ratio for name, ratio in self.use.items() if name not in _STATIC}
+        return max(use, key=lambda name: use[name])
 
     @property
     def effort(self) -> Array:

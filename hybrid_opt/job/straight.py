@@ -26,6 +26,10 @@ TICK = 0.008
 """Phases last a whole number of these [s], so that controllers of 125, 250, 500 and 1000 Hz meet
 their ends."""
 
+LIFTING_ACCELERATION = 0.5
+"""Largest of the box when it is lifted off and set down [m/s^2]: a twentieth of gravity, so that
+these short ways ask for no more force than the carry."""
+
 
 @dataclass(frozen=True)
 class Straight:
@@ -229,4 +233,5 @@ class _Limits:
         ]
         payload = workcell.payload
         jerk = JerkLimits.of(workcell) or JerkLimits(np.full(len(joints[0]), np.inf))
-        return cls(joints[0], joints[1], payload.velocity_max, payload.acceleration_max, jerk)
+        gentle = min(payload.acceleration_max, LIFTING_ACCELERATION)
+        return cls(joints[0], joints[1], payload.velocity_max, gentle, jerk)

@@ -13,21 +13,16 @@ _PHASE_HEAD = ["phase", "begins [s]", "takes [s]", "presses [N]", "most used"]
 
 def job_text(job: Job) -> str:
     """The phases with their times and most used limits, and the forces."""
-    rows = []
-    for phase in job.phases:
-        name, ratio = max(
-            ((key, use) for key, use in phase.use.items() if key not in ("friction", "path speed")),
-            key=lambda item: item[1],
-        )
-        rows.append(
-            [
-                phase.name.replace("_", " "),
-                f"{phase.begin:.3f}",
-                f"{phase.duration:.3f}",
-                f"{phase.force.normal.max():.1f}",
-                f"{100.0 * ratio:.1f} % {name}",
-            ]
-        )
+    rows = [
+        [
+            phase.name.replace("_", " "),
+            f"{phase.begin:.3f}",
+            f"{phase.duration:.3f}",
+            f"{phase.force.normal.max():.1f}",
+            f"{100.0 * phase.use[phase.most_used]:.1f} % {phase.most_used}",
+        ]
+        for phase in job.phases
+    ]
     stands = [" and ".join(names) or "nothing" for names in job.stands_on]
     return "\n".join(
         [

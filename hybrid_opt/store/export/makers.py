@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from symbolic.errors import SettingsError
 from symbolic.robot.urdf import arm_model, robot_urdf, turning_joints
@@ -11,8 +12,8 @@ from symbolic.workcell.records import Robot, Workcell
 ABB = "ABB"
 UR = "UR e-series"
 
-AXES = 6
-"""Robot axes of a target."""
+SIX, SEVEN = 6, 7
+"""Axes of an arm that a language's targets can hold."""
 
 _SIGNS = {
     ABB: re.compile(r"(?<![a-z])(abb|irb|crb|gofa|yumi|swifti)(?![a-z])"),
@@ -42,18 +43,22 @@ def require_maker(workcell: Workcell, maker: str, language: str, any_arm: bool) 
             )
 
 
-def require_axes(workcell: Workcell, language: str) -> None:
-    """Refuse a language whose targets hold six robot axes for arms with other joints.
+def require_axes(workcell: Workcell, language: str, allowed: Sequence[int] = (SIX,)) -> None:
+    """Refuse a language for arms whose joints its targets cannot hold.
+
+    Args:
+        allowed: numbers of turning joints that they can.
 
     Raises:
-        SettingsError: an arm has more joints, or one that slides.
+        SettingsError: an arm has another number of joints, or one that slides.
     """
     for robot in workcell.robots:
         turning = turning_joints(arm_model(robot))
-        if len(turning) != AXES or not all(turning):
+        if len(turning) not in allowed or not all(turning):
+            slide = "" if all(turning) else f", {turning.count(False)} of them sliding"
             raise SettingsError(
-                f"robot {robot.name!r} has {len(turning)} joints; targets of {language} hold "
-                f"{AXES} turning axes, choose another form"
+                f"robot {robot.name!r} has {len(turning)} joints{slide}; targets of {language} "
+                f"hold {' or '.join(map(str, allowed))} turning axes, choose another form"
             )
 
 

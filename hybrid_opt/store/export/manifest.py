@@ -101,6 +101,7 @@ def phase_documents(job: Job) -> list[dict[str, Any]]:
             "duration": phase.duration,
             "peak_normal_force": phase.force.normal.max(axis=0).tolist(),
             "free_of_collisions": phase.certificate.is_free,
+            "most_used": phase.most_used,
             "limits": {name: float(use) for name, use in phase.use.items()},
         }
         for phase in job.phases

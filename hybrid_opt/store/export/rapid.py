@@ -13,13 +13,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.job.sampling import SampledJob
-from hybrid_opt.store.export.makers import ABB, require_axes, require_maker
+from hybrid_opt.store.export.makers import ABB, SEVEN, SIX, require_axes, require_maker
 from hybrid_opt.store.export.options import BundleOptions
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.physics.pose import inverse
 
 TASKS = ("T_ROB1", "T_ROB2")
+TWO_ARMED_TASKS = ("T_ROB_L", "T_ROB_R")
+"""Of two robots, and of the two seven-axis arms of a YuMi."""
+
+EXTRA = 2
+"""Along the chain, the joint of a seven-axis arm that ABB counts as the seventh, `eax_a`."""
+
 MAX_MOVES = 2000
 """A module beyond this many moves is refused: controllers load them slowly or not at all."""
 
@@ -46,11 +52,11 @@ def rapid_files(sampled: SampledJob, options: BundleOptions) -> dict[str, str | 
     """The modules of both tasks.
 
     Raises:
-        SettingsError: an arm is not ABB's or has more than six joints, or the time step is too
-            short or the job too long.
+        SettingsError: an arm is not ABB's or has neither six nor seven turning joints, or the time
+            step is too short or the job too long.
     """
     require_maker(sampled.job.workcell, ABB, "RAPID", options.any_arm)
-    require_axes(sampled.job.workcell, "RAPID")
+    require_axes(sampled.job.workcell, "RAPID", (SIX, SEVEN))
     moves = len(sampled.time) - 1
     step = float(np.diff(sampled.time).min())
     if step < LEAST_MOVE_TIME or moves > MAX_MOVES:
@@ -58,22 +64,29 @@ def rapid_files(sampled: SampledJob, options: BundleOptions) -> dict[str, str | 
             f"{moves} moves of {step:g} s are too many or too short for RAPID; choose a time "
             f"step of at least {LEAST_MOVE_TIME:g} s that gives at most {MAX_MOVES} moves"
         )
+    tasks = _tasks(sampled)
     # RAPID files have Windows line ends.
     return {
-        f"{TASKS[arm]}/Carry{arm + 1}.mod": "\r\n".join(_module(sampled, arm)) + "\r\n"
+        f"{tasks[arm]}/Carry{arm + 1}.mod": "\r\n".join(_module(sampled, arm)) + "\r\n"
         for arm in (0, 1)
     }
 
 
+def _tasks(sampled: SampledJob) -> tuple[str, str]:
+    """Names of both tasks."""
+    two_armed = all(len(joints) == SEVEN for joints in sampled.job.joint_names)
+    return TWO_ARMED_TASKS if two_armed else TASKS
+
+
 def _module(sampled: SampledJob, arm: int) -> Iterator[str]:
-    job, robot = sampled.job, sampled.job.workcell.robots[arm]
+    job, robot, tasks = sampled.job, sampled.job.workcell.robots[arm], _tasks(sampled)
     degrees = np.rad2deg(sampled.arm(arm, sampled.q))
     yield f"MODULE Carry{arm + 1}"
     yield f"  ! {_comment(job.workcell.name)}"
-    yield f"  ! Robot {_comment(robot.name)} in task {TASKS[arm]}"
+    yield f"  ! Robot {_comment(robot.name)} in task {tasks[arm]}"
     yield f"  ! {len(degrees)} positions, {float(sampled.time[-1]):.3f} s"
     yield "  ! Positions alone do not squeeze: CarryForce has to make this arm press."
-    yield f'  PERS tasks carryTasks{{2}} := [["{TASKS[0]}"],["{TASKS[1]}"]];'
+    yield f'  PERS tasks carryTasks{{2}} := [["{tasks[0]}"],["{tasks[1]}"]];'
     yield f"  PERS tooldata carryPad := {_tool_data(sampled, arm)};"
     yield f"  PERS loaddata carryHalfBox := {_load_data(sampled, arm)};"
     yield "  ! Set to TRUE when CarryForce does what it says."
@@ -84,7 +97,7 @@ def _module(sampled: SampledJob, arm: int) -> Iterator[str]:
     yield f"  CONST jointtarget carryFirst := {_target(degrees[0])};"
     yield ""
     yield from _main(sampled)
-    yield from _start_check()
+    yield from _start_check(degrees.shape[1])
     yield from _force_hook(sampled, arm)
     for index, phase in enumerate(job.phases):
         yield f"  PROC Carry_{phase.name}()"
@@ -119,13 +132,14 @@ def _main(sampled: SampledJob) -> Iterator[str]:
     yield ""
 
 
-def _start_check() -> Iterator[str]:
+def _start_check(joints: int) -> Iterator[str]:
     """No move to the first position: the way there is not checked for collisions."""
+    axes = [f"robax.rax_{axis}" for axis in range(1, SIX + 1)]
+    axes += ["extax.eax_a"] if joints == SEVEN else []
     yield "  PROC CarryCheckStart()"
     yield "    VAR jointtarget here;"
     yield "    here := CJointT();"
-    for axis in range(1, 7):
-        joint = f"robax.rax_{axis}"
+    for joint in axes:
         yield f"    IF Abs(here.{joint} - carryFirst.{joint}) > {START_TOLERANCE:g} THEN"
         yield '      TPWrite "Carry: jog the robot to carryFirst, pads away from the box.";'
         yield "      Stop;"
@@ -189,8 +203,11 @@ def _frame(pose: Array) -> str:
 
 
 def _target(degrees: Array) -> str:
-    """A jointtarget without external axes."""
-    return f"[{_numbers(degrees)},[9E9,9E9,9E9,9E9,9E9,9E9]]"
+    """A jointtarget; a seventh axis is an external one to RAPID, other external axes are unused."""
+    if len(degrees) == SIX:
+        return f"[{_numbers(degrees)},[9E9,9E9,9E9,9E9,9E9,9E9]]"
+    robot = np.delete(degrees, EXTRA)
+    return f"[{_numbers(robot)},[{degrees[EXTRA]:.6f},9E9,9E9,9E9,9E9,9E9]]"
 
 
 def _numbers(values: Array) -> str:
