@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,24 @@ from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, Repli
 from hybrid_opt.carry import Carry
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.selection import balanced, peak_normal_forces
-from hybrid_opt.timing import TimingModel, timed_trajectory
+from hybrid_opt.job.plan import JobModel
+from hybrid_opt.timing import TimingLimits, timed_trajectory
 from hybrid_opt.timing.robustness import payload_sensitivity
 from hybrid_opt.work.job import Emit, Executor, Job, answer_all
 from hybrid_opt.work.serial import SerialExecutor
 from studies.report.data_drivable import gather_drivable
+from studies.report.jobs import (
+    RECOMMENDED_LABEL,
+    DrawnJob,
+    JobModelSource,
+    JobRequest,
+    drawn_job,
+)
 from studies.report.reach import reach_map
 from studies.report.records import (
     AlgorithmRuns,
     DrawnCarry,
+    DrivableReport,
     Front,
     ReachMap,
     ReportData,
@@ -34,11 +43,11 @@ from studies.report.records import (
     TimedSelection,
 )
 from studies.terminal_summary import title
-from studies.timing_stage import TimingModelSource
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.workcell.archive import archive_cell
 from symbolic.workcell.decision import initial_decision
+from symbolic.workcell.records import Workcell
 
 INITIAL_LABEL = "hand-made"
 CURVE_POINTS = 12
@@ -65,11 +74,14 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     geometry = build_geometry(workcell)
     algorithms = _algorithms(results, summary, maker)
     carries = _best(results, algorithms, maker)
-    slow: list[Callable[[TimingModel], Any]] = [partial(_reach, geometry)]
+    drivable = gather_drivable(results, summary)
+    slow: list[Callable[[JobModel], Any]] = [partial(_reach, geometry)]
     slow += [partial(_timing, carry.label, carry.x) for carry in carries]
-    job = Job(TimingModelSource(PackedCell.of(archive_cell(workcell))), _called)
-    reach, *timings = answer_all(executor or SerialExecutor(), job, slow)
+    slow += [partial(_job, request) for request in _job_requests(carries, drivable, workcell)]
     archive = archive_cell(workcell)
+    job = Job(JobModelSource(PackedCell.of(archive)), _called)
+    reach, *found = answer_all(executor or SerialExecutor(), job, slow)
+    timings, jobs = found[: len(carries)], found[len(carries) :]
     return ReportData(
         root=results.root,
         workcell=workcell,
@@ -83,9 +95,10 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         initial=carries[0],
         timings=tuple(timings),
         reach=reach,
-        drivable=gather_drivable(results, summary),
         branches=read_branches(results.root),
         simulations=read_simulations(results.root),
+        drivable=drivable,
+        jobs=tuple(jobs),
     )
 
 
@@ -141,18 +154,34 @@ class _CarryMaker:
         return self.carry(front.x[row], label)
 
 
-def _called(model: TimingModel, call: Callable[[TimingModel], Any], emit: Emit) -> Any:
+def _called(model: JobModel, call: Callable[[JobModel], Any], emit: Emit) -> Any:
     return call(model)
 
 
-def _reach(geometry: CellGeometry, model: TimingModel) -> ReachMap:
+def _reach(geometry: CellGeometry, model: JobModel) -> ReachMap:
     return reach_map(geometry, np.random.default_rng(REACH_SEED))
 
 
-def _timing(label: str, x: Array, model: TimingModel) -> TimedSelection:
-    timed = timed_trajectory(model, x, curve_points=CURVE_POINTS)
+def _timing(label: str, x: Array, model: JobModel) -> TimedSelection:
+    timed = timed_trajectory(model.timing, x, curve_points=CURVE_POINTS)
     assert timed.curve is not None
     return TimedSelection(label, timed.report, timed.curve, timed.margins)
+
+
+def _job_requests(
+    carries: Sequence[DrawnCarry], drivable: DrivableReport | None, workcell: Workcell
+) -> list[JobRequest]:
+    """The recommended carry's job, then those of hand-made and selected ones."""
+    found = []
+    if drivable is not None and drivable.recommended is not None:
+        x, force = drivable.recommended[: workcell.task.n_var], float(drivable.recommended[-1])
+        found.append(JobRequest(RECOMMENDED_LABEL, x, TimingLimits(force=force), True))
+    limits = TimingLimits(reference_speed=True)
+    return found + [JobRequest(carry.label, carry.x, limits, True) for carry in carries]
+
+
+def _job(request: JobRequest, model: JobModel) -> DrawnJob:
+    return drawn_job(model, request)
 
 
 def shown(label: str, carry: Carry) -> DrawnCarry:

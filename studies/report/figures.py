@@ -55,7 +55,8 @@ def report_figures(data: ReportData) -> Iterator[ReportFigure]:
     )
     yield ReportFigure(
         "fig06_arm",
-        "The first arm as its collision shapes, and the reach of its pad (paper Figure 6).",
+        f"The arm {data.workcell.robots[0].name} as its collision shapes, and the reach of its pad "
+        "(paper Figure 6).",
         lambda: figures_cell.arm_and_reach(geometry, data.reach, data.initial),
     )
     if data.solved:

@@ -60,7 +60,7 @@ def write_report(
             ("tex", table.latex()),
         ):
             write_atomically(root / TABLES / f"{table.name}.{suffix}", text.encode())
-    document = PageData(data, cell).document()
+    document = PageData(data, cell).document(executor)
     page = root / PAGE
     write_atomically(page, render_page(data, document, tables, pictures).encode())
     done()

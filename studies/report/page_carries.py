@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 import hybrid_opt as ho
 from hybrid_opt.display.scene import packed
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.timing.jerk import drive_with_jerk
+from studies.report.jobs import DrawnJob, JobRequest
 from symbolic.array import Array
 
 MAX_SAMPLES = 60
@@ -19,6 +22,7 @@ MAX_SAMPLES = 60
 DRIVEN = "as robots drive it"
 WITHIN_JERK = "within the limits on jerk"
 ASSUMED = "as the search assumed"
+WHOLE_JOB = "the whole job"
 
 LAWS = {"constant": "constant speed", "ramped": "ramped speed"}
 
@@ -32,25 +36,78 @@ class Shown:
         x: (n_var,) decision vector.
         provenance: how it came about, stored with a saved file.
         jerk: whether it is also shown within the cell's limits on jerk, where it has any.
+        job: the whole job around it, where it is planned already.
     """
 
     label: str
     x: Array
     provenance: str
     jerk: bool = False
+    job: DrawnJob | None = None
+
+
+@dataclass
+class Collected:
+    """The trajectories of a page, as they are put together.
+
+    Attributes:
+        n_var: length of the report's first experiment's decision vectors.
+        trajectories: JSON values.
+        jobs: what to plan a job around, by the trajectory's number.
+    """
+
+    n_var: int
+    trajectories: list[dict[str, Any]] = field(default_factory=list)
+    jobs: dict[int, JobRequest] = field(default_factory=dict)
+
+    def add_job(self, number: int, job: DrawnJob) -> None:
+        """Add a planned job as one more motion of its trajectory, or say why there is none."""
+        trajectory = self.trajectories[number]
+        if job.samples is None:
+            trajectory["jobProblem"] = job.problem
+            return
+        assert job.torque_use is not None, "a planned job uses torques"
+        assert job.contact_torque_use is not None, "a planned job presses"
+        trajectory["motions"].insert(
+            1,
+            {
+                "name": WHOLE_JOB,
+                "peaks": [round(value, 4) for value in job.peaks],
+                "duration": round(job.duration, 5),
+                "payloadLimit": trajectory["motions"][0]["payloadLimit"],
+                "torqueUse": (100.0 * job.torque_use).round(3).tolist(),
+                "contactTorqueUse": (100.0 * job.contact_torque_use).round(3).tolist(),
+                "data": packed(job.samples, np.float32),
+                "remark": job.remark,
+                "phases": [_phase(phase) for phase in job.phases],
+            },
+        )
+
+
+def _phase(phase: Mapping[str, Any]) -> dict[str, Any]:
+    """A phase of a manifest as the page shows it."""
+    most = phase["most_used"]
+    return {
+        "name": phase["name"].replace("_", " "),
+        "begin": round(phase["begin"], 5),
+        "duration": round(phase["duration"], 5),
+        "peaks": [round(value, 4) for value in phase["peak_normal_force"]],
+        "most": most,
+        "use": round(100.0 * phase["limits"][most], 2),
+    }
 
 
 class PageCarries:
     """Collects the trajectories of one cell for the page."""
 
-    def __init__(self, cell: ho.Cell, number: int, sink: list[dict[str, Any]]) -> None:
+    def __init__(self, cell: ho.Cell, number: int, sink: Collected) -> None:
         """Take trajectories of a cell.
 
         Args:
             cell: the cell; under 'optimal' its carries are timed within their force limits, else
                 as close to the reference speeds as limits allow.
             number: of the cell among those whose files the page holds.
-            sink: takes the trajectories as JSON values.
+            sink: takes the trajectories.
         """
         self._cell, self._number, self._sink = cell, number, sink
         self._limit = np.concatenate([robot.torque_max for robot in cell.workcell.robots])
@@ -60,7 +117,8 @@ class PageCarries:
         """Add a trajectory; returns its number on the page."""
         judged = self._cell.carry(shown.x)
         assert judged.judgement is not None, "carries of a cell are judged"
-        driven, problem = self._driven(shown.x)
+        limits = self._limits(shown.x)
+        driven, problem = self._driven(shown.x, limits)
         motions = [] if driven is None else [self._motion(DRIVEN, driven)]
         if shown.jerk:
             motions += self._within_jerk(shown.x)
@@ -73,7 +131,11 @@ class PageCarries:
         if not judged.judgement.feasible:
             name = f"{name} (infeasible)"
         figures = trajectory_figures(judged).items()
-        self._sink.append(
+        number = len(self._sink.trajectories)
+        if not problem and shown.job is None:
+            x = shown.x[: self._sink.n_var]
+            self._sink.jobs[number] = JobRequest(shown.label, x, limits)
+        self._sink.trajectories.append(
             {
                 "label": f"{name}: {self._values(judged, driven)}",
                 "objectives": [float(value) for value in values.values()],
@@ -86,18 +148,24 @@ class PageCarries:
                 "provenance": {"source": shown.provenance},
             }
         )
-        return len(self._sink) - 1
+        if shown.job is not None:
+            self._sink.add_job(number, shown.job)
+        return number
 
     def point(self, number: int) -> tuple[float, float]:
         """Largest normal force [N] and duration [s] of a trajectory as its robots drive it."""
-        motion = self._sink[number]["motions"][0]
+        motion = self._sink.trajectories[number]["motions"][0]
         return max(motion["peaks"]), motion["duration"]
 
     def _values(self, judged: ho.Carry, driven: ho.Carry | None) -> str:
-        """What it is named by: time and force where they are what is minimised, else forces."""
+        """What it is named by: what is minimised, forces and times with their units."""
         if self._optimal:
             carry = driven or judged
             return f"{carry.duration:.2f} s, {carry.peak_normal_force.max():.2f} N"
+        assert judged.judgement is not None, "carries of a cell are judged"
+        found = judged.judgement.objectives
+        if tuple(found) != PAPER_OBJECTIVES:
+            return ", ".join(f"{name.replace('_', ' ')} {found[name]:.4f}" for name in found)
         return ", ".join(
             f"{robot.name} {force:.2f} N"
             for robot, force in zip(
@@ -105,11 +173,13 @@ class PageCarries:
             )
         )
 
-    def _driven(self, x: Array) -> tuple[ho.Carry | None, str]:
-        """The carry as robots drive it, or why they cannot."""
-        limits = ho.TimingLimits(reference_speed=True)
+    def _limits(self, x: Array) -> ho.TimingLimits:
         if self._optimal:
-            limits = ho.TimingLimits(force=float(x[-1]))
+            return ho.TimingLimits(force=float(x[-1]))
+        return ho.TimingLimits(reference_speed=True)
+
+    def _driven(self, x: Array, limits: ho.TimingLimits) -> tuple[ho.Carry | None, str]:
+        """The carry as robots drive it, or why they cannot."""
         timing = ho.time_path(self._cell, x, limits)
         return timing.carry, "" if timing.ok else f"robots cannot drive it: {timing.reason}"
 

@@ -8,10 +8,14 @@ from typing import Any
 import numpy as np
 
 import hybrid_opt as ho
+from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.display.scene import packed, scene_data
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.work.job import Executor, Job, answer_all
+from hybrid_opt.work.serial import SerialExecutor
 from studies.drivable import is_drivable
-from studies.report.page_carries import PageCarries, Shown
+from studies.report.jobs import RECOMMENDED_LABEL, JobModelSource, drawn_job
+from studies.report.page_carries import Collected, PageCarries, Shown
 from studies.report.page_views import FrontView, drive_look
 from studies.report.records import AlgorithmRuns, DrawnCarry, DrivableReport, Front, ReportData
 from studies.report.style import HAND_MADE, LineStyle, series
@@ -21,7 +25,7 @@ from symbolic.workcell.archive import CellArchive, archive_to_json
 MAX_CLOUD = 1500
 """Feasible candidates per algorithm in the background of the fronts."""
 
-MAX_FRONT = 100
+MAX_FRONT = 40
 """Trajectories of one front on the page, spread evenly over it."""
 
 CURVE_MEMBERS = 6
@@ -55,12 +59,17 @@ class PageData:
             cell: of the first experiment, with its objectives.
         """
         self._data, self._cell = data, cell
-        self._trajectories: list[dict[str, Any]] = []
+        self._collected = Collected(data.workcell.task.n_var)
+        self._planned = {job.label: job for job in data.jobs}
         self._lists: list[dict[str, Any]] = []
         self._cells: list[CellArchive] = []
 
-    def document(self) -> dict[str, Any]:
-        """The page's data as JSON values."""
+    def document(self, executor: Executor | None = None) -> dict[str, Any]:
+        """The page's data as JSON values.
+
+        Args:
+            executor: who plans the jobs, None for this process.
+        """
         data = self._data
         views = []
         first = 0
@@ -71,6 +80,7 @@ class PageData:
             view, picked = self._search_view()
             views.append(view)
             first = first if data.drivable is not None else picked
+        self._plan_jobs(executor or SerialExecutor())
         contacts = data.workcell.contacts
         rest = data.static[:2]
         known_rest = bool(np.isfinite(rest).all()) and len(rest) == 2
@@ -81,16 +91,23 @@ class PageData:
             "patchRadius": min(contact.patch_radius for contact in contacts),
             "restForce": float(force.max()) if known_rest else None,
             "first": first,
-            "trajectories": self._trajectories,
+            "trajectories": self._collected.trajectories,
             "views": views,
             "lists": self._lists,
             "cells": [_cell_json(archive) for archive in self._cells],
             **scene_data(data.geometry, data.carries[-1].timed),
         }
 
+    def _plan_jobs(self, executor: Executor) -> None:
+        """Plan the whole job around every trajectory that robots can drive."""
+        jobs = self._collected.jobs
+        plan = Job(JobModelSource(PackedCell.of(self._data.archive)), drawn_job)
+        for number, job in zip(jobs, answer_all(executor, plan, list(jobs.values())), strict=True):
+            self._collected.add_job(number, job)
+
     def _carries(self, cell: ho.Cell, archive: CellArchive) -> PageCarries:
         self._cells.append(archive)
-        return PageCarries(cell, len(self._cells) - 1, self._trajectories)
+        return PageCarries(cell, len(self._cells) - 1, self._collected)
 
     def _drive_view(self, drivable: DrivableReport) -> dict[str, Any]:
         """Time against force of hand-made path, the other experiment's optimum and the fronts."""
@@ -104,7 +121,8 @@ class PageData:
             found = self._data.summary.recommendation
             source = "" if found is None else found.source
             title = f"{RECOMMENDED} ({source})"
-            shown = Shown(title, drivable.recommended, source, jerk=True)
+            job = self._planned.get(RECOMMENDED_LABEL)
+            shown = Shown(title, drivable.recommended, source, jerk=True, job=job)
             member = carries.add(shown)
             always.append(np.array([carries.point(member)]))
             view.add(RECOMMENDED, [member], always[0], CHOICE)
@@ -135,6 +153,7 @@ class PageData:
         for carry, timed, look in drawn:
             known = np.isfinite(timed.curve.duration)
             force, duration = timed.curve.force[known], timed.curve.duration[known]
+            source = self._source(carry)
             label = carry.label if carry is self._data.initial else f"{carry.label}: least force"
             view.lines.append(
                 {
@@ -147,7 +166,7 @@ class PageData:
             )
             low, high = task.force_limit
             members = [
-                carries.add(Shown(label, np.append(carry.x[: task.n_path], limit), label))
+                carries.add(Shown(source, np.append(carry.x[: task.n_path], limit), source))
                 for limit in force[_spread(len(force), CURVE_MEMBERS)]
                 if low <= limit <= high
             ]
@@ -156,13 +175,23 @@ class PageData:
             view.add(f"{label}, timed", members, points, style)
             self._lists.append({"label": f"{label}, timed", "members": members})
 
+    def _source(self, carry: DrawnCarry) -> str:
+        """Whose a trajectory is: of which algorithm and replica, where it is no hand-made one."""
+        for algorithm in self._data.algorithms:
+            if carry is algorithm.best:
+                return f"{carry.label}, replica {algorithm.shown.replica}: least force"
+        return carry.label
+
     def _search_view(self) -> tuple[dict[str, Any], int]:
         """The fronts of the first experiment; also the trajectory to begin with."""
         data = self._data
         carries = self._carries(self._cell, data.archive)
         titles = [*data.objective_titles, "", ""]
         view = FrontView("The search's objectives", f"{titles[0]} [-]", f"{titles[1]} [-]")
-        picked = [carries.add(_of(carry)) for carry in data.carries]
+        picked = []
+        for carry in data.carries:
+            source, job = self._source(carry), self._planned.get(carry.label)
+            picked.append(carries.add(Shown(source, carry.x, source, job=job)))
         self._lists.append({"label": "Hand-made and selected", "members": picked})
         selected = np.array([carry.objectives for carry in data.carries])
         searched = [selected[1:] if len(picked) > 1 else selected]
@@ -187,10 +216,6 @@ class PageData:
         first = np.concatenate([points[:, :2] for points in searched])
         document = view.document(first if two else np.zeros((0, 2)))
         return document, picked[-1] if len(picked) == 1 else picked[1]
-
-
-def _of(carry: DrawnCarry) -> Shown:
-    return Shown(carry.label, carry.x, carry.label)
 
 
 def _look(look: LineStyle, opened: bool) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from hybrid_opt.timing import ForceCurve, TimingReport
 from hybrid_opt.timing.robustness import Margin, PayloadSensitivity
 from studies.drivable import ReplicaFront
 from studies.jerk_costs import JerkCosts
+from studies.report.jobs import DrawnJob
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.workcell.archive import CellArchive
@@ -186,6 +187,7 @@ class ReportData:
         drivable: the drivable experiment, None without one.
         branches: how the start branches were decided, None where the workcell decides them.
         simulations: of the carries that were driven in the simulated cell, empty without.
+        jobs: the whole jobs around the recommended, the hand-made and the selected trajectories.
     """
 
     root: Path
@@ -203,6 +205,7 @@ class ReportData:
     drivable: DrivableReport | None = None
     branches: BranchCompetition | None = None
     simulations: tuple[StoredSimulation, ...] = ()
+    jobs: tuple[DrawnJob, ...] = ()
 
     @property
     def solved(self) -> tuple[AlgorithmRuns, ...]:

@@ -14,6 +14,7 @@ from studies.drivable import is_drivable
 from studies.jerk_costs import HEAD, NOTE, JerkCosts
 from studies.report.records import AlgorithmRuns, DrawnCarry, ReportData
 from studies.report.table_text import NOTHING, Table, number
+from studies.report.tables_job import phases
 from studies.simulation_text import HEADINGS, MEANING, simulation_rows
 from studies.terminal_summary import PAPER
 
@@ -38,6 +39,9 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
         tables.append(rank_tests(data))
     if data.timings:
         tables.append(timings(data))
+    if data.jobs:
+        left, right = (robot.name for robot in data.workcell.robots)
+        tables.append(phases(data.jobs, (left, right)))
     if any(selection.margins for selection in data.timings):
         tables.append(margins(data))
     return tuple(tables)

@@ -20,6 +20,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 from hybrid_opt.cell import Cell
 from hybrid_opt.store.replay import replay
 from hybrid_opt.store.trajectory_file import read_trajectory
+from studies.report import page_data
 from studies.report.generate import write_report
 from studies.report.records import ReportData
 from tests.studies.test_report_page import HOSTILE, with_hostile_names
@@ -146,7 +147,7 @@ def test_a_click_on_a_point_selects_its_trajectory(browser: webdriver.Chrome, re
     until(browser, lambda: state(browser)["selected"] in group)
     chosen = state(browser)["selected"]
     carry = browser.execute_script(
-        "return report.data.trajectories[arguments[0]].motions[0]", chosen
+        "return report.data.trajectories[arguments[0]].motions[report.state.motion]", chosen
     )
     shown = browser.find_element(By.ID, "figures-of-choice").text
     assert f"{carry['peaks'][0]:.2f} N" in shown
@@ -206,14 +207,17 @@ def test_pictures_and_timings_can_be_switched(browser: webdriver.Chrome, report:
     for option in browser.find_elements(By.CSS_SELECTOR, "#motion option"):
         option.click()
         moments.append(browser.find_element(By.ID, "figures-of-choice").text)
-    assert len(moments) == len(set(moments)) == 2
+    assert len(moments) == len(set(moments)) == 3
+    # The chosen kind of timing stays chosen.
+    browser.execute_script("report.select(report.data.views[1].groups[0].members[1])")
+    assert "as the search assumed" in browser.find_element(By.ID, "figures-of-choice").text
 
 
 def test_plays_pauses_and_scrubs(browser: webdriver.Chrome, report: Path) -> None:
     opened(browser, report)
     still = scene_hash(browser)
     browser.find_element(By.ID, "play").click()
-    until(browser, lambda: state(browser)["share"] > 0.02)
+    until(browser, lambda: state(browser)["share"] > 0.1)
     browser.find_element(By.ID, "play").click()
     assert not state(browser)["playing"]
     stopped = state(browser)["share"]
@@ -226,9 +230,39 @@ def test_plays_pauses_and_scrubs(browser: webdriver.Chrome, report: Path) -> Non
     )
     end = browser.find_element(By.ID, "moment").text
     duration = browser.execute_script(
-        "return report.data.trajectories[report.state.selected].motions[0].duration"
+        "const s = report.state, chosen = report.data.trajectories[s.selected];"
+        "return chosen.motions[s.motion].duration"
     )
-    assert end == f"{duration:.2f} s"
+    assert end == f"{duration:.2f} s, retreat"
+
+
+def test_the_whole_job_is_played_with_its_phases_named(
+    browser: webdriver.Chrome, report: Path
+) -> None:
+    opened(browser, report)
+    job = browser.execute_script(
+        "return report.data.trajectories[report.state.selected].motions[report.state.motion]"
+    )
+    names = [phase["name"] for phase in job["phases"]]
+    assert names[0] == "approach"
+    assert "carry" in names
+    strip = browser.find_elements(By.CSS_SELECTOR, "#phases button")
+    assert [button.text for button in strip] == names
+    for k, phase in enumerate(job["phases"]):
+        middle = (phase["begin"] + phase["duration"] / 2.0) / job["duration"]
+        browser.execute_script("report.seek(arguments[0])", middle)
+        assert browser.find_element(By.ID, "moment").text.endswith(f" s, {phase['name']}")
+        current = browser.find_elements(By.CSS_SELECTOR, "#phases [aria-current='true']")
+        assert [button.text for button in current] == [names[k]]
+    strip[names.index("carry")].click()
+    begin = job["phases"][names.index("carry")]["begin"]
+    assert browser.find_element(By.ID, "moment").text == f"{begin:.2f} s, carry"
+    rows = browser.find_elements(By.CSS_SELECTOR, "#phase-table tbody tr")
+    assert [row.find_element(By.TAG_NAME, "td").text for row in rows] == names
+    # The carry alone has no phases to play, but still the job's table.
+    browser.find_elements(By.CSS_SELECTOR, "#motion option")[0].click()
+    assert browser.find_elements(By.CSS_SELECTOR, "#phases button") == []
+    assert len(browser.find_elements(By.CSS_SELECTOR, "#phase-table tbody tr")) == len(names)
 
 
 def test_playing_ends_at_the_goal(browser: webdriver.Chrome, report: Path) -> None:
@@ -288,8 +322,9 @@ def test_fits_the_window(
 
 
 def test_hostile_names_are_shown_as_text(
-    browser: webdriver.Chrome, data: ReportData, tmp_path: Path
+    browser: webdriver.Chrome, data: ReportData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(page_data, "MAX_FRONT", 2)
     hostile = write_report(
         tmp_path, with_hostile_names(data), Cell(data.workcell), with_paper=False
     )

@@ -18,8 +18,13 @@ import hybrid_opt as ho
 from hybrid_opt.branches import BranchCompetition, PairResult
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.job.plan import JobModel
+from hybrid_opt.robust.squeeze import SqueezeSettings
 from studies.recommendation_text import recommendation_text
+from studies.report import page_data
 from studies.report.generate import write_report
+from studies.report.jobs import pressure_shift
+from studies.report.page_carries import Collected, PageCarries, Shown
 from studies.report.page_data import PageData
 from studies.report.records import ReportData
 
@@ -107,7 +112,10 @@ def test_the_policy_allows_exactly_the_pages_scripts(text: str) -> None:
     assert len(scripts) == 4
 
 
-def test_hostile_names_stay_text(data: ReportData, tmp_path: Path, text: str) -> None:
+def test_hostile_names_stay_text(
+    data: ReportData, tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_data, "MAX_FRONT", 2)
     hostile = write_report(
         tmp_path, with_hostile_names(data), Cell(data.workcell), with_paper=False
     ).read_text("utf-8")
@@ -158,7 +166,8 @@ def test_every_point_shows_what_robots_drive(data: ReportData, document: dict[st
         x = entry.front.x[k]
         timing = ho.time_path(cell, x, ho.TimingLimits(force=float(x[-1])))
         shown = document["trajectories"][group["members"][k]]
-        (motion,) = shown["motions"]
+        motion, job = shown["motions"]
+        assert job["name"] == "the whole job"
         assert motion["duration"] == pytest.approx(timing.duration, abs=1e-5)
         assert max(motion["peaks"]) <= x[-1] * 1.005
         assert (group["x"][k], group["y"][k]) == (max(motion["peaks"]), motion["duration"])
@@ -171,8 +180,84 @@ def test_every_point_shows_what_robots_drive(data: ReportData, document: dict[st
     searched = document["trajectories"][document["views"][1]["groups"][0]["members"][0]]
     assert [motion["name"] for motion in searched["motions"]] == [
         "as robots drive it",
+        "the whole job",
         "as the search assumed: ramped speed",
     ]
+
+
+def test_every_point_has_the_phases_of_its_job(
+    data: ReportData, document: dict[str, Any], text: str
+) -> None:
+    """As `plan_job` plans them around the same timing."""
+    assert data.drivable is not None
+    entry = data.drivable.fronts[0]
+    label = entry.front.label
+    group = next(g for g in document["views"][0]["groups"] if g["label"] == label)
+    x = entry.front.x[0]
+    cell = Cell(data.workcell)
+    limits = ho.TimingLimits(force=float(x[-1]))
+    timing = ho.time_path(cell, x[: data.workcell.task.n_var], limits)
+    job = JobModel(cell.compiled, cell.timing_model).plan(timing, within_jerk=False)
+    shown = document["trajectories"][group["members"][0]]["motions"][1]
+    assert [phase["name"] for phase in shown["phases"]] == [
+        phase.name.replace("_", " ") for phase in job.phases
+    ]
+    assert shown["duration"] == pytest.approx(job.duration, abs=1e-5)
+    assert shown["peaks"] == pytest.approx(job.peak_normal_force, abs=1e-3)
+    for mine, phase in zip(shown["phases"], job.phases, strict=True):
+        assert mine["duration"] == pytest.approx(phase.duration, abs=1e-5)
+        assert mine["use"] == pytest.approx(100.0 * phase.use[mine["most"]], abs=1e-2)
+    samples = np.frombuffer(base64.b64decode(shown["data"]), "<f4").reshape(-1, 23)
+    assert np.all(np.diff(samples[:, 0]) > 0.0)
+    np.testing.assert_allclose(samples[0, 7:19], job.phases[0].motion.q[0], atol=1e-5)
+    np.testing.assert_allclose(samples[-1, 7:19], job.phases[-1].motion.q[-1], atol=1e-5)
+    np.testing.assert_allclose(samples[[0, -1], 19:21], 0.0)
+    timed = document["trajectories"][document["first"]]
+    assert [motion["name"] for motion in timed["motions"]][:2] == [
+        "as robots drive it",
+        "the whole job",
+    ]
+    assert "Phases of the whole jobs." in text
+    assert [job.label for job in data.jobs][:2] == ["recommended", "hand-made"]
+    assert not any(job.problem for job in data.jobs)
+
+
+def test_points_are_named_by_what_was_minimised(data: ReportData) -> None:
+    cell = Cell(data.workcell, ("mean_force", "friction_use"))
+    found = Collected(data.workcell.task.n_var)
+    PageCarries(cell, 0, found).add(Shown("NSGA-II, replica 1", data.initial.x, ""))
+    (trajectory,) = found.trajectories
+    mean, friction = trajectory["objectives"]
+    assert trajectory["label"] == (
+        f"NSGA-II, replica 1: mean force {mean:.4f}, friction use {friction:.4f}"
+    )
+
+
+def test_selected_trajectories_name_their_replica(
+    data: ReportData, document: dict[str, Any]
+) -> None:
+    best = data.solved[0].best
+    assert best is not None
+    name = f"{best.label}, replica {data.solved[0].shown.replica}: least force: "
+    labels = [trajectory["label"] for trajectory in document["trajectories"]]
+    # In both pictures: once as it was selected, and at some of the forces of its curve.
+    assert sum(label.startswith(name) for label in labels) >= 2
+
+
+def test_pressure_shifts_are_those_of_the_plan(data: ReportData) -> None:
+    """Without more squeeze than planned, the wrenches put the centre of pressure where the plan
+    has it."""
+    cell = Cell(data.workcell)
+    timing = ho.time_path(cell, data.initial.x, ho.TimingLimits(reference_speed=True))
+    model = JobModel(cell.compiled, cell.timing_model)
+    settings = SqueezeSettings(factor=1.0, smoothing=0.002)
+    job = model.plan(timing, settings, within_jerk=False)
+    carry = job.timing.carry
+    assert carry is not None
+    phase = job.phase("carry")
+    shift = pressure_shift(job, phase)[: len(carry)]
+    extra = phase.force.normal[: len(carry)] / carry.normal_force
+    np.testing.assert_allclose(shift * extra, carry.pressure_shift, atol=2e-5)
 
 
 def test_the_page_begins_with_the_recommended_carry(
@@ -201,7 +286,10 @@ def test_the_first_look_is_not_squashed(document: dict[str, Any], data: ReportDa
         assert low <= inside.min() <= inside.max() <= high
 
 
-def test_polished_fronts_stand_beside_the_searchs(hybrid_data: ReportData) -> None:
+def test_polished_fronts_stand_beside_the_searchs(
+    hybrid_data: ReportData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PageData, "_plan_jobs", lambda *_: None)  # not what is looked at
     document = PageData(hybrid_data, Cell(hybrid_data.workcell)).document()
     groups = document["views"][1]["groups"]
     assert [group["label"] for group in groups] == [

@@ -35,7 +35,7 @@
     return motion.samples;
   }
 
-  const state = { selected: -1, motion: 0, view: 0, whole: false, share: 0, playing: false,
+  const state = { selected: -1, motion: 0, kind: "the whole job", view: 0, whole: false, share: 0, playing: false,
     last: 0, marked: 0 };
   let scene = null;
   try {
@@ -138,13 +138,58 @@
       xaxis: { title: { text: "time [s]", standoff: 6 }, range: [0, end] },
       yaxis: { title: { text: title }, rangemode: "normal" },
       legend: { orientation: "h", yref: "container", y: 0.99, yanchor: "top",
-        font: { size: 10 } }, shapes: [cursor(0)] };
+        font: { size: 10 } }, shapes: marks(motion, 0) };
     Plotly.react(id, traces, layout, PLAIN);
   }
 
   function cursor(time) {
     return { type: "line", x0: time, x1: time, yref: "paper", y0: 0, y1: 1,
       line: { color: "#b00020", width: 1 } };
+  }
+
+  /* The cursor, and where phases begin. */
+  function marks(motion, time) {
+    const begins = (motion.phases || []).slice(1).map((phase) => ({ type: "line",
+      x0: phase.begin, x1: phase.begin, yref: "paper", y0: 0, y1: 1, layer: "below",
+      line: { color: "#d8dde1", width: 1 } }));
+    return [...begins, cursor(time)];
+  }
+
+  /* The phase of a time, -1 where a motion has none. */
+  function phaseAt(motion, time) {
+    const phases = motion.phases || [];
+    let found = phases.length - 1;
+    while (found > 0 && phases[found].begin > time + 1e-4) found -= 1;
+    return found;
+  }
+
+  /* The job's phases: a strip below the picture, and a table. */
+  function fillPhases() {
+    const job = carries[state.selected].motions.find((m) => m.phases);
+    const phases = job ? job.phases : [];
+    const playing = Boolean(shown().phases);
+    $("phases").replaceChildren(...(playing ? phases : []).map((phase) => {
+      const made = document.createElement("button");
+      made.type = "button";
+      made.textContent = phase.name;
+      made.style.flexGrow = String(phase.duration);
+      made.title = `${phase.begin.toFixed(2)} s to ${(phase.begin + phase.duration).toFixed(2)} s`;
+      made.addEventListener("click", () => seek(phase.begin / job.duration));
+      return made;
+    }));
+    $("phase-section").hidden = !phases.length;
+    const row = (cells, kind) => {
+      const line = document.createElement("tr");
+      cells.forEach((text) => {
+        line.appendChild(document.createElement(kind)).textContent = text;
+      });
+      return line;
+    };
+    $("phase-table").tHead.replaceChildren(row(["phase", "begins [s]", "takes [s]",
+      ...data.robots.map((robot) => `${robot} presses [N]`), "most used limit"], "th"));
+    $("phase-table").tBodies[0].replaceChildren(...phases.map((phase) => row([phase.name,
+      phase.begin.toFixed(2), phase.duration.toFixed(2), ...phase.peaks.map((f) => f.toFixed(1)),
+      `${phase.most} ${phase.use.toFixed(0)} %`], "td")));
   }
 
   /* One arm's joints of a list of both arms'. */
@@ -184,10 +229,11 @@
 
   function select(index) {
     state.selected = index;
-    state.motion = 0;
     const carry = carries[index];
+    state.motion = Math.max(0, carry.motions.findIndex((m) => m.name === state.kind));
     $("chooser").value = String(index);
     $("motion").replaceChildren(...carry.motions.map((m, k) => new Option(m.name, String(k))));
+    $("motion").value = String(state.motion);
     $("motion").disabled = carry.motions.length < 2;
     $("save").disabled = !data.cells[carry.cell];
     if (data.views.some((view) => view.groups.length)) mark();
@@ -199,13 +245,16 @@
     const carry = carries[state.selected];
     const motion = shown();
     const peaks = data.robots.map((robot, i) => `${robot} ${motion.peaks[i].toFixed(2)} N`);
-    $("figures-of-choice").textContent =
-      `${motion.duration.toFixed(2)} s, peak normal forces ${peaks.join(", ")}, payload at the ` +
-      `limit ${motion.payloadLimit.toFixed(2)} kg (${motion.name})` +
-      (carry.problem ? `; ${carry.problem}` : "");
+    const what = motion.phases ? `commanded at most ${peaks.join(", ")} (${motion.remark})`
+      : `peak normal forces ${peaks.join(", ")}`;
+    const problems = [carry.problem, carry.jobProblem && `no whole job: ${carry.jobProblem}`];
+    $("figures-of-choice").textContent = [`${motion.duration.toFixed(2)} s, ${what}, payload at ` +
+      `the limit ${motion.payloadLimit.toFixed(2)} kg (${motion.name})`,
+      ...problems.filter((text) => text)].join("; ");
     const rest = data.restForce === null ? []
       : [{ label: "level payload at rest", value: data.restForce, colour: "#b00020" }];
     lines("force-plot", motion, COLUMNS.force, 1, "normal force [N]", rest);
+    fillPhases();
     lines("pressure-plot", motion, COLUMNS.shift, 1000, "pressure shift [mm]",
       [{ label: "patch radius", value: 1000 * data.patchRadius, colour: "#000" }]);
     drawTorque(motion);
@@ -250,12 +299,16 @@
       scene.place(mixed.subarray(COLUMNS.pose, COLUMNS.q), mixed.subarray(COLUMNS.q, COLUMNS.force));
     }
     $("scrub").value = String(Math.round(1000 * state.share));
-    $("moment").textContent = time.toFixed(2) + " s";
+    const phase = phaseAt(shown(), time);
+    $("moment").textContent = time.toFixed(2) + " s" +
+      (phase < 0 ? "" : ", " + shown().phases[phase].name);
+    [...$("phases").children].forEach((button, i) =>
+      button.setAttribute("aria-current", String(i === phase)));
     const now = performance.now();
     if (!state.playing || now - state.marked > 120) {
       state.marked = now;
       ["force-plot", "pressure-plot"].forEach((id) =>
-        Plotly.relayout(id, { shapes: [cursor(time)] }));
+        Plotly.relayout(id, { shapes: marks(shown(), time) }));
     }
   }
 
@@ -304,6 +357,7 @@
   $("chooser").addEventListener("change", (event) => select(Number(event.target.value)));
   $("motion").addEventListener("change", (event) => {
     state.motion = Number(event.target.value);
+    state.kind = shown().name;
     show();
   });
   $("save").addEventListener("click", save);
