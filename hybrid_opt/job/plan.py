@@ -127,8 +127,11 @@ class JobModel:
 
         Raises:
             SettingsError: the timing failed, or the squeeze is not possible.
-            JobError: an arm does not reach a place, something collides, or a limit is exceeded.
+            JobError: the pads do not face one another, an arm does not reach a place, something
+                collides, or a limit is exceeded.
         """
+        if not self.workcell.has_facing_pads:
+            raise JobError("whole jobs are those of two round pads that face one another")
         carry = timing.carry
         if carry is None or not timing.ok:
             raise SettingsError(

@@ -214,6 +214,12 @@ def test_what_presses_too_hard_is_refused() -> None:
         rack_jobs().plan(rack_timing(), SqueezeSettings(factor=8.0))
 
 
+def test_pads_that_do_not_face_one_another_have_no_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(rack().workcell), "has_facing_pads", False)
+    with pytest.raises(JobError, match="face one another"):
+        rack_jobs().plan(rack_timing())
+
+
 def test_a_failed_timing_has_no_job() -> None:
     failed = time_path(rack().timing_model, rack().initial, TimingLimits(force=30.0))
     with pytest.raises(SettingsError, match="no timing to export"):
