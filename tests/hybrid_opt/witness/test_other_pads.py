@@ -1,0 +1,73 @@
+"""Boxes at rest between other pads, simulated: they slip just below the planned forces."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hybrid_opt.witness.drive import Drive
+from hybrid_opt.witness.scene import SimulationSettings, presses_on_box, rim
+from hybrid_opt.witness.simulate import Witness
+from symbolic.physics.payload_load import load_function
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
+from tests.symbolic.cells import ROOT, call, with_payload
+
+pytest.importorskip("mujoco")
+
+DURATION = 0.5
+
+
+def shipped(name: str) -> Workcell:
+    return load(ROOT / "studies" / "workcells" / f"{name}.toml")
+
+
+def at_rest(cell: Workcell, settings: SimulationSettings) -> Drive:
+    """Level and still, pressed with the planned force."""
+    still = np.zeros(6)
+    press = call(load_function(cell), still, still, still)["normal_force"][1]
+    n = int(DURATION / settings.time_step)
+    none = np.zeros((n, 3))
+    return Drive(
+        leader=0,
+        time=settings.time_step * np.arange(n) - settings.settle,
+        position=none,
+        velocity=none,
+        acceleration=none,
+        rotation=np.tile(np.eye(3), (n, 1, 1)),
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        spin=none,
+        spin_rate=none,
+        press=np.full(n, press),
+        tilt=np.zeros((n, 2, 2)),
+        own=np.zeros(n),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "centre_of_mass"), [("drum", (-0.04, 0.0, 0.0)), ("fork", (0.0, 0.0, 0.0))]
+)
+def test_the_planned_forces_are_the_least(
+    name: str, centre_of_mass: tuple[float, float, float]
+) -> None:
+    """A drum between pads 30 degrees off opposite; a crate held by three pads."""
+    cell = with_payload(shipped(name), centre_of_mass=np.array(centre_of_mass))
+    settings = SimulationSettings()
+    witness, drive = Witness(cell, settings), at_rest(cell, settings)
+    assert not witness.simulate(drive, 0.98).holds
+    assert witness.simulate(drive, 1.02).holds
+
+
+def test_pads_press_on_plates_where_the_payload_is_no_box() -> None:
+    assert presses_on_box(shipped("fork"))
+    assert presses_on_box(shipped("uneven"))
+    assert not presses_on_box(shipped("drum"))
+
+
+def test_a_rectangles_rim_runs_through_its_corners() -> None:
+    (first, _) = shipped("drum").contacts
+    found = rim(first, 8)
+    assert found.shape == (8, 2)
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [0.03, 0.015]
+    np.testing.assert_allclose(found[::2], corners)
+    np.testing.assert_allclose(found[1::2], (corners + np.roll(corners, -1, axis=0)) / 2)
