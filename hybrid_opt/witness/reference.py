@@ -12,8 +12,9 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.timing.model import contact_torque
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.physics.pose import inverse
 from symbolic.robot.model import build_robot_model
-from symbolic.workcell.records import Robot, Workcell
+from symbolic.workcell.records import Contact, Robot, Workcell
 
 SETTLE = 0.3
 """Time at rest before a carry begins [s]."""
@@ -190,8 +191,10 @@ def press_torque(workcell: Workcell, q: Array) -> Array:
     """(n, all joints) torques of each arm's joints that press with 1 N, at joints (n, all)."""
     return np.concatenate(
         [
-            _press_torque(robot, values)
-            for robot, values in zip(workcell.robots, _split(workcell, q), strict=True)
+            _press_torque(robot, contact, values)
+            for robot, contact, values in zip(
+                workcell.robots, workcell.contacts, _split(workcell, q), strict=True
+            )
         ],
         axis=1,
     )
@@ -208,14 +211,18 @@ def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
     return np.concatenate(found, axis=1)
 
 
-def _press_torque(robot: Robot, q: Array) -> Array:
+def _press_torque(robot: Robot, contact: Contact, q: Array) -> Array:
+    """Several pads press alike."""
+    T_flange_box = robot.T_flange_pad @ inverse(contact.T_box_pad)
+    pads = [T_flange_box @ pad.T_box_pad for pad in contact.further]
+    places = np.mean([robot.T_flange_pad, *pads], axis=0)
     arm = build_robot_model(robot)
     data, flange = arm.model.createData(), arm.flange_id
     torque = np.empty_like(q)
     for k, row in enumerate(q):
         J = pin.computeFrameJacobian(arm.model, data, row, flange, pin.LOCAL)
-        force = robot.T_flange_pad[:3, 2]
-        torque[k] = J[:3].T @ force + J[3:].T @ np.cross(robot.T_flange_pad[:3, 3], force)
+        force = places[:3, 2]
+        torque[k] = J[:3].T @ force + J[3:].T @ np.cross(places[:3, 3], force)
     return torque
 
 

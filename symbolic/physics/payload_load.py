@@ -51,6 +51,15 @@ nominal contact point, world axes [N, N m].
 SIZES = {"pose": 6, "rate": 6, "second_rate": 6, "friction": 2, "centre_of_mass": 3}
 """Inputs of `uncertain_load_function` and how many entries each has."""
 
+SAMPLE_SIZES = (
+    ("pose", 6),
+    ("force", 3),
+    ("moment", 3),
+    ("friction", 2),
+    ("centre_of_mass", 3),
+)
+"""Inputs of the functions that allocate anew; force and moment in the world frame."""
+
 RESIDUAL_TOLERANCE = 1e-9
 """Moment that counts as carried, as a share of the force times the distance of the contacts."""
 
@@ -96,7 +105,7 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
     """
     if workcell.task.allocation == "paper":
         return paper_load_function(workcell)
-    if workcell.has_facing_pads:
+    if workcell.has_opposite_pads:
         return _joint_load_function(workcell)
     return _grasp_load_function(workcell)
 
@@ -145,8 +154,9 @@ def _joint_load_function(workcell: Workcell) -> ca.Function:
     found = paper_load_function(workcell)(*inputs.values())
     paper = dict(zip(LOAD_OUTPUTS, found, strict=True))
     force = paper["contact_force"][:3] + paper["contact_force"][3:]
+    shift = "pressure_shift" if workcell.has_facing_pads else "shift_vector"
     suffices = _suffices_function(workcell)(
-        paper["pressure_shift"], paper["moment_residual"], force
+        inputs["pose"], paper[shift], paper["moment_residual"], force
     )
     kept = [paper[name] for name in GRASP_OUTPUTS]
     passed = [
@@ -155,7 +165,8 @@ def _joint_load_function(workcell: Workcell) -> ca.Function:
     asked = [inputs["pose"], force, paper["required_moment"], inputs["friction"]]
     asked.append(inputs["centre_of_mass"])
     unused = [ca.MX.sym("unused", value.shape[0]) for value in asked]
-    anew = _joint_sample_function(workcell)
+    general = not workcell.has_facing_pads
+    anew = _grasp_sample_function(workcell) if general else _joint_sample_function(workcell)
     choice = ca.Function.if_else(
         "allocation",
         ca.Function("keep", [*unused, *passed], passed),
@@ -173,10 +184,7 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
     found = _required_function(workcell)(*[inputs[name] for name in SIZES if name != "friction"])
     outputs = dict(zip(names, found, strict=True))
     asked = (inputs["pose"], outputs["force"], outputs["required_moment"])
-    centre, friction = inputs["centre_of_mass"], inputs["friction"]
-    load = box_load_function(workcell)(*asked, centre)
-    wrenches = grasp_wrenches(Grasp(workcell), load, friction)
-    held = grasp_world_function(workcell)(*asked, centre, wrenches)
+    held = _grasp_sample_function(workcell)(*asked, inputs["friction"], inputs["centre_of_mass"])
     outputs |= dict(zip(GRASP_OUTPUTS, held, strict=True))
     return _named(inputs, outputs)
 
@@ -210,20 +218,45 @@ def _required_function(workcell: Workcell) -> ca.Function:
 
 
 def _suffices_function(workcell: Workcell) -> ca.Function:
-    """pressure_shift (2,), moment_residual (3,), force (3,) to whether the paper's result holds."""
-    shift, residual, force = (ca.SX.sym(*entry) for entry in (("shift", 2), ("rest", 3), ("f", 3)))
+    """pose, shifts, moment_residual (3,) and force (3,) to whether the paper's result holds.
+
+    The shifts are their lengths (2,) where both patches are round, else shift_vector (6,).
+    """
+    sizes = (("pose", 6), ("shift", 2 if workcell.has_facing_pads else 6), ("rest", 3), ("f", 3))
+    pose, shift, residual, force = inputs = [ca.SX.sym(*entry) for entry in sizes]
     points = [contact.T_box_pad[:3, 3] for contact in workcell.contacts]
     distance = float(np.linalg.norm(points[0] - points[1]))
-    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
     carried = ca.sumsqr(residual) <= (RESIDUAL_TOLERANCE * distance) ** 2 * ca.sumsqr(force)
-    within = ca.logic_and(shift[0] <= radius[0], shift[1] <= radius[1])
-    return ca.Function("suffices", [shift, residual, force], [ca.logic_and(within, carried)])
+    rotation = rotation_matrix(workcell.task.orientation, pose[3:])
+    within = []
+    for i, contact in enumerate(workcell.contacts):
+        if workcell.has_facing_pads:
+            within.append(shift[i] <= contact.patch_radius)
+            continue
+        axes = ca.mtimes(rotation, ca.DM(contact.T_box_pad[:3, :2]))
+        moved = ca.mtimes(axes.T, shift[3 * i : 3 * i + 3])
+        if contact.half_sides is None:
+            within.append(_length(moved) <= contact.patch_radius)
+        else:
+            x, y = contact.half_sides
+            within.append(ca.logic_and(ca.fabs(moved[0]) <= x, ca.fabs(moved[1]) <= y))
+    holds = ca.logic_and(ca.logic_and(within[0], within[1]), carried)
+    return ca.Function("suffices", inputs, [holds])
+
+
+def _grasp_sample_function(workcell: Workcell) -> ca.Function:
+    """As `_joint_sample_function`, for pads anywhere."""
+    inputs = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES]
+    pose, force, moment, friction, centre_of_mass = inputs
+    asked = (pose, force, moment, centre_of_mass)
+    wrenches = grasp_wrenches(Grasp(workcell), box_load_function(workcell)(*asked), friction)
+    return ca.Function("grasp_sample", inputs, grasp_world_function(workcell)(*asked, wrenches))
 
 
 def _joint_sample_function(workcell: Workcell) -> ca.Function:
     """pose, force, moment (world), friction and centre of mass to the outputs `GRASP_OUTPUTS`."""
-    sizes = (("pose", 6), ("force", 3), ("moment", 3), ("friction", 2), ("centre_of_mass", 3))
-    pose, force, moment, friction, centre_of_mass = inputs = [ca.MX.sym(*entry) for entry in sizes]
+    inputs = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES]
+    pose, force, moment, friction, centre_of_mass = inputs
     radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
     asked = (pose, force, moment, centre_of_mass)
     held = allocate_jointly(_balance_function(workcell)(*asked), friction, radius)

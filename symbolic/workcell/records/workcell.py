@@ -80,9 +80,14 @@ class Workcell:
     def has_facing_pads(self) -> bool:
         """Whether two round pads with opposite normals hold the payload: what the paper's
         allocation and all closed forms are for."""
+        return self.has_opposite_pads and not any(c.half_sides for c in self.contacts)
+
+    @property
+    def has_opposite_pads(self) -> bool:
+        """Whether two pads with opposite normals hold the payload, whatever their patches."""
         first, second = (contact.T_box_pad[:3, 2] for contact in self.contacts)
-        facing = np.allclose(first, -second, atol=1e-9)
-        return facing and not any(c.further or c.half_sides for c in self.contacts)
+        opposite = np.allclose(first, -second, atol=1e-9)
+        return opposite and not any(contact.further for contact in self.contacts)
 
     @property
     def pads(self) -> tuple[Contact, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -95,3 +97,31 @@ def test_derivatives_by_the_motion() -> None:
             call(function, pose, rate, second + sign * step)["normal_force"] for sign in (1.0, -1.0)
         ]
         np.testing.assert_allclose(found[:, k], (ends[0] - ends[1]) / 2e-4, atol=1e-3 * scale)
+
+
+def test_opposite_rectangles_keep_the_papers_forces_where_they_suffice() -> None:
+    """Bit by bit; where a centre of pressure would leave its rectangle they press harder."""
+    rng = np.random.default_rng(2)
+    paper_cell, kept, pressed = hand_cell(), 0, 0
+    for _ in range(12):
+        half_x, half_y = rng.uniform(0.005, 0.15, 2)
+        patch = {"patch_radius": float(np.hypot(half_x, half_y)), "half_sides": (half_x, half_y)}
+        first, second = (replace(contact, **patch) for contact in paper_cell.contacts)
+        cell = with_task(replace(paper_cell, contacts=(first, second)), allocation="joint")
+        motion = random_motion(rng)
+        paper, ours = (call(load_function(each), *motion) for each in (paper_cell, cell))
+        R = rotation(motion[0][3:])
+        shifts = paper["shift_vector"].reshape(2, 3) @ R
+        local = [
+            shift @ contact.T_box_pad[:3, :2]
+            for shift, contact in zip(shifts, cell.contacts, strict=True)
+        ]
+        if (np.abs(local) <= [half_x, half_y]).all():
+            kept += 1
+            for name, value in paper.items():
+                np.testing.assert_array_equal(ours[name], value, err_msg=name)
+        else:
+            pressed += 1
+            efforts = [float(np.sum(each["contact_force"] ** 2)) for each in (paper, ours)]
+            assert efforts[1] >= efforts[0]
+    assert min(kept, pressed) >= 2
