@@ -13,6 +13,7 @@ from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.squeeze import Squeeze, extra_force
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
+from symbolic.errors import SettingsError
 from symbolic.physics.pose import box_rotation
 from symbolic.workcell.records import Workcell
 
@@ -21,8 +22,14 @@ def held(model: TimingModel, squeeze: Squeeze, motions: Sequence[Motion]) -> lis
     """Forces of phases that follow one another, with the box held in all of them.
 
     Raises:
-        SettingsError: the uncertainty leaves no friction or patch.
+        SettingsError: the uncertainty leaves no friction or patch, or the contacts are not two pads
+            with opposite normals.
     """
+    if not model.workcell.has_opposite_pads:
+        raise SettingsError(
+            "a job presses with two pads whose normals are opposite; carries with other pads can "
+            "be searched, timed and simulated"
+        )
     ends = np.cumsum([0.0, *(motion.duration for motion in motions)])
     time = np.concatenate([m.time + at for m, at in zip(motions, ends[:-1], strict=True)])
     box = BoxMotion(
