@@ -30,7 +30,7 @@ def at_rest(cell: Workcell, settings: SimulationSettings) -> Drive:
     none = np.zeros((n, 3))
     return Drive(
         leader=0,
-        time=settings.time_step * np.arange(n) - settings.settle,
+        time=np.asarray(settings.time_step * np.arange(n) - settings.settle, dtype=float),
         position=none,
         velocity=none,
         acceleration=none,

@@ -104,9 +104,12 @@ def test_opposite_rectangles_keep_the_papers_forces_where_they_suffice() -> None
     rng = np.random.default_rng(2)
     paper_cell, kept, pressed = hand_cell(), 0, 0
     for _ in range(12):
-        half_x, half_y = rng.uniform(0.005, 0.15, 2)
-        patch = {"patch_radius": float(np.hypot(half_x, half_y)), "half_sides": (half_x, half_y)}
-        first, second = (replace(contact, **patch) for contact in paper_cell.contacts)
+        half_x, half_y = (float(half) for half in rng.uniform(0.005, 0.15, 2))
+        diagonal = float(np.hypot(half_x, half_y))
+        first, second = (
+            replace(contact, patch_radius=diagonal, half_sides=(half_x, half_y))
+            for contact in paper_cell.contacts
+        )
         cell = with_task(replace(paper_cell, contacts=(first, second)), allocation="joint")
         motion = random_motion(rng)
         paper, ours = (call(load_function(each), *motion) for each in (paper_cell, cell))
