@@ -200,7 +200,11 @@ static int linearised_rows(const problem* p, int stage, double x, double y, cons
       const double sign = r[k] > 0.0 ? 1.0 : -1.0;
       const double room = bound - sign * r[k] + sign * (by_a[k] * a + by_w[k] * w);
       const double least = 0.5 * (1.0 - sign * still);
-      rows[count] = stage_row(sign * by_a[k], sign * by_w[k], larger(room, least), end);
+      if (room >= least || w <= 0.0)
+        rows[count] = stage_row(sign * by_a[k], sign * by_w[k], larger(room, least), end);
+      else /* by u'^2 the chord to rest: a row that is only loosened may cut nothing off here */
+        rows[count] = stage_row(sign * by_a[k], sign * (r[k] - still - by_a[k] * a) / w,
+                                bound - sign * still, end);
       rows[count++].key = end * RATIOS + k;
     }
   }
