@@ -18,9 +18,14 @@ from hybrid_opt.campaign.layout import (
     selected_file,
 )
 from hybrid_opt.campaign.results import read_summary
-from hybrid_opt.campaign.simulated import StoredSimulation, stored_simulation
+from hybrid_opt.campaign.simulated import (
+    StoredSimulation,
+    Whose,
+    not_simulated,
+    stored_simulation,
+)
 from hybrid_opt.cell import Cell
-from hybrid_opt.errors import ResultsError
+from hybrid_opt.errors import ResultsError, WitnessError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
@@ -29,6 +34,7 @@ from hybrid_opt.witness.arms import CellWitness
 from hybrid_opt.witness.controller import Control
 from hybrid_opt.work.job import Emit, Job, ListLedger
 from studies.terminal_summary import title
+from symbolic.errors import SettingsError
 
 CONTROL: Control = "leader"
 
@@ -123,8 +129,12 @@ def _nothing() -> None:
 
 
 def _simulated(_: None, one: Simulated, emit: Emit) -> StoredSimulation:
+    whose = Whose(one.label, one.digest, CONTROL)
     with TemporaryDirectory() as folder:
         cell = Cell(one.trajectory.unpack(Path(folder)))
-        carry = driven_carry(cell, one.trajectory.x)
-        found = account_of(cell, carry, CellWitness(cell.workcell), CONTROL)
-        return stored_simulation(found, one.label, one.digest, CONTROL)
+        try:
+            carry = driven_carry(cell, one.trajectory.x)
+            found = account_of(cell, carry, CellWitness(cell.workcell), CONTROL)
+        except (WitnessError, SettingsError) as error:
+            return not_simulated(whose, str(error))
+        return stored_simulation(found, whose)

@@ -35,10 +35,9 @@ def simulation_rows(found: Sequence[StoredSimulation]) -> list[tuple[str, ...]]:
             number(one.duration, 2),
             f"{one.slips:.3f} to {one.holds:.3f}" if math.isfinite(one.holds) else one.problem,
             f"pad {one.pad} at {one.begins:.2f} s" if one.pad else "-",
-            "robust forces" if one.robust else f"{one.factor:g} times the plan",
-            " / ".join(number(value, 2) for value in one.predicted.max(axis=0)),
-            " / ".join(number(value, 2) for value in one.simulated.max(axis=0)),
-            number(100.0 * float(one.largest_error.max()), 1),
+            "robust forces" if one.robust else f"{number(one.factor, 1)} times the plan",
+            *(" / ".join(number(force, 2) for force in forces) for forces in one.peaks),
+            number(100.0 * one.largest_error, 1),
             number(1e3 * one.slip, 3),
             "yes" if one.arrives else "NO",
         )

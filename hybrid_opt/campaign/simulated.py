@@ -8,7 +8,6 @@ from typing import Annotated
 
 import numpy as np
 
-from hybrid_opt.campaign.documents import Pair
 from hybrid_opt.campaign.layout import SIMULATED
 from hybrid_opt.store.json_records import Figure, Shape, read_record
 from hybrid_opt.witness.account import Account
@@ -26,11 +25,11 @@ class StoredSimulation:
         label: of the carry.
         trajectory: SHA-256 of its file.
         controller: of the arms.
-        duration: [s].
+        duration: [s]; this and all further figures null where nothing could be simulated.
         slips, holds: multiples of the planned forces right below and above the threshold, null
             where there is none.
         pad, begins: where it slips first, 0 for nowhere, and when [s].
-        problem: why there is no threshold.
+        problem: why there is no threshold, or no simulation.
         robust: whether the run that is shown presses with robust forces.
         factor: of the forces there.
         arrives: whether the box held and ended at its goal.
@@ -42,17 +41,17 @@ class StoredSimulation:
     label: str
     trajectory: str
     controller: str
-    duration: float
+    duration: Figure
     slips: Figure
     holds: Figure
     pad: int
     begins: Figure
     problem: str
     robust: bool
-    factor: float
+    factor: Figure
     arrives: bool
-    slip: float
-    misses: float
+    slip: Figure
+    misses: Figure
     time: Annotated[Array, Shape((None,))]
     predicted: Annotated[Array, Shape((None, 2))]
     simulated: Annotated[Array, Shape((None, 2))]
@@ -68,14 +67,52 @@ class StoredSimulation:
         return (self.slips + self.holds) / 2.0
 
     @property
-    def largest_error(self) -> Pair:
-        """(2,) largest difference of both forces of each robot over the reference."""
-        return np.asarray(np.abs(self.simulated / self.predicted - 1.0).max(axis=0))
+    def peaks(self) -> Array:
+        """(2, 2) largest predicted and simulated force of each robot [N], NaN without any."""
+        if not len(self.time):
+            return np.full((2, 2), np.nan)
+        return np.stack([self.predicted.max(axis=0), self.simulated.max(axis=0)])
+
+    @property
+    def largest_error(self) -> float:
+        """Largest difference of both forces of either robot over the reference, NaN without any."""
+        if not len(self.time):
+            return float("nan")
+        return float(np.abs(self.simulated / self.predicted - 1.0).max())
 
 
-def stored_simulation(
-    found: Account, label: str, trajectory: str, controller: str
-) -> StoredSimulation:
+@dataclass(frozen=True)
+class Whose:
+    """What is simulated, as the attributes of those names in `StoredSimulation`."""
+
+    label: str
+    trajectory: str
+    controller: str
+
+
+def not_simulated(whose: Whose, problem: str) -> StoredSimulation:
+    """A carry that no arms can drive, or a cell that cannot be simulated, and why."""
+    nan, nothing = float("nan"), np.zeros((0, 2))
+    return StoredSimulation(
+        **vars(whose),
+        duration=nan,
+        slips=nan,
+        holds=nan,
+        pad=0,
+        begins=nan,
+        problem=problem,
+        robust=False,
+        factor=nan,
+        arrives=False,
+        slip=nan,
+        misses=nan,
+        time=nothing[:, 0],
+        predicted=nothing,
+        simulated=nothing,
+    )
+
+
+def stored_simulation(found: Account, whose: Whose) -> StoredSimulation:
     """An account as a study stores it: from the beginning of the carry on."""
     nan, threshold, shown = float("nan"), found.threshold, found.shown
     begin = float(found.pressed.reference.motion.time[2])
@@ -83,9 +120,7 @@ def stored_simulation(
     even = np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).round().astype(int)
     rows = rows[even] if len(rows) else np.array([len(shown.time) - 1])
     return StoredSimulation(
-        label=label,
-        trajectory=trajectory,
-        controller=controller,
+        **vars(whose),
         duration=float(found.pressed.reference.motion.time[-1] - begin),
         slips=nan if threshold is None else threshold.slips.factor,
         holds=nan if threshold is None else threshold.holds.factor,

@@ -155,7 +155,7 @@ def _carry_figures(data: ReportData) -> Iterator[ReportFigure]:
             lambda: figures_carry.duration_against_force(data),
         )
     yield from _price_figure(data)
-    if data.simulations:
+    if any(len(found.time) for found in data.simulations):
         yield ReportFigure(
             "simulated_forces",
             "Normal forces in the simulated cell, arms under force control, beside those that were "

@@ -23,8 +23,13 @@ def simulated_forces(data: ReportData) -> Figure:
     """Normal force of each robot: reference dashed, measured in the simulated cell solid."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     panels = figure.subplots(1, 2, sharey=True)
+    drawn = [
+        (found, look)
+        for found, look in zip(data.simulations, _looks(data), strict=True)
+        if len(found.time)
+    ]
     for i, (axes, robot) in enumerate(zip(panels, data.workcell.robots, strict=True)):
-        for found, look in zip(data.simulations, _looks(data), strict=True):
+        for found, look in drawn:
             axes.plot(
                 found.time,
                 found.simulated[:, i],
@@ -38,7 +43,7 @@ def simulated_forces(data: ReportData) -> Figure:
                 color="black",
                 linestyle=PREDICTED,
                 linewidth=0.8,
-                label="predicted" if found is data.simulations[-1] else None,
+                label="predicted" if found is drawn[-1][0] else None,
             )
         axes.set_xlabel("time [s]")
         panel_label(axes, "ab"[i], f"robot {shortened(robot.name)!r}")

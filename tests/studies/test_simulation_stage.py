@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign.layout import SIMULATED
-from hybrid_opt.campaign.simulated import StoredSimulation, read_simulations
+from hybrid_opt.campaign.simulated import StoredSimulation, Whose, not_simulated, read_simulations
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
@@ -69,6 +69,17 @@ def test_the_table_tells_threshold_forces_and_what_became_of_the_box() -> None:
     assert first.split()[-1] == "yes"
     assert lost in second
     assert second.split()[-1] == "NO"
+
+
+def test_what_cannot_be_simulated_is_told_and_kept(own_study: Path) -> None:
+    one = wanted_carries(own_study)[0]
+    lost = not_simulated(Whose(one.label, one.digest, "leader"), "joint 'lift' moves both arms")
+    (own_study / SIMULATED).mkdir()
+    write_json(own_study / SIMULATED / f"{one.name}.json", to_json(lost))
+    assert is_done(own_study, one)
+    (row,) = simulation_text(read_simulations(own_study)).splitlines()[3:4]
+    assert "joint 'lift' moves both arms" in row
+    assert row.split()[-1] == "NO"
 
 
 def test_without_the_simulator_it_is_told_before_the_work(
