@@ -46,11 +46,10 @@ def simulate_arms(
                 reference, control, LOW, HIGH, BISECTIONS
             )
             print(f"  with a time step of {step:g} s: {swept.factor:.4f}")
-    robust = found.pressed.robust
-    if robust is not None:
-        print(f"  robust forces up to {robust.peak[0]:.2f} / {robust.peak[1]:.2f} N:")
+    peak = found.pressed.reference.normal_force.max(axis=0)
+    print(f"  pressed up to {peak[0]:.2f} / {peak[1]:.2f} N, {found.pressed.squeeze}:")
     _tell(found.shown, carry)
-    if robust is not None:
+    if found.pressed.squeeze.uncertainty is not None:
         _cases(cell, found.pressed.reference, settings, options)
         rubs_less = CellWitness(
             workcell_of_case(cell.workcell, worst_friction(cell.workcell)), settings
@@ -67,7 +66,7 @@ def _tell(outcome: ArmOutcome, carry: Carry) -> None:
     during = outcome.time >= carry.time[0]
     missing = (outcome.normal_force / outcome.normal_force_reference)[during] - 1.0
     print(
-        f"  at {outcome.factor:g} times the force the box "
+        f"  the box "
         f"{'arrives' if outcome.arrives else 'does NOT arrive'}: slip up to "
         f"{1e3 * outcome.slip.max():.3f} mm, {1e3 * outcome.misses:.2f} mm from its goal; normal "
         f"forces within {100.0 * np.abs(missing).max():.1f} % of their reference, rms "

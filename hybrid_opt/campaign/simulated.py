@@ -31,7 +31,7 @@ class StoredSimulation:
         pad, begins: where it slips first, 0 for nowhere, and when [s].
         problem: why there is no threshold, or no simulation.
         robust: whether the run that is shown presses with robust forces.
-        factor: of the forces there.
+        factor: there of the planned squeeze, null with robust forces.
         arrives: whether the box held and ended at its goal.
         slip, misses: largest slip, and distance from the goal [m].
         time: (n,) [s].
@@ -115,6 +115,7 @@ def not_simulated(whose: Whose, problem: str) -> StoredSimulation:
 def stored_simulation(found: Account, whose: Whose) -> StoredSimulation:
     """An account as a study stores it: from the beginning of the carry on."""
     nan, threshold, shown = float("nan"), found.threshold, found.shown
+    squeeze = found.pressed.squeeze
     begin = float(found.pressed.reference.motion.time[2])
     rows = np.flatnonzero(shown.time >= begin)
     even = np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).round().astype(int)
@@ -127,8 +128,8 @@ def stored_simulation(found: Account, whose: Whose) -> StoredSimulation:
         pad=0 if threshold is None else threshold.slips.pad + 1,
         begins=nan if threshold is None else threshold.slips.time[-1],
         problem=found.problem,
-        robust=found.pressed.robust is not None,
-        factor=found.pressed.factor,
+        robust=squeeze.factor is None,
+        factor=nan if squeeze.factor is None else squeeze.factor,
         arrives=shown.arrives,
         slip=float(shown.slip.max()),
         misses=shown.misses,

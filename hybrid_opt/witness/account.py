@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
-from hybrid_opt.robust.force import RobustForce, robust_model
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, chosen_squeeze, extra_force
 from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
@@ -20,9 +20,6 @@ from symbolic.array import Array
 LOW, HIGH, BISECTIONS = 0.9, 1.5, 8
 """Factors between which a threshold is looked for, to about 0.2 %."""
 
-SHOWN_FACTOR = 1.1
-"""Of the planned force in the run that is described where nothing is uncertain."""
-
 
 @dataclass(frozen=True, eq=False)
 class Pressed:
@@ -30,13 +27,11 @@ class Pressed:
 
     Attributes:
         reference: what the cell is told.
-        factor: multiple of its forces.
-        robust: the forces behind it; None where nothing is uncertain.
+        squeeze: how its forces came about.
     """
 
     reference: Reference
-    factor: float
-    robust: RobustForce | None
+    squeeze: Squeeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,17 +72,17 @@ def account_of(
     except WitnessError as error:
         problem = str(error)
     pressed = pressed_reference(cell, carry, leader)
-    shown = witness.simulate(pressed.reference, control, pressed.factor)
+    shown = witness.simulate(pressed.reference, control)
     return Account(threshold, problem, pressed, shown)
 
 
 def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> Pressed:
-    """With the robust forces of the workcell's uncertainty; without any, `SHOWN_FACTOR` times the
-    planned ones."""
-    if cell.workcell.uncertainty.is_empty:
-        return Pressed(carry_reference(cell, carry, leader=leader), SHOWN_FACTOR, None)
-    force = robust_model(cell.workcell).robust_force(carry, leader=leader)
-    return Pressed(carry_reference(cell, carry, force.commanded, leader), 1.0, force)
+    """As a job presses: with robust forces where the workcell states what is uncertain, smoothed so
+    that controllers can follow them and never below what is needed."""
+    squeeze = chosen_squeeze(cell.workcell, SqueezeSettings(leader=leader))
+    extra = extra_force(cell.workcell, squeeze, carry.time, carry, carry.normal_force)
+    press = carry.normal_force[:, 1 - leader] + extra
+    return Pressed(carry_reference(cell, carry, press, leader), squeeze)
 
 
 def driven_carry(cell: Cell, x: Array) -> Carry:

