@@ -18,7 +18,7 @@ from hybrid_opt.proposing.kinematics import (
     spun,
 )
 from symbolic.array import Array
-from symbolic.physics.pose import pose_matrix
+from symbolic.physics.pose import box_placement
 from symbolic.workcell.records import Workcell
 
 STARTS = 768
@@ -161,7 +161,7 @@ class _Finder:
     def start_postures(self, T_box_joint: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
         """Distinct postures at the start and the index of each one's spin."""
         kinematics, found, start = self.kinematics, self.found, self.task.start
-        T_world_box = pose_matrix(start[:3], start[3:])
+        T_world_box = box_placement(self.task.workcell.task.orientation, start)
         which = np.arange(STARTS) % len(T_box_joint)
         targets = np.array([T_world_box @ T for T in T_box_joint])[which]
         centre = (kinematics.lower + kinematics.upper) / 2.0
@@ -212,7 +212,7 @@ class _Finder:
                 return
             poses = box_poses(start, goal, GUIDE_POSES)
             poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
-            targets = np.array([pose_matrix(p[:3], p[3:]) @ T_box_joint for p in poses])
+            targets = box_placement(self.task.workcell.task.orientation, poses) @ T_box_joint
             arrived, path, score = self._followed(targets, q[waiting])
             if self.kinematics.redundant and len(arrived) < len(waiting):
                 also, other, scores = self._resolved(targets, q[waiting])

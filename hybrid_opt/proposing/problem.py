@@ -15,15 +15,16 @@ from hybrid_opt.proposing.document import completed, merged
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError, WorkcellError
-from symbolic.physics.pose import rotation_from_rpy
+from symbolic.physics.pose import box_rotation, rotation_from_rpy
 from symbolic.robot.packages import PACKAGE_SCHEME
 from symbolic.workcell.file import load
+from symbolic.workcell.orientation import Orientation
 from symbolic.workcell.records import Workcell
 
 PROPOSED = ("waypoints", "initial", "redundant")
 """Keys of the task that are proposed anew, whatever the file has."""
 
-REACH_OF_DRAFT = 1.0
+REACH_OF_DRAFT = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 """How far beside start and goal the one free waypoint of a draft may be [m, rad]; of no meaning."""
 
 
@@ -43,9 +44,11 @@ class Problem:
 
     @property
     def poses(self) -> tuple[Array, Array]:
-        """(6,) start and goal of the box, the goal's angles on the turns nearest the start's."""
+        """(6,) start and goal of the box, the goal's angles on the turns nearest the start's;
+        rotation vectors as they are."""
         start, goal = (np.array(self.data["task"][key], dtype=float) for key in ("start", "goal"))
-        goal[3:] = np.unwrap([start[3:], goal[3:]], axis=0)[1]
+        turned = orientation_of(self.data["task"])
+        goal[3:] = turned.unwrapped(np.array([start[3:], goal[3:]]))[1]
         return start, goal
 
     def workcell(self, changes: dict[str, Any] | None = None) -> Workcell:
@@ -133,6 +136,13 @@ def _problems(data: dict[str, Any]) -> list[str]:
         pose = task.get(key)
         if not isinstance(pose, list) or len(pose) != 6 or not all(map(_is_number, pose)):
             found.append(f"task.{key}: allowed are 6 numbers: x, y, z, roll, pitch, yaw")
+    reference = task.get("rotation_reference", [0.0, 0.0, 0.0])
+    if (
+        not isinstance(reference, list)
+        or len(reference) != 3
+        or not all(map(_is_number, reference))
+    ):
+        found.append("task.rotation_reference: allowed are 3 numbers: roll, pitch, yaw")
     waypoints = task.get("waypoints", [])
     if isinstance(waypoints, list) and any("fixed" in w for w in waypoints if isinstance(w, dict)):
         found.append(
@@ -171,6 +181,13 @@ def with_places(data: dict[str, Any], folder: Path) -> dict[str, Any]:
     return data
 
 
+def orientation_of(task: dict[str, Any]) -> Orientation:
+    """What the last three numbers of the poses of a task's table mean."""
+    if task.get("rotation") != "quaternion":
+        return Orientation()
+    return Orientation("quaternion", rotation_from_rpy(task.get("rotation_reference", [0, 0, 0])))
+
+
 def contact_points(data: dict[str, Any], bases: Array | None) -> list[list[float]]:
     """Middles of opposite faces of the box that face the robots, one per robot [m].
 
@@ -180,7 +197,7 @@ def contact_points(data: dict[str, Any], bases: Array | None) -> list[list[float
     """
     size = np.array(data["payload"]["size"], dtype=float)
     start, goal = (np.array(data["task"][key], dtype=float) for key in ("start", "goal"))
-    R = rotation_from_rpy(start[3:])
+    R = box_rotation(orientation_of(data["task"]), start)
     along = goal[:3] - start[:3] if bases is None else bases[0] - bases[1]
     share = np.abs(R.T @ (along * [1.0, 1.0, 0.0]))
     upright = np.abs(R[2]) > 0.7
