@@ -22,6 +22,9 @@ REDUNDANT_UNIT = 0.15
 LIMITS = np.array([10.0, 10.0, 10.0, np.pi, 0.5 * np.pi, np.pi])
 """Beyond which no pose of a workcell file may be, or should be (angles) [m, rad]."""
 
+VECTOR_LIMITS = np.array([10.0, 10.0, 10.0, 4.0, 4.0, 4.0])
+"""The same of poses with rotation vectors: a turn over, and room beside it [m, rad]."""
+
 DRAFTED = 0.01
 """Half-width of bounds that nothing is known of yet [m, rad]."""
 
@@ -97,7 +100,8 @@ def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
     task, n = workcell.task, len(workcell.task.waypoints)
     poses = len(task.free_indices)
     unit = [np.tile(UNIT, poses)]
-    least, most = [np.tile(-LIMITS, poses)], [np.tile(LIMITS, poses)]
+    limits = VECTOR_LIMITS if task.orientation.is_vector else LIMITS
+    least, most = [np.tile(-limits, poses)], [np.tile(limits, poses)]
     for joint in task.redundant:
         arm = 0 if joint.drives[0] >= 0 else 1
         robot, index = workcell.robots[arm], joint.drives[arm]
