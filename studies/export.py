@@ -47,11 +47,15 @@ def _parser() -> argparse.ArgumentParser:
         description="Plan the whole job around a stored trajectory (approach, press, lift, carry, "
         "set down, release, retreat) and write it as one bundle with a manifest, in a folder of "
         "its own below DIR.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("file", metavar="TRAJECTORY", help="a trajectory file")
     parser.add_argument("--form", choices=list(FORMATS), required=True, help="what is written")
-    parser.add_argument("--output", default="bundles", metavar="DIR", help="folder of bundles")
+    parser.add_argument(
+        "--output",
+        default="bundles",
+        metavar="DIR",
+        help="folder of bundles (default: %(default)s)",
+    )
     parser.add_argument(
         "--use",
         choices=TIMINGS,
@@ -75,15 +79,17 @@ def _parser() -> argparse.ArgumentParser:
         default=WIDTH,
         metavar="S",
         help="half the width of the window over which a timing whose acceleration jumps is "
-        "averaged [s]; 0 leaves it as it is",
+        "averaged [s]; 0 leaves it as it is (default: %(default)g)",
     )
-    parser.add_argument("--step", type=float, metavar="S", help="time between samples [s]")
+    parser.add_argument(
+        "--step", type=float, metavar="S", help="time between samples [s] (default: the form's own)"
+    )
     parser.add_argument(
         "--stiffness",
         type=float,
         default=BundleOptions().stiffness,
         metavar="N/m",
-        help="of each arm at its pad, for what a late arm does",
+        help="of each arm at its pad, for what a late arm does (default: %(default)g)",
     )
     parser.add_argument(
         "--skew",

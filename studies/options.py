@@ -50,7 +50,11 @@ force = number(1e-3, 1e6)
 def add_leader(parser: argparse._ActionsContainer) -> None:
     """Add which arm keeps its place while the other is force-controlled; counted from 1."""
     parser.add_argument(
-        "--leader", type=int, choices=(1, 2), default=1, help="the arm that keeps its place"
+        "--leader",
+        type=int,
+        choices=(1, 2),
+        default=1,
+        help="the arm that keeps its place (default: %(default)s)",
     )
 
 
