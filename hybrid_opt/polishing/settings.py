@@ -157,6 +157,8 @@ class DrivableSettings:
         steadiness: curvature by the path of the program that finds multipliers.
         corrections: of a step by how geometric rows bend along it, at most.
         bend: of a scaled geometric row that is left uncorrected.
+        candidates: random ones among which starts far from a front are looked for.
+        far_share: of the attempts that go to such starts.
     """
 
     first_radius: float = 0.3
@@ -172,6 +174,8 @@ class DrivableSettings:
     steadiness: float = 1.0
     corrections: int = 3
     bend: float = 0.01
+    candidates: int = 600
+    far_share: float = 0.3
 
 
 @dataclass(frozen=True)

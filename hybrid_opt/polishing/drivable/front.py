@@ -2,8 +2,9 @@
 
 Every attempt is at one force limit, or at one duration. It starts from the path that is driven
 best there of all that are known, so that what one attempt finds serves the others. Points of the
-given front come first, evenly spread; then both ends and the widest gaps, and where these are
-narrow, points again from other paths.
+given front come first, evenly spread; then random paths far from all that is known, because a
+search's front often lies in one basin of several; then both ends and the widest gaps, and where
+these are narrow, points again from other paths.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._tried: set[float] = set()
 
     def all(self, rng: np.random.Generator) -> None:
-        """The front's points, then ends and gaps, then other starts, while attempts last."""
+        """The front's points, starts far away, ends and gaps, other starts, while attempts last."""
         rows = self._archive.rows()
         count = min(len(rows), ceil(self._settings.points * self._settings.front.own_share))
         forces = [
@@ -118,6 +119,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         ]
         for force in forces:
             self._at("point", force)
+        self._far_away(rng, max(forces))
         self._at("extreme", self._range[1])
         self._at("extreme", self._between(self._range[0], min(map(self._force, rows))))
         while self._left() > 0:
@@ -150,6 +152,29 @@ class DriveRun(PolishRun[DriveAttempt]):
         others = np.flatnonzero(np.isfinite(durations) & (durations > durations.min()))
         chosen = int(rng.choice(others)) if len(others) else int(np.argmin(durations))
         self._attempt("extreme", chosen, force)
+
+    def _far_away(self, rng: np.random.Generator, force: float) -> None:
+        """Attempts from random feasible paths that are driven well and lie far from known ones."""
+        settings, low, high = self._settings.drivable, self._evaluator.lower, self._evaluator.upper
+        count = int(settings.far_share * self._settings.points)
+        if not count:
+            return
+        x = rng.uniform(low, high, (settings.candidates, len(low)))
+        x[:, -1] = force
+        found = self._evaluator.evaluate(x)
+        order = np.flatnonzero(found.feasible)
+        order = order[np.argsort(found.objectives[order, 1 - self._by_force], kind="stable")]
+        x, objectives = x[order], found.objectives[order]
+        unit = (high - low)[: self._n_path]
+        for _ in range(min(count, len(x))):
+            faster = len(x) - len(x) // 2
+            known = np.array([path[: self._n_path] for path in self._archive.x])
+            away = x[:faster, None, : self._n_path] - known
+            distance = np.sqrt(((away / np.where(unit > 0.0, unit, 1.0)) ** 2).mean(axis=2))
+            k = int(np.argmax(distance.min(axis=1)))
+            goal = Goal("duration", force)
+            self._do([DriveAttempt("extreme", -1, x[k], objectives[k], goal)])
+            x, objectives = np.delete(x, k, axis=0), np.delete(objectives, k, axis=0)
 
     def _attempt(self, aim: Aim, index: int, force: float) -> None:
         self._tried.add(force)

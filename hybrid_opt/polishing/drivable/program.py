@@ -34,6 +34,10 @@ NEAR = 0.85
 NEAR_FORCE = 0.6
 """The same for the normal forces, of what the limit leaves above the force at rest."""
 
+REST_MARGIN = 2e-3
+"""Share of the patches that is kept free standing still: only the stages' beginnings have rows, and
+where rest uses a patch up there is no timing at all."""
+
 LEAST_SCALE = 1e-2
 """A row's slope by the squared speeds below which it is not scaled up further."""
 
@@ -115,6 +119,7 @@ class JointProgram:
         self.rows = values.rows() / self.scale - 1.0
         self._mix = kinds.mix / self.scale[:, None]
         self._geometric(places, at)
+        self._still(values)
         self._speeds()
         self._carry_over = grid.carry_over * half
 
@@ -129,6 +134,15 @@ class JointProgram:
         value, slope = self._places.first(extended_waypoints(self._grid.workcell.task, at.x))
         self.geometry = (self._required - value) / self._place_scale
         self._geometry_slope = -slope * self._half / self._place_scale[:, None]
+
+    def _still(self, values: StageValues) -> None:
+        """Rows of the pressure at rest, after the geometric ones; they bend little."""
+        share, slope = values.pressure_at_rest()
+        near = np.flatnonzero(share > NEAR)
+        begins = 2 * (near // (len(share) // self._grid.stages))
+        by_path = np.matmul(slope[near, None], self._grid.carry_over[begins])[:, 0] * self._half
+        self.geometry = np.append(self.geometry, share[near] - 1.0 + REST_MARGIN)
+        self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
     def _speeds(self) -> None:
         """Duration with its derivatives, and what u'' and u'^2 of each point are by omega."""
@@ -159,14 +173,16 @@ class JointProgram:
 
     def geometry_after(self, d: Array) -> Array:
         """(geometric rows,) what they lack after a step, beyond what their slopes foretell."""
+        beyond = np.zeros(len(self.geometry))
         if not self.place_rows:
-            return self.geometry
+            return beyond
         x = self._at.x.copy()
         x[: self.n_path] += self._half * d[: self.n_path]
         value, _ = self._places.first(extended_waypoints(self._grid.workcell.task, x))
         lacking = (self._required - value) / self._place_scale
         foretold = self.geometry + self._geometry_slope @ d[: self.n_path]
-        return np.asarray(lacking - foretold)
+        beyond[: len(lacking)] = lacking - foretold[: len(lacking)]
+        return beyond
 
     def near(self) -> NDArray[np.bool_]:
         """(points, kinds) rows that the iterate uses far."""
@@ -197,7 +213,7 @@ class JointProgram:
         """
         point, kind = np.nonzero(chosen)
         local = np.matmul(self._mix[kind][:, None, :], self._values.slope[point])[:, 0]
-        A = np.zeros((len(point) + len(self.geometry) + self._has_duration, self.n))
+        A = np.zeros((len(point) + len(self.geometry) + self.has_duration, self.n))
         m, moving = len(point), self._grid.moving
         A[:m, : self.n_path] = np.matmul(local[:, None, :moving], self._carry_over[point])[:, 0]
         by_speed = np.matmul(local[:, None, moving:], self._local[point])[:, 0]
@@ -218,7 +234,8 @@ class JointProgram:
         return Linear(A / scales[:, None], b / scales), scales
 
     @property
-    def _has_duration(self) -> int:
+    def has_duration(self) -> int:
+        """Whether a wanted duration is the last row."""
         return int(self._at.duration is not None)
 
     def gradient(self) -> Array:

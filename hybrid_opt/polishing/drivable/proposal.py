@@ -95,7 +95,7 @@ class Proposer:
             (self._residuals(program, best, found) for found in (first, second)),
             key=lambda known: known.stationarity + known.complementarity,
         )
-        bent = np.zeros(len(program.place_rows))
+        bent = np.zeros(len(program.geometry))
         for _ in range(self._driven.corrections):
             change = program.geometry_after(second[0].d) - bent
             if np.abs(change).max(initial=0.0) <= self._driven.bend:
@@ -146,7 +146,7 @@ class Proposer:
         geometry = dict(
             zip(program.place_rows, unscaled[m : m + len(program.place_rows)].tolist(), strict=True)
         )
-        duration = float(unscaled[-1]) if len(unscaled) > m + len(geometry) else 0.0
+        duration = float(unscaled[-1]) if program.has_duration else 0.0
         return step, Multipliers(timing, geometry, duration), linear
 
     def _named(
@@ -162,7 +162,7 @@ class Proposer:
         values = np.zeros(len(scales))
         values[: len(point)] = multipliers.timing[point, kind] * scales[: len(point)]
         values[len(point) : len(point) + len(geometry)] = geometry
-        if len(values) > len(point) + len(geometry):
+        if program.has_duration:
             values[-1] = multipliers.duration
         return np.where(values > self._driven.negligible, values, 0.0)
 

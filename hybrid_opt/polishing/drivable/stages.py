@@ -139,12 +139,7 @@ class StageValues:
         out = functions.first.batch(*inputs)
         full = out["slope"]
         follow = tuple(found["follow"][s] for found in held)
-        slope = np.concatenate([full[:, :, : grid.moving], full[:, :, -2:]], axis=2)
-        start = grid.moving
-        for along in follow:
-            n = along.shape[2]
-            slope[:, :, : grid.pose] += full[:, :, start : start + n] @ np.swapaxes(along, 1, 2)
-            start += n
+        slope = _followed(grid, full, follow)
         pull = tuple(found["pull"][s] for found in held)
         return cls(
             grid,
@@ -156,6 +151,17 @@ class StageValues:
             (pull[0], pull[1]),
             functions,
         )
+
+    def pressure_at_rest(self) -> tuple[Array, Array]:
+        """Shares (rows,) of the patches that standing still uses, at every stage's beginning, and
+        their slopes (rows, moving) by the extended pose."""
+        begins = [values[::2] for values in self._inputs]
+        still = np.zeros(len(begins[-1]))
+        out = self._functions.first.batch(*begins[:-2], still, still)
+        follow = tuple(along[::2] for along in self._follow)
+        block = self.grid.layout.block("pressure")
+        slope = _followed(self.grid, out["slope"], follow)[:, block, : self.grid.moving]
+        return out["value"][:, block].reshape(-1), slope.reshape(-1, self.grid.moving)
 
     def rows(self) -> Array:
         """(points, kinds) mix . quantities of every inequality."""
@@ -201,3 +207,14 @@ class StageValues:
             total[:, :pose, :pose] += follow @ closed @ np.swapaxes(follow, 1, 2)
             start += n_joints
         return at, (total + np.swapaxes(total, 1, 2)) / 2.0
+
+
+def _followed(grid: StageGrid, full: Array, follow: tuple[Array, ...]) -> Array:
+    """Slopes by pose, derivatives, u'' and u'^2 where the joints follow the pose."""
+    slope = np.concatenate([full[:, :, : grid.moving], full[:, :, -2:]], axis=2)
+    start = grid.moving
+    for along in follow:
+        n = along.shape[2]
+        slope[:, :, : grid.pose] += full[:, :, start : start + n] @ np.swapaxes(along, 1, 2)
+        start += n
+    return slope

@@ -22,6 +22,7 @@ from tests.hybrid_opt.polishing.drivable.cells import (
     functions,
     polisher,
     start,
+    tilted,
 )
 
 FORCE = 52.0
@@ -100,6 +101,18 @@ def assert_slopes(programs: Programs, seed: int) -> None:
     np.testing.assert_allclose(rows[:m], foretold[chosen], atol=1e-12 * np.abs(foretold).max())
     geometry = (programs.at(h * d).geometry - programs.at(-h * d).geometry) / (2.0 * h)
     np.testing.assert_allclose(rows[m:], geometry, rtol=1e-5, atol=1e-8)
+
+
+def test_pressure_at_rest_has_rows_with_exact_slopes() -> None:
+    programs = Programs(tilted(FORCE))
+    program, h = programs.at(), 1e-6
+    assert len(program.geometry) > len(ROWS)
+    d = direction(program, 2)
+    chosen = program.near()
+    linear, scales = program.linear(chosen)
+    rows = ((linear.A * scales[:, None]) @ d)[int(chosen.sum()) :]
+    difference = (programs.at(h * d).geometry - programs.at(-h * d).geometry) / (2.0 * h)
+    np.testing.assert_allclose(rows, difference, rtol=1e-5, atol=1e-7)
 
 
 def test_slopes_exist_where_the_box_does_not_turn() -> None:
