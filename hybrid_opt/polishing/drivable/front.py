@@ -119,7 +119,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         ]
         for force in forces:
             self._at("point", force)
-        self._far_away(rng, max(forces))
+        # Not at the front's largest force, where attempts from far away need most rounds.
+        self._far_away(rng, 0.5 * (self._range[0] + max(*forces, self._range[0])))
         self._at("extreme", self._range[1])
         self._at("extreme", self._between(self._range[0], min(map(self._force, rows))))
         while self._left() > 0:
