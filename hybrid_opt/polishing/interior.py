@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hybrid_opt.polishing.inequalities import Inequalities
 from hybrid_opt.polishing.interior_steps import direction, estimated, kept, largest, until
 from hybrid_opt.polishing.program import Program
 from hybrid_opt.polishing.residuals import UNKNOWN, residuals
@@ -70,6 +71,9 @@ SHORTENED = (0.1, 0.7)
 NEGLIGIBLE = 1e-3
 """Share of the largest multiplier below which a row's curvature is left out of a step."""
 
+DISTANT = 2e-2
+"""The same of rows whose slack exceeds their multiplier: they will not rule in the end."""
+
 
 @dataclass
 class _State:
@@ -89,11 +93,7 @@ class DenseSolver:
 
     def __init__(self, program: Program, settings: PolishSettings) -> None:
         self._program, self._settings = program, settings
-        upper = np.flatnonzero(np.isfinite(program.above))
-        lower = np.flatnonzero(np.isfinite(program.below))
-        self._rows = np.concatenate([upper, lower])
-        self._sign = np.concatenate([-np.ones(len(upper)), np.ones(len(lower))])
-        self._shift = np.concatenate([program.above[upper], -program.below[lower]])
+        self._rows = Inequalities(program)
         self._mu = settings.solve.barrier
         # Bounds are a hair wider than they are, so that no rounding puts an iterate on one.
         hair = HAIR * (program.high - program.low)
@@ -122,7 +122,7 @@ class DenseSolver:
         lam_z, y = estimated(
             self._program.cost, now.A, (now.h, now.z - self._low, self._high - now.z)
         )
-        multipliers = lam_z, self._of_rows(y)
+        multipliers = lam_z, self._rows.multipliers(y)
         usable = bool(np.isfinite(z).all())
         return Answer(
             z=z,
@@ -138,16 +138,9 @@ class DenseSolver:
         low, high = self._low, self._high
         push = PUSH * (high - low)
         z = np.clip(self._program.start, low + push, high - push)
-        h, A = self._inequalities(z)
+        h, A = self._rows.at(z)
         s = np.maximum(h, SLACK)
         return _State(z, s, self._mu / s, self._mu / (z - low), self._mu / (high - z), h, A)
-
-    def _inequalities(self, z: Array) -> tuple[Array, Array]:
-        values, jacobian = self._program.constraints(z)
-        return (
-            self._sign * values[self._rows] + self._shift,
-            self._sign[:, None] * jacobian[self._rows],
-        )
 
     def _error(self, now: _State, mu: float) -> float:
         """Largest residual of the barrier's conditions, multipliers scaled as in the paper."""
@@ -181,8 +174,9 @@ class DenseSolver:
         to_low, to_high = now.z - self._low, self._high - now.z
         # Rows that are far from ruling are left out of the curvature: most of its cost, and next to
         # nothing of the step.
-        ruling = np.where(now.y > NEGLIGIBLE * now.y.max(initial=0.0), now.y, 0.0)
-        M = program.curvature(now.z, self._of_rows(ruling)) + (now.A.T * D) @ now.A
+        least = np.where(now.s > now.y, DISTANT, NEGLIGIBLE) * now.y.max(initial=0.0)
+        ruling = np.where(now.y > least, now.y, 0.0)
+        M = program.curvature(now.z, self._rows.multipliers(ruling)) + (now.A.T * D) @ now.A
         M[np.diag_indices_from(M)] += now.low / to_low + now.high / to_high
         r = now.h - now.s
         fixed = -program.cost + mu / to_low - mu / to_high
@@ -215,12 +209,6 @@ class DenseSolver:
         now.y = np.maximum(now.y, raised)
         return changed
 
-    def _of_rows(self, y: Array) -> Array:
-        """(n_rows,) the inequalities' multipliers in CasADi's convention."""
-        multipliers = np.zeros(len(self._program.below))
-        np.add.at(multipliers, self._rows, -self._sign * y)
-        return multipliers
-
     def _search(
         self, now: _State, dz: Array, ds: Array
     ) -> tuple[Array, Array, Array, Array] | None:
@@ -250,7 +238,7 @@ class DenseSolver:
         self._blocking = np.zeros(len(now.s), dtype=np.bool_)
         for _ in range(TRIALS):
             z, s = np.clip(now.z + alpha * dz, *self._inner), now.s + alpha * ds
-            h, A = self._inequalities(z)
+            h, A = self._rows.at(z)
             share = SHORTENED[0]
             if np.isfinite(h).all():
                 lost = np.flatnonzero(held & (h < (1.0 - keep) * now.s))

@@ -17,6 +17,9 @@ LONGEST = 2.0
 NEAR = 0.1
 """Slack of inequalities that may have a multiplier."""
 
+TURNS = 30
+"""Iterations of the least squares for every inequality."""
+
 DUAL_RANGE = 1e10
 """Multipliers stay within this factor of what the barrier asks for."""
 
@@ -71,15 +74,20 @@ def estimated(cost: Array, A: Array, slacks: tuple[Array, Array, Array]) -> tupl
     Returns:
         Of the bounds (n,) in CasADi's convention, and of the inequalities (m,), not negative.
     """
-    n, near = len(cost), np.flatnonzero(slacks[0] < NEAR)
-    slack = np.concatenate([slacks[0][near], *slacks[1:]])
-    slopes = np.hstack([A[near].T, np.eye(n), -np.eye(n)])
-    conditions = np.vstack([slopes, np.diag(np.minimum(np.abs(slack), NEAR))])
-    y = np.zeros(len(A))
+    n, m = len(cost), len(A)
+    slack = np.concatenate(slacks)
+    near = np.flatnonzero(slack < NEAR)
+    found = np.zeros(len(slack))
+    if not len(near):
+        # Nothing can have a multiplier; SciPy ends the process at a matrix without columns.
+        return np.zeros(n), np.zeros(m)
+    slopes = np.hstack([A.T, np.eye(n), -np.eye(n)])[:, near]
+    conditions = np.vstack([slopes, np.diag(np.abs(slack[near]))])
     try:
-        found, _ = nnls(conditions, np.concatenate([cost, np.zeros(len(slack))]))
+        right = np.concatenate([cost, np.zeros(len(near))])
+        found[near], _ = nnls(conditions, right, maxiter=TURNS * len(near))
     except RuntimeError:
         # Its iterations ran out: no multipliers, which the residuals tell.
-        return np.zeros(n), y
-    y[near], low, high = np.split(found, [len(near), len(near) + n])
+        pass
+    y, low, high = np.split(found, [m, m + n])
     return high - low, y

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 from symbolic.smooth.place import PlaceConstraint
 
@@ -65,47 +66,47 @@ class Layout:
             tuple(sorted(places, key=lambda row: (repr(row.constraint), row.place))),
         )
 
-    @property
+    @cached_property
     def decision(self) -> slice:
         """The decision vector among the variables."""
         return slice(0, self.n_var)
 
-    @property
+    @cached_property
     def peaks(self) -> slice:
         """Both scaled peak forces."""
         return slice(self.n_var, self.n_var + 2)
 
-    @property
+    @cached_property
     def level(self) -> int:
         """The level."""
         return self.n_var + 2
 
-    @property
+    @cached_property
     def n_variables(self) -> int:
         """All of them."""
         return self.n_var + 3
 
-    @property
+    @cached_property
     def forces(self) -> slice:
         """The force rows among all rows."""
         return slice(0, len(self.force_rows))
 
-    @property
+    @cached_property
     def sides(self) -> slice:
         """The rows of both objectives."""
         return slice(self.forces.stop, self.forces.stop + 2)
 
-    @property
+    @cached_property
     def patches(self) -> slice:
         """The pressure rows."""
         return slice(self.sides.stop, self.sides.stop + len(self.pressure_rows))
 
-    @property
+    @cached_property
     def places(self) -> slice:
         """The rows at places."""
         return slice(self.patches.stop, self.patches.stop + len(self.place_rows))
 
-    @property
+    @cached_property
     def n_rows(self) -> int:
         """All of them."""
         return int(self.places.stop)

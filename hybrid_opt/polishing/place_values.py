@@ -62,13 +62,44 @@ class _Group:
 
 
 @dataclass(frozen=True)
+class _Pull:
+    """How a group's rows depend on an arm's joints.
+
+    Attributes:
+        group: which one.
+        at: (rows,) positions of the rows' places among the arm's.
+        columns: of the group's gradient that are by the arm's joints.
+        q: the group's input.
+        slopes: (rows, n) the gradients by the joints, where the arm keeps them.
+    """
+
+    group: int
+    at: Indices
+    columns: slice
+    q: Array
+    slopes: Array
+
+
+@dataclass(frozen=True)
 class _Arm:
-    """An arm where rows need it: which places, and the position of each place among them."""
+    """An arm where rows need it.
+
+    Attributes:
+        places: which ones.
+        position: of each place among them.
+        rows, at: all rows that depend on its joints, and the positions of their places.
+        slopes: (rows, n) their gradients by the joints.
+        pulls: of these rows group by group.
+    """
 
     places: Indices
     position: Indices
     first: PreparedBatch
     second: PreparedBatch
+    rows: Indices
+    at: Indices
+    slopes: Array
+    pulls: tuple[_Pull, ...]
 
     @property
     def joints(self) -> int:
@@ -100,7 +131,9 @@ class PlaceValues:
         self._basis, self._rate_basis = places.basis[:, moved], places.rate_basis[:, moved]
         self._size = functions.model.workcell.task.extended_size
         self._arms = [self._arm(arm, closures) for arm in range(len(places.q))]
-        self._row_basis, self._row_rate_basis = self._basis[self._at], self._rate_basis[self._at]
+        self._row_basis = self._basis[self._at][:, self._free_rows]
+        self._row_rate_basis = self._rate_basis[self._at][:, self._free_rows]
+        self._moving = any(group.moving for group in self._groups)
 
     def _group(self, rows: tuple[PlaceRow, ...], own: Indices, functions: RowFunctions) -> _Group:
         constraints = [rows[k].constraint for k in own.tolist()]
@@ -121,7 +154,20 @@ class PlaceValues:
             closures[ClosureKey(arm, order)].prepared(max(1, len(at))) for order in get_args(Order)
         )
         first.inputs["q_reference"][: len(at)] = self._places.q[arm][at]
-        return _Arm(at, position, first, second)
+        chosen = [k for k, group in enumerate(self._groups) if arm in group.arms]
+        rows = np.concatenate([np.empty(0, dtype=np.intp), *(self._groups[k].rows for k in chosen)])
+        slopes, pulls, start = np.empty((len(rows), first.outputs["q"].shape[1])), list[_Pull](), 0
+        for k in chosen:
+            group = self._groups[k]
+            own = slopes[start : start + len(group.rows)]
+            begin = 12 if group.moving else 6
+            for other in group.arms[: group.arms.index(arm)]:
+                begin += self._places.q[other].shape[1]
+            columns, q = slice(begin, begin + slopes.shape[1]), group.first.inputs[f"q_{arm + 1}"]
+            pulls.append(_Pull(k, position[group.places], columns, q, own))
+            start += len(group.rows)
+        where = position[self._at[rows]]
+        return _Arm(at, position, first, second, rows, where, slopes, tuple(pulls))
 
     def first(self, waypoints: Array) -> tuple[Array, Array]:
         """Values (rows,) and gradients (rows, variables) by the path's variables.
@@ -136,41 +182,32 @@ class PlaceValues:
         for arm in self._arms:
             count = len(arm.places)
             arm.first.inputs["pose"][:count] = extended[arm.places]
-            arm.first(count)
+            q = arm.first(count)["q"]
+            for pull in arm.pulls:
+                np.take(q, pull.at, axis=0, out=pull.q, mode="clip")
         values = np.empty(self._count)
         by_pose, by_rate = np.zeros((2, self._count, self._size))
         for group in self._groups:
             inputs = group.first.inputs
-            inputs["pose"][...] = pose[group.places]
+            np.take(pose, group.places, axis=0, out=inputs["pose"], mode="clip")
             if group.moving:
-                inputs["rate"][...] = rate[group.places]
-            for index in group.arms:
-                arm = self._arms[index]
-                inputs[f"q_{index + 1}"][...] = arm.first.outputs["q"][arm.position[group.places]]
+                np.take(rate, group.places, axis=0, out=inputs["rate"], mode="clip")
             found = group.first()
             values[group.rows] = found["value"]
-            own = np.zeros((len(group.rows), self._size))
-            own[:, :POSE_SIZE] = found["gradient"][:, :6]
+            by_pose[group.rows, :POSE_SIZE] = found["gradient"][:, :6]
             if group.moving:
                 by_rate[group.rows, :POSE_SIZE] = found["gradient"][:, 6:12]
-            for index, slope in self._by_joints(group):
-                # The interface's arrays are transposed matrices (`codegen.signature`).
-                arm = self._arms[index]
-                follow = arm.first.outputs["follow"][arm.position[group.places]]
-                own += np.matmul(follow, slope[:, :, None])[:, :, 0]
-            by_pose[group.rows] = own
-        total = self._row_basis[:, :, None] * by_pose[:, None, :]
-        total += self._row_rate_basis[:, :, None] * by_rate[:, None, :]
-        return values, total[:, self._free_rows, self._columns]
-
-    def _by_joints(self, group: _Group) -> list[tuple[int, Array]]:
-        """The gradients (rows, n) of the last values by the joints of each of a group's arms."""
-        found, start = [], 12 if group.moving else 6
-        for index in group.arms:
-            stop = start + self._arms[index].joints
-            found.append((index, group.first.outputs["gradient"][:, start:stop]))
-            start = stop
-        return found
+        for arm in self._arms:
+            for pull in arm.pulls:
+                gradient = self._groups[pull.group].first.outputs["gradient"]
+                pull.slopes[...] = gradient[:, pull.columns]
+            # The interface's arrays are transposed matrices (`codegen.signature`).
+            follow = arm.first.outputs["follow"][arm.at]
+            by_pose[arm.rows] += np.matmul(follow, arm.slopes[:, :, None])[:, :, 0]
+        total = self._row_basis * by_pose[:, self._columns]
+        if self._moving:
+            total += self._row_rate_basis * by_rate[:, self._columns]
+        return values, total
 
     def second(self, weight: Array) -> Array:
         """Second derivatives (variables, variables) of the values weighted by (rows,), where
@@ -179,7 +216,7 @@ class PlaceValues:
         total = np.zeros((n * n, size * size))
         least = NEGLIGIBLE * np.abs(weight).max(initial=0.0)
         pulls = [np.zeros((len(arm.places), arm.joints)) for arm in self._arms]
-        for group in self._groups:
+        for k, group in enumerate(self._groups):
             chosen = np.flatnonzero(np.abs(weight[group.rows]) > least)
             count = len(chosen)
             if not count:
@@ -190,9 +227,10 @@ class PlaceValues:
                 inputs[name][:count] = values[chosen]
             inputs["weight"][:count] = own
             hessian = group.second(count)["hessian"][:count]
-            for index, slope in self._by_joints(group):
-                where = self._arms[index].position[at]
-                np.add.at(pulls[index], where, own[:, None] * slope[chosen])
+            for index in group.arms:
+                arm = self._arms[index]
+                (pull,) = (pull for pull in arm.pulls if pull.group == k)
+                np.add.at(pulls[index], pull.at[chosen], own[:, None] * pull.slopes[chosen])
             if group.moving:
                 self._add_moving(total, at, hessian)
             else:

@@ -95,6 +95,7 @@ class SmoothCell:
         self.blocks = sample_blocks(workcell.task)
         self.coefficients = branch_coefficients(workcell)
         self.free = workcell.task.free_entries
+        self._n_path = workcell.task.n_path
         fixed = [waypoint.lower for waypoint in self.task.waypoints]
         self._fixed = np.column_stack([fixed, *[joint.lower for joint in self.task.redundant]])
 
@@ -102,7 +103,7 @@ class SmoothCell:
         """As `extended_waypoints`, which looks up what is known here and unwraps what need not
         be."""
         points = self._fixed.copy()
-        points[self.free] = x[: self.task.n_path]
+        points[self.free] = x[: self._n_path]
         turns = points[1:, 3:POSE_SIZE] - points[:-1, 3:POSE_SIZE]
         return extended_waypoints(self.task, x) if np.abs(turns).max() > np.pi else points
 

@@ -104,7 +104,7 @@ class Scene:
         own = self._own_axes(self.geometry.bodies[i].frame)
         middle, turned = ca.mtimes(own.A, centre), ca.mtimes(own.A, rotation)
         for k, interval in enumerate(self._interval(i, own)):
-            reach = sum(half[m] * self.soft.absolute_above(turned[k, m]) for m in range(3))
+            reach = sum(half[m] * self.soft.entry_above(turned[k, m]) for m in range(3))
             pairs.append((interval, (middle[k] - reach, middle[k] + reach)))
         return _gaps(pairs)
 
@@ -155,14 +155,14 @@ class Scene:
         match shape:
             case Box():
                 half = np.asarray(shape.size) / 2.0
-                return sum((half[k] * self.soft.absolute_above(u[k]) for k in range(3)), ca.SX(0))
+                return sum((half[k] * self.soft.entry_above(u[k]) for k in range(3)), ca.SX(0))
             case Cylinder():
-                axial = self.soft.absolute_above(u[2]) * (shape.length / 2.0)
+                axial = self.soft.entry_above(u[2]) * (shape.length / 2.0)
                 return axial + shape.radius * self.soft.cosine_above(u[2])
             case Sphere():
                 return ca.SX(shape.radius)
             case Capsule():
-                return self.soft.absolute_above(u[2]) * (shape.length / 2.0) + shape.radius
+                return self.soft.entry_above(u[2]) * (shape.length / 2.0) + shape.radius
             case _:
                 raise AssertionError("a cover has no hulls")
 

@@ -24,16 +24,27 @@ _TINY = 1e-12
 
 @dataclass(frozen=True)
 class Softness:
-    """The operations; width [m] 0 means exact.
+    """The operations; width 0 means exact.
 
     `above` results are at least the true value, `below` results at most.
+
+    Attributes:
+        width: of the kinks [m].
+        turn: of those of the entries of rotations [1], whose effect is a body's size longer; None
+            for the same number as `width`.
     """
 
     width: float = 0.0
+    turn: float | None = None
 
     def absolute_above(self, x: ca.SX) -> ca.SX:
         """|x| or slightly more."""
         return ca.sqrt(x * x + self.width**2) if self.width else ca.fabs(x)
+
+    def entry_above(self, x: ca.SX) -> ca.SX:
+        """|x| of an entry of a rotation, or slightly more."""
+        turn = self.width if self.turn is None else self.turn
+        return ca.sqrt(x * x + turn**2) if turn else ca.fabs(x)
 
     def absolute_below(self, x: ca.SX) -> ca.SX:
         """|x| or slightly less."""

@@ -27,6 +27,11 @@ WIDTH = 2e-4
 by measured distances (`hybrid_opt.polishing.constraints`)."""
 
 
+TURN = 1e-2
+"""Width of the kinks where a face of a box becomes parallel to another [1]: the best carries lie
+in these kinks, and a solver that sees them sharp creeps along."""
+
+
 class Place:
     """The symbols of one place and what is built from them once.
 
@@ -48,7 +53,7 @@ class Place:
         """The bodies, with the kinks of their distances rounded."""
         placed = [self.model.robots[arm].joint_placements(self.q[arm]) for arm in (0, 1)]
         rotation = rotation_matrix(self.model.workcell.task.orientation, self.pose[3:])
-        softness = Softness(WIDTH)
+        softness = Softness(WIDTH, TURN)
         return Scene(self.model.geometry, rotation, self.pose[:3], (placed[0], placed[1]), softness)
 
     def gaps(self, obstacle: ca.SX) -> list[ca.SX]:
