@@ -121,8 +121,9 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         "--polish-points",
         type=int,
         metavar="N",
-        help=f"solves that the polish of one front may take (default: {PolishSettings().points}, "
-        f"{DRIVABLE_POLISH_POINTS} for a drivable one, with --quick {QUICK_POLISH_POINTS})",
+        help="solves that the polish of one front may take before it is filled up between its ends "
+        f"(default: {PolishSettings().points}, {DRIVABLE_POLISH_POINTS} for a drivable one, with "
+        f"--quick {QUICK_POLISH_POINTS})",
     )
     after.add_argument(
         "--drivable",

@@ -26,7 +26,7 @@ from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.run import Polisher
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
 from hybrid_opt.work.job import Emit, Job, answer_all
 from hybrid_opt.work.processes import local_executor
@@ -101,20 +101,20 @@ def compute_reference_front(
     executor = local_executor(jobs)
     parts = answer_all(
         executor,
-        _polish_job(cell, ATTEMPTS),
+        _polish_job(cell, ATTEMPTS, FillSettings(attempts=0)),
         list(zip([start[None] for start in begins], rng.spawn(len(begins)), strict=True)),
         lambda: tell(f"start {next(count)} of {len(begins)}"),
     )
     union = np.concatenate([part.x for part in parts])
-    (front,) = answer_all(executor, _polish_job(cell, points), [(union, rng)])
+    (front,) = answer_all(executor, _polish_job(cell, points, FillSettings()), [(union, rng)])
     tell(f"reference front: {len(front.x)} points")
     return ReferenceFront(evaluator.workcell.digest, front.objectives, front.x)
 
 
 def _polish_job(
-    cell: PackedCell, attempts: int
+    cell: PackedCell, attempts: int, fill: FillSettings
 ) -> Job[Polisher, tuple[Array, np.random.Generator], PolishedFront]:
-    settings = PolishSettings(points=attempts, rounds=ROUNDS)
+    settings = PolishSettings(points=attempts, rounds=ROUNDS, fill=fill)
     source = PolisherSource(cell, PAPER_OBJECTIVES, settings)
     return Job(source, _polished)
 

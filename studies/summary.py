@@ -61,6 +61,7 @@ POLISHED_FIGURES = (
     "spacing",
     "seconds",
     "equivalent_evaluations",
+    "widest_gap",
     "mean_excess_above_static",
     "payload_limit",
 )

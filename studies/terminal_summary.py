@@ -225,8 +225,8 @@ def _over_replicas(algorithms: Mapping[str, AlgorithmFigures]) -> str:
 
 def _polish(algorithms: Mapping[str, AlgorithmFigures]) -> str:
     """What the polish made of the fronts; nothing without one."""
-    head = ["median", "HV before", "HV after", "better in", "above static %", "payload kg"]
-    rows = [[*head, "seconds", "= evaluations"]]
+    head = ["median", "HV before", "HV after", "better in", "points", "widest gap %"]
+    rows = [[*head, "above static %", "payload kg", "seconds", "= evaluations"]]
     for name, entry in algorithms.items():
         if entry.polished is None:
             continue
@@ -237,6 +237,8 @@ def _polish(algorithms: Mapping[str, AlgorithmFigures]) -> str:
                 number(entry.statistics["hypervolume"].median, 5),
                 number(after["hypervolume"].median, 5),
                 f"{entry.polished.replicas_improved} of {len(entry.replicas)}",
+                number(after["non_dominated"].median, 0),
+                number(100.0 * after["widest_gap"].median, 0),
                 number(after["mean_excess_above_static"].median, 2),
                 number(after["payload_limit"].median, 3),
                 number(after["seconds"].median, 2),

@@ -118,6 +118,7 @@ class PolishEffort:
         success_share: of the front's own points, those accepted or optimal.
         seconds, median_attempt_seconds: spent in total and per attempt.
         equivalent_evaluations: candidate evaluations that take as long.
+        widest_gap: share of the front's length between the neighbours that are farthest apart.
         worst_stationarity, worst_feasibility, median_stationarity: residuals of accepted points.
     """
 
@@ -127,6 +128,7 @@ class PolishEffort:
     seconds: Seconds
     median_attempt_seconds: Figure
     equivalent_evaluations: Count
+    widest_gap: Figure
     worst_stationarity: Figure
     worst_feasibility: Figure
     median_stationarity: Figure

@@ -290,6 +290,7 @@ def polish_document(front: PolishedFront) -> PolishDocument:
             seconds=front.seconds,
             median_attempt_seconds=_median([o.seconds for o in front.outcomes]),
             equivalent_evaluations=front.equivalent_evaluations,
+            widest_gap=front.widest_gap,
             worst_stationarity=_worst([o.residuals.stationarity for o in accepted]),
             worst_feasibility=_worst([o.residuals.feasibility for o in accepted]),
             median_stationarity=_median([o.residuals.stationarity for o in accepted]),

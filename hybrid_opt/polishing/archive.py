@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from hybrid_opt.indicators import metrics
@@ -33,6 +36,12 @@ class GrowingFront:
         self.objectives.append(objectives)
         self.parent.append(-1)
         self.polished.append(True)
+
+    def drop(self, indices: Sequence[int]) -> None:
+        """Take out points; the others' indices change."""
+        lists: tuple[list[Any], ...] = (self.x, self.objectives, self.parent, self.polished)
+        for values in lists:
+            values[:] = [value for k, value in enumerate(values) if k not in indices]
 
     def rows(self) -> list[int]:
         """Indices of the non-dominated points by increasing first objective."""

@@ -2,14 +2,14 @@
 
 Points of the front are improved first, each against its own start, so that neither objective gets
 worse. From the improved ones the solver goes on to the ends of the front and to its balanced
-middle, and then into the widest gaps between neighbours, along the normal of the chord. Every
-answer is judged by the full evaluator and certified between the samples before it is believed.
+middle, and then along the front into the widest gaps between neighbours. Every answer is judged by
+the full evaluator and certified between the samples before it is believed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -17,8 +17,11 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import FORCE_PAIRS
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost
+from hybrid_opt.polishing.filling import Edge, crept, filling
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
-from hybrid_opt.polishing.plan import Attempt, PlanState, aimed, points, widest_gap
+from hybrid_opt.polishing.kick import kicked
+from hybrid_opt.polishing.mirror import mirror_of
+from hybrid_opt.polishing.plan import Attempt, PlanState, aimed, points
 from hybrid_opt.polishing.point import PolishSolver, Solution, SolveTask
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.run import Polisher, PolishRun
@@ -78,45 +81,83 @@ class ForceRun(PolishRun[Attempt]):
         emit: Callable[[PolishOutcome], None],
     ) -> None:
         super().__init__(polisher.evaluator, polisher.settings, archive, recorded, emit)
-        self._solver = polisher.solver
+        self._solver, self._mirror = polisher.solver, mirror_of(polisher.evaluator.workcell)
         self._tried: set[tuple[int | None, bytes]] = set()
         self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
+        self._images: list[int] = []
 
     def _solution(self, attempt: Attempt) -> Solution:
-        task = SolveTask(attempt.x, attempt.target, attempt.radius, attempt.wide)
+        task = SolveTask(attempt.x, attempt.target, attempt.radius, attempt.wide, attempt.near)
         return self._solver.solve(task)
 
     def all(self, rng: np.random.Generator) -> None:
-        """The front's points first; then ends, middle and gaps in turns, while attempts last."""
+        """The front's points, then ends and middle in turns while attempts last; then what lies
+        between. Mirror images are taken in all the way, and certified together in the end."""
         self._do(points(self._archive, self._settings))
         while self._left() > 0:
-            for _ in range(self._settings.front.turns_per_gap):
-                self._turn((0, 1), rng)
-                if self._stalls[None] < self._settings.front.middle_stalls:
-                    self._turn((None,), rng)
-            self._do(self._gap())
+            self._turn((0, 1), rng)
+            if self._stalls[None] < self._settings.front.middle_stalls:
+                self._turn((None,), rng)
+        self._fill()
+        self._certify_images()
+
+    def _fill(self) -> None:
+        """Attempts between the ends, until the front is even or no side of a gap is left."""
+        tried: set[Edge] = set()
+        self._most += self._settings.fill.attempts * self._settings.points
+        while self._left() > 0:
+            found = filling(self._archive, tried, self._settings.fill)
+            if found is None:
+                return
+            tried |= {found.edge, self._reflected(found.edge)}
+            self._do([found.attempt])
+            outcome = self.outcomes[-1]
+            if outcome.status == "accepted" and crept(self._archive, found, outcome.objectives):
+                edge = outcome.x.tobytes(), *found.edge[1:]
+                tried |= {edge, self._reflected(edge)}
+
+    def _reflected(self, edge: Edge) -> Edge:
+        """The mirror image of a side of a gap, itself where it has none."""
+        start, across, near = edge
+        return self._reflected_bytes(start), self._reflected_bytes(across), near
+
+    def _reflected_bytes(self, x: bytes) -> bytes:
+        image = self._image(np.frombuffer(x))
+        return x if image is None else image.tobytes()
+
+    def _image(self, x: Array) -> Array | None:
+        return None if self._mirror is None else self._mirror.image(x)
+
+    def _take(self, attempt: Attempt, outcome: PolishOutcome) -> None:
+        super()._take(attempt, outcome)
+        if outcome.status != "accepted" or (image := self._image(outcome.x)) is None:
+            return
+        found = self._evaluator.evaluate(image)
+        if found.feasible[0] and not self._archive.dominates(found.objectives[0]):
+            self._archive.add(image, found.objectives[0])
+            self._images.append(len(self._archive.x) - 1)
+
+    def _certify_images(self) -> None:
+        """Leave out images that are not proven free of collisions between the samples."""
+        standing = [k for k in self._archive.rows() if k in self._images]
+        if standing:
+            x = np.array([self._archive.x[k] for k in standing])
+            proven = self._evaluator.certified(self._evaluator.evaluate(x)).feasible
+            self._archive.drop([k for k, good in zip(standing, proven, strict=True) if not good])
 
     def _turn(self, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
         """An attempt at each of some aims, and whether it came further."""
+        kick = partial(kicked, self._evaluator, self._settings.kick, rng=rng)
         for objective in objectives:
             before, stalls = self._archive.best(objective)[1], self._stalls[objective]
             search = PlanState(objective, stalls > 0, self._tried)
-            attempt = aimed(self._archive, search, self._settings, rng)
+            attempt = aimed(self._archive, search, self._settings, kick, rng)
             self._tried.add((objective, attempt.x.tobytes()))
+            if (image := self._image(attempt.x)) is not None:
+                self._tried.add((None if objective is None else 1 - objective, image.tobytes()))
             self._do([attempt])
             further = self._archive.best(objective)[1] < before - self._settings.front.progress
             self._stalls[objective] = 0 if further else stalls + 1
-
-    def _gap(self) -> list[Attempt]:
-        """An attempt in the widest gap that was not tried, none where all are narrow."""
-        tried = {outcome.start.tobytes() for outcome in self.outcomes if outcome.aim == "gap"}
-        found = widest_gap(self._archive, tried, self._settings)
-        if found is None:
-            return []
-        attempt, beyond = found
-        half = (attempt.x + beyond) / 2.0
-        feasible = self._evaluator.evaluate(half).feasible[0]
-        return [replace(attempt, x=half) if feasible else attempt]
 
 
 def polish_front(

@@ -1,8 +1,8 @@
-"""What the polish of a front attempts next: a point of it, an end, the middle, or a gap."""
+"""What the polish of a front attempts first: points of it, its ends and its middle."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from math import ceil
 
@@ -28,7 +28,7 @@ class Attempt:
     Attributes:
         aim, parent, start: as in `hybrid_opt.polishing.records.PolishOutcome`.
         x: (n_var,) decision vector to start from.
-        target, radius, wide: see `hybrid_opt.polishing.point.SolveTask`.
+        target, radius, wide, near: see `hybrid_opt.polishing.point.SolveTask`.
     """
 
     aim: Aim
@@ -38,6 +38,7 @@ class Attempt:
     target: Target
     radius: float
     wide: bool = False
+    near: bool = False
 
 
 def points(archive: GrowingFront, settings: PolishSettings) -> list[Attempt]:
@@ -80,56 +81,38 @@ class PlanState:
     tried: Collection[tuple[int | None, bytes]]
 
 
+Kick = Callable[[Array, int], tuple[Array, Array] | None]
+"""From a decision vector and the objective that matters to another start and its objectives; None
+where none was found."""
+
+
 def aimed(
     archive: GrowingFront,
     state: PlanState,
     settings: PolishSettings,
+    kick: Kick,
     rng: np.random.Generator,
 ) -> Attempt:
     """An attempt at an end of the front or at its balanced middle.
 
-    It goes on from the best point. Where the last attempt came no further from there, it starts
-    from any other point, those that are dominated by now included, and looks farther: ends lie
-    in several basins, and another start may lead into a better one.
+    It goes on from the best point. Where that was tried, or came no further, ends start from a kick
+    away from it: they lie in several basins. The middle starts from any other point then, those
+    that are dominated by now included.
     """
     objective, stalled, tried = state.objective, state.stalled, state.tried
     radius, k = settings.trust.first, archive.best(objective)[0]
     fresh = [row for row, x in enumerate(archive.x) if (objective, x.tobytes()) not in tried]
-    wide = stalled or k not in fresh
-    if wide and fresh:
+    span = np.full(2, LEAST_SPAN)
+    away = stalled or k not in fresh
+    if away and objective is not None and (kicked := kick(archive.x[k], objective)) is not None:
+        x, start = kicked
+        return Attempt("extreme", -1, x, start, extreme(start, span, objective), radius)
+    if away and fresh:
         k = fresh[int(rng.integers(len(fresh)))]
     elif not fresh:
         radius = settings.front.small_radius
-    start, span = archive.objectives[k], np.full(2, LEAST_SPAN)
+    start = archive.objectives[k]
     if objective is None:
         return Attempt("balance", -1, archive.x[k], start, balance(start, span), radius)
     target = extreme(start, span, objective)
-    return Attempt("extreme", -1, archive.x[k], start, target, radius, wide)
-
-
-def widest_gap(
-    archive: GrowingFront, tried: Collection[bytes], settings: PolishSettings
-) -> tuple[Attempt, Array] | None:
-    """An attempt in the widest gap between neighbours, along the normal of their chord.
-
-    Args:
-        tried: starts of earlier attempts, as bytes.
-
-    Returns:
-        The attempt, from the first neighbour, and the second one's decision vector; None where
-        no gap is left.
-    """
-    rows, span = archive.rows(), archive.span()
-    values = np.array([archive.objectives[k] for k in rows]) / span
-    widths = np.linalg.norm(np.diff(values, axis=0), axis=1)
-    for gap in np.argsort(-widths, kind="stable").tolist():
-        first, second = rows[gap], rows[gap + 1]
-        start = (archive.objectives[first] + archive.objectives[second]) / 2.0
-        if start.tobytes() in tried or widths[gap] <= settings.front.least_gap:
-            continue
-        chord = np.abs(values[gap + 1] - values[gap])
-        normal = chord[::-1] / np.linalg.norm(chord)
-        target = pascoletti_serafini(start, span, normal)
-        radius = settings.trust.first
-        return Attempt("gap", -1, archive.x[first], start, target, radius), archive.x[second]
-    return None
+    return Attempt("extreme", -1, archive.x[k], start, target, radius, wide=away)

@@ -44,12 +44,14 @@ class SolveTask:
         target: what to aim at.
         radius: of the first box of trust, in halves of the decision variables' ranges.
         wide: whether to look farther than the nearest optimum, with `SolveSettings.wide_barrier`.
+        near: whether the start is nearly an optimum of the target, as a neighbour on the front is.
     """
 
     x: Array
     target: Target
     radius: float = TrustSettings().first
     wide: bool = False
+    near: bool = False
 
 
 @dataclass
@@ -105,6 +107,13 @@ class PolishSolver:
         self._settings = settings
         wide = replace(settings.solve, barrier=settings.solve.wide_barrier)
         self._wide = replace(settings, solve=wide)
+        near = settings.fill
+        self._near = replace(
+            settings,
+            rounds=near.rounds,
+            max_iterations=near.iterations,
+            solve=replace(settings.solve, barrier=near.barrier),
+        )
         self._solve = {"ipopt": ipopt, "dense": dense}[settings.solve.solver]
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
         self._reader = CarryReader(evaluator, grid, functions.rows, robust)
@@ -114,8 +123,8 @@ class PolishSolver:
         x = np.clip(task.x, self._cell.task.lower, self._cell.task.upper)
         best = _Best(x, self._reader.read(x), Learned(self._active, self._settings.stricter))
         region = TrustRegion(self._settings.trust, task.radius)
-        solution, settings = Solution(x), self._wide if task.wide else self._settings
-        while solution.rounds < self._settings.rounds and not region.is_spent:
+        solution, settings = Solution(x), self._settings_for(task)
+        while solution.rounds < settings.rounds and not region.is_spent:
             required = best.learned.required(best.carry, task.target, lenient=solution.rounds == 0)
             program = SmoothProgram(
                 self._cell, required, task.target, best.carry, best.x, region.radius
@@ -138,6 +147,10 @@ class PolishSolver:
             elif level(task.target, carry.peak) >= level(task.target, best.carry.peak):
                 higher = self._active.forces.higher(carry, task.target) - required.keys()
                 best.learned.ask(higher)
+                if answer.converged and not higher and not region.holds(step):
+                    solution.converged = True
+                    solution.residuals = program.residuals_at(best.x, best.carry, answer)
+                    break
                 if not higher:
                     region.barren(step)
             else:
@@ -150,6 +163,11 @@ class PolishSolver:
             if not np.isfinite(solution.residuals.stationarity):
                 solution.residuals = answer.residuals
         return solution
+
+    def _settings_for(self, task: SolveTask) -> PolishSettings:
+        if task.near:
+            return self._near
+        return self._wide if task.wide else self._settings
 
     def _part(
         self, best: _Best, x: Array, required: dict[Row, float], target: Target

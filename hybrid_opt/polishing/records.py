@@ -84,6 +84,15 @@ class PolishedFront:
         return int(np.ceil(self.seconds / self.evaluation_seconds))
 
     @property
+    def widest_gap(self) -> float:
+        """Share of the front's length, along both objectives, between the neighbours that are
+        farthest apart; NaN for fewer than two points."""
+        if len(self.objectives) < 2:
+            return float("nan")
+        sides = np.abs(np.diff(self.objectives, axis=0))
+        return float((sides / sides.sum(axis=0)).sum(axis=1).max() / 2.0)
+
+    @property
     def counts(self) -> dict[str, int]:
         """Attempts by status, and those not accepted also by 'status: reason'."""
         listed = Counter[str](outcome.status for outcome in self.outcomes)

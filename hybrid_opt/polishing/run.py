@@ -63,6 +63,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         self._evaluator, self._settings = evaluator, settings
         self._archive, self._recorded, self._emit = archive, recorded, emit
         self.outcomes: list[PolishOutcome] = []
+        self._most = settings.points
 
     @abstractmethod
     def all(self, rng: np.random.Generator) -> None:
@@ -73,7 +74,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         """What the solver makes of an attempt."""
 
     def _left(self) -> int:
-        return self._settings.points - len(self.outcomes)
+        return self._most - len(self.outcomes)
 
     def _do(self, attempts: list[AnyAttempt]) -> None:
         """Solve, judge and take in attempts; those on record are not solved again."""

@@ -116,25 +116,64 @@ class FrontSettings:
 
     Attributes:
         own_share: of the attempts that go to points of the given front.
-        turns_per_gap: turns at the ends and the middle before one at a gap: they decide
-            hypervolume and payload.
         progress: least gain of an attempt that counts as coming further, in units of the
             reference force.
         middle_stalls: attempts at the balanced middle in a row that came no further, after which
             it is left.
         small_radius: first box of trust of an attempt that goes on where the last came no further.
-        least_gap: gaps narrower than this are left, in units of the front's extent.
+        least_gap: gaps of a drivable front narrower than this are left, in units of its extent.
         optimal: residual of stationarity below which a point that could not be improved counts as
             optimal.
     """
 
     own_share: float = 1.0 / 6.0
-    turns_per_gap: int = 3
     progress: float = 2e-5
     middle_stalls: int = 1
     small_radius: float = 0.1
     least_gap: float = 0.02
     optimal: float = 1e-3
+
+
+@dataclass(frozen=True)
+class KickSettings:
+    """How another start is looked for, see `hybrid_opt.polishing.kick`.
+
+    Attributes:
+        candidates: that are drawn.
+        share: of the decision variables that are drawn anew.
+        distance: least change of the one that changes most, as a share of its range.
+    """
+
+    candidates: int = 1000
+    share: float = 0.15
+    distance: float = 0.3
+
+
+@dataclass(frozen=True)
+class FillSettings:
+    """How a front is filled once its ends are known, see `hybrid_opt.polishing.filling`.
+
+    Attributes:
+        members: points that the front is to have.
+        attempts: at most, for each of `PolishSettings.points`.
+        stride: from the neighbour that an attempt starts from, along both objectives, at most, in
+            units of the front's extent.
+        far: width beyond which a gap that no neighbour leads into is looked at from afar.
+        far_radius, radius: of the first box of trust from afar and from a neighbour, in halves of
+            the decision variables' ranges.
+        rounds, iterations, barrier: of a solve from a neighbour on the front, in place of
+            `PolishSettings.rounds`, `PolishSettings.max_iterations` and `SolveSettings.barrier`.
+    """
+
+    members: int = 50
+    attempts: int = 4
+    stride: float = 0.2
+    far: float = 0.1
+    far_radius: float = 1.0
+    radius: float = 0.2
+    rounds: int = 2
+    iterations: int = 15
+    barrier: float = 1e-5
 
 
 @dataclass(frozen=True)
@@ -183,7 +222,8 @@ class PolishSettings:
     """What decides the results of a polish.
 
     Attributes:
-        points: attempts that one front may take.
+        points: attempts that one front may take at its points, ends and middle; those that fill
+            it between them come on top.
         method: how a point is improved: along the diagonal (Pascoletti and Serafini 1984), or by
             minimising one objective while the other is held (epsilon constraint).
         max_iterations: of the solver in one round; see `SolveSettings.patience`.
@@ -196,10 +236,10 @@ class PolishSettings:
         clearance: distance kept from obstacles [m]; lets the motion between samples be certified.
         stricter: least rise of a required value that counts as a new demand [m, rad, 1].
         tolerance: improvement of an objective below which a point counts as optimal already.
-        near, trust, solve, front, drivable: the parts' own.
+        near, trust, solve, front, kick, fill, drivable: the parts' own.
     """
 
-    points: int = 24
+    points: int = 12
     method: Method = "pascoletti-serafini"
     max_iterations: int = 30
     rounds: int = 7
@@ -213,6 +253,8 @@ class PolishSettings:
     trust: TrustSettings = field(default_factory=TrustSettings)
     solve: SolveSettings = field(default_factory=SolveSettings)
     front: FrontSettings = field(default_factory=FrontSettings)
+    kick: KickSettings = field(default_factory=KickSettings)
+    fill: FillSettings = field(default_factory=FillSettings)
     drivable: DrivableSettings = field(default_factory=DrivableSettings)
 
     def __post_init__(self) -> None:

@@ -22,13 +22,14 @@ from hybrid_opt.polishing.records import (
     outcome_from_json,
     outcome_to_json,
 )
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
-SETTINGS = PolishSettings(points=7)
+SETTINGS = PolishSettings(points=7, fill=FillSettings(attempts=1))
+PATIENT = PolishSettings(points=1, rounds=25, max_iterations=80)
 
 
 @cache
@@ -94,7 +95,7 @@ def test_residuals_of_accepted_points_are_told() -> None:
 
 
 def test_with_time_a_point_becomes_stationary() -> None:
-    patient = FrontPolisher(evaluator(), PolishSettings(points=1, rounds=25, max_iterations=80))
+    patient = FrontPolisher(evaluator(), replace(PATIENT, fill=FillSettings(attempts=0)))
     (outcome,) = patient.polish(start_front(), np.random.default_rng(0)).outcomes
     assert outcome.status == "accepted"
     assert outcome.residuals.stationarity < 1e-4
@@ -108,7 +109,8 @@ def test_what_it_cost_is_told_in_evaluations() -> None:
     assert result.equivalent_evaluations == pytest.approx(
         result.seconds / result.evaluation_seconds, abs=1.0
     )
-    assert len(result.outcomes) <= SETTINGS.points
+    most = SETTINGS.points * (1 + SETTINGS.fill.attempts)
+    assert SETTINGS.points < len(result.outcomes) <= most
     assert sum(o.status == "accepted" for o in result.outcomes) == result.counts["accepted"]
 
 
@@ -131,7 +133,7 @@ def test_an_attempt_that_ended_its_process_costs_itself_alone() -> None:
     )
     assert (again.outcomes[2].status, again.outcomes[2].reason) == ("failed", "killed")
     assert again.outcomes[2] not in emitted
-    assert len(again.outcomes) == len(polished().outcomes)
+    assert len(again.outcomes) > 3
     assert len(emitted) == len(again.outcomes) - 3
 
 
