@@ -49,6 +49,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="the workcell file (default: NAME-proposed.toml beside the problem file)",
     )
     parser.add_argument(
+        "--bases",
+        action="store_true",
+        help="propose where the robots stand as well; only the height of their bases counts then",
+    )
+    parser.add_argument(
         "--time",
         type=number(1.0, 1e6),
         default=ho.ProposeSettings().seconds,
@@ -72,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     proposal = ho.propose(
         problem,
         rng=np.random.default_rng(options.seed),
-        settings=ho.ProposeSettings(seconds=options.time),
+        settings=ho.ProposeSettings(seconds=options.time, bases=options.bases),
         tell=(lambda text: None) if options.quiet else _teller(),
     )
     replace_file(output, proposal.text(output.parent).encode())

@@ -53,6 +53,7 @@ class Sampling:
 
     Attributes:
         feasible: (n,) verdicts on decision vectors (n, n_var).
+        certain: whether one decision vector is feasible between its samples too.
         unit: (n_var,) half-widths that are scaled together [m, rad].
         limits: (2, n_var) what no bounds exceed.
         rng: the randomness.
@@ -61,6 +62,7 @@ class Sampling:
     """
 
     feasible: Callable[[Array], NDArray[np.bool_]]
+    certain: Callable[[Array], bool]
     unit: Array
     limits: Array
     rng: np.random.Generator
@@ -86,15 +88,15 @@ def find_bounds(centre: Array, sampling: Sampling) -> Bounds:
         if len(good) < 6 or sampling.out_of_time():
             break
         moved = np.round(good.mean(axis=0), 4)
-        if not bool(sampling.feasible(moved[None])[0]):
+        if not sampling.certain(moved):
             break
         centre = moved
     for _ in range(ROUNDS):
         x = _drawn(centre, scale, sampling, CONFIRMED)
         share = float(sampling.feasible(x).mean())
-        if sampling.low <= share <= sampling.high or sampling.out_of_time():
+        if 1.3 * sampling.low <= share <= 0.85 * sampling.high or sampling.out_of_time():
             break
-        scale *= 0.8 if share < sampling.low else 1.2
+        scale *= 0.8 if share < aim else 1.2
         scale = float(np.clip(scale, NARROWEST, WIDEST))
     return Bounds(centre, *_box(centre, scale, sampling), share, len(x))
 

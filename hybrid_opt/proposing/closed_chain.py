@@ -17,8 +17,7 @@ from hybrid_opt.proposing.holding import LIMIT_MARGIN, MANIPULABILITY_MARGIN, Ho
 from hybrid_opt.proposing.judge import PoseJudge
 from hybrid_opt.proposing.kinematics import JUMP, box_to_last_joint, spun
 from symbolic.array import Array
-from symbolic.physics.pose import inverse, pose_matrix
-from symbolic.robot.urdf import arm_model
+from symbolic.physics.pose import box_placement, inverse
 from symbolic.workcell.records import POSE_SIZE, Workcell
 
 STEP = 0.02
@@ -55,10 +54,12 @@ class Place:
 class _Follower:
     """One arm with pinocchio's numbers."""
 
-    def __init__(self, workcell: Workcell, judge: PoseJudge, arm: int, hold: Hold) -> None:
+    def __init__(
+        self, workcell: Workcell, judge: PoseJudge, arm: int, hold: Hold, model: pin.Model
+    ) -> None:
         robot, geometry = workcell.robots[arm], judge.geometry.arms[arm]
         self.name = robot.name
-        self.model = arm_model(robot)
+        self.model = model
         self.data = self.model.createData()
         self.names = list(self.model.names)[1:]
         self.last = self.model.njoints - 1
@@ -116,16 +117,29 @@ class ClosedChain:
         refused: how often what other than a collision was in the way.
     """
 
-    def __init__(self, workcell: Workcell, judge: PoseJudge, holds: tuple[Hold, Hold]) -> None:
-        """workcell: with its redundant joints chosen."""
+    def __init__(
+        self,
+        workcell: Workcell,
+        judge: PoseJudge,
+        holds: tuple[Hold, Hold],
+        models: tuple[pin.Model, pin.Model],
+    ) -> None:
+        """Prepare both arms.
+
+        Args:
+            workcell: with its redundant joints chosen.
+            judge, holds: see the class.
+            models: of both arms (`symbolic.robot.urdf.arm_model`).
+        """
         self.judge = judge
+        self._orientation = workcell.task.orientation
         self.looked = 0
         self.refused: Counter[str] = Counter()
-        self._arms = [_Follower(workcell, judge, arm, holds[arm]) for arm in (0, 1)]
+        self._arms = [_Follower(workcell, judge, arm, holds[arm], models[arm]) for arm in (0, 1)]
 
     def close(self, extended: Array, q: tuple[Array, Array]) -> Place | None:
         """The configuration near given joints; collisions do not count."""
-        T_world_box = pose_matrix(extended[:3], extended[3:POSE_SIZE])
+        T_world_box = box_placement(self._orientation, extended[:POSE_SIZE])
         found = []
         for arm, near in zip(self._arms, q, strict=True):
             closed = arm.close(T_world_box, extended, near)
@@ -160,10 +174,6 @@ class ClosedChain:
         for place in self.along(begin, path[1:]):
             last, count = place, count + 1
         return last if count == len(path) - 1 else None
-
-    def free(self, place: Place) -> bool:
-        """Whether nothing collides."""
-        return self._free([place]) == 1
 
     def _free(self, places: list[Place]) -> int:
         """How many of these are free before the first that is not."""

@@ -88,7 +88,12 @@ def changes(problem: Problem, found: Found) -> dict[str, Any]:
             entry["redundant_joints"] = list(robot.redundant_joints)
         robots.append(entry)
         spin = float(problem.data["contacts"][i].get("spin", 0.0)) + found.spins[i]
-        contacts.append({"spin": round(float(np.remainder(spin + np.pi, 2 * np.pi) - np.pi), 9)})
+        contacts.append(
+            {
+                **problem.contacts[i],
+                "spin": round(float(np.remainder(spin + np.pi, 2 * np.pi) - np.pi), 9),
+            }
+        )
     whole: dict[str, Any] = merged(
         found.given, {"robots": robots, "contacts": contacts, "task": task}
     )

@@ -106,14 +106,18 @@ class Task:
         workcell: the cell.
         start, goal: (6,) box poses.
         spins: of the pad beside that of the file [rad].
-        judge: of collisions.
+        judge: of collisions; None: they do not count.
+        starts: random starts of the search for postures.
+        guides: of `GUIDES`, so many are tried.
     """
 
     workcell: Workcell
     start: Array
     goal: Array
     spins: Array
-    judge: PoseJudge
+    judge: PoseJudge | None
+    starts: int = STARTS
+    guides: int = len(GUIDES)
 
 
 def find_holds(
@@ -162,12 +166,12 @@ class _Finder:
         """Distinct postures at the start and the index of each one's spin."""
         kinematics, found, start = self.kinematics, self.found, self.task.start
         T_world_box = box_placement(self.task.workcell.task.orientation, start)
-        which = np.arange(STARTS) % len(T_box_joint)
+        which = np.arange(self.task.starts) % len(T_box_joint)
         targets = np.array([T_world_box @ T for T in T_box_joint])[which]
         centre = (kinematics.lower + kinematics.upper) / 2.0
         half = (kinematics.upper - kinematics.lower) / 2.0
         half = np.where(kinematics.geometry.turning, np.minimum(half, np.pi), half)
-        q = centre + half * self.rng.uniform(-1.0, 1.0, (STARTS, len(half)))
+        q = centre + half * self.rng.uniform(-1.0, 1.0, (self.task.starts, len(half)))
         solved = kinematics.solve(q, targets, SEARCH_STEPS, SEARCH_DAMPING)
         good = solved.residual <= REACHED
         q, which, measure = solved.q[good], which[good], solved.manipulability[good]
@@ -192,8 +196,8 @@ class _Finder:
     def colliding(self, pose: Array, q: Array) -> NDArray[np.bool_]:
         """(n,) of postures (n, joints) that hold the box at a pose; counts what they meet."""
         judge, arm = self.task.judge, self.arm
-        if not len(q):
-            return np.zeros(0, dtype=bool)
+        if judge is None or not len(q):
+            return np.zeros(len(q), dtype=bool)
         hit = judge.arm_colliding(arm, np.tile(pose, (len(q), 1)), q)
         absent = np.zeros(judge.geometry.arms[1 - arm].joints)
         for row in np.flatnonzero(hit)[:MOST_HOLDS].tolist():
@@ -207,7 +211,7 @@ class _Finder:
         """Follow postures of one spin along guides to the goal; add those that arrive."""
         start, goal = self.task.start, self.task.goal
         waiting = np.arange(len(q))
-        for bow in GUIDES:
+        for bow in GUIDES[: self.task.guides]:
             if not len(waiting):
                 return
             poses = box_poses(start, goal, GUIDE_POSES)

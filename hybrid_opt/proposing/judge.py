@@ -59,6 +59,10 @@ class PoseJudge:
             self.met[found.first_contact.first, found.first_contact.second] += 1
         return found.colliding
 
+    def without_screening(self, pose: Array, q_1: Array, q_2: Array) -> NDArray[np.bool_]:
+        """The same by FCL alone, for every pair."""
+        return np.asarray(self._checker.collision_mask(pose, q_1, q_2).any(axis=1))
+
     def arm_colliding(self, arm: int, pose: Array, q: Array) -> NDArray[np.bool_]:
         """(n,) of one arm and the box, as if the other arm were not there."""
         absent = np.zeros((len(q), self.geometry.arms[1 - arm].joints))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from hybrid_opt.proposing.holding import GUIDE_POSES, GUIDES, Hold
 from hybrid_opt.proposing.judge import MARGINS, PoseJudge
 from hybrid_opt.proposing.kinematics import box_poses
 from symbolic.array import Array
+from symbolic.robot.urdf import arm_model
 from symbolic.workcell.records import POSE_SIZE, Task, Workcell
 
 GUIDES_TRIED = 3
@@ -52,16 +54,18 @@ def ranked_pairs(
     """
     scored = [(a.score + b.score, (a, b)) for a in holds[0] for b in holds[1]]
     scored.sort(key=lambda item: -item[0])
-    judges = [judge.with_margin(margin) for margin in MARGINS]
+    judges = cache(judge.with_margin)
+    models = (arm_model(workcell.robots[0]), arm_model(workcell.robots[1]))
     found = []
     for score, pair in scored[:MOST_PAIRS]:
         start, goal = (_place(workcell.task, pose, pair, k) for k, pose in enumerate(ends))
-        for wide in judges:
-            chain = ClosedChain(workcell, wide, pair)
-            if chain.free(start) and chain.free(goal):
-                share = _free_share(chain, start, goal)
-                found.append((share + 0.1 * score, Pair(pair, start, goal, chain, share)))
-                break
+        wide = next(
+            (judges(margin) for margin in MARGINS if _free(judges(margin), start, goal)), None
+        )
+        if wide is not None:
+            chain = ClosedChain(workcell, wide, pair, models)
+            share = _free_share(chain, start, goal)
+            found.append((share + 0.1 * score, Pair(pair, start, goal, chain, share)))
     found.sort(key=lambda item: -item[0])
     return [pair for _, pair in found]
 
@@ -75,6 +79,14 @@ def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Place
         for joint, place in task.redundant_of(arm):
             extended[place] = q[joint]
     return Place(extended, (joints[0], joints[1]))
+
+
+def _free(judge: PoseJudge, *places: Place) -> bool:
+    """Whether nothing collides in any of these configurations."""
+    return not any(
+        judge.colliding(place.extended[None, :POSE_SIZE], place.q[0][None], place.q[1][None])[0]
+        for place in places
+    )
 
 
 def _free_share(chain: ClosedChain, start: Place, goal: Place) -> float:

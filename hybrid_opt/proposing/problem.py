@@ -15,7 +15,7 @@ from hybrid_opt.proposing.document import completed, merged
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError, WorkcellError
-from symbolic.physics.pose import box_rotation, rotation_from_rpy
+from symbolic.physics.pose import box_placement, rotation_from_rpy
 from symbolic.robot.packages import PACKAGE_SCHEME
 from symbolic.workcell.file import load
 from symbolic.workcell.orientation import Orientation
@@ -24,7 +24,7 @@ from symbolic.workcell.records import Workcell
 PROPOSED = ("waypoints", "initial", "redundant")
 """Keys of the task that are proposed anew, whatever the file has."""
 
-REACH_OF_DRAFT = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
+REACH_OF_DRAFT = 0.01
 """How far beside start and goal the one free waypoint of a draft may be [m, rad]; of no meaning."""
 
 
@@ -47,9 +47,33 @@ class Problem:
         """(6,) start and goal of the box, the goal's angles on the turns nearest the start's;
         rotation vectors as they are."""
         start, goal = (np.array(self.data["task"][key], dtype=float) for key in ("start", "goal"))
-        turned = orientation_of(self.data["task"])
-        goal[3:] = turned.unwrapped(np.array([start[3:], goal[3:]]))[1]
+        goal[3:] = self.orientation.unwrapped(np.array([start[3:], goal[3:]]))[1]
         return start, goal
+
+    @property
+    def orientation(self) -> Orientation:
+        """What the last three numbers of a pose mean."""
+        task = self.data["task"]
+        if task.get("rotation") != "quaternion":
+            return Orientation()
+        reference = rotation_from_rpy(task.get("rotation_reference", [0.0, 0.0, 0.0]))
+        return Orientation("quaternion", reference)
+
+    @property
+    def contacts(self) -> list[dict[str, Any]]:
+        """Both contacts' points, the middles of opposite faces where the file has none: those that
+        face the robots, or those that the carry passes sideways where the robots have no bases."""
+        entries = self.data["contacts"]
+        if all("xyz" in entry for entry in entries):
+            return [{"xyz": entry["xyz"]} for entry in entries]
+        found = [robot.get("base", {}).get("xyz") for robot in self.data["robots"]]
+        known = all(isinstance(xyz, list) and len(xyz) == 3 for xyz in found)
+        bases = np.array(found, dtype=float) if known else None
+        start, goal = self.poses
+        size = np.array(self.data["payload"]["size"], dtype=float)
+        way = np.array([start, goal])
+        points = contact_points(size, way, box_placement(self.orientation, start)[:3, :3], bases)
+        return [{"xyz": point} for point in points]
 
     def workcell(self, changes: dict[str, Any] | None = None) -> Workcell:
         """The workcell with one free waypoint halfway where nothing else is said.
@@ -61,8 +85,9 @@ class Problem:
             WorkcellError: with all problems of the file.
         """
         data = with_places(self.data, self.source.parent)
+        changes = merged({"contacts": self.contacts}, changes or {})
         task = data["task"]
-        if "waypoints" not in (changes or {}).get("task", {}):
+        if "waypoints" not in changes.get("task", {}):
             poses = np.array([task["start"], task["goal"]], dtype=float)
             task["waypoints"] = [
                 {
@@ -72,7 +97,7 @@ class Problem:
             ]
         with TemporaryDirectory() as folder:
             draft = Path(folder) / self.source.name
-            draft.write_text(completed("", data, changes or {}), encoding="utf-8")
+            draft.write_text(completed("", data, changes), encoding="utf-8")
             try:
                 return load(draft)
             except WorkcellError as error:
@@ -149,8 +174,17 @@ def _problems(data: dict[str, Any]) -> list[str]:
             "task.waypoints: found a fixed one; allowed is a carry from start to goal, put fixed "
             "poses into the proposed file"
         )
+    if task.get("time_law") == "optimal":
+        found.append(
+            "task.time_law: found 'optimal'; allowed are 'constant' and 'ramped', change it in the "
+            "proposed file"
+        )
     size = data["payload"].get("size")
-    if not isinstance(size, list) or len(size) != 3 or not all(map(_is_number, size)):
+    if all("xyz" in entry for entry in data["contacts"]):
+        return found
+    if data["payload"].get("kind", "box") != "box":
+        found.append("contacts: xyz is needed for a payload that is no box")
+    elif not isinstance(size, list) or len(size) != 3 or not all(map(_is_number, size)):
         found.append("payload.size: allowed are 3 numbers")
     return found
 
@@ -181,29 +215,23 @@ def with_places(data: dict[str, Any], folder: Path) -> dict[str, Any]:
     return data
 
 
-def orientation_of(task: dict[str, Any]) -> Orientation:
-    """What the last three numbers of the poses of a task's table mean."""
-    if task.get("rotation") != "quaternion":
-        return Orientation()
-    return Orientation("quaternion", rotation_from_rpy(task.get("rotation_reference", [0, 0, 0])))
-
-
-def contact_points(data: dict[str, Any], bases: Array | None) -> list[list[float]]:
+def contact_points(
+    size: Array, way: Array, R_world_box: Array, bases: Array | None
+) -> list[list[float]]:
     """Middles of opposite faces of the box that face the robots, one per robot [m].
 
     Args:
-        data: the problem's tables.
+        size: (3,) edges of the box [m].
+        way: (2, 6) start and goal.
+        R_world_box: (3, 3) at the start.
         bases: (2, 3) positions of the robots [m]; None: the faces that the carry passes sideways.
     """
-    size = np.array(data["payload"]["size"], dtype=float)
-    start, goal = (np.array(data["task"][key], dtype=float) for key in ("start", "goal"))
-    R = box_rotation(orientation_of(data["task"]), start)
-    along = goal[:3] - start[:3] if bases is None else bases[0] - bases[1]
-    share = np.abs(R.T @ (along * [1.0, 1.0, 0.0]))
-    upright = np.abs(R[2]) > 0.7
+    along = way[1, :3] - way[0, :3] if bases is None else bases[0] - bases[1]
+    share = np.abs(R_world_box.T @ (along * [1.0, 1.0, 0.0]))
+    upright = np.abs(R_world_box[2]) > 0.7
     share[upright] = np.inf if bases is None else -1.0
     axis = int(np.argmin(share) if bases is None else np.argmax(share))
-    side = 1.0 if bases is None else float(np.sign(along @ R[:, axis]) or 1.0)
+    side = 1.0 if bases is None else float(np.sign(along @ R_world_box[:, axis]) or 1.0)
     point = np.zeros(3)
     point[axis] = side * size[axis] / 2.0
     return [point.tolist(), (-point).tolist()]

@@ -13,11 +13,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hybrid_opt.carry import Judgement
 from hybrid_opt.errors import ProposalError
+from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
 from hybrid_opt.proposing.completion import Found, changes, decision_bounds
 from hybrid_opt.proposing.pairing import Pair
@@ -28,7 +30,7 @@ from hybrid_opt.proposing.setup import Setup, prepare
 from hybrid_opt.proposing.trial import BranchLostError, Trial
 from hybrid_opt.proposing.via_points import MOST_VIA_POINTS, fit, shortened
 from symbolic.array import Array
-from symbolic.errors import SettingsError
+from symbolic.errors import SettingsError, WorkcellError
 from symbolic.workcell.records import POSE_SIZE
 
 ROUNDS = ((2000, 6), (6000, 10), (20000, 16), (60000, 24))
@@ -39,6 +41,12 @@ STRAYS = ((0.0, 0.15), (0.0, 0.05), (0.3, 0.15), (0.3, 0.05))
 
 ASIDE = 0.8
 """How far beside start and goal a path may run [m]."""
+
+FEW = 3
+"""Via-points that are taken at once; where a path needs more, others are tried first."""
+
+LONG_TRIED = 2
+"""Of those that need more, so many are judged."""
 
 PLANNING = 0.7
 """Share of the time after which no path is looked for any more."""
@@ -54,11 +62,14 @@ class ProposeSettings:
     Attributes:
         seconds: for all of it.
         feasible: least and largest share of random candidates within the bounds that is feasible.
+        bases: whether the robots' bases are proposed too; of those in the file only the height
+            counts.
         clock: what seconds are counted by.
     """
 
     seconds: float = 120.0
     feasible: tuple[float, float] = (0.02, 0.20)
+    bases: bool = False
     clock: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
@@ -136,6 +147,16 @@ def propose(
 
 
 @dataclass
+class _Lazy:
+    """A choice of bases, prepared when its turn comes."""
+
+    given: dict[str, Any]
+    spins: Array
+    setup: Setup | None = None
+    problem: str = ""
+
+
+@dataclass
 class _Search:
     """One proposal on its way."""
 
@@ -163,36 +184,65 @@ class _Search:
 
     def run(self) -> Proposal:
         self.begun = self.settings.clock()
-        setups = self._setups()
+        self.tell("bases" if self.settings.bases else "ways to hold the box")
+        spins = 2.0 * np.pi * np.arange(SPINS) / SPINS
+        choices = base_choices(self.problem, spins, self.rng) if self.settings.bases else [{}]
+        setups = [_Lazy(given, spins) for given in choices]
         for effort, most in ROUNDS:
             for setup in setups:
-                for number, pair in enumerate(setup.pairs[:most]):
-                    for stray in STRAYS:
-                        if self.too_late:
-                            raise self._failed(no_path(setups[0].pairs, self.refusals))
-                        self.tell(f"paths of pair {number + 1} of {len(setup.pairs)}, {effort}")
-                        found = self._carry(setup, pair, stray, effort)
-                        if found is not None:
-                            return found
-        raise self._failed(no_path(setups[0].pairs, self.refusals))
+                found = self._round(setup, effort, most)
+                if found is not None:
+                    return found
+                if self.too_late:
+                    break
+        raise self._failed(setups)
 
-    def _setups(self) -> list[Setup]:
-        """The cell with all ways to hold; several where bases are to be found."""
-        self.tell("ways to hold the box")
-        spins = 2.0 * np.pi * np.arange(SPINS) / SPINS
-        try:
-            return [prepare(self.problem, {}, spins, self.rng)]
-        except ProposalError as error:
-            raise self._failed(str(error)) from error
+    def _round(self, lazy: _Lazy, effort: int, most: int) -> Proposal | None:
+        """One round with one choice of bases."""
+        if lazy.setup is None and not lazy.problem:
+            self.tell("ways to hold the box")
+            try:
+                lazy.setup = prepare(self.problem, lazy.given, lazy.spins, self.rng)
+            except (ProposalError, WorkcellError) as error:
+                if isinstance(error, WorkcellError) and not lazy.given:
+                    raise  # the file is wrong, not the bases that were tried
+                lazy.problem = str(error)
+        if lazy.setup is None:
+            return None
+        for number, pair in enumerate(lazy.setup.pairs[:most]):
+            long: list[Array] = []
+            for stray in STRAYS:
+                if self.too_late:
+                    break
+                self.tell(f"paths of pair {number + 1} of {len(lazy.setup.pairs)}")
+                via = self._via_points(lazy.setup, pair, stray, effort)
+                if via is None:
+                    continue
+                if len(via) > FEW:  # another path may do with fewer
+                    long.append(via)
+                    continue
+                found = self._judged(lazy.setup, pair, via)
+                if found is not None:
+                    return found
+            for via in sorted(long, key=len)[:LONG_TRIED]:
+                found = None if self.out_of_time else self._judged(lazy.setup, pair, via)
+                if found is not None:
+                    return found
+        return None
 
-    def _failed(self, reasons: str) -> ProposalError:
-        spent = f"{self.spent:.0f} s"
-        return ProposalError(f"{self.problem.source}: no carry found in {spent}: {reasons}")
+    def _failed(self, setups: list[_Lazy]) -> ProposalError:
+        begin = f"{self.problem.source}: no carry found in {self.spent:.0f} s: "
+        if not setups:
+            return ProposalError(f"{begin}no bases from which both arms follow the box were found")
+        tried = next((lazy for lazy in setups if lazy.setup is not None), setups[0])
+        if tried.setup is None:
+            return ProposalError(begin + tried.problem)
+        return ProposalError(begin + no_path(tried.setup.pairs, self.refusals))
 
-    def _carry(
+    def _via_points(
         self, setup: Setup, pair: Pair, stray: tuple[float, float], effort: int
-    ) -> Proposal | None:
-        """A carry in one way of holding, or None."""
+    ) -> Array | None:
+        """The fewest via-points of a path in one way of holding, None where none are found."""
         task = setup.workcell.task
         lower, upper = np.full((2, task.extended_size), np.nan)
         ends = np.array([pair.start.extended, pair.goal.extended])
@@ -210,10 +260,10 @@ class _Search:
         dense = shortened(pair.chain, corners, self.rng)
         for count in range(1, MOST_VIA_POINTS + 1):
             via = fit(pair.chain, dense, count, self.rng)
-            if via is not None and not self.too_late:
-                proposal = self._judged(setup, pair, np.round(via, 4))
-                if proposal is not None:
-                    return proposal
+            if via is not None:
+                return np.asarray(np.round(via, 4))
+            if self.too_late:
+                break
         return None
 
     def _judged(self, setup: Setup, pair: Pair, via: Array) -> Proposal | None:
@@ -262,6 +312,13 @@ class _Search:
         unit, limits = decision_bounds(trial.workcell)
         low, high = self.settings.feasible
         sampling = Sampling(
-            trial.feasible, unit, limits, self.rng, low, high, lambda: self.out_of_time
+            trial.feasible,
+            trial.certain,
+            unit,
+            limits,
+            self.rng,
+            low,
+            high,
+            lambda: self.out_of_time,
         )
         return find_bounds(trial.initial, sampling)

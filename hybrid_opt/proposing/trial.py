@@ -74,12 +74,20 @@ class Trial:
 
     def verdict(self) -> tuple[Judgement, str]:
         """Whether the proposed carry is feasible, certified between its samples, and if not why."""
-        verdicts = self.evaluator.evaluate(self.initial[None])
+        return self.verdict_on(self.initial)
+
+    def certain(self, x: Array) -> bool:
+        """Whether a decision vector (n_var,) is feasible, between its samples too."""
+        return bool(self.feasible(x[None])[0]) and self.verdict_on(x)[0].feasible
+
+    def verdict_on(self, x: Array) -> tuple[Judgement, str]:
+        """The same of a decision vector (n_var,)."""
+        verdicts = self.evaluator.evaluate(x[None])
         judgement = verdicts.judgement(0, self.evaluator.objective_names)
         if not judgement.feasible:
             return judgement, str(explain(self.evaluator, verdicts)[0])
         try:
-            certificate = self.evaluator.certificate(self.initial)
+            certificate = self.evaluator.certificate(x)
         except LostPathError as error:
             return replace(judgement, feasible=False, reason="reach"), str(error)
         if certificate.is_free:

@@ -16,7 +16,11 @@ def sampling(n: int, seed: int) -> Sampling:
 
     limits = np.array([np.full(n, -10.0), np.full(n, 10.0)])
     rng = np.random.default_rng(seed)
-    return Sampling(feasible, np.full(n, 0.1), limits, rng, 0.02, 0.20, lambda: False)
+
+    def certain(x: Array) -> bool:
+        return bool(feasible(x[None])[0])
+
+    return Sampling(feasible, certain, np.full(n, 0.1), limits, rng, 0.02, 0.20, lambda: False)
 
 
 @pytest.mark.parametrize("n", [3, 6, 12])

@@ -1,42 +1,125 @@
-"""Orientations in a problem file: angles, and rotation vectors."""
-
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from hybrid_opt.proposing.problem import Problem, contact_points, orientation_of
+from hybrid_opt.proposing.document import completed
+from hybrid_opt.proposing.problem import Problem, contact_points, read_problem
+from symbolic.errors import WorkcellError
 from symbolic.physics.pose import rotation_from_rpy
+from symbolic.workcell.file import load
+from tests.hybrid_opt.proposing.test_proposal import rack_problem
 
-POSE = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+POST = Path("studies/problems/past-a-post.toml")
 
 
-def data_of(turn: float, **task: object) -> dict[str, dict[str, object]]:
-    start, goal = [*POSE[:5], turn], [0.5, 0.0, 1.0, 0.0, 0.0, 4.0]
-    return {"task": {"start": start, "goal": goal, **task}, "payload": {"size": [0.2, 0.3, 0.1]}}
+def test_the_shipped_problem_is_read_without_contact_points() -> None:
+    workcell = read_problem(POST).workcell()
+    for contact, side in zip(workcell.contacts, (1.0, -1.0), strict=True):
+        np.testing.assert_allclose(contact.T_box_pad[:3, 3], [0.0, side * 0.2, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("bases", "expected"),
+    [
+        ([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]], [0.0, 0.2, 0.0]),
+        ([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]], [0.0, -0.2, 0.0]),
+        ([[-1.0, 0.2, 0.5], [1.0, 0.0, 0.0]], [-0.15, 0.0, 0.0]),
+        (None, [0.0, 0.2, 0.0]),
+    ],
+)
+def test_contacts_face_the_robots(bases: Any, expected: list[float]) -> None:
+    way = np.array([[-0.4, 0.0, 0.3, 0, 0, 0], [0.4, 0.1, 0.6, 0, 0, 0]])
+    given = None if bases is None else np.array(bases)
+    first, second = contact_points(np.array([0.3, 0.4, 0.2]), way, np.eye(3), given)
+    np.testing.assert_allclose(first, expected)
+    np.testing.assert_allclose(second, -np.array(expected))
+
+
+def test_a_turned_box_is_pressed_on_the_faces_that_look_at_the_robots() -> None:
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    bases = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    first, _ = contact_points(np.array([0.3, 0.4, 0.2]), np.zeros((2, 6)), quarter, bases)
+    np.testing.assert_allclose(first, [0.15, 0.0, 0.0])
+
+
+def test_paths_lead_to_the_same_files_from_another_folder(tmp_path: Path) -> None:
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "robots").mkdir()
+    text = Path("studies/workcells/rack.toml").read_text(encoding="utf-8")
+    (tmp_path / "robots" / "gofa12.urdf").write_bytes(
+        Path("studies/robots/gofa12.urdf").read_bytes()
+    )
+    (tmp_path / "cells" / "rack.toml").write_text(text, encoding="utf-8")
+    problem = read_problem(tmp_path / "cells" / "rack.toml")
+    waypoints = {"task": {"waypoints": [{"lower": [-1.0] * 6, "upper": [1.0] * 6}]}}
+    other = tmp_path / "rack.toml"
+    other.write_text(problem.completed(waypoints, tmp_path), encoding="utf-8")
+    assert tomllib.loads(other.read_text())["robots"][0]["urdf"] == "robots/gofa12.urdf"
+    assert load(other).robots[0].urdf == tmp_path / "robots" / "gofa12.urdf"
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"goal": [0.0]}, r"task\.goal"),
+        ({"waypoints": [{"fixed": [0.0] * 6}]}, "found a fixed one"),
+        ({"time_law": "optimal"}, r"task\.time_law"),
+        ({"reference_force": -1.0}, r"task\.reference_force"),
+    ],
+)
+def test_what_is_wrong_is_told_with_its_key_and_the_file(
+    changes: dict[str, Any], told: str, tmp_path: Path
+) -> None:
+    path = rack_problem(tmp_path, changes)
+    with pytest.raises(WorkcellError, match=told) as error:
+        read_problem(path).workcell()
+    assert str(path) in str(error.value)
+
+
+def test_missing_sections_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "empty.toml"
+    path.write_text("name = 'x'\n")
+    with pytest.raises(WorkcellError, match="task: missing"):
+        read_problem(path)
+    path.write_text(completed("", {"task": {}, "payload": {}, "robots": [], "contacts": [1]}, {}))
+    with pytest.raises(WorkcellError, match="exactly 2 tables"):
+        read_problem(path)
+
+
+BASES = [{"base": {"xyz": [0.0, 0.9, 0.0]}}, {"base": {"xyz": [0.0, -0.9, 0.0]}}]
+
+
+def problem_of(turn: float, robots: Any = BASES, **task: object) -> Problem:
+    start = [0.0, 0.0, 1.0, 0.0, 0.0, turn]
+    goal = [0.5, 0.0, 1.0, 0.0, 0.0, 4.0]
+    data = {
+        "task": {"start": start, "goal": goal, **task},
+        "payload": {"size": [0.2, 0.3, 0.1]},
+        "contacts": [{}, {}],
+        "robots": robots,
+    }
+    return Problem(Path(), "", data)
 
 
 def test_angles_go_the_near_way_and_rotation_vectors_as_written() -> None:
-    angles = Problem(Path(), "", data_of(0.0))
-    assert angles.poses[1][5] == pytest.approx(4.0 - 2.0 * np.pi)
-    vectors = Problem(Path(), "", data_of(0.0, rotation="quaternion"))
-    assert vectors.poses[1][5] == 4.0
+    assert problem_of(0.0).poses[1][5] == pytest.approx(4.0 - 2.0 * np.pi)
+    assert problem_of(0.0, rotation="quaternion").poses[1][5] == 4.0
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi / 2.0, 0.3])
-def test_about_one_axis_both_have_the_same_contacts(turn: float) -> None:
-    bases = np.array([[0.0, 0.9, 0.0], [0.0, -0.9, 0.0]])
-    angles, vectors = data_of(turn), data_of(turn, rotation="quaternion")
-    for given in (bases, None):
-        assert contact_points(angles, given) == contact_points(vectors, given)
+@pytest.mark.parametrize("robots", [BASES, [{}, {}]])
+def test_about_one_axis_both_have_the_same_contacts(turn: float, robots: Any) -> None:
+    angles = problem_of(turn, robots)
+    assert angles.contacts == problem_of(turn, robots, rotation="quaternion").contacts
 
 
 def test_contacts_lie_on_faces_of_the_turned_reference() -> None:
     quarter = [0.0, 0.0, np.pi / 2.0]
-    task = {"rotation": "quaternion", "rotation_reference": quarter}
-    np.testing.assert_array_equal(orientation_of(task).reference, rotation_from_rpy(quarter))
-    bases = np.array([[0.0, 0.9, 0.0], [0.0, -0.9, 0.0]])
-    first, _ = contact_points(data_of(0.0, **task), bases)
-    assert first == [0.1, 0.0, 0.0]
+    problem = problem_of(0.0, rotation="quaternion", rotation_reference=quarter)
+    np.testing.assert_array_equal(problem.orientation.reference, rotation_from_rpy(quarter))
+    assert problem.contacts[0]["xyz"] == [0.1, 0.0, 0.0]

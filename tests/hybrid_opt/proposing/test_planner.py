@@ -1,0 +1,97 @@
+"""Paths of the closed chain in the rack; the oracles are Pinocchio and FCL without screening."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hybrid_opt.proposing.closed_chain import Place
+from hybrid_opt.proposing.kinematics import ArmKinematics, box_to_last_joint, spun
+from hybrid_opt.proposing.planner import Budget, Leave, freedom, plan
+from hybrid_opt.proposing.problem import read_problem
+from hybrid_opt.proposing.setup import Setup, prepare
+from hybrid_opt.proposing.via_points import fit, free_share, shortened
+from symbolic.physics.pose import pose_matrix
+from tests.hybrid_opt.proposing.test_proposal import rack_problem
+
+SPINS = np.array([0.0, np.pi / 2.0])
+
+
+@pytest.fixture(scope="module")
+def rack(tmp_path_factory: pytest.TempPathFactory) -> Setup:
+    problem = read_problem(rack_problem(tmp_path_factory.mktemp("rack")))
+    return prepare(problem, {}, SPINS, np.random.default_rng(3))
+
+
+def planned(setup: Setup, seed: int) -> list[Place]:
+    pair = setup.pairs[0]
+    ends = pair.start.extended, pair.goal.extended
+    leave = Leave(np.minimum(*ends) - 0.8, np.maximum(*ends) + 0.8, 0.0, 0.15)
+    budget = Budget(20_000, lambda: False)
+    found = plan(pair.chain, (pair.start, pair.goal), freedom(*ends, leave), budget, seed)
+    assert found is not None
+    return found
+
+
+def test_paths_hold_the_box_with_both_arms_and_are_free(rack: Setup) -> None:
+    pair = rack.pairs[0]
+    path = shortened(pair.chain, planned(rack, 1), np.random.default_rng(0))
+    np.testing.assert_array_equal(path[0].extended, pair.start.extended)
+    np.testing.assert_allclose(path[-1].extended, pair.goal.extended, atol=1e-12)
+    poses = np.array([place.extended for place in path])
+    for arm in (0, 1):
+        kinematics = ArmKinematics.of(rack.workcell, arm, ())
+        q = np.array([place.q[arm] for place in path])
+        contact = spun(rack.workcell.contacts[arm], pair.holds[arm].spin)
+        T_box_joint = box_to_last_joint(rack.workcell, kinematics.geometry, contact, arm)
+        _, T = kinematics.chain(q)
+        wanted = np.array([pose_matrix(pose[:3], pose[3:]) @ T_box_joint for pose in poses])
+        np.testing.assert_allclose(T, wanted, atol=1e-5)
+        assert np.abs(np.diff(q, axis=0)).max() < 0.5
+        assert np.all(q >= rack.workcell.robots[arm].position_lower)
+        assert np.all(q <= rack.workcell.robots[arm].position_upper)
+    q_1, q_2 = (np.array([place.q[arm] for place in path]) for arm in (0, 1))
+    assert not pair.chain.judge.without_screening(poses, q_1, q_2).any()
+
+
+def test_the_same_seed_gives_the_same_path(rack: Setup) -> None:
+    first, again, other = (planned(rack, seed) for seed in (1, 1, 2))
+    assert len(first) == len(again)
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a.extended, b.extended)
+    assert len(other) != len(first) or any(
+        np.any(a.extended != b.extended) for a, b in zip(first, other, strict=True)
+    )
+
+
+def test_few_via_points_follow_a_path(rack: Setup) -> None:
+    pair, rng = rack.pairs[0], np.random.default_rng(0)
+    path = shortened(pair.chain, planned(rack, 1), rng)
+    straight = np.array([pair.start.extended, pair.goal.extended])
+    assert free_share(pair.chain, pair.start, straight) < 1.0
+    found = [fit(pair.chain, path, count, rng) for count in (1, 2, 3, 4, 5)]
+    via = next(each for each in found if each is not None)
+    whole = np.vstack([straight[:1], via, straight[1:]])
+    assert free_share(pair.chain, pair.start, whole) == 1.0
+
+
+def test_what_may_be_spent_on_a_path_is_kept(rack: Setup) -> None:
+    pair = rack.pairs[0]
+    ends = pair.start.extended, pair.goal.extended
+    room = freedom(*ends, Leave(np.minimum(*ends) - 0.8, np.maximum(*ends) + 0.8, 0.0, 0.15))
+    budget = Budget(10**9, lambda: True)
+    assert plan(pair.chain, (pair.start, pair.goal), room, budget, 1) is None
+
+
+def test_a_tilted_path_may_turn_and_a_level_one_may_not() -> None:
+    start, goal = np.zeros(6), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.3])
+    level = freedom(start, goal, Leave(start - 1.0, goal + 1.0, 0.0, 0.1))
+    assert level.directions.shape == (6, 4)
+    np.testing.assert_allclose(level.extended(level.coordinates(goal)), goal, atol=1e-12)
+    assert np.all(level.coordinates(goal) <= level.upper)
+    tilted = freedom(start, goal, Leave(start - 1.0, goal + 1.0, 0.2, 0.1))
+    assert tilted.directions.shape == (6, 6)
+    turned = np.array([0.0, 0.0, 0.0, 0.15, -0.15, 0.0])
+    inside = tilted.coordinates(turned)
+    assert np.all((inside >= tilted.lower) & (inside <= tilted.upper))
+    np.testing.assert_allclose(tilted.extended(inside), turned, atol=1e-12)
