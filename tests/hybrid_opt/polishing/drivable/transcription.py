@@ -22,7 +22,7 @@ from symbolic.cell_model import CellModel
 from symbolic.physics.pose import inverse
 from symbolic.workcell.records import Workcell
 
-STAGES = 20
+STAGES = 30
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,10 @@ class Guess:
 
 @dataclass(frozen=True)
 class Found:
-    """An optimum: decision vector (n_path,), duration [s], force limit [N]."""
+    """An optimum: the path's variables (n_path,), duration [s]."""
 
     path: Array
     duration: float
-    force: float
 
 
 class Transcription:
@@ -61,12 +60,11 @@ class Transcription:
         assert task.n_path == 6 * len(task.free_indices), "arms of six joints"
         assert not self._cell.payload.centre_of_mass.any()
 
-    def solve(self, guess: Guess, force: float | None, duration: float | None = None) -> Found:
-        """Least duration within a force limit [N], or least force within a duration [s]."""
+    def solve(self, guess: Guess, force: float) -> Found:
+        """Least duration within a force limit [N]."""
         cell, n = self._cell, self.stages
         task = cell.task
         x, w = ca.MX.sym("x", task.n_path), ca.MX.sym("w", n - 1)
-        limit = ca.MX.sym("limit")
         arms = ca.MX.sym("arms", 36, n + 1)
         points = ca.MX(np.array([waypoint.lower for waypoint in task.waypoints]))
         for k, row in enumerate(task.free_indices):
@@ -79,33 +77,29 @@ class Transcription:
         arm_ends = ca.horzcat(arms[:, :-1], arms[:, 1:])
         speeds = ca.horzcat(squared[:-1].T, squared[1:].T)
         rows = self._limited.map(2 * n)(
-            ends, arm_ends, ca.horzcat(second.T, second.T), speeds, ca.repmat(limit, 1, 2 * n)
+            ends, arm_ends, ca.horzcat(second.T, second.T), speeds, np.full((1, 2 * n), force)
         )
         root = ca.sqrt(w)
         slowness = 1.0 / (ca.vertcat(0.0, root) + ca.vertcat(root, 0.0))
         total = 2.0 / n * ca.sum1(slowness)
         equal, below = ca.vec(held[:36, :]), ca.vertcat(ca.vec(rows), ca.vec(held[36:, :]))
-        z = ca.vertcat(x, w, limit, ca.vec(arms))
-        g = ca.vertcat(equal, below, total)
-        lower = np.concatenate([np.zeros(equal.numel()), np.full(below.numel(), -np.inf), [0.0]])
-        upper = np.concatenate([np.zeros(equal.numel()), np.ones(below.numel()), [np.inf]])
-        if duration is not None:
-            upper[-1] = duration
+        z = ca.vertcat(x, w, ca.vec(arms))
+        g = ca.vertcat(equal, below)
+        lower = np.concatenate([np.zeros(equal.numel()), np.full(below.numel(), -np.inf)])
+        upper = np.concatenate([np.zeros(equal.numel()), np.ones(below.numel())])
         options = {
             "ipopt.print_level": 0,
             "print_time": False,
             "ipopt.max_iter": 600,
             "ipopt.tol": 1e-4,
-            "ipopt.mu_strategy": "adaptive",
+            "ipopt.mu_init": 1e-3,
             # The rest is creeping along directions in which nothing matters.
             "ipopt.acceptable_tol": 1e-2,
             "ipopt.acceptable_iter": 10,
             "ipopt.acceptable_constr_viol_tol": 1e-6,
             "ipopt.acceptable_obj_change_tol": 1e-6,
         }
-        goal = total if duration is None else limit / 50.0
-        solver = ca.nlpsol("joint", "ipopt", {"x": z, "f": goal, "g": g}, options)
-        forces = task.force_limit if force is None else (force, force)
+        solver = ca.nlpsol("joint", "ipopt", {"x": z, "f": total, "g": g}, options)
         starts = np.concatenate([guess.q, guess.q_first, guess.q_second], axis=1)
         free = np.full(24, np.inf)
         low, high = (
@@ -113,14 +107,11 @@ class Transcription:
             for name in ("position_lower", "position_upper")
         )
         found = solver(
-            x0=np.concatenate(
-                [guess.x[: task.n_path], guess.speed[1:-1] ** 2, [forces[1]], starts.ravel()]
-            ),
+            x0=np.concatenate([guess.x[: task.n_path], guess.speed[1:-1] ** 2, starts.ravel()]),
             lbx=np.concatenate(
                 [
                     task.lower[: task.n_path],
                     np.full(n - 1, 1e-6),
-                    [forces[0]],
                     np.tile(np.concatenate([low, -free]), n + 1),
                 ]
             ),
@@ -128,7 +119,6 @@ class Transcription:
                 [
                     task.upper[: task.n_path],
                     np.full(n - 1, np.inf),
-                    [forces[1]],
                     np.tile(np.concatenate([high, free]), n + 1),
                 ]
             ),
@@ -136,9 +126,7 @@ class Transcription:
             ubg=upper,
         )
         assert solver.stats()["success"], solver.stats()["return_status"]
-        best = np.array(found["x"]).ravel()
-        at = task.n_path + n - 1
-        return Found(best[: task.n_path], float(np.array(found["g"])[-1, 0]), float(best[at]))
+        return Found(np.array(found["x"]).ravel()[: task.n_path], float(found["f"]))
 
     @cached_property
     def _held(self) -> ca.Function:
@@ -153,13 +141,14 @@ class Transcription:
         for arm, robot in enumerate(self._cell.robots):
             own = self._model.robots[arm]
             q = joints[6 * arm : 6 * arm + 6]
-            T_box_flange = self._cell.contacts[arm].T_box_pad @ inverse(robot.T_flange_pad)
-            T_base_world = inverse(robot.T_world_base)
-            at = pose[:3] + ca.mtimes(rotation, T_box_flange[:3, 3])
-            target = ca.mtimes(T_base_world[:3, :3], at) + T_base_world[:3, 3]
-            turned = ca.mtimes([T_base_world[:3, :3], rotation, T_box_flange[:3, :3]])
+            held = self._cell.contacts[arm].T_box_pad @ inverse(robot.T_flange_pad)
+            T_base_box = ca.mtimes(
+                ca.DM(inverse(robot.T_world_base)),
+                ca.blockcat([[rotation, pose[:3]], [ca.DM.zeros(1, 3), 1.0]]),
+            )
+            target = ca.mtimes(T_base_box, ca.DM(held))
             R, p = own.placement(q)
-            gaps += [target - p, _axis(ca.mtimes(turned, R.T))]
+            gaps += [target[:3, 3] - p, _axis(ca.mtimes(target[:3, :3], R.T))]
             room.append(robot.min_manipulability / ca.fabs(ca.det(own.jacobian(q))))
         gap = ca.vertcat(*gaps)
         first = ca.jacobian(gap, s)
@@ -211,7 +200,7 @@ class Transcription:
 
 def _rotation(rpy: ca.SX) -> ca.SX:
     """Of roll, pitch and yaw about the world's x, y and z, in this order."""
-    (cr, cp, cy), (sr, sp, sy) = ((f(rpy[k]) for k in range(3)) for f in (ca.cos, ca.sin))
+    (cr, cp, cy), (sr, sp, sy) = ([f(rpy[k]) for k in range(3)] for f in (ca.cos, ca.sin))
     x = ca.blockcat([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     y = ca.blockcat([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     z = ca.blockcat([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
