@@ -12,6 +12,7 @@ from hybrid_opt.proposing.holding import HoldSearch, Task
 from hybrid_opt.proposing.judge import PoseJudge
 from hybrid_opt.proposing.pairing import Pair
 from symbolic.array import Array
+from symbolic.physics.pose import box_placement
 from symbolic.robot.urdf import arm_model
 
 TOLD = 3
@@ -70,7 +71,8 @@ def _missing(task: Task, arm: int, pose: Array) -> float:
     low = np.maximum(robot.position_lower, -np.pi)
     high = np.minimum(robot.position_upper, np.pi)
     postures = rng.uniform(low, high, (8, len(low)))
-    return min(missing_reach(robot, contact, pose, q) for q in postures)
+    T_world_box = box_placement(task.workcell.task.orientation, pose)
+    return min(missing_reach(robot, contact, T_world_box, q) for q in postures)
 
 
 def no_pair(task: Task, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
