@@ -25,6 +25,7 @@ from hybrid_opt.polishing.records import (
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
@@ -96,7 +97,8 @@ def test_residuals_of_accepted_points_are_told() -> None:
 
 def test_with_time_a_point_becomes_stationary() -> None:
     patient = FrontPolisher(evaluator(), replace(PATIENT, fill=FillSettings(attempts=0)))
-    (outcome,) = patient.polish(start_front(), np.random.default_rng(0)).outcomes
+    start = initial_decision(evaluator().workcell.task)[None]
+    (outcome,) = patient.polish(start, np.random.default_rng(0)).outcomes
     assert outcome.status == "accepted"
     assert outcome.residuals.stationarity < 1e-4
     assert outcome.residuals.feasibility < 1e-6
