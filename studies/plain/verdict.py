@@ -75,7 +75,10 @@ class PlainJudge:
                 reason, position = here[0], k / (n - 1)
                 break
         shares = dict(zip(CONSTRAINTS, outputs["violation_time"].tolist(), strict=True))
-        shares["collision"] = collisions.time / float(time[-1])
+        # Of the last sample before an arm is lost both neighbouring steps count.
+        hit = np.zeros(n)
+        hit[:reached] = collisions.colliding
+        shares["collision"] = float(np.trapezoid(hit, time) / time[-1])
         peaks = outputs["normal_force"].max(axis=0)
         return PlainVerdict(
             candidate=candidate,
