@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.workcell.reader import read_only
 
 Rotation = Literal["roll-pitch-yaw", "quaternion"]
 
@@ -26,7 +27,7 @@ class Orientation:
     """
 
     rotation: Rotation = "roll-pitch-yaw"
-    reference: Array = field(default_factory=lambda: np.eye(3))
+    reference: Array = field(default_factory=lambda: read_only(np.eye(3)))
 
     @property
     def is_vector(self) -> bool:
