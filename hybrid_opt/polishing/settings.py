@@ -201,7 +201,7 @@ class DrivableSettings:
     """
 
     first_radius: float = 0.3
-    rounds: int = 40
+    rounds: int = 16
     least_radius: float = 1e-5
     stationary: float = 1e-4
     feasible: float = 5e-3
