@@ -26,7 +26,7 @@ from studies.benchmark_turns import progress
 from symbolic.workcell.records import Workcell
 
 EVALUATIONS = 1000
-POLISH_POINTS = 4
+POLISH_ATTEMPTS = 4
 LEAST_SHARE = 0.02
 """Parts below this share of their stage are summed up as 'other'."""
 
@@ -57,12 +57,12 @@ def profile_study(workcell: Workcell, seed: int) -> tuple[StageTime, ...]:
         )
 
     def polishing() -> None:
-        settings = PolishSettings(points=POLISH_POINTS)
+        settings = PolishSettings(attempts=POLISH_ATTEMPTS)
         fronts.append(polish(cell, fronts[0], rng=np.random.default_rng(seed), settings=settings))
 
     stages: dict[str, Callable[[], object]] = {
         f"search ({EVALUATIONS} evaluations, certified)": searching,
-        f"polish ({POLISH_POINTS} points)": polishing,
+        f"polish ({POLISH_ATTEMPTS} attempts)": polishing,
         "timing (one carry)": lambda: time_path(cell, fronts[0].balanced()),
     }
     return tuple(_timed(name, run) for name, run in stages.items())

@@ -20,11 +20,11 @@ from symbolic.errors import SettingsError
 
 _DEFAULT = CampaignSettings()
 
-QUICK_EVALUATIONS, QUICK_REPLICAS, QUICK_POLISH_POINTS = 300, 2, 2
+QUICK_EVALUATIONS, QUICK_REPLICAS, QUICK_POLISH_ATTEMPTS = 300, 2, 2
 """Of a small but complete study."""
 
-DRIVABLE_POLISH_POINTS = 10
-"""Solves of one drivable front: each takes several times as long as one of a paper's front."""
+DRIVABLE_POLISH_ATTEMPTS = 10
+"""At one drivable front: each takes several times as long as one of a paper's front."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -118,12 +118,12 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         "drivable carries)",
     )
     after.add_argument(
-        "--polish-points",
+        "--polish-attempts",
         type=int,
         metavar="N",
-        help="solves that the polish of one front may take before it is filled up between its ends "
-        f"(default: {PolishSettings().points}, {DRIVABLE_POLISH_POINTS} for a drivable one, with "
-        f"--quick {QUICK_POLISH_POINTS})",
+        help="attempts that the polish of one front may take before it is filled between its ends "
+        f"(default: {PolishSettings().attempts}, for a drivable one {DRIVABLE_POLISH_ATTEMPTS}, "
+        f"with --quick {QUICK_POLISH_ATTEMPTS})",
     )
     after.add_argument(
         "--drivable",
@@ -229,24 +229,24 @@ def campaign_settings(
 
 
 def polish_settings(
-    options: argparse.Namespace, usual: bool, points: int | None = None
+    options: argparse.Namespace, usual: bool, attempts: int | None = None
 ) -> PolishSettings | None:
     """How the options want fronts polished, None for not at all.
 
     Args:
         usual: whether they are polished where the options do not say.
-        points: solves of one front likewise.
+        attempts: at one front likewise.
 
     Raises:
         SettingsError: a value is not allowed.
     """
     if not (usual if options.polish is None else options.polish):
         return None
-    if options.polish_points is not None:
-        points = options.polish_points
+    if options.polish_attempts is not None:
+        attempts = options.polish_attempts
     elif options.quick:
-        points = QUICK_POLISH_POINTS
-    return PolishSettings() if points is None else PolishSettings(points=points)
+        attempts = QUICK_POLISH_ATTEMPTS
+    return PolishSettings() if attempts is None else PolishSettings(attempts=attempts)
 
 
 def wish(options: argparse.Namespace) -> Wish:

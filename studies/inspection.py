@@ -189,7 +189,7 @@ def _optimum(cell: Cell) -> Optimum:
             cell,
             Front.of_search(cell, "hand-made", verdicts),
             rng=np.random.default_rng(0),
-            settings=ho.PolishSettings(points=POLISH_ATTEMPTS),
+            settings=ho.PolishSettings(attempts=POLISH_ATTEMPTS),
         )
     except SettingsError as error:
         return Optimum(0, (), str(error))

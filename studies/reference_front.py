@@ -69,7 +69,7 @@ class ReferenceFront:
 def compute_reference_front(
     evaluator: CandidateEvaluator,
     starts: int,
-    points: int,
+    attempts: int,
     rng: np.random.Generator,
     jobs: int = 1,
     tell: Callable[[str], None] = lambda text: None,
@@ -79,7 +79,7 @@ def compute_reference_front(
     Args:
         evaluator: with the paper's objectives.
         starts: random feasible candidates to start from, the hand-made trajectory besides.
-        points: attempts of the final polish of the union.
+        attempts: of the final polish of the union.
         rng: draws the candidates.
         jobs: worker processes, 0 for one per core; has no influence on the result.
         tell: takes a line of progress.
@@ -106,7 +106,7 @@ def compute_reference_front(
         lambda: tell(f"start {next(count)} of {len(begins)}"),
     )
     union = np.concatenate([part.x for part in parts])
-    (front,) = answer_all(executor, _polish_job(cell, points, FillSettings()), [(union, rng)])
+    (front,) = answer_all(executor, _polish_job(cell, attempts, FillSettings()), [(union, rng)])
     tell(f"reference front: {len(front.x)} points")
     return ReferenceFront(evaluator.workcell.digest, front.objectives, front.x)
 
@@ -114,7 +114,7 @@ def compute_reference_front(
 def _polish_job(
     cell: PackedCell, attempts: int, fill: FillSettings
 ) -> Job[Polisher, tuple[Array, np.random.Generator], PolishedFront]:
-    settings = PolishSettings(points=attempts, rounds=ROUNDS, fill=fill)
+    settings = PolishSettings(attempts=attempts, rounds=ROUNDS, fill=fill)
     source = PolisherSource(cell, PAPER_OBJECTIVES, settings)
     return Job(source, _polished)
 
@@ -176,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--output", type=Path, required=True, help="the CSV file to write")
     parser.add_argument("--starts", type=whole(1, 10**4), default=24, help="random starts")
     parser.add_argument(
-        "--points", type=whole(0, 10**5), default=60, help="attempts of the final polish"
+        "--attempts", type=whole(0, 10**5), default=60, help="attempts of the final polish"
     )
     parser.add_argument("--seed", type=seed, default=1, help="of the random starts")
     parser.add_argument(
@@ -186,12 +186,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     command = (
         f"python -m studies.reference_front {options.workcell} --output FILE "
-        f"--starts {options.starts} --points {options.points} --seed {options.seed}"
+        f"--starts {options.starts} --attempts {options.attempts} --seed {options.seed}"
     )
     front = compute_reference_front(
         CandidateEvaluator(load(options.workcell)),
         options.starts,
-        options.points,
+        options.attempts,
         np.random.default_rng(options.seed),
         options.jobs,
         lambda text: print(text, file=sys.stderr, flush=True),

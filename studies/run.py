@@ -30,7 +30,7 @@ from hybrid_opt.recommending.wish import Wish
 from hybrid_opt.witness.outcome import mujoco_module
 from hybrid_opt.work.processes import warm_up
 from studies.cli import (
-    DRIVABLE_POLISH_POINTS,
+    DRIVABLE_POLISH_ATTEMPTS,
     campaign_parser,
     campaign_settings,
     execution_settings,
@@ -198,9 +198,11 @@ def main(
         if execution.executor == "processes":
             warm_up(*WORKERS_LOAD)
         study = StudySettings(
-            polish=polish_settings(options, polishable, DRIVABLE_POLISH_POINTS if alone else None),
+            polish=polish_settings(
+                options, polishable, DRIVABLE_POLISH_ATTEMPTS if alone else None
+            ),
             drivable=options.drivable,
-            drivable_polish=polish_settings(options, True, DRIVABLE_POLISH_POINTS),
+            drivable_polish=polish_settings(options, True, DRIVABLE_POLISH_ATTEMPTS),
             wish=wish(options),
             simulate=options.simulate,
             report=options.report,

@@ -263,7 +263,7 @@ class _Polish:
     def lost(self, index: int, reason: str) -> None:
         """A solver that crashes or hangs costs the attempt at hand only."""
         journal = self._journal(index)
-        if len(journal.payloads) >= self._settings.points:
+        if len(journal.payloads) >= self._settings.attempts:
             give_up(reason)
         journal.append(_block_of(Lost(reason)))
 

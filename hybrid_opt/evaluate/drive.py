@@ -108,18 +108,18 @@ class Driver:
 
 
 def _at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:
-    """Time, u' and u'' at path parameters u; u'' is that of the stage that begins there."""
+    """Time, u' and u'' at path parameters u; u'' is that of the interval that begins there."""
     if not np.isfinite(timing.duration):
         return u, np.zeros_like(u), np.zeros_like(u)
     squared = timing.grid_speed**2
-    stages = len(squared) - 1
-    stage = np.minimum((u * stages).astype(int), stages - 1)
-    acceleration = np.diff(squared) * stages / 2.0
+    intervals = len(squared) - 1
+    interval = np.minimum((u * intervals).astype(int), intervals - 1)
+    acceleration = np.diff(squared) * intervals / 2.0
     # Average speed over a piece of constant acceleration is that of its ends.
-    steps = 2.0 / stages / (timing.grid_speed[:-1] + timing.grid_speed[1:])
+    steps = 2.0 / intervals / (timing.grid_speed[:-1] + timing.grid_speed[1:])
     begins = np.concatenate([[0.0], np.cumsum(steps)])[:-1]
-    into = u - stage / stages
-    speed = np.sqrt(np.maximum(squared[stage] + 2.0 * acceleration[stage] * into, 0.0))
-    total = timing.grid_speed[stage] + speed
-    time = begins[stage] + 2.0 * into / np.where(total > 0.0, total, 1.0)
-    return time, speed, acceleration[stage]
+    into = u - interval / intervals
+    speed = np.sqrt(np.maximum(squared[interval] + 2.0 * acceleration[interval] * into, 0.0))
+    total = timing.grid_speed[interval] + speed
+    time = begins[interval] + 2.0 * into / np.where(total > 0.0, total, 1.0)
+    return time, speed, acceleration[interval]

@@ -101,21 +101,21 @@ def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing
 
 def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
     """u, u' and u'' of the averaged timing at every `EVERY`th step."""
-    stages = len(grid_speed) - 1
-    grid = np.linspace(0.0, 1.0, stages + 1)
+    intervals = len(grid_speed) - 1
+    grid = np.linspace(0.0, 1.0, intervals + 1)
     steps = 2.0 * np.diff(grid) / (grid_speed[:-1] + grid_speed[1:])
     begins = np.concatenate([[0.0], np.cumsum(steps)])
     reach = int(np.ceil(width / STEP))
     count = int(np.ceil(begins[-1] / STEP)) + 1
     # At rest before and after, for as long as the window reaches beyond what is kept.
     time = STEP * np.arange(-2 * reach, count + 2 * reach)
-    stage = np.clip(np.searchsorted(begins, time, side="right") - 1, 0, stages - 1)
-    into = np.clip(time, 0.0, begins[-1]) - begins[stage]
+    interval = np.clip(np.searchsorted(begins, time, side="right") - 1, 0, intervals - 1)
+    into = np.clip(time, 0.0, begins[-1]) - begins[interval]
     change = np.diff(grid_speed) / steps
     speed = np.where(
-        (time > 0.0) & (time < begins[-1]), grid_speed[stage] + change[stage] * into, 0.0
+        (time > 0.0) & (time < begins[-1]), grid_speed[interval] + change[interval] * into, 0.0
     )
-    place = grid[stage] + (grid_speed[stage] + change[stage] * into / 2.0) * into
+    place = grid[interval] + (grid_speed[interval] + change[interval] * into / 2.0) * into
     s = np.linspace(-1.0, 1.0, 2 * reach + 1)
     kernel = (1.0 - s**2) ** 3
     slope = -6.0 * s * (1.0 - s**2) ** 2 / (reach * STEP)

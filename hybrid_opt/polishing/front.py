@@ -104,7 +104,7 @@ class ForceRun(PolishRun[Attempt]):
     def _fill(self) -> None:
         """Attempts between the ends, until the front is even or no side of a gap is left."""
         tried: set[Edge] = set()
-        self._most += self._settings.fill.attempts * self._settings.points
+        self._most += self._settings.fill.attempts * self._settings.attempts
         while self._left() > 0:
             found = filling(self._archive, tried, self._settings.fill)
             if found is None:

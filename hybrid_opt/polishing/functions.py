@@ -127,7 +127,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     def make() -> dict[str, ca.Function]:
         model = compiled.model
         place, functions = Place(model), dict[str, ca.Function]()
-        # What is driven has limits at the stages of its timing, not at samples.
+        # What is driven has limits at the intervals of its timing, not at samples.
         for quantity in () if driven else QUANTITIES:
             functions |= _named(sample_functions(model.workcell, quantity))
         for arm in ARMS:

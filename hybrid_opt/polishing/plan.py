@@ -44,7 +44,7 @@ class Attempt:
 def points(archive: GrowingFront, settings: PolishSettings) -> list[Attempt]:
     """Evenly spread points of the front, the balanced one among them."""
     rows = archive.rows()
-    count = min(len(rows), ceil(settings.points * settings.front.own_share))
+    count = min(len(rows), ceil(settings.attempts * settings.front.own_share))
     chosen = {rows[int(k)] for k in np.round(np.linspace(0, len(rows) - 1, count))}
     middle, _ = archive.best(None)
     if middle not in chosen and count > 2:

@@ -63,7 +63,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         self._evaluator, self._settings = evaluator, settings
         self._archive, self._recorded, self._emit = archive, recorded, emit
         self.outcomes: list[PolishOutcome] = []
-        self._most = settings.points
+        self._most = settings.attempts
 
     @abstractmethod
     def all(self, rng: np.random.Generator) -> None:
@@ -193,7 +193,7 @@ class Polisher(ABC):
         feasible = np.flatnonzero(found.feasible)
         archive = GrowingFront(x[feasible], found.objectives[feasible], feasible.tolist())
         run = self._run(archive, list(recorded), emit)
-        if len(feasible) and self.settings.points:
+        if len(feasible) and self.settings.attempts:
             run.all(rng)
         rows = archive.rows() if len(feasible) else []
         return PolishedFront(

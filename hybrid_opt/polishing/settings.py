@@ -155,7 +155,7 @@ class FillSettings:
 
     Attributes:
         members: points that the front is to have.
-        attempts: at most, for each of `PolishSettings.points`.
+        attempts: at most, for each of `PolishSettings.attempts`.
         stride: from the neighbour that an attempt starts from, along both objectives, at most, in
             units of the front's extent.
         far: width beyond which a gap that no neighbour leads into is looked at from afar.
@@ -222,8 +222,8 @@ class PolishSettings:
     """What decides the results of a polish.
 
     Attributes:
-        points: attempts that one front may take at its points, ends and middle; those that fill
-            it between them come on top.
+        attempts: that one front may take at its points, ends and middle; those that fill it
+            between them come on top.
         method: how a point is improved: along the diagonal (Pascoletti and Serafini 1984), or by
             minimising one objective while the other is held (epsilon constraint).
         max_iterations: of the solver in one round; see `SolveSettings.patience`.
@@ -239,7 +239,7 @@ class PolishSettings:
         near, trust, solve, front, kick, fill, drivable: the parts' own.
     """
 
-    points: int = 12
+    attempts: int = 12
     method: Method = "pascoletti-serafini"
     max_iterations: int = 30
     rounds: int = 7
@@ -267,7 +267,7 @@ class PolishSettings:
             raise SettingsError(
                 f"polish method {self.method!r}; known are {', '.join(get_args(Method))}"
             )
-        for name, least in (("points", 0), ("max_iterations", 1), ("rounds", 1)):
+        for name, least in (("attempts", 0), ("max_iterations", 1), ("rounds", 1)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise SettingsError(

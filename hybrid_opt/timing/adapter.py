@@ -1,7 +1,7 @@
 """The one place that talks to toppra.
 
 toppra logs its failures and returns None or NaN. Here a failure is a record with the reason and
-the stage, and everything that comes back is checked.
+the interval, and everything that comes back is checked.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ SPEED_CEILING = 1e4
 
 RESCALINGS = (1.0, 0.4, 2.5)
 """Factors on the path coordinate, tried in turn: toppra's linear programs use absolute tolerances
-and now and then call a feasible stage infeasible."""
+and now and then call a feasible interval infeasible."""
 
 
 @dataclass(frozen=True)
-class StageRows:
-    """Linear limits on a path's timing: by stage i and row k, a u'' + b u'^2 <= bound.
+class IntervalRows:
+    """Linear limits on a path's timing: by interval i and row k, a u'' + b u'^2 <= bound.
 
-    u'' is constant on a stage, u'^2 is that at the stage's beginning.
+    u'' is constant on an interval, u'^2 is that at the interval's beginning.
 
     Attributes:
-        a, b, bound: (stages, k).
+        a, b, bound: (intervals, k).
     """
 
     a: Array
@@ -42,32 +42,32 @@ class StageRows:
 
 @dataclass(frozen=True)
 class SolverFailure:
-    """A failure of toppra: what it could not do, and the stage at which."""
+    """A failure of toppra: what it could not do, and the interval at which."""
 
     reason: str
-    stage: int
+    interval: int
 
 
-def fastest_speed(rows: StageRows, grid: Array) -> Array | SolverFailure:
+def fastest_speed(rows: IntervalRows, grid: Array) -> Array | SolverFailure:
     """The fastest motion from rest to rest within linear limits.
 
     Args:
         rows: the limits.
-        grid: (stages + 1,) increasing path coordinate, scaled so that speeds are around one.
+        grid: (intervals + 1,) increasing path coordinate, scaled so that speeds are around one.
 
     Returns:
-        (stages + 1,) squared path speed at the grid points, zero at both ends, or a failure.
+        (intervals + 1,) squared path speed at the grid points, zero at both ends, or a failure.
     """
     found: Array | SolverFailure = SolverFailure("not tried", 0)
     for factor in RESCALINGS:
-        scaled = StageRows(rows.a / factor, rows.b / factor**2, rows.bound)
+        scaled = IntervalRows(rows.a / factor, rows.b / factor**2, rows.bound)
         found = _solve(scaled, factor * grid)
         if not isinstance(found, SolverFailure):
             return found / factor**2
     return found
 
 
-def _solve(rows: StageRows, grid: Array) -> Array | SolverFailure:
+def _solve(rows: IntervalRows, grid: Array) -> Array | SolverFailure:
     # Imported late: toppra pulls in plotting.
     from toppra.algorithm import TOPPRA
     from toppra.constraint import LinearConstraint
@@ -109,17 +109,17 @@ def _solve(rows: StageRows, grid: Array) -> Array | SolverFailure:
         )
         _, speed, _, controllable = algorithm.compute_parameterization(0.0, 0.0, return_data=True)
     if np.isnan(controllable).any():
-        stage = int(np.flatnonzero(np.isnan(controllable).any(axis=1))[-1])
-        return SolverFailure("no speed at this place lets the path be finished", stage)
+        interval = int(np.flatnonzero(np.isnan(controllable).any(axis=1))[-1])
+        return SolverFailure("no speed at this place lets the path be finished", interval)
     if speed is None:
         return SolverFailure("the path cannot be started from rest", 0)
     if not np.isfinite(speed).all():
-        stage = int(np.argmin(np.isfinite(speed)))
-        return SolverFailure("the forward pass broke down", min(stage, len(grid) - 2))
+        interval = int(np.argmin(np.isfinite(speed)))
+        return SolverFailure("the forward pass broke down", min(interval, len(grid) - 2))
     squared: Array = np.asarray(speed, dtype=float) ** 2
     if np.any(squared[:-1] + squared[1:] <= 0.0):
-        stage = int(np.argmax(squared[:-1] + squared[1:] <= 0.0))
-        return SolverFailure("the motion comes to a standstill", stage)
+        interval = int(np.argmax(squared[:-1] + squared[1:] <= 0.0))
+        return SolverFailure("the motion comes to a standstill", interval)
     return squared
 
 

@@ -23,7 +23,7 @@ from symbolic.functions.timing import timing_functions
 from symbolic.robot.urdf import arm_model
 from symbolic.workcell.records import Robot, Workcell
 
-STAGES = 200
+INTERVALS = 200
 """Pieces of constant path acceleration."""
 
 REFINEMENT = 10
@@ -107,32 +107,32 @@ class TimingModel:
 
     Attributes:
         workcell: the cell.
-        stages: pieces of constant path acceleration.
+        intervals: pieces of constant path acceleration.
         joint_names: names of both arms' joints.
     """
 
     def __init__(
         self,
         cell: Workcell | CompiledCell,
-        stages: int = STAGES,
+        intervals: int = INTERVALS,
     ) -> None:
         """Load or build the compiled functions.
 
         Args:
             cell: the cell; compiled, where others share its functions.
-            stages: pieces of constant path acceleration.
+            intervals: pieces of constant path acceleration.
 
         Raises:
-            SettingsError: the number of stages is out of range.
+            SettingsError: the number of intervals is out of range.
             DualArmError: the model or its code cannot be built.
         """
-        if not 10 <= stages <= 2000:
-            raise SettingsError(f"{stages} stages; allowed are 10 to 2000")
+        if not 10 <= intervals <= 2000:
+            raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000")
         self._compiled = CompiledCell.of(cell)
         self.workcell = workcell = self._compiled.workcell
-        self.stages = stages
+        self.intervals = intervals
         self.joint_names = (joint_names(workcell.robots[0]), joint_names(workcell.robots[1]))
-        samples = REFINEMENT * stages + 1
+        samples = REFINEMENT * intervals + 1
 
         def make(model: CellModel) -> dict[str, ca.Function]:
             return timing_functions(model, samples)
@@ -140,7 +140,7 @@ class TimingModel:
         self._functions = self._compiled.functions("timing", make, str(samples))
 
     def path_motion(self, x: Array) -> PathMotion:
-        """The geometry at `REFINEMENT` samples per stage, uniform in u.
+        """The geometry at `REFINEMENT` samples per interval, uniform in u.
 
         Raises:
             SettingsError: x has the wrong shape or is not finite.

@@ -37,37 +37,37 @@ OUTCOMES = (
 """What its statuses mean."""
 
 
-def passes_function(compiled: CompiledCell, stages: int) -> NumericFunction | None:
+def passes_function(compiled: CompiledCell, intervals: int) -> NumericFunction | None:
     """The timing of one path from its limits; None without a C compiler, or where the contact
     forces are allocated jointly.
 
-    Inputs: samples (2 stages + 1, `LimitLayout.size`), both ends and the middle of
-    every stage; options (4,): largest normal force [N],
+    Inputs: samples (2 intervals + 1, `LimitLayout.size`), both ends and the middle of
+    every interval; options (4,): largest normal force [N],
     infinite for none, then whether torques, pressure shifts and the reference speeds are limited
-    (0 or 1). Outputs: status, index into `OUTCOMES`; stage of a failure; duration [s], infinite
+    (0 or 1). Outputs: status, index into `OUTCOMES`; interval of a failure; duration [s], infinite
     without a timing; peak (2,) normal forces [N]; use (len(KINDS), 3): largest share of each limit,
-    path parameter and joint or contact there; squared (stages + 1,) u'^2 at the grid points;
+    path parameter and joint or contact there; squared (intervals + 1,) u'^2 at the grid points;
     sweeps, how often both passes ran; slowed, the factor on the speed. Without a timing peak and
     use are those of standing still.
 
     Args:
         compiled: the cell.
-        stages: pieces of constant path acceleration.
+        intervals: pieces of constant path acceleration.
     """
     workcell, cache = compiled.workcell, compiled.cache
     if workcell.task.allocation != "paper":
         return None  # the passes know the paper's normal forces in closed form, and no others
     if compiled.is_identified:
         own = source_digest("hybrid_opt")
-        key = compiled.key("path timing", str(stages), own)
-        return load_or_compile(key, lambda: _source(workcell, stages), cache)
+        key = compiled.key("path timing", str(intervals), own)
+        return load_or_compile(key, lambda: _source(workcell, intervals), cache)
     if find_compiler() is None:
         return None
-    signature, text = _source(workcell, stages)
+    signature, text = _source(workcell, intervals)
     return load_or_compile(digest("path timing", text), lambda: (signature, text), cache)
 
 
-def _source(workcell: Workcell, stages: int) -> tuple[Signature, str]:
+def _source(workcell: Workcell, intervals: int) -> tuple[Signature, str]:
     # Not imported at the top: a warm start needs no CasADi.
     from codegen.source import handwritten_source
     from symbolic.physics.path_limits import limit_layout, ratio_functions
@@ -75,7 +75,7 @@ def _source(workcell: Workcell, stages: int) -> tuple[Signature, str]:
     layout = limit_layout(workcell)
     branches = _branches(workcell)
     constants = {
-        "STAGES": stages,
+        "INTERVALS": intervals,
         "JOINTS": layout.joints,
         "SIZE": layout.size,
         "RATIOS": layout.joints + 2,
@@ -93,9 +93,9 @@ def _source(workcell: Workcell, stages: int) -> tuple[Signature, str]:
     signature = Signature(
         "path_timing",
         ("samples", "options"),
-        ("status", "stage", "duration", "peak", "use", "squared", "sweeps", "slowed"),
-        ((2 * stages + 1, layout.size), (4,)),
-        ((), (), (), (2,), (len(KINDS), 3), (stages + 1,), (), ()),
+        ("status", "interval", "duration", "peak", "use", "squared", "sweeps", "slowed"),
+        ((2 * intervals + 1, layout.size), (4,)),
+        ((), (), (), (2,), (len(KINDS), 3), (intervals + 1,), (), ()),
     )
     return signature, handwritten_source(signature, text, ratio_functions(workcell))
 

@@ -1,6 +1,6 @@
 """Timings of many paths of one workcell, in compiled code: what a search can afford.
 
-The method is that of `hybrid_opt.timing.solve` without its linear programs over all stages; see
+The method is that of `hybrid_opt.timing.solve` without its linear programs over all intervals; see
 docs/timing.md. A carry is not built: `drive_path` recomputes one for a timing found here.
 """
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from symbolic.cell_model import CellModel
 
-PATH_STAGES = 100
+PATH_INTERVALS = 100
 """Pieces of constant path acceleration."""
 
 
@@ -43,7 +43,7 @@ class PathTiming:
             the path itself fails.
         use: largest share of each limit by name of the constraint, likewise; empty where the path
             itself fails.
-        grid_speed: (stages + 1,) path speed u' at the grid points [1/s], zero without a timing.
+        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s], zero without a timing.
         sweeps: how often both passes ran.
         slowed: uniform factor on the path speed that made the limits hold, 1 normally.
     """
@@ -70,14 +70,14 @@ class PathTimer:
 
     Attributes:
         workcell: the cell.
-        stages: pieces of constant path acceleration.
+        intervals: pieces of constant path acceleration.
         compiled: whether the passes are compiled.
     """
 
     def __init__(
         self,
         cell: Workcell | CompiledCell,
-        stages: int = PATH_STAGES,
+        intervals: int = PATH_INTERVALS,
         threads: int = 1,
         lanes: int = 0,
     ) -> None:
@@ -85,20 +85,20 @@ class PathTimer:
 
         Args:
             cell: the cell; compiled, where others share its functions.
-            stages: pieces of constant path acceleration.
+            intervals: pieces of constant path acceleration.
             threads: threads that share a batch.
             lanes: paths of a batch that run side by side; 0 for what suits the machine. One lane
                 builds faster.
 
         Raises:
-            SettingsError: the number of stages is out of range.
+            SettingsError: the number of intervals is out of range.
             DualArmError: the model or its code cannot be built.
         """
-        if not 10 <= stages <= 2000:
-            raise SettingsError(f"{stages} stages; allowed are 10 to 2000")
+        if not 10 <= intervals <= 2000:
+            raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000")
         self._compiled = compiled = CompiledCell.of(cell)
         self.workcell = workcell = compiled.workcell
-        self.stages = stages
+        self.intervals = intervals
         self._threads = threads
         self._joint_names = (joint_names(workcell.robots[0]), joint_names(workcell.robots[1]))
 
@@ -107,13 +107,13 @@ class PathTimer:
             from symbolic.physics.path_limits import path_function, sample_limits_function
 
             return {
-                "path": path_function(model, 2 * stages + 1),
+                "path": path_function(model, 2 * intervals + 1),
                 "sample_limits": sample_limits_function(model),
             }
 
-        functions = compiled.functions("path limits", make, str(stages), lanes=lanes)
+        functions = compiled.functions("path limits", make, str(intervals), lanes=lanes)
         self._path, self._limits = functions["path"], functions["sample_limits"]
-        self._passes = passes_function(compiled, stages)
+        self._passes = passes_function(compiled, intervals)
 
     @property
     def compiled(self) -> bool:
@@ -122,12 +122,12 @@ class PathTimer:
 
     def path_limits(self, x: Array) -> dict[str, Array]:
         """Of waypoints (n, n_var) the outputs of `symbolic.physics.path_limits.path_function` and
-        `limits`, at both ends and in the middle of every stage."""
+        `limits`, at both ends and in the middle of every interval."""
         paths = self._path.batch(np.ascontiguousarray(x, dtype=float), threads=self._threads)
         shapes = zip(self._limits.input_names, self._limits.input_shapes, strict=True)
         samples = [paths[name].reshape(-1, *shape) for name, shape in shapes]
         rows = self._limits.batch(*samples, threads=self._threads)["limits"]
-        return paths | {"limits": rows.reshape(len(x), 2 * self.stages + 1, rows.shape[-1])}
+        return paths | {"limits": rows.reshape(len(x), 2 * self.intervals + 1, rows.shape[-1])}
 
     def time(self, x: Array, limits: TimingLimits) -> PathTiming:
         """The fastest timing from rest to rest of one path.
@@ -177,7 +177,7 @@ class PathTimer:
 
     @cached_property
     def _model(self) -> TimingModel:
-        return TimingModel(self._compiled, self.stages)
+        return TimingModel(self._compiled, self.intervals)
 
     def _path_failure(self, paths: dict[str, Array], row: int) -> PathTiming | None:
         """Why a path cannot be timed at all."""
@@ -192,21 +192,21 @@ class PathTimer:
             if check.failed.any():
                 sample = int(np.argmax(check.failed.any(axis=1)))
                 robot = self.workcell.robots[int(np.argmax(check.failed[sample]))].name
-                place = Place(check.constraint, robot, "", sample, sample / (2 * self.stages))
+                place = Place(check.constraint, robot, "", sample, sample / (2 * self.intervals))
                 return self._failed(check.status, place)
         return None
 
     def _failed(self, status: TimingStatus, place: Place) -> PathTiming:
         return PathTiming(
-            status, place, float("inf"), np.full(2, np.nan), {}, np.zeros(self.stages + 1)
+            status, place, float("inf"), np.full(2, np.nan), {}, np.zeros(self.intervals + 1)
         )
 
     def _timing(self, out: dict[str, Array], k: int) -> PathTiming:
         status = OUTCOMES[int(out["status"][k])]
         use = out["use"][k]
         if status is TimingStatus.SOLVER_FAILED:
-            stage = int(out["stage"][k])
-            place = Place("path timing", "", "", stage, stage / self.stages)
+            interval = int(out["interval"][k])
+            place = Place("path timing", "", "", interval, interval / self.intervals)
         else:
             place = self._place(int(np.argmax(use[:, 0])), use)
         return PathTiming(
@@ -223,7 +223,7 @@ class PathTimer:
     def _place(self, kind: int, use: Array) -> Place:
         """The joint or contact that uses a kind of limit most, and where."""
         name, column, parameter = KINDS[kind], int(use[kind, 2]), float(use[kind, 1])
-        sample = round(parameter * self.stages)
+        sample = round(parameter * self.intervals)
         robots = self.workcell.robots
         if name.startswith("joint"):
             arm = int(column >= len(self._joint_names[0]))

@@ -1,4 +1,4 @@
-"""Limits at the points of the path's stages: rows for the linear problem, recomputed values."""
+"""Limits at the points of the path's intervals: rows for the linear problem, recomputed values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hybrid_opt.robust.path_force import robust_path
 from hybrid_opt.timing import rows as rows_of
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel, contact_torque
 from hybrid_opt.timing.records import TimingLimits
-from hybrid_opt.timing.rows import STAGE_POINTS, PointRows
+from hybrid_opt.timing.rows import INTERVAL_ENDS, PointRows
 from hybrid_opt.timing.use import limits_pressure
 from symbolic.array import Array
 
@@ -21,24 +21,24 @@ FORCE_SHARPNESS = 0.02
 
 
 class PointLimits:
-    """The limits of one path at `STAGE_POINTS` of every stage.
+    """The limits of one path at `INTERVAL_ENDS` of every interval.
 
     Attributes:
         points: the path's geometry there.
         scale: the solver's path coordinate is scale times u, so that speeds are around one [s].
-        grid: (stages + 1,) the solver's path coordinate at the stages' ends.
+        grid: (intervals + 1,) the solver's path coordinate at the intervals' ends.
         rest: (points, k) `ratios` standing still.
     """
 
     def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
         self._model = model
         self._limits = limits
-        stages = model.stages
-        offsets = np.array([round(REFINEMENT * share) for share in STAGE_POINTS])
-        self._index = (REFINEMENT * np.arange(stages)[:, None] + offsets).reshape(-1)
+        intervals = model.intervals
+        offsets = np.array([round(REFINEMENT * share) for share in INTERVAL_ENDS])
+        self._index = (REFINEMENT * np.arange(intervals)[:, None] + offsets).reshape(-1)
         self.points = motion.at(self._index)
         self.scale = duration_at_speed_limits(model, motion, limits)
-        self.grid = np.linspace(0.0, self.scale, stages + 1)
+        self.grid = np.linspace(0.0, self.scale, intervals + 1)
         still = np.zeros(len(self._index))
         self.rest = self.ratios(still, still)
 
@@ -53,10 +53,10 @@ class PointLimits:
         )
 
     def at_points(self, squared: Array) -> tuple[Array, Array]:
-        """u'^2 and u'' (points,) of a timing (stages + 1,) in the scaled coordinate."""
+        """u'^2 and u'' (points,) of a timing (intervals + 1,) in the scaled coordinate."""
         slope = np.diff(squared)
-        w = squared[:-1, None] + np.outer(slope, STAGE_POINTS)
-        a = np.repeat(slope / (2.0 * np.diff(self.grid)), len(STAGE_POINTS))
+        w = squared[:-1, None] + np.outer(slope, INTERVAL_ENDS)
+        a = np.repeat(slope / (2.0 * np.diff(self.grid)), len(INTERVAL_ENDS))
         return w.reshape(-1) / self.scale**2, a / self.scale
 
     def first_cuts(self) -> PointRows:

@@ -143,7 +143,7 @@ class Timing:
         place: where it fails, or the most used limit.
         carry: the carry under this timing, re-sampled; None without a timing.
         use: largest value over its limit, by constraint, recomputed on `carry`.
-        grid_speed: (stages + 1,) path speed u' at the grid points [1/s]; empty without a timing.
+        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]; empty without a timing.
         iterations: linear problems solved.
         slowed: uniform factor on the path speed that made recomputed limits hold, 1 normally.
         seconds: computing time.
@@ -185,7 +185,7 @@ class JerkTiming:
     """A timing within jerk limits, and what they cost.
 
     Attributes:
-        timing: without `grid_speed`: its u'' is not constant on stages.
+        timing: without `grid_speed`: its u'' is not constant on intervals.
         limits: the jerk limits.
         jerk_use: largest joint jerk and payload jerk over their limits.
         without: duration of the fastest timing without jerk limits [s].

@@ -14,11 +14,11 @@ from symbolic.errors import SettingsError
 
 
 def refined_carry(model: TimingModel, motion: PathMotion, grid_speed: Array) -> Carry:
-    """The carry at `REFINEMENT` samples per stage, both ends of every stage included.
+    """The carry at `REFINEMENT` samples per interval, both ends of every interval included.
 
     Args:
         motion: the path's geometry.
-        grid_speed: (stages + 1,) path speed u' at the grid points, u'' constant between [1/s].
+        grid_speed: (intervals + 1,) path speed u' at the grid points, u'' constant between [1/s].
     """
     squared = grid_speed**2
     share = np.linspace(0.0, 1.0, REFINEMENT + 1)
@@ -26,10 +26,10 @@ def refined_carry(model: TimingModel, motion: PathMotion, grid_speed: Array) -> 
     speed = np.sqrt(np.maximum(w, 0.0))
     # Average speed over a piece of constant acceleration is that of its ends.
     total = speed[:, :1] + speed
-    elapsed = 2.0 * share / model.stages / np.where(total > 0.0, total, 1.0)
+    elapsed = 2.0 * share / model.intervals / np.where(total > 0.0, total, 1.0)
     starts = np.concatenate([[0.0], np.cumsum(elapsed[:, -1])])[:-1]
-    a = np.repeat(np.diff(squared) * model.stages / 2.0, REFINEMENT + 1)
-    index = REFINEMENT * np.arange(model.stages)[:, None] + np.arange(REFINEMENT + 1)
+    a = np.repeat(np.diff(squared) * model.intervals / 2.0, REFINEMENT + 1)
+    index = REFINEMENT * np.arange(model.intervals)[:, None] + np.arange(REFINEMENT + 1)
     return model.carry(
         motion.at(index.reshape(-1)), (starts[:, None] + elapsed).reshape(-1), speed.reshape(-1), a
     )
@@ -45,9 +45,9 @@ def drive_path(
     """A given timing of a path with its carry, held against every limit.
 
     Args:
-        model: its stages are those of the timing.
+        model: its intervals are those of the timing.
         x: (n_var,) decision vector.
-        grid_speed: (stages + 1,) path speed u' at the grid points [1/s].
+        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s].
         motion: the path's geometry, where it is known already.
 
     Returns:
@@ -58,10 +58,10 @@ def drive_path(
     """
     grid_speed = np.asarray(grid_speed, dtype=float)
     moves = np.all(grid_speed[:-1] + grid_speed[1:] > 0.0) if grid_speed.ndim == 1 else False
-    if grid_speed.shape != (model.stages + 1,) or not moves:
+    if grid_speed.shape != (model.intervals + 1,) or not moves:
         raise SettingsError(
-            f"path speeds of shape {grid_speed.shape}; needs {model.stages + 1} that never stand "
-            "still over a stage"
+            f"path speeds of shape {grid_speed.shape}; needs {model.intervals + 1} that never "
+            "stand still over an interval"
         )
     motion = model.path_motion(x) if motion is None else motion
     failure = path_failure(model, motion)

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from hybrid_opt.timing.adapter import SPEED_CEILING, StageRows
+from hybrid_opt.timing.adapter import SPEED_CEILING, IntervalRows
 from hybrid_opt.timing.model import PathMotion
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.physics.contact_forces import GRAVITY, normal_force_branches
 from symbolic.workcell.records import Workcell
 
-STAGE_POINTS = (0.0, 1.0)
-"""Places within a stage at which limits are imposed, as a share of its length."""
+INTERVAL_ENDS = (0.0, 1.0)
+"""Places within an interval at which limits are imposed, as a share of its length."""
 
 
 @dataclass(frozen=True)
@@ -42,19 +42,19 @@ def join(rows: list[PointRows]) -> PointRows:
     )
 
 
-def stage_rows(rows: PointRows, stages: int, scale: float) -> StageRows:
-    """The rows of each stage's points in terms of its u'' and its initial u'^2.
+def interval_rows(rows: PointRows, intervals: int, scale: float) -> IntervalRows:
+    """The rows of each interval's points in terms of its u'' and its initial u'^2.
 
     Args:
-        rows: at the points of all stages, `STAGE_POINTS` per stage in order.
+        rows: at the points of all intervals, `INTERVAL_ENDS` per interval in order.
         scale: the path coordinate is scale times u.
     """
     k = rows.alpha.shape[1]
-    # Within a stage u'^2 = u'^2_0 + 2 share length u''.
-    progress = np.tile(np.array(STAGE_POINTS) * 2.0 * scale / stages, stages)[:, None]
+    # Within an interval u'^2 = u'^2_0 + 2 share length u''.
+    progress = np.tile(np.array(INTERVAL_ENDS) * 2.0 * scale / intervals, intervals)[:, None]
     alpha, beta = rows.alpha / scale, rows.beta / scale**2
-    shape = (stages, len(STAGE_POINTS) * k)
-    return StageRows(
+    shape = (intervals, len(INTERVAL_ENDS) * k)
+    return IntervalRows(
         (alpha + progress * beta).reshape(shape), beta.reshape(shape), rows.bound.reshape(shape)
     )
 

@@ -22,7 +22,7 @@ from hybrid_opt.timing.path_check import path_failure
 from hybrid_opt.timing.point_limits import POINT_TOLERANCE, PointLimits
 from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.refined import refined_carry
-from hybrid_opt.timing.rows import STAGE_POINTS, PointRows
+from hybrid_opt.timing.rows import INTERVAL_ENDS, PointRows
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_ratios, limit_use, worst
 from symbolic.array import Array
 
@@ -43,7 +43,7 @@ class _State:
 
     Attributes:
         cuts: supporting lines of convex limits.
-        tightened: (stages,) divisor of a stage's bounds, above one where a limit is exceeded
+        tightened: (intervals,) divisor of an interval's bounds, above one where a limit is exceeded
             between the points at which it is imposed.
         near: which of the limits that are not convex came near their bound so far.
         linearised: their rows, about the last timing.
@@ -109,10 +109,10 @@ class _Problem:
 
     def solve(self) -> Timing:
         """Solve linear problems until recomputed limits hold and nothing changes any more."""
-        stages = self._model.stages
+        intervals = self._model.intervals
         state = _State(
             [self._at.first_cuts()],
-            np.ones(stages),
+            np.ones(intervals),
             np.zeros(self._at.rest.shape[1], dtype=bool),
         )
         fixed = self._at.fixed()
@@ -122,7 +122,7 @@ class _Problem:
             parts = [fixed, *state.cuts]
             if state.linearised is not None:
                 parts.append(state.linearised)
-            linear = rows_of.stage_rows(rows_of.join(parts), stages, self._at.scale)
+            linear = rows_of.interval_rows(rows_of.join(parts), intervals, self._at.scale)
             linear.bound[:] /= state.tightened[:, None]
             found = fastest_speed(linear, self._at.grid)
             if isinstance(found, SolverFailure):
@@ -151,11 +151,11 @@ class _Problem:
         return excess <= POINT_TOLERANCE and change <= SETTLED
 
     def _tighten(self, state: _State, squared: Array) -> bool:
-        """Tighten the stages that exceed a limit between their points; whether there are any."""
+        """Tighten the intervals that exceed a limit between their points; whether there are any."""
         ratios = limit_ratios(self._refined(squared), self._model.workcell, self._limits)
         del ratios["friction"]
         use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
-        excess = use.reshape(self._model.stages, -1).max(axis=1)
+        excess = use.reshape(self._model.intervals, -1).max(axis=1)
         exceeded = excess > 1.0 + RECOMPUTED_TOLERANCE / 2.0
         state.tightened = np.where(exceeded, state.tightened * excess, state.tightened)
         return bool(exceeded.any())
@@ -202,15 +202,16 @@ class _Problem:
         return refined_carry(self._model, self._motion, np.sqrt(squared) / self._at.scale)
 
     def _solver_failure(self, failure: SolverFailure, iterations: int) -> Timing:
-        point = len(STAGE_POINTS) * failure.stage
+        point = len(INTERVAL_ENDS) * failure.interval
         columns = self._at.rest[point]
-        place = Place("path timing", "", "", failure.stage, float(self._at.points.parameter[point]))
+        parameter = float(self._at.points.parameter[point])
+        place = Place("path timing", "", "", failure.interval, parameter)
         detail = ""
         if columns.size:
             detail = f" (at rest there, limits are used to {100.0 * np.abs(columns).max():.1f} %)"
         return Timing(
             TimingStatus.SOLVER_FAILED,
-            f"{failure.reason}: stage {failure.stage} of {self._model.stages}, "
+            f"{failure.reason}: interval {failure.interval} of {self._model.intervals}, "
             f"u = {place.parameter:.4f}{detail}",
             place,
             None,

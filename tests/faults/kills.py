@@ -29,7 +29,7 @@ from tests.symbolic.cells import ROOT
 
 CELL = ROOT / "studies" / "workcells" / "transfer.toml"
 SMALL = (
-    *("--evaluations", "60", "--replicas", "2", "--polish-points", "1", "--seed", "3"),
+    *("--evaluations", "60", "--replicas", "2", "--polish-attempts", "1", "--seed", "3"),
     *("--population", "nsga2=20", "--population", "mopso=20", "--jobs", "2"),
 )
 STAGES = ("search", "polish", "drivable", "recommendation", "summary", "timing", "report")

@@ -42,7 +42,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     campaign = CampaignSettings(
         algorithms=("nsga2",), evaluations=60, replicas=1, seed=3, populations=(("nsga2", 20),)
     )
-    study = StudySettings(PolishSettings(points=1), report=False)
+    study = StudySettings(PolishSettings(attempts=1), report=False)
     execution = ExecutionSettings(root, jobs=1)
     run_study(load(TRANSFER), campaign, execution, Progress(shown=False), study)
     return root

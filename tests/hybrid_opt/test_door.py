@@ -40,7 +40,7 @@ def front() -> ho.Front:
 @cache
 def polished() -> ho.Front:
     rng = np.random.default_rng(1)
-    return ho.polish(cell(), front(), rng=rng, settings=ho.PolishSettings(points=2))
+    return ho.polish(cell(), front(), rng=rng, settings=ho.PolishSettings(attempts=2))
 
 
 def test_everything_that_is_promised_is_there() -> None:

@@ -47,7 +47,7 @@ def test_most_carries_are_feasible_and_certified(cell: Cell) -> None:
 @pytest.mark.slow
 def test_the_polish_lowers_the_forces(cell: Cell) -> None:
     front = ho.search(cell, "nsga2", evaluations=60, rng=np.random.default_rng(3))
-    settings = ho.PolishSettings(points=3, rounds=4)
+    settings = ho.PolishSettings(attempts=3, rounds=4)
     polished = ho.polish(cell, front, rng=np.random.default_rng(3), settings=settings)
     assert polished.objectives.sum(axis=1).min() < front.objectives.sum(axis=1).min()
 

@@ -32,7 +32,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
         settings,
         ExecutionSettings(root, jobs=1),
         Progress(shown=False),
-        StudySettings(PolishSettings(points=3), report=False),
+        StudySettings(PolishSettings(attempts=3), report=False),
     )
     return root
 

@@ -18,7 +18,7 @@ SMALL = {
     "range(5)": "range(2)",
     "cell.random(500": "cell.random(60",
     "polish(cell, front, rng=rng)": (
-        "polish(cell, front, rng=rng, settings=ho.PolishSettings(points=2))"
+        "polish(cell, front, rng=rng, settings=ho.PolishSettings(attempts=2))"
     ),
     "curve_points=5": "curve_points=2",
 }

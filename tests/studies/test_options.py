@@ -48,7 +48,7 @@ def test_the_ends_belong_to_the_range() -> None:
         (inspect.main, ["c.toml", "--seed", "x"]),
         (reference_front.main, ["c.toml", "--output", "f.csv", "--starts", "0"]),
         (reference_front.main, ["c.toml", "--output", "f.csv", "--jobs", "-1"]),
-        (reference_front.main, ["c.toml", "--output", "f.csv", "--points", "-1"]),
+        (reference_front.main, ["c.toml", "--output", "f.csv", "--attempts", "-1"]),
         (reference_front.main, ["c.toml", "--output", "f.csv", "--seed", "-1"]),
     ],
 )

@@ -19,7 +19,7 @@ def second_opinion(driver: Driver, model: TimingModel, x: Array) -> str:
     """Why the timing of a decision vector (n_var,) is not believed, empty where it is.
 
     Args:
-        model: of the driver's workcell and stages.
+        model: of the driver's workcell and intervals.
     """
     (timing,) = driver.timings(np.asarray(x)[None])
     if not timing.ok:

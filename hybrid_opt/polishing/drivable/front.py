@@ -77,7 +77,7 @@ class DrivablePolisher(Polisher):
         known = functions or polish_functions(evaluator.compiled)
         self.drivable = DrivableSolver(evaluator, known, settings)
         # At once: the cell's files may be there only for as long as this is made.
-        self._timings = TimingModel(evaluator.compiled, self.drivable.driver.timer.stages)
+        self._timings = TimingModel(evaluator.compiled, self.drivable.driver.timer.intervals)
 
     def doubt(self, x: Array) -> str:
         """Why a timing is not believed, see `hybrid_opt.polishing.drivable.certified`."""
@@ -113,7 +113,7 @@ class DriveRun(PolishRun[DriveAttempt]):
     def all(self, rng: np.random.Generator) -> None:
         """The front's points, starts far away, ends and gaps, other starts, while attempts last."""
         rows = self._archive.rows()
-        count = min(len(rows), ceil(self._settings.points * self._settings.front.own_share))
+        count = min(len(rows), ceil(self._settings.attempts * self._settings.front.own_share))
         forces = [
             self._force(rows[k]) for k in np.linspace(0, len(rows) - 1, count).round().astype(int)
         ]
@@ -157,7 +157,7 @@ class DriveRun(PolishRun[DriveAttempt]):
     def _far_away(self, rng: np.random.Generator, force: float) -> None:
         """Attempts from random feasible paths that are driven well and lie far from known ones."""
         settings, low, high = self._settings.drivable, self._evaluator.lower, self._evaluator.upper
-        count = int(settings.far_share * self._settings.points)
+        count = int(settings.far_share * self._settings.attempts)
         if not count:
             return
         x = rng.uniform(low, high, (settings.candidates, len(low)))

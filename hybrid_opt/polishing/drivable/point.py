@@ -72,7 +72,7 @@ class DrivableSolver:
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
         self._reader = CarryReader(evaluator, grid, functions.rows)
         self._proposer = Proposer(
-            self._cell, functions.driven, driver.timer.stages, settings.drivable
+            self._cell, functions.driven, driver.timer.intervals, settings.drivable
         )
         self.driver = driver
         self._half = self._cell.unit.half[: task.n_path]

@@ -5,7 +5,7 @@ speeds at the grid points between both ends as u'^2_i = w_i (1 + omega_i), the f
 F (1 + phi). With T the duration, and all of it about the iterate (xi, w, F) with duration T_0,
 
     minimise    T / T_0  (aim 'duration', phi = 0)   or   phi  (aim 'force', T <= T_wanted)
-    subject to  every limit at both ends of every stage <= 1, normal forces <= F (1 + phi)
+    subject to  every limit at both ends of every interval <= 1, normal forces <= F (1 + phi)
                 c_r(x) / scale_r >= required_r / scale_r   chosen geometric rows, as in
                 `hybrid_opt.polishing.program`.
 
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.polishing.drivable.stages import StageGrid, StageValues
+from hybrid_opt.polishing.drivable.intervals import IntervalGrid, IntervalValues
 from hybrid_opt.polishing.layout import PlaceRow
 from hybrid_opt.polishing.place_values import PlaceValues
 from hybrid_opt.polishing.residuals import Residuals
@@ -35,8 +35,8 @@ NEAR_FORCE = 0.6
 """The same for the normal forces, of what the limit leaves above the force at rest."""
 
 REST_MARGIN = 2e-3
-"""Share of the patches that is kept free standing still: only the stages' beginnings have rows, and
-where rest uses a patch up there is no timing at all."""
+"""Share of the patches that is kept free standing still: only the intervals' beginnings have rows,
+and where rest uses a patch up there is no timing at all."""
 
 LEAST_SCALE = 1e-2
 """A row's slope by the squared speeds below which it is not scaled up further."""
@@ -63,7 +63,7 @@ class Iterate:
 
     Attributes:
         x: (n_var,) decision vector.
-        squared: (stages + 1,) u'^2.
+        squared: (intervals + 1,) u'^2.
         force: force limit [N].
         duration: wanted [s] for the aim 'force', None for 'duration'.
     """
@@ -98,9 +98,9 @@ class JointProgram:
 
     def __init__(
         self,
-        grid: StageGrid,
+        grid: IntervalGrid,
         at: Iterate,
-        values: StageValues,
+        values: IntervalValues,
         half: Array,
         places: tuple[tuple[PlaceRow, ...], PlaceValues, Array],
     ) -> None:
@@ -112,7 +112,7 @@ class JointProgram:
             places: geometric rows, their values, and what each has to keep.
         """
         self._grid, self._at, self._values, self._half = grid, at, values, half
-        self.n_path, self.n_speeds = len(half), grid.stages - 1
+        self.n_path, self.n_speeds = len(half), grid.intervals - 1
         self.n = self.n_path + self.n_speeds + 1
         kinds = grid.kinds
         self.scale = np.where(kinds.is_force, at.force, 1.0)
@@ -135,22 +135,22 @@ class JointProgram:
         self.geometry = (self._required - value) / self._place_scale
         self._geometry_slope = -slope * self._half / self._place_scale[:, None]
 
-    def _still(self, values: StageValues) -> None:
+    def _still(self, values: IntervalValues) -> None:
         """Rows of the pressure at rest, after the geometric ones; they bend little."""
         share, slope = values.pressure_at_rest()
         near = np.flatnonzero(share > NEAR)
-        begins = 2 * (near // (len(share) // self._grid.stages))
+        begins = 2 * (near // (len(share) // self._grid.intervals))
         by_path = np.matmul(slope[near, None], self._grid.carry_over[begins])[:, 0] * self._half
         self.geometry = np.append(self.geometry, share[near] - 1.0 + REST_MARGIN)
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
     def _speeds(self) -> None:
         """Duration with its derivatives, and what u'' and u'^2 of each point are by omega."""
-        n, w = self._grid.stages, self._at.squared
+        n, w = self._grid.intervals, self._at.squared
         root = np.sqrt(w)
         pair = root[:-1] + root[1:]
         self.total = float((2.0 / n / pair).sum())
-        # dT/dw_i of the stages before and after the grid point i = 1 ... n - 1.
+        # dT/dw_i of the intervals before and after the grid point i = 1 ... n - 1.
         inner, share = root[1:-1], 2.0 / n / self.total
         before, after = share / pair[:-1] ** 2, share / pair[1:] ** 2
         by_root = -(before + after)
@@ -159,14 +159,14 @@ class JointProgram:
         own = 2.0 * share * (1.0 / pair[:-1] ** 3 + 1.0 / pair[1:] ** 3)
         self.cost_diagonal = own * inner**2 / 4.0 - by_root * inner / 4.0
         self.cost_beside = 2.0 * share / pair[1:-1] ** 3 * inner[:-1] * inner[1:] / 4.0
-        # By omega at the beginning and the end of the point's stage; those of both ends are fixed.
+        # By omega at both ends of the point's interval; those of the path's ends are fixed.
         begins, ends = np.repeat(w[:-1], 2), np.repeat(w[1:], 2)
         at_end = np.tile([0.0, 1.0], n)
         self._local = np.zeros((2 * n, 2, 2))
         self._local[:, 0, 0], self._local[:, 0, 1] = -begins * n / 2.0, ends * n / 2.0
         self._local[:, 1, 0], self._local[:, 1, 1] = (1.0 - at_end) * begins, at_end * ends
-        stage = np.repeat(np.arange(n), 2)
-        self._column = np.stack([stage - 1, stage], axis=1)
+        interval = np.repeat(np.arange(n), 2)
+        self._column = np.stack([interval - 1, interval], axis=1)
         self._held = (self._column < 0) | (self._column >= self.n_speeds)
         self._local[np.broadcast_to(self._held[:, None, :], self._local.shape)] = 0.0
         self._column = np.clip(self._column, 0, self.n_speeds - 1)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from hybrid_opt.polishing.constraints.learned import Learned
 from hybrid_opt.polishing.drivable import quadratic
 from hybrid_opt.polishing.drivable.functions import DrivenFunctions
+from hybrid_opt.polishing.drivable.intervals import IntervalGrid, IntervalValues
 from hybrid_opt.polishing.drivable.program import Iterate, JointProgram, Linear, Multipliers
-from hybrid_opt.polishing.drivable.stages import StageGrid, StageValues
 from hybrid_opt.polishing.drivable.timed import Goal, TimedPath
 from hybrid_opt.polishing.layout import PlaceRow, Row
 from hybrid_opt.polishing.placed_carry import PlacedCarry
@@ -63,13 +63,13 @@ class Proposer:
         self,
         cell: SmoothCell,
         functions: DrivenFunctions,
-        stages: int,
+        intervals: int,
         settings: DrivableSettings,
     ) -> None:
-        """stages: pieces of constant u''."""
+        """intervals: pieces of constant u''."""
         self._cell, self._functions = cell, functions
         self._task, self._driven = cell.task, settings
-        self._stages = StageGrid(cell.workcell, stages)
+        self._intervals = IntervalGrid(cell.workcell, intervals)
         self._half = cell.unit.half[: cell.task.n_path]
 
     def step(self, best: Reached, goal: Goal, radius: float, lenient: bool) -> Proposal | None:
@@ -174,12 +174,12 @@ class Proposer:
             (row for row in required if isinstance(row, PlaceRow)),
             key=lambda row: (repr(row.constraint), row.place),
         )
-        values = StageValues.at(
-            self._stages, self._functions, best.x, best.squared, best.timed.joints
+        values = IntervalValues.at(
+            self._intervals, self._functions, best.x, best.squared, best.timed.joints
         )
         duration = goal.limit if goal.aim == "force" else None
         program = JointProgram(
-            self._stages,
+            self._intervals,
             Iterate(best.x, best.squared, best.timed.force, duration),
             values,
             self._half,
@@ -194,7 +194,7 @@ class Proposer:
     def _box(self, best: Reached, goal: Goal, radius: float) -> tuple[Array, Array]:
         """Bounds of a step."""
         n = self._task.n_path
-        low = np.full(n + self._stages.stages, -LEAST_SQUARED)
+        low = np.full(n + self._intervals.intervals, -LEAST_SQUARED)
         high = np.full(len(low), LARGEST_SQUARED)
         xi = best.x[:n]
         low[:n] = np.maximum((self._task.lower[:n] - xi) / self._half, -radius)

@@ -41,8 +41,8 @@ class TimedPath:
     Attributes:
         duration: [s], infinite where there is none.
         force: force limit [N].
-        squared: (stages + 1,) u'^2 at the grid points.
-        joints: of both arms at the grid points (stages + 1, n) [rad].
+        squared: (intervals + 1,) u'^2 at the grid points.
+        joints: of both arms at the grid points (intervals + 1, n) [rad].
     """
 
     duration: float

@@ -1,10 +1,10 @@
-/* The fastest timing of one path by a backward and a forward pass over stages of constant u''.
+/* The fastest timing of one path by a backward and a forward pass over intervals of constant u''.
 
    docs/timing.md explains the method; `symbolic.physics.path_limits.LimitLayout` the numbers at a
-   sample. The text before this file defines STAGES, JOINTS, the SIZE of a sample's row, the offset
-   of every block (AT_...), RATIOS, FORCE_BRANCHES and limit_ratios, limit_slopes of CasADi.
+   sample. The text before this file defines INTERVALS, JOINTS, the SIZE of a sample's row, the
+   offset of every block (AT_...), RATIOS, FORCE_BRANCHES and limit_ratios, limit_slopes of CasADi.
 
-   x and y are the squared speeds u'^2 at the beginning and the end of a stage. There is rest at
+   x and y are the squared speeds u'^2 at the beginning and the end of an interval. There is rest at
    both ends of the path, and standing still is allowed everywhere, so that (0, 0) satisfies every
    row that is made here. */
 
@@ -20,18 +20,18 @@ enum { MOTION, FORCE, RATIO, GROUPS };
 static const int GROUP[KINDS] = {MOTION, MOTION, MOTION, MOTION, MOTION, MOTION, MOTION, FORCE,
                                  RATIO, RATIO};
 
-#define SAMPLES (2 * STAGES + 1)  /* of the path: the ends of the stages and their middles */
-#define HALF (0.5 * STAGES)       /* u'' = HALF (y - x) */
+#define SAMPLES (2 * INTERVALS + 1)  /* of the path: the ends of the intervals and their middles */
+#define HALF (0.5 * INTERVALS)       /* u'' = HALF (y - x) */
 #define MAX_ROWS 160
-#define MAX_ROUNDS 40             /* of rows added at one stage */
-#define MAX_RENEWALS 6            /* of linearisations at one stage */
+#define MAX_ROUNDS 40             /* of rows added at one interval */
+#define MAX_RENEWALS 6            /* of linearisations at one interval */
 #define MAX_SWEEPS 12
 #define MAX_HALVINGS 60
-#define MAX_REPAIRS (100 * STAGES)
+#define MAX_REPAIRS (100 * INTERVALS)
 #define CONVEX_TOLERANCE 1e-7     /* excess over a limit that counts as none */
 #define RATIO_TOLERANCE 1e-4      /* the same, of limits that are linearised */
-#define CONFLICT 1e-3             /* excess at which a stage counts as impossible */
-#define TIGHTEN 1e-3              /* excess between the ends of a stage that tightens it */
+#define CONFLICT 1e-3             /* excess at which an interval counts as impossible */
+#define TIGHTEN 1e-3              /* excess between the ends of an interval that tightens it */
 #define LARGEST_EXCESS 5e-3       /* a timing with more is slowed down */
 #define LEAST_SPEED 0.98          /* slowed further, it has not converged */
 #define NEARLY 0.9                /* a limit used this far is worth a row in advance */
@@ -45,11 +45,11 @@ typedef struct {
   const double* samples;           /* (SAMPLES, SIZE) */
   double force;                    /* largest normal force, infinite without */
   int torque, pressure, reference; /* whether these limits hold */
-  double* rest;                    /* (STAGES + 1, RATIOS) standing still */
-  double* rest_force;              /* (STAGES + 1,) larger normal force standing still */
-  double (*tight)[GROUPS];         /* (STAGES, GROUPS) divisor of what a limit leaves for motion */
-  double* top;                     /* (STAGES + 1,) largest u'^2 that can be brought to rest */
-  double* squared;                 /* (STAGES + 1,) u'^2 */
+  double* rest;                    /* (INTERVALS + 1, RATIOS) standing still */
+  double* rest_force;              /* (INTERVALS + 1,) larger normal force standing still */
+  double (*tight)[GROUPS];         /* (INTERVALS, GROUPS) divisor of what is left for motion */
+  double* top;                     /* (INTERVALS + 1,) largest u'^2 that can be brought to rest */
+  double* squared;                 /* (INTERVALS + 1,) u'^2 */
 } problem;
 
 static double larger(double a, double b) { return a > b ? a : b; }
@@ -90,10 +90,10 @@ static int normal_forces(const double* f, double a, double w, double* n, double*
   return best;
 }
 
-/* ---- rows of a stage ---- */
+/* ---- rows of an interval ---- */
 
-/* alpha u'' + beta u'^2 <= bound at the beginning (end = 0) or the end of a stage. */
-static line stage_row(double alpha, double beta, double bound, int end) {
+/* alpha u'' + beta u'^2 <= bound at the beginning (end = 0) or the end of an interval. */
+static line interval_row(double alpha, double beta, double bound, int end) {
   line row = {-HALF * alpha, HALF * alpha, bound, 0};
   if (end) row.y += beta; else row.x += beta;
   return row;
@@ -104,12 +104,12 @@ static int append(line* rows, int count, line row) {
   return count;
 }
 
-/* The convex limits of a stage that (x, y) uses beyond `threshold`, as supporting lines. */
-static int convex_rows(const problem* p, int stage, double x, double y, double threshold,
+/* The convex limits of an interval that (x, y) uses beyond `threshold`, as supporting lines. */
+static int convex_rows(const problem* p, int interval, double x, double y, double threshold,
                        line* rows, int count) {
-  const double a = HALF * (y - x), limit = 1.0 / p->tight[stage][MOTION];
+  const double a = HALF * (y - x), limit = 1.0 / p->tight[interval][MOTION];
   for (int end = 0; end < 2; ++end) {
-    const double* f = p->samples + 2 * (stage + end) * SIZE;
+    const double* f = p->samples + 2 * (interval + end) * SIZE;
     const double w = end ? y : x;
     const double *alpha = f + AT_ACCELERATION, *beta = alpha + JOINTS;
     int worst = 0;
@@ -120,7 +120,8 @@ static int convex_rows(const problem* p, int stage, double x, double y, double t
     }
     if (largest > limit * threshold) {
       const double sign = alpha[worst] * a + beta[worst] * w > 0.0 ? 1.0 : -1.0;
-      count = append(rows, count, stage_row(sign * alpha[worst], sign * beta[worst], limit, end));
+      const double by_a = sign * alpha[worst], by_w = sign * beta[worst];
+      count = append(rows, count, interval_row(by_a, by_w, limit, end));
     }
     for (int cone = 0; cone < 2; ++cone) {
       const double *first = f + AT_CONE + 6 * cone, *second = first + 3;
@@ -135,12 +136,12 @@ static int convex_rows(const problem* p, int stage, double x, double y, double t
         by_a += v[k] / length * first[k];
         by_w += v[k] / length * second[k];
       }
-      count = append(rows, count, stage_row(by_a, by_w, limit, end));
+      count = append(rows, count, interval_row(by_a, by_w, limit, end));
     }
     if (isfinite(p->force)) {
       double n[2], force[3], direction[3];
-      const double rest = p->rest_force[stage + end];
-      const double bound = rest + (p->force - rest) / p->tight[stage][FORCE];
+      const double rest = p->rest_force[interval + end];
+      const double bound = rest + (p->force - rest) / p->tight[interval][FORCE];
       const int branch = normal_forces(f, a, w, n, force);
       const double value = larger(n[0], n[1]);
       if (value - rest <= (bound - rest) * threshold) continue;
@@ -156,7 +157,8 @@ static int convex_rows(const problem* p, int stage, double x, double y, double t
         by_w += direction[k] * c[3 + k];
         still += direction[k] * c[6 + k];
       }
-      count = append(rows, count, stage_row(by_a / bound, by_w / bound, 1.0 - still / bound, end));
+      const line row = interval_row(by_a / bound, by_w / bound, 1.0 - still / bound, end);
+      count = append(rows, count, row);
     }
   }
   return count;
@@ -170,21 +172,21 @@ static int limited(const problem* p, int ratio) {
    those of the keys in `wanted` (2 RATIOS) as well, where it is given. Rest stays allowed: a
    linearisation from far away must not forbid it. Returns their number; *worst is the largest
    excess. */
-static int linearised_rows(const problem* p, int stage, double x, double y, const char* wanted,
+static int linearised_rows(const problem* p, int interval, double x, double y, const char* wanted,
                            line* rows, double* worst) {
-  const double a = HALF * (y - x), tight = p->tight[stage][RATIO];
+  const double a = HALF * (y - x), tight = p->tight[interval][RATIO];
   int count = 0;
   *worst = -1.0;
   if (!p->torque && !p->pressure) return 0;
   for (int end = 0; end < 2; ++end) {
-    const double* f = p->samples + 2 * (stage + end) * SIZE;
+    const double* f = p->samples + 2 * (interval + end) * SIZE;
     const double w = end ? y : x;
     double r[RATIOS], by_a[RATIOS], by_w[RATIOS];
     int exceeded = 0;
     ratios_at(f, a, w, r);
     for (int k = 0; k < RATIOS; ++k) {
       if (!limited(p, k)) continue;
-      const double still = fabs(p->rest[(stage + end) * RATIOS + k]);
+      const double still = fabs(p->rest[(interval + end) * RATIOS + k]);
       const double bound = still + (1.0 - still) / tight;
       const double excess = fabs(r[k]) - bound;
       *worst = larger(*worst, excess);
@@ -194,16 +196,16 @@ static int linearised_rows(const problem* p, int stage, double x, double y, cons
     slopes_at(f, a, w, r, by_a, by_w);
     for (int k = 0; k < RATIOS; ++k) {
       if (!limited(p, k)) continue;
-      const double still = p->rest[(stage + end) * RATIOS + k];
+      const double still = p->rest[(interval + end) * RATIOS + k];
       const double bound = fabs(still) + (1.0 - fabs(still)) / tight;
       if (fabs(r[k]) - bound <= RATIO_TOLERANCE && !(wanted && wanted[end * RATIOS + k])) continue;
       const double sign = r[k] > 0.0 ? 1.0 : -1.0;
       const double room = bound - sign * r[k] + sign * (by_a[k] * a + by_w[k] * w);
       const double least = 0.5 * (1.0 - sign * still);
       if (room >= least || w <= 0.0)
-        rows[count] = stage_row(sign * by_a[k], sign * by_w[k], larger(room, least), end);
+        rows[count] = interval_row(sign * by_a[k], sign * by_w[k], larger(room, least), end);
       else /* by u'^2 the chord to rest: a row that is only loosened may cut nothing off here */
-        rows[count] = stage_row(sign * by_a[k], sign * (r[k] - still - by_a[k] * a) / w,
+        rows[count] = interval_row(sign * by_a[k], sign * (r[k] - still - by_a[k] * a) / w,
                                 bound - sign * still, end);
       rows[count++].key = end * RATIOS + k;
     }
@@ -244,22 +246,22 @@ static int cuts(const double* best, line r) {
 
 /* ---- passes ---- */
 
-/* Whether a stage's exact limits allow (x, y), up to an excess. */
-static int allowed(const problem* p, int stage, double x, double y, double excess) {
+/* Whether an interval's exact limits allow (x, y), up to an excess. */
+static int allowed(const problem* p, int interval, double x, double y, double excess) {
   line scratch[MAX_ROWS];
   double worst;
-  if (convex_rows(p, stage, x, y, 1.0 + excess, scratch, 0)) return 0;
-  linearised_rows(p, stage, x, y, 0, scratch, &worst);
+  if (convex_rows(p, interval, x, y, 1.0 + excess, scratch, 0)) return 0;
+  linearised_rows(p, interval, x, y, 0, scratch, &worst);
   return worst <= excess;
 }
 
-/* The largest u'^2 at the beginning of a stage from which at most `top` is left at its end. */
-static double backward(const problem* p, int stage, double ceiling, double top, double guess) {
+/* The largest u'^2 at the beginning of an interval from which at most `top` is left at its end. */
+static double backward(const problem* p, int interval, double ceiling, double top, double guess) {
   line rows[MAX_ROWS] = {{1, 0, ceiling, 0}, {-1, 0, 0, 0}, {0, 1, top, 0}, {0, -1, 0, 0}};
   line near[2 * RATIOS], fresh[2 * RATIOS];
   double best[2] = {ceiling, smaller(top, ceiling)}, worst = -1.0, x = 0.0, y = 0.0, found = -1.0;
   int n_near = 0, from = 4, renewals = 0;
-  int count = convex_rows(p, stage, smaller(guess, ceiling), top, NEARLY, rows, 4);
+  int count = convex_rows(p, interval, smaller(guess, ceiling), top, NEARLY, rows, 4);
   for (int round = 0; round < MAX_ROUNDS; ++round) {
     for (; from < count; ++from)
       if (cuts(best, rows[from])) move_onto(best, rows[from], rows, from, 0, 0);
@@ -268,9 +270,9 @@ static double backward(const problem* p, int stage, double ceiling, double top, 
       if (cuts(trial, near[k])) move_onto(trial, near[k], rows, count, near, k);
     x = smaller(larger(trial[0], 0.0), ceiling);
     y = smaller(larger(trial[1], 0.0), top);
-    count = convex_rows(p, stage, x, y, 1.0 + CONVEX_TOLERANCE, rows, count);
+    count = convex_rows(p, interval, x, y, 1.0 + CONVEX_TOLERANCE, rows, count);
     if (count > from) continue;
-    int n_fresh = linearised_rows(p, stage, x, y, 0, fresh, &worst);
+    int n_fresh = linearised_rows(p, interval, x, y, 0, fresh, &worst);
     if (worst <= RATIO_TOLERANCE) {
       /* Linearisations from elsewhere may cut off too much: renew here those that stop x. */
       char stops[2 * RATIOS] = {0};
@@ -281,7 +283,7 @@ static double backward(const problem* p, int stage, double ceiling, double top, 
       const int better = x > found * (1.0 + RATIO_TOLERANCE);
       found = larger(found, x);
       if (!any || !better || ++renewals > MAX_RENEWALS) return found;
-      n_fresh = linearised_rows(p, stage, x, y, stops, fresh, &worst);
+      n_fresh = linearised_rows(p, interval, x, y, stops, fresh, &worst);
     }
     for (int k = 0; k < n_fresh; ++k) { /* one linearisation per limit: the last */
       int place = 0;
@@ -294,31 +296,31 @@ static double backward(const problem* p, int stage, double ceiling, double top, 
   double low = 0.0, high = 1.0;
   for (int k = 0; k < 20; ++k) {
     const double share = 0.5 * (low + high);
-    if (allowed(p, stage, share * x, share * y, CONFLICT)) low = share; else high = share;
+    if (allowed(p, interval, share * x, share * y, CONFLICT)) low = share; else high = share;
   }
   return low * x;
 }
 
-/* Between an allowed u'^2 at the end of a stage and one beyond it: a linearisation may have left
-   the limit far behind. */
-static double halve(const problem* p, int stage, double x, double low, double high) {
+/* Between an allowed u'^2 at the end of an interval and one beyond it: a linearisation may have
+   left the limit far behind. */
+static double halve(const problem* p, int interval, double x, double low, double high) {
   /* Counted: between 0 and the least number there is no middle that would end the loop. */
   for (int k = 0; k < MAX_HALVINGS && high - low > 1e-4 * high; ++k) {
     const double middle = 0.5 * (low + high);
-    if (allowed(p, stage, x, middle, RATIO_TOLERANCE)) low = middle; else high = middle;
+    if (allowed(p, interval, x, middle, RATIO_TOLERANCE)) low = middle; else high = middle;
   }
   return low;
 }
 
-/* The largest u'^2 at the end of a stage that begins with x, at most `top`; negative where the
-   stage's limits leave none. */
-static double forward(const problem* p, int stage, double x, double top) {
-  const double limit = 1.0 / p->tight[stage][MOTION];
+/* The largest u'^2 at the end of an interval that begins with x, at most `top`; negative where the
+   interval's limits leave none. */
+static double forward(const problem* p, int interval, double x, double top) {
+  const double limit = 1.0 / p->tight[interval][MOTION];
   double high = top;
   for (int end = 0; end < 2; ++end) {
-    const double* alpha = p->samples + 2 * (stage + end) * SIZE + AT_ACCELERATION;
+    const double* alpha = p->samples + 2 * (interval + end) * SIZE + AT_ACCELERATION;
     for (int j = 0; j < JOINTS; ++j) {
-      const line r = stage_row(alpha[j], alpha[JOINTS + j], 0.0, end);
+      const line r = interval_row(alpha[j], alpha[JOINTS + j], 0.0, end);
       if (fabs(r.y) <= 1e-300) continue;
       high = smaller(high, limit / fabs(r.y) - r.x * x / r.y);
     }
@@ -327,11 +329,11 @@ static double forward(const problem* p, int stage, double x, double top) {
   for (int round = 0; round < MAX_ROUNDS; ++round) {
     line rows[MAX_ROWS];
     double worst = -1.0, next = y;
-    int count = convex_rows(p, stage, x, y, 1.0 + CONVEX_TOLERANCE, rows, 0);
+    int count = convex_rows(p, interval, x, y, 1.0 + CONVEX_TOLERANCE, rows, 0);
     if (!count) {
-      count = linearised_rows(p, stage, x, y, 0, rows, &worst);
+      count = linearised_rows(p, interval, x, y, 0, rows, &worst);
       if (count) beyond = y;
-      else if (worst < -CONFLICT) y = halve(p, stage, x, y, beyond);
+      else if (worst < -CONFLICT) y = halve(p, interval, x, y, beyond);
     }
     if (!count) break;
     for (int k = 0; k < count; ++k)
@@ -340,9 +342,9 @@ static double forward(const problem* p, int stage, double x, double top) {
     y = next;
     if (y <= 0.0) break;
   }
-  if (stage < STAGES - 1 && y <= 0.0) return -1.0;
+  if (interval < INTERVALS - 1 && y <= 0.0) return -1.0;
   y = larger(y, 0.0);
-  return allowed(p, stage, x, y, CONFLICT) ? y : -1.0;
+  return allowed(p, interval, x, y, CONFLICT) ? y : -1.0;
 }
 
 /* Largest u'^2 that the speed limits leave at a grid point. */
@@ -352,21 +354,21 @@ static double speed_ceiling(const problem* p, int i) {
   double demand = 1e-4, tight = 1.0;
   for (int k = 0; k < count; ++k) demand = larger(demand, fabs(d[k]));
   if (i > 0) tight = larger(tight, p->tight[i - 1][MOTION]);
-  if (i < STAGES) tight = larger(tight, p->tight[i][MOTION]);
+  if (i < INTERVALS) tight = larger(tight, p->tight[i][MOTION]);
   return 1.0 / (tight * demand * demand);
 }
 
-/* Both passes; the stage that could not be driven, or -1. */
+/* Both passes; the interval that could not be driven, or -1. */
 static int sweep(problem* p) {
-  p->top[STAGES] = 0.0;
-  for (int i = STAGES - 1; i >= 0; --i) {
+  p->top[INTERVALS] = 0.0;
+  for (int i = INTERVALS - 1; i >= 0; --i) {
     const double next = p->top[i + 1];
-    const double guess = i < STAGES - 1 ? larger(2.0 * next - p->top[i + 2], next) : next;
+    const double guess = i < INTERVALS - 1 ? larger(2.0 * next - p->top[i + 2], next) : next;
     p->top[i] = backward(p, i, speed_ceiling(p, i), next, guess);
   }
   p->squared[0] = 0.0;
   int repairs = 0;
-  for (int i = 0; i < STAGES;) {
+  for (int i = 0; i < INTERVALS;) {
     const double y = forward(p, i, p->squared[i], p->top[i + 1]);
     if (y >= 0.0) { p->squared[++i] = y; continue; }
     /* Only limits that are not convex allow x and nothing after it: keep below this x. */
@@ -451,45 +453,45 @@ static void reset(largest_use* use, double* peak) {
   peak[0] = peak[1] = 0.0;
 }
 
-/* Judges a timing slowed by `factor` inside a stage, at its middle and its quarters. What is between
-   the samples is interpolated; ratios matter there only if the middle is near their limit. */
-static void judge_inside(const problem* p, int stage, double factor, largest_use* use,
+/* Judges a timing slowed by `factor` inside an interval, at its middle and its quarters. What is
+   between the samples is interpolated; ratios matter there only if the middle is near the limit. */
+static void judge_inside(const problem* p, int interval, double factor, largest_use* use,
                          double* peak) {
-  const double x = factor * factor * p->squared[stage];
-  const double y = factor * factor * p->squared[stage + 1], a = HALF * (y - x);
+  const double x = factor * factor * p->squared[interval];
+  const double y = factor * factor * p->squared[interval + 1], a = HALF * (y - x);
   double f[SIZE];
   largest_use middle[KINDS] = {{0}};
-  judge(p, p->samples + (2 * stage + 1) * SIZE, (stage + 0.5) / STAGES, a, 0.5 * (x + y), 1, middle,
-        peak);
+  judge(p, p->samples + (2 * interval + 1) * SIZE, (interval + 0.5) / INTERVALS, a, 0.5 * (x + y),
+        1, middle, peak);
   for (int k = 0; k < KINDS; ++k)
     note(use, k, middle[k].ratio, middle[k].parameter, middle[k].column);
   const int near = larger(middle[JOINT_TORQUE].ratio, middle[PRESSURE].ratio) > NEARLY;
   for (int quarter = 1; quarter <= 3; quarter += 2) {
     const double share = 0.25 * quarter;
-    between(p, 2.0 * (stage + share), near ? SIZE : AT_MOMENT, f);
-    judge(p, f, (stage + share) / STAGES, a, x + share * (y - x), near, use, peak);
+    between(p, 2.0 * (interval + share), near ? SIZE : AT_MOMENT, f);
+    judge(p, f, (interval + share) / INTERVALS, a, x + share * (y - x), near, use, peak);
   }
 }
 
-/* Judges a timing slowed by `factor` at the ends of all stages and inside them; returns the largest
-   use. */
+/* Judges a timing slowed by `factor` at the ends of all intervals and inside them; returns the
+   largest use. */
 static double judge_all(const problem* p, double factor, largest_use* use, double* peak) {
   reset(use, peak);
-  for (int i = 0; i < STAGES; ++i) {
+  for (int i = 0; i < INTERVALS; ++i) {
     const double x = factor * factor * p->squared[i], y = factor * factor * p->squared[i + 1];
     const double a = HALF * (y - x);
-    judge(p, p->samples + 2 * i * SIZE, i / (double)STAGES, a, x, 1, use, peak);
-    judge(p, p->samples + 2 * (i + 1) * SIZE, (i + 1) / (double)STAGES, a, y, 1, use, peak);
+    judge(p, p->samples + 2 * i * SIZE, i / (double)INTERVALS, a, x, 1, use, peak);
+    judge(p, p->samples + 2 * (i + 1) * SIZE, (i + 1) / (double)INTERVALS, a, y, 1, use, peak);
     judge_inside(p, i, factor, use, peak);
   }
   return worst_of(use);
 }
 
-/* Judges inside all stages, where no limit was imposed, and tightens the stages that exceed one by
+/* Judges inside all intervals, where no limit was imposed, and tightens those that exceed one by
    the group of that limit; returns the largest use. */
 static double tighten(problem* p) {
   double largest = 0.0;
-  for (int i = 0; i < STAGES; ++i) {
+  for (int i = 0; i < INTERVALS; ++i) {
     largest_use use[KINDS];
     double peak[2], excess[GROUPS] = {1.0, 1.0, 1.0};
     reset(use, peak);
@@ -508,10 +510,10 @@ static double tighten(problem* p) {
 /* Standing still everywhere: fills `rest` and `rest_force`; returns the largest use. */
 static double judge_rest(problem* p, largest_use* use, double* peak) {
   reset(use, peak);
-  for (int i = 0; i <= STAGES; ++i) {
+  for (int i = 0; i <= INTERVALS; ++i) {
     const double* f = p->samples + 2 * i * SIZE;
     double n[2], force[3];
-    judge(p, f, i / (double)STAGES, 0.0, 0.0, 1, use, peak);
+    judge(p, f, i / (double)INTERVALS, 0.0, 0.0, 1, use, peak);
     ratios_at(f, 0.0, 0.0, p->rest + i * RATIOS);
     normal_forces(f, 0.0, 0.0, n, force);
     p->rest_force[i] = larger(n[0], n[1]);
@@ -519,15 +521,15 @@ static double judge_rest(problem* p, largest_use* use, double* peak) {
   return worst_of(use);
 }
 
-/* Both passes until the limits hold between the ends of the stages as well. */
-static int solve(problem* p, largest_use* use, double* peak, double* stage, double* sweeps,
+/* Both passes until the limits hold between the ends of the intervals as well. */
+static int solve(problem* p, largest_use* use, double* peak, double* interval, double* sweeps,
                  double* slowed) {
   for (int k = 0; k < SAMPLES * SIZE; ++k)
     if (!isfinite(p->samples[k])) {
-      *stage = k / SIZE / 2;
+      *interval = k / SIZE / 2;
       return BROKEN;
     }
-  for (int i = 0; i < STAGES; ++i)
+  for (int i = 0; i < INTERVALS; ++i)
     for (int k = 0; k < GROUPS; ++k) p->tight[i][k] = 1.0;
   if (judge_rest(p, use, peak) >= 1.0 - 1e-6) return AT_REST;
   double worst = INFINITY;
@@ -535,7 +537,7 @@ static int solve(problem* p, largest_use* use, double* peak, double* stage, doub
     const int stuck = sweep(p);
     *sweeps += 1.0;
     if (stuck >= 0) {
-      *stage = stuck;
+      *interval = stuck;
       return STUCK;
     }
     worst = tighten(p);
@@ -547,46 +549,46 @@ static int solve(problem* p, largest_use* use, double* peak, double* stage, doub
     if (judge_all(p, factor, use, peak) > 1.0) high = factor; else low = factor;
   }
   judge_all(p, low, use, peak);
-  for (int i = 0; i <= STAGES; ++i) p->squared[i] *= low * low;
+  for (int i = 0; i <= INTERVALS; ++i) p->squared[i] *= low * low;
   *slowed = low;
   return low < LEAST_SPEED ? SLOWED : REACHED;
 }
 
 /* Inputs: samples (SAMPLES, SIZE); options (4,): largest normal force, whether torques, pressure
-   and the reference speeds are limited. Outputs: status; stage of a failure; duration; peak (2,)
-   normal forces; use (KINDS, 3): ratio, parameter, column; squared (STAGES + 1,) u'^2; sweeps;
+   and the reference speeds are limited. Outputs: status; interval of a failure; duration; peak (2,)
+   normal forces; use (KINDS, 3): ratio, parameter, column; squared (INTERVALS + 1,) u'^2; sweeps;
    slowed. */
 int path_timing(const double** arg, double** res, long long* iw, double* w, int mem) {
   const double* options = arg[1];
-  double *status = res[0], *stage = res[1], *duration = res[2], *peak = res[3], *uses = res[4];
+  double *status = res[0], *interval = res[1], *duration = res[2], *peak = res[3], *uses = res[4];
   double *squared = res[5], *sweeps = res[6], *slowed = res[7];
   largest_use use[KINDS];
   problem p = {
     arg[0], options[0], options[1] > 0.5, options[2] > 0.5, options[3] > 0.5, w,
-    w + (STAGES + 1) * RATIOS, (double(*)[GROUPS])(w + (STAGES + 1) * (RATIOS + 1)),
-    w + (STAGES + 1) * (RATIOS + 1 + GROUPS), squared,
+    w + (INTERVALS + 1) * RATIOS, (double(*)[GROUPS])(w + (INTERVALS + 1) * (RATIOS + 1)),
+    w + (INTERVALS + 1) * (RATIOS + 1 + GROUPS), squared,
   };
   (void)iw; (void)mem;
-  *stage = *sweeps = *duration = 0.0;
+  *interval = *sweeps = *duration = 0.0;
   *slowed = 1.0;
-  for (int i = 0; i <= STAGES; ++i) squared[i] = 0.0;
+  for (int i = 0; i <= INTERVALS; ++i) squared[i] = 0.0;
   reset(use, peak);
-  *status = solve(&p, use, peak, stage, sweeps, slowed);
+  *status = solve(&p, use, peak, interval, sweeps, slowed);
   for (int k = 0; k < KINDS; ++k) {
     uses[3 * k] = use[k].ratio;
     uses[3 * k + 1] = use[k].parameter;
     uses[3 * k + 2] = use[k].column;
   }
   if (*status == REACHED || *status == SLOWED)
-    for (int i = 0; i < STAGES; ++i)
-      *duration += 2.0 / STAGES / (sqrt(squared[i]) + sqrt(squared[i + 1]));
+    for (int i = 0; i < INTERVALS; ++i)
+      *duration += 2.0 / INTERVALS / (sqrt(squared[i]) + sqrt(squared[i + 1]));
   else
     *duration = INFINITY;
   return 0;
 }
 
 int path_timing_work(long long* arg, long long* res, long long* iw, long long* w) {
-  *arg = 2; *res = 8; *iw = 0; *w = (STAGES + 1) * (RATIOS + 2 + GROUPS);
+  *arg = 2; *res = 8; *iw = 0; *w = (INTERVALS + 1) * (RATIOS + 2 + GROUPS);
   return 0;
 }
 void path_timing_incref(void) {}

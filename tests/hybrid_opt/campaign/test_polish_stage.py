@@ -39,7 +39,7 @@ from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
 SETTINGS = CampaignSettings(algorithms=("nsga2",), evaluations=200, replicas=1, seed=5)
-POLISHED = PolishSettings(points=4, fill=FillSettings(attempts=1))
+POLISHED = PolishSettings(attempts=4, fill=FillSettings(attempts=1))
 SILENT = Progress(shown=False)
 
 
@@ -68,8 +68,8 @@ def test_a_polished_front_is_feasible_certified_and_better(finished: Path) -> No
     before = metrics.hypervolume(replica.front, corner)
     assert metrics.hypervolume(polished.objectives, corner) > before
     assert polished.polished.any()
-    most = POLISHED.points * (1 + POLISHED.fill.attempts)
-    assert POLISHED.points < polished.figures.attempts <= most
+    most = POLISHED.attempts * (1 + POLISHED.fill.attempts)
+    assert POLISHED.attempts < polished.figures.attempts <= most
     assert 0.0 < polished.figures.widest_gap < 1.0
     assert polished.figures.equivalent_evaluations > 0
     assert not (polished_folder(finished, "nsga2", 0) / JOURNAL).exists()
@@ -141,7 +141,7 @@ class Repeating(FrontPolisher):
 
 def test_other_settings_are_refused(finished: Path) -> None:
     execution = ExecutionSettings(finished, jobs=1, resume=True)
-    other: Stage = polish_stage(PolishSettings(points=5))
+    other: Stage = polish_stage(PolishSettings(attempts=5))
     with (
         open_folder(SETTINGS, execution, load(RACK)) as folder,
         pytest.raises(ResultsError, match="polish"),

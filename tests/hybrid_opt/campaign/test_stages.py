@@ -105,7 +105,7 @@ def test_a_damaged_marker_is_told(tmp_path: Path, content: str) -> None:
 
 def test_a_stage_of_other_settings_is_refused(tmp_path: Path) -> None:
     ran: list[str] = []
-    run(tmp_path, Stage("polish", noting(ran, "polish"), {"points": 20}))
+    run(tmp_path, Stage("polish", noting(ran, "polish"), {"attempts": 20}))
     with pytest.raises(ResultsError, match=r"'polish' was run with .*20.*, now asked for is .*30"):
-        run(tmp_path, Stage("polish", noting(ran, "polish"), {"points": 30}))
+        run(tmp_path, Stage("polish", noting(ran, "polish"), {"attempts": 30}))
     assert ran == ["polish"]

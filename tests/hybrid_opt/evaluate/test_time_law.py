@@ -13,15 +13,15 @@ from symbolic.workcell.records import TimeLaw
 from tests.hybrid_opt.timing.cells import initial, near_initial, timing_of
 from tests.symbolic.cells import hand_cell
 
-STAGES = 20
+INTERVALS = 20
 
 
 @cache
 def timing(law: TimeLaw) -> TimingModel:
     """Sampled as densely as the timing recomputes a path."""
     cell = hand_cell()
-    task = replace(cell.task, time_law=law, samples=REFINEMENT * STAGES + 1)
-    return timing_of(replace(cell, task=task), STAGES)
+    task = replace(cell.task, time_law=law, samples=REFINEMENT * INTERVALS + 1)
+    return timing_of(replace(cell, task=task), INTERVALS)
 
 
 def test_joint_rates_are_those_of_the_exact_derivatives() -> None:

@@ -29,8 +29,8 @@ from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
-SETTINGS = PolishSettings(points=7, fill=FillSettings(attempts=1))
-PATIENT = PolishSettings(points=1, rounds=25, max_iterations=80)
+SETTINGS = PolishSettings(attempts=7, fill=FillSettings(attempts=1))
+PATIENT = PolishSettings(attempts=1, rounds=25, max_iterations=80)
 
 
 @cache
@@ -111,8 +111,8 @@ def test_what_it_cost_is_told_in_evaluations() -> None:
     assert result.equivalent_evaluations == pytest.approx(
         result.seconds / result.evaluation_seconds, abs=1.0
     )
-    most = SETTINGS.points * (1 + SETTINGS.fill.attempts)
-    assert SETTINGS.points < len(result.outcomes) <= most
+    most = SETTINGS.attempts * (1 + SETTINGS.fill.attempts)
+    assert SETTINGS.attempts < len(result.outcomes) <= most
     assert sum(o.status == "accepted" for o in result.outcomes) == result.counts["accepted"]
 
 
@@ -141,7 +141,7 @@ def test_an_attempt_that_ended_its_process_costs_itself_alone() -> None:
 
 def test_a_front_of_one_point() -> None:
     one = evaluator().workcell.task.initial.reshape(1, -1)
-    result = FrontPolisher(evaluator(), replace(SETTINGS, points=4)).polish(
+    result = FrontPolisher(evaluator(), replace(SETTINGS, attempts=4)).polish(
         one, np.random.default_rng(0)
     )
     assert np.any(np.all(result.objectives <= objectives_of(one)[0], axis=1))
@@ -166,7 +166,7 @@ def test_infeasible_points_are_no_front() -> None:
 
 
 def test_no_points_means_no_polish() -> None:
-    result = FrontPolisher(evaluator(), PolishSettings(points=0)).polish(
+    result = FrontPolisher(evaluator(), PolishSettings(attempts=0)).polish(
         start_front(), np.random.default_rng(0)
     )
     assert result.outcomes == ()
@@ -174,7 +174,7 @@ def test_no_points_means_no_polish() -> None:
 
 
 def test_epsilon_constraint_improves_too() -> None:
-    settings = PolishSettings(points=3, method="epsilon")
+    settings = PolishSettings(attempts=3, method="epsilon")
     result = FrontPolisher(evaluator(), settings).polish(start_front(), np.random.default_rng(0))
     own = [o for o in result.outcomes if o.aim == "point"]
     assert own[0].status == "accepted"
@@ -202,7 +202,7 @@ class Broken(PolishSolver):
 
 def test_a_broken_solver_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(front_module, "PolishSolver", Broken)
-    polisher = FrontPolisher(evaluator(), PolishSettings(points=9, rounds=1))
+    polisher = FrontPolisher(evaluator(), PolishSettings(attempts=9, rounds=1))
     result = polisher.polish(start_front(), np.random.default_rng(0))
     before = objectives_of(start_front())
     order = np.lexsort(before.T[::-1])

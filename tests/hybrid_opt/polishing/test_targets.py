@@ -78,8 +78,8 @@ def test_a_normal_reaches_both_ends_of_its_chord_alike() -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("points", -1),
-        ("points", 2.5),
+        ("attempts", -1),
+        ("attempts", 2.5),
         ("max_iterations", 0),
         ("rounds", 0),
         ("margin", 0.0),

@@ -13,18 +13,18 @@ from symbolic.array import Array
 from symbolic.workcell.records import Workcell
 from tests.symbolic.cells import hand_cell, hand_model
 
-STAGES = 200
+INTERVALS = 200
 
 
 @cache
-def hand_timing(stages: int = STAGES) -> TimingModel:
+def hand_timing(intervals: int = INTERVALS) -> TimingModel:
     """The hand-written cell, to be timed."""
-    return timing_of(hand_cell(), stages)
+    return timing_of(hand_cell(), intervals)
 
 
-def timing_of(cell: Workcell, stages: int = STAGES) -> TimingModel:
+def timing_of(cell: Workcell, intervals: int = INTERVALS) -> TimingModel:
     """A cell of the hand-written kind, to be timed."""
-    return TimingModel(CompiledCell(cell, model=hand_model(cell)), stages)
+    return TimingModel(CompiledCell(cell, model=hand_model(cell)), intervals)
 
 
 def with_robots(cell: Workcell, **factors: float) -> Workcell:

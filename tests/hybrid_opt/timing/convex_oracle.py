@@ -1,6 +1,6 @@
 """Time-optimal timing as one convex program, solved by an interior-point method.
 
-Independent of the timing package in formulation and solver: all stages at once, norms as
+Independent of the timing package in formulation and solver: all intervals at once, norms as
 second-order cones, times through rotated cones (after Verscheure et al., 2009). It shares only
 the geometry along the path.
 """
@@ -65,8 +65,8 @@ class _Program:
 
 def shortest_duration(model: TimingModel, x: Array, limits: TimingLimits) -> float:
     """Shortest duration [s] from rest to rest; torque and pressure limits are left out."""
-    n, cell = model.stages, model.workcell
-    motion = model.path_motion(x).at(np.arange(0, REFINEMENT * model.stages + 1, REFINEMENT))
+    n, cell = model.intervals, model.workcell
+    motion = model.path_motion(x).at(np.arange(0, REFINEMENT * model.intervals + 1, REFINEMENT))
     scale = 5.0  # around the duration [s], so that variables are around one
     delta = scale / n
     program = _Program(3 * n + 2)
@@ -77,16 +77,16 @@ def shortest_duration(model: TimingModel, x: Array, limits: TimingLimits) -> flo
         program.norm([({i: 1.0}, 1.0), ({root + i: 2.0}, 0.0), ({i: 1.0}, -1.0)])
         for speed, bound in _speeds(model, motion, i, limits):
             program.at_most({i: speed**2 / scale**2}, bound**2)
-    for stage, (i, k) in enumerate(pairwise(range(n + 1))):
-        total = {inverse + stage: 1.0, root + i: 1.0, root + k: 1.0}
-        difference = {inverse + stage: 1.0, root + i: -1.0, root + k: -1.0}
+    for interval, (i, k) in enumerate(pairwise(range(n + 1))):
+        total = {inverse + interval: 1.0, root + i: 1.0, root + k: 1.0}
+        difference = {inverse + interval: 1.0, root + i: -1.0, root + k: -1.0}
         program.norm([(total, 0.0), ({}, 2.0), (difference, 0.0)])
         for point in (i, k):
 
             def affine(
                 first: float, second: float, i: int = i, k: int = k, point: int = point
             ) -> Terms:
-                """Terms of first u'' + second u'^2 at a point of the stage."""
+                """Terms of first u'' + second u'^2 at a point of the interval."""
                 slope = first / scale / (2.0 * delta)
                 terms = {i: -slope, k: slope}
                 terms[point] += second / scale**2

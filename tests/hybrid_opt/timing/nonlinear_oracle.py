@@ -1,7 +1,7 @@
 """Torque-limited timing as one nonlinear program, solved by IPOPT with exact contact forces.
 
-Independent of the timing package's sequence of linear problems: all stages at once, joint torques
-straight from the symbolic load and the arms' coefficients, nothing linearised by hand.
+Independent of the timing package's sequence of linear problems: all intervals at once, joint
+torques straight from the symbolic load and the arms' coefficients, nothing linearised by hand.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ def shortest_duration(model: TimingModel, x: Array, start: Array) -> float:
     """Shortest duration [s] with joint speed, acceleration and torque and payload limits.
 
     Args:
-        start: (stages + 1,) path speed u' [1/s] to begin the search from.
+        start: (intervals + 1,) path speed u' [1/s] to begin the search from.
     """
-    cell, n = model.workcell, model.stages
+    cell, n = model.workcell, model.intervals
     motion = model.path_motion(x).at(np.arange(0, REFINEMENT * n + 1, REFINEMENT))
     w = ca.MX.sym("w", n - 1)  # u'^2 at the inner grid points
     squared = ca.vertcat(0.0, w, 0.0)

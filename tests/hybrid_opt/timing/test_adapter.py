@@ -7,13 +7,13 @@ import logging
 import numpy as np
 import pytest
 
-from hybrid_opt.timing.adapter import SolverFailure, StageRows, fastest_speed
+from hybrid_opt.timing.adapter import IntervalRows, SolverFailure, fastest_speed
 
 
-def rows(n: int, *limits: tuple[float, float, float]) -> StageRows:
-    """The same rows a u'' + b u'^2 <= bound on every stage."""
+def rows(n: int, *limits: tuple[float, float, float]) -> IntervalRows:
+    """The same rows a u'' + b u'^2 <= bound on every interval."""
     a, b, bound = (np.tile(column, (n, 1)) for column in np.array(limits).T)
-    return StageRows(a, b, bound)
+    return IntervalRows(a, b, bound)
 
 
 def duration(squared: np.ndarray, grid: np.ndarray) -> float:
@@ -36,7 +36,7 @@ def test_bounded_speed_takes_the_time_of_a_trapezoid() -> None:
     assert duration(found, grid) == pytest.approx(2.0 + 1.0 / 3.0, rel=1e-3)
 
 
-def test_contradicting_rows_fail_at_their_stage(
+def test_contradicting_rows_fail_at_their_interval(
     caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     limits = rows(50, (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0))
@@ -44,7 +44,7 @@ def test_contradicting_rows_fail_at_their_stage(
     with caplog.at_level(logging.DEBUG):
         found = fastest_speed(limits, np.linspace(0.0, 1.0, 51))
     assert isinstance(found, SolverFailure)
-    assert found.stage == 20
+    assert found.interval == 20
     assert "no speed" in found.reason
     assert caplog.records == []
     assert capfd.readouterr().err == ""

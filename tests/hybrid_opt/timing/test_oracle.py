@@ -39,7 +39,7 @@ def test_duration_agrees_with_a_convex_program(seed: int) -> None:
 @pytest.mark.parametrize("factor", [0.6, 0.55])
 @pytest.mark.parametrize("seed", range(3))
 def test_torque_limited_duration_agrees_with_a_nonlinear_program(factor: float, seed: int) -> None:
-    model = timing_of(with_robots(hand_cell(), torque_max=factor), stages=40)
+    model = timing_of(with_robots(hand_cell(), torque_max=factor), intervals=40)
     (x,) = near_initial(np.random.default_rng(seed), 1, size=0.5)
     timing = time_path(model, x, TimingLimits(pressure=False))
     assert timing.ok, timing.reason

@@ -41,12 +41,12 @@ from tests.symbolic.cells import (
     with_task,
 )
 
-STAGES = 100
+INTERVALS = 100
 STATIC = 98.1 / 2.0
 
 
-def timer_of(cell: Workcell, stages: int = STAGES) -> PathTimer:
-    return PathTimer(CompiledCell(cell, model=hand_model(cell)), stages, lanes=1)
+def timer_of(cell: Workcell, intervals: int = INTERVALS) -> PathTimer:
+    return PathTimer(CompiledCell(cell, model=hand_model(cell)), intervals, lanes=1)
 
 
 @cache
@@ -77,7 +77,7 @@ def test_durations_agree_with_time_path_and_limits_hold(share: float | None, fac
     cell = with_contacts(
         with_robots(hand_cell(), torque_max=factor), patch_radius=(0.0315 * factor, 0.0315)
     )
-    timer, model = timer_of(cell), timing_of(cell, STAGES)
+    timer, model = timer_of(cell), timing_of(cell, INTERVALS)
     limits = TimingLimits(force=None if share is None else share * STATIC)
     for x in near_initial(np.random.default_rng(3), 4):
         assert_agrees(timer, model, x, limits)
@@ -87,7 +87,7 @@ def test_durations_agree_with_time_path_and_limits_hold(share: float | None, fac
 @pytest.mark.parametrize("name", ["rack", "transfer"])
 def test_two_hundred_random_carries_agree_with_time_path(name: str) -> None:
     cell = load(RACK.with_name(f"{name}.toml"))
-    timer, model = PathTimer(cell), TimingModel(cell, STAGES)
+    timer, model = PathTimer(cell), TimingModel(cell, INTERVALS)
     rng, task, timed = np.random.default_rng(12), cell.task, 0
     for k in range(2000):
         x = rng.uniform(task.lower, task.upper)
@@ -107,7 +107,7 @@ def test_two_hundred_random_carries_agree_with_time_path(name: str) -> None:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_duration_agrees_with_a_convex_program(seed: int) -> None:
-    model = hand_timing(STAGES)
+    model = hand_timing(INTERVALS)
     (x,) = near_initial(np.random.default_rng(100 + seed), 1)
     share = (None, 1.02, 1.1, 1.3)[seed % 4]
     static = hand_timer().time(x, TimingLimits(force=1.0)).peak_force.max()
@@ -119,7 +119,7 @@ def test_duration_agrees_with_a_convex_program(seed: int) -> None:
     )
     found = hand_timer().time(x, limits)
     exact = convex_oracle.shortest_duration(model, x, limits)
-    # Stages that exceed a limit between their ends are tightened, which the program does not do.
+    # Intervals that exceed a limit between their ends are tightened, which the program does not do.
     assert found.duration == pytest.approx(exact, rel=1e-3)
 
 
@@ -166,7 +166,7 @@ def test_limits_used_up_at_rest_are_named_as_time_path_names_them() -> None:
     )
     for cell, limits in cases:
         found = timer_of(cell).time(initial(), limits)
-        expected = time_path(timing_of(cell, STAGES), initial(), limits)
+        expected = time_path(timing_of(cell, INTERVALS), initial(), limits)
         assert found.status is expected.status is TimingStatus.INFEASIBLE_AT_REST
         assert expected.place is not None
         assert found.place.constraint == expected.place.constraint
@@ -206,19 +206,19 @@ def test_without_a_compiler_time_path_answers(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_misuse_is_refused() -> None:
-    with pytest.raises(SettingsError, match="stages"):
-        PathTimer(hand_cell(), stages=5)
+    with pytest.raises(SettingsError, match="intervals"):
+        PathTimer(hand_cell(), intervals=5)
     with pytest.raises(SettingsError, match="finite"):
         hand_timer().time(np.full(18, np.nan), TimingLimits())
     with pytest.raises(SettingsError, match="path speeds"):
-        drive_path(hand_timing(STAGES), initial(), np.zeros(STAGES + 1), TimingLimits())
-    too_fast = np.sin(np.linspace(0.0, np.pi, STAGES + 1))
-    judged = drive_path(hand_timing(STAGES), initial(), 10.0 * too_fast, TimingLimits())
+        drive_path(hand_timing(INTERVALS), initial(), np.zeros(INTERVALS + 1), TimingLimits())
+    too_fast = np.sin(np.linspace(0.0, np.pi, INTERVALS + 1))
+    judged = drive_path(hand_timing(INTERVALS), initial(), 10.0 * too_fast, TimingLimits())
     assert judged.status is TimingStatus.EXCEEDED
 
 
 def test_it_takes_two_milliseconds_and_a_tenth_of_time_path() -> None:
-    model, timer = hand_timing(STAGES), hand_timer()
+    model, timer = hand_timing(INTERVALS), hand_timer()
     limits = TimingLimits(force=1.1 * STATIC)
     ours, theirs = [], []
     for _ in range(10):

@@ -15,11 +15,11 @@ from tests.hybrid_opt.timing.cells import initial, timing_of
 from tests.symbolic.cells import hand_cell
 
 SET = Uncertainty(0.1, 0.05, np.array([0.005, 0.005, 0.0]), 0.003, np.array([0.0, 0.2, 0.2]))
-STAGES = 50
+INTERVALS = 50
 
 
 def unsure() -> TimingModel:
-    return timing_of(replace(hand_cell(), uncertainty=SET), STAGES)
+    return timing_of(replace(hand_cell(), uncertainty=SET), INTERVALS)
 
 
 def test_the_robust_forces_use_the_limit_up_and_keep_it() -> None:

@@ -38,12 +38,12 @@ STATIC = WEIGHT / 2.0
 
 
 def worst_ratios(model: TimingModel, timing: Timing, limits: TimingLimits) -> Array:
-    """Largest use of any limit but friction on each stage of the refined samples."""
+    """Largest use of any limit but friction on each interval of the refined samples."""
     assert timing.carry is not None
     ratios = limit_ratios(timing.carry, model.workcell, limits)
     del ratios["friction"]
     use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
-    worst: Array = use.reshape(model.stages, -1).max(axis=1)
+    worst: Array = use.reshape(model.intervals, -1).max(axis=1)
     return worst
 
 
@@ -65,7 +65,7 @@ def test_limits_hold_between_the_grid_points_and_are_reached(
     assert timing.ok, timing.reason
     use = worst_ratios(model, timing, limits)
     assert use.max() <= 1.005
-    # Time-optimal motion has a limit active everywhere; where it changes sides, a stage may not.
+    # Time-optimal motion has a limit active everywhere, but in intervals where it changes sides.
     assert np.mean(use > 0.98) > 0.95
 
 
@@ -260,11 +260,11 @@ def test_a_force_limit_has_to_be_a_force(force: float) -> None:
         TimingLimits(force=force)
 
 
-def test_decision_vectors_and_stages_are_checked() -> None:
+def test_decision_vectors_and_intervals_are_checked() -> None:
     with pytest.raises(SettingsError, match="finite numbers"):
         fastest_timing(hand_timing(), np.full(18, np.nan))
-    with pytest.raises(SettingsError, match="stages"):
-        TimingModel(hand_cell(), stages=5)
+    with pytest.raises(SettingsError, match="intervals"):
+        TimingModel(hand_cell(), intervals=5)
 
 
 def test_scaling_all_rates_scales_the_time() -> None:

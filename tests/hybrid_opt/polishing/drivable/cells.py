@@ -49,7 +49,7 @@ def functions() -> PolishFunctions:
 @cache
 def polisher(rounds: int = 40) -> DrivablePolisher:
     """Of the drivable rack."""
-    settings = PolishSettings(points=3, drivable=DrivableSettings(rounds=rounds))
+    settings = PolishSettings(attempts=3, drivable=DrivableSettings(rounds=rounds))
     return DrivablePolisher(evaluator(), settings, functions())
 
 

@@ -60,7 +60,7 @@ def test_an_empty_front_stays_empty() -> None:
 
 
 def test_the_time_law_chooses_the_polish() -> None:
-    found = polisher_for(evaluator(), PolishSettings(points=1), functions())
+    found = polisher_for(evaluator(), PolishSettings(attempts=1), functions())
     assert isinstance(found, DrivablePolisher)
 
 

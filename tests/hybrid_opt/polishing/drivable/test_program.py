@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hybrid_opt.polishing.drivable.front import DrivablePolisher
+from hybrid_opt.polishing.drivable.intervals import IntervalGrid, IntervalValues
 from hybrid_opt.polishing.drivable.program import Iterate, JointProgram, Multipliers
-from hybrid_opt.polishing.drivable.stages import StageGrid, StageValues
 from hybrid_opt.polishing.drivable.timed import Goal
 from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.grid import Grid
@@ -47,7 +47,7 @@ class Programs:
         self.x, self.duration = x, duration
         self.timed = owner.drivable.judge.timed(x[:-1], Goal("duration", FORCE))
         self.carry = CarryReader(owner.evaluator, grid, self.functions.rows).read(x)
-        self.stages = StageGrid(workcell, 100)
+        self.intervals = IntervalGrid(workcell, 100)
 
     def at(self, d: Array | None = None) -> JointProgram:
         """The program after a step d of the scaled variables from the path."""
@@ -58,10 +58,10 @@ class Programs:
             squared[1:-1] *= 1.0 + d[n:-1]
         driven = self.functions.driven
         assert driven is not None
-        values = StageValues.at(self.stages, driven, x, squared, self.timed.joints)
+        values = IntervalValues.at(self.intervals, driven, x, squared, self.timed.joints)
         places = (ROWS, place_values(self.cell, ROWS, self.carry), np.array([0.01, 0.01]))
         iterate = Iterate(x, squared, FORCE, self.duration)
-        return JointProgram(self.stages, iterate, values, self.half, places)
+        return JointProgram(self.intervals, iterate, values, self.half, places)
 
 
 def direction(program: JointProgram, seed: int) -> Array:
@@ -77,9 +77,9 @@ def test_the_compiled_timing_satisfies_the_program() -> None:
     program = programs.at()
     assert program.total == pytest.approx(programs.timed.duration, rel=1e-12)
     assert program.rows.max() < 2e-3
-    # Time-optimal: some limit is used fully in nearly every stage.
-    by_stage = program.rows.max(axis=1).reshape(-1, 2).max(axis=1)
-    assert np.mean(by_stage > -0.01) > 0.9
+    # Time-optimal: some limit is used fully in nearly every interval.
+    by_interval = program.rows.max(axis=1).reshape(-1, 2).max(axis=1)
+    assert np.mean(by_interval > -0.01) > 0.9
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -37,7 +37,7 @@ def rail(tmp_path_factory: pytest.TempPathFactory) -> PolishedCell:
     cell = without_obstacles(driven(rack_on_rail(tmp_path_factory.mktemp("rail"), 0.4, 0.25)))
     evaluator = CandidateEvaluator(cell, DRIVABLE_OBJECTIVES, compiled=CompiledCell(cell))
     functions = polish_functions(evaluator.compiled)
-    settings = PolishSettings(points=3, drivable=DrivableSettings(rounds=12))
+    settings = PolishSettings(attempts=3, drivable=DrivableSettings(rounds=12))
     return DrivablePolisher(evaluator, settings, functions), functions
 
 
@@ -59,5 +59,5 @@ def test_a_carry_with_a_redundant_joint_is_driven_better_and_believed(rail: Poli
     # The slide's values are used, not only the box's path.
     assert np.abs(found.x[18:-1] - x[18:-1]).max() > 1e-3
     assert evaluator.certified(evaluator.evaluate(found.x)).feasible[0]
-    timings = TimingModel(evaluator.compiled, solver.driver.timer.stages)
+    timings = TimingModel(evaluator.compiled, solver.driver.timer.intervals)
     assert second_opinion(solver.driver, timings, found.x) == ""

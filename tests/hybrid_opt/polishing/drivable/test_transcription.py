@@ -24,7 +24,7 @@ from hybrid_opt.timing.model import REFINEMENT
 from symbolic.array import Array
 from tests.hybrid_opt.polishing.drivable.cells import drivable_rack, start_in
 from tests.hybrid_opt.polishing.drivable.transcription import (
-    STAGES,
+    INTERVALS,
     Guess,
     Transcription,
     without_obstacles,
@@ -52,7 +52,7 @@ def polisher() -> DrivablePolisher:
 
 @cache
 def coarse() -> TimingModel:
-    return TimingModel(compiled(), STAGES)
+    return TimingModel(compiled(), INTERVALS)
 
 
 @cache

@@ -22,13 +22,13 @@ from symbolic.cell_model import CellModel
 from symbolic.physics.pose import inverse
 from symbolic.workcell.records import Workcell
 
-STAGES = 30
+INTERVALS = 30
 
 
 @dataclass(frozen=True)
 class Guess:
     """What the solver begins with: decision vector, speeds u', joints and derivatives by u at the
-    grid points (stages + 1, ...)."""
+    grid points (intervals + 1, ...)."""
 
     x: Array
     speed: Array
@@ -49,11 +49,11 @@ class Transcription:
     """The program of one cell of six-joint arms with equal friction, its payload's centre of mass
     in the middle."""
 
-    def __init__(self, model: CellModel, stages: int = STAGES) -> None:
-        self._model, self._cell, self.stages = model, model.workcell, stages
+    def __init__(self, model: CellModel, intervals: int = INTERVALS) -> None:
+        self._model, self._cell, self.intervals = model, model.workcell, intervals
         task, n = self._cell.task, len(self._cell.task.waypoints)
         each = natural_quintic(np.eye(n))
-        grid = np.linspace(0.0, 1.0, stages + 1)
+        grid = np.linspace(0.0, 1.0, intervals + 1)
         self._bases = [
             np.array([evaluate_spline(each, u, order) for u in grid]) for order in range(3)
         ]
@@ -62,7 +62,7 @@ class Transcription:
 
     def solve(self, guess: Guess, force: float) -> Found:
         """Least duration within a force limit [N]."""
-        cell, n = self._cell, self.stages
+        cell, n = self._cell, self.intervals
         task = cell.task
         x, w = ca.MX.sym("x", task.n_path), ca.MX.sym("w", n - 1)
         arms = ca.MX.sym("arms", 36, n + 1)

@@ -1,9 +1,9 @@
-"""Limits at both ends of every stage of a path, by its waypoints and squared speeds.
+"""Limits at both ends of every interval of a path, by its waypoints and squared speeds.
 
-A stage is a piece of the path with constant u''. Its two ends are two points, so that n stages
-have 2 n points, both of one stage in a row. What is limited at a point depends on the waypoints,
-which are linear in pose and derivatives, and on the squared speeds at both ends of the stage:
-u'' = (w_end - w_begin) n / 2, u'^2 = w.
+An interval is a piece of the path with constant u''. Its two ends are two points, so that n
+intervals have 2 n points, both of one interval in a row. What is limited at a point depends on the
+waypoints, which are linear in pose and derivatives, and on the squared speeds at both ends of the
+interval: u'' = (w_end - w_begin) n / 2, u'^2 = w.
 """
 
 from __future__ import annotations
@@ -60,23 +60,23 @@ class RowKinds:
         return cls(mix, np.arange(len(mix)) >= len(mix) - forces.shape[0] * forces.shape[1])
 
 
-class StageGrid:
+class IntervalGrid:
     """What all paths of a workcell share.
 
     Attributes:
         workcell: the cell.
-        stages: pieces of constant u''.
+        intervals: pieces of constant u''.
         sample: (points,) grid point of each point.
         moving: entries of the extended pose and its two derivatives, 3 (6 + m).
         carry_over: (points, moving, n_path) from the path's variables to them.
         kinds: the inequalities of a point.
     """
 
-    def __init__(self, workcell: Workcell, stages: int) -> None:
-        self.workcell, self.stages = workcell, stages
+    def __init__(self, workcell: Workcell, intervals: int) -> None:
+        self.workcell, self.intervals = workcell, intervals
         task = workcell.task
-        basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, stages + 1))
-        self.sample = (np.arange(stages)[:, None] + np.array([0, 1])).reshape(-1)
+        basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, intervals + 1))
+        self.sample = (np.arange(intervals)[:, None] + np.array([0, 1])).reshape(-1)
         self._bases = (basis.position, basis.first, basis.second)
         rows, columns = task.free_entries
         self.pose, self.moving = task.extended_size, 3 * task.extended_size
@@ -88,14 +88,14 @@ class StageGrid:
         self.layout = driven_layout(workcell)
 
     def path(self, x: Array) -> tuple[Array, Array, Array]:
-        """Extended pose and both derivatives (stages + 1, 6 + m) of a decision vector."""
+        """Extended pose and both derivatives (intervals + 1, 6 + m) of a decision vector."""
         waypoints = extended_waypoints(self.workcell.task, x)
         first, second, third = (np.ascontiguousarray(b @ waypoints) for b in self._bases)
         return first, second, third
 
 
 @dataclass(frozen=True)
-class StageValues:
+class IntervalValues:
     """The limited quantities of one driven path with their derivatives.
 
     Attributes:
@@ -105,7 +105,7 @@ class StageValues:
             u'^2, the joints following.
     """
 
-    grid: StageGrid
+    grid: IntervalGrid
     value: Array
     slope: Array
     _inputs: tuple[Array, ...]
@@ -117,24 +117,24 @@ class StageValues:
     @classmethod
     def at(
         cls,
-        grid: StageGrid,
+        grid: IntervalGrid,
         functions: DrivenFunctions,
         x: Array,
         squared: Array,
         near: tuple[Array, Array],
-    ) -> StageValues:
+    ) -> IntervalValues:
         """Evaluate.
 
         Args:
             x: (n_var,) decision vector.
-            squared: (stages + 1,) u'^2 at the grid points.
-            near: joints of both arms (stages + 1, n) near those that hold the box.
+            squared: (intervals + 1,) u'^2 at the grid points.
+            near: joints of both arms (intervals + 1, n) near those that hold the box.
         """
         path, s = grid.path(x), grid.sample
         held = [
             functions.closures[ClosureKey(arm, "first")].batch(path[0], near[arm]) for arm in (0, 1)
         ]
-        a = np.repeat(np.diff(squared) * grid.stages / 2.0, 2)
+        a = np.repeat(np.diff(squared) * grid.intervals / 2.0, 2)
         inputs = (*(part[s] for part in path), *(found["q"][s] for found in held), a, squared[s])
         out = functions.first.batch(*inputs)
         full = out["slope"]
@@ -153,8 +153,8 @@ class StageValues:
         )
 
     def pressure_at_rest(self) -> tuple[Array, Array]:
-        """Shares (rows,) of the patches that standing still uses, at every stage's beginning, and
-        their slopes (rows, moving) by the extended pose."""
+        """Shares (rows,) of the patches that standing still uses, at every interval's beginning,
+        and their slopes (rows, moving) by the extended pose."""
         begins = [values[::2] for values in self._inputs]
         still = np.zeros(len(begins[-1]))
         out = self._functions.first.batch(*begins[:-2], still, still)
@@ -209,7 +209,7 @@ class StageValues:
         return at, (total + np.swapaxes(total, 1, 2)) / 2.0
 
 
-def _followed(grid: StageGrid, full: Array, follow: tuple[Array, ...]) -> Array:
+def _followed(grid: IntervalGrid, full: Array, follow: tuple[Array, ...]) -> Array:
     """Slopes by pose, derivatives, u'' and u'^2 where the joints follow the pose."""
     slope = np.concatenate([full[:, :, : grid.moving], full[:, :, -2:]], axis=2)
     start = grid.moving
