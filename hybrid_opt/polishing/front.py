@@ -22,7 +22,7 @@ from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.kick import kicked
 from hybrid_opt.polishing.mirror import mirror_of
 from hybrid_opt.polishing.plan import Attempt, PlanState, aimed, points
-from hybrid_opt.polishing.point import PolishSolver, Solution, SolveTask
+from hybrid_opt.polishing.point import PolishSolver, Solution, SolveStart
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.run import Polisher, PolishRun
 from hybrid_opt.polishing.settings import PolishSettings
@@ -87,8 +87,8 @@ class ForceRun(PolishRun[Attempt]):
         self._images: list[int] = []
 
     def _solution(self, attempt: Attempt) -> Solution:
-        task = SolveTask(attempt.x, attempt.target, attempt.radius, attempt.wide, attempt.near)
-        return self._solver.solve(task)
+        start = SolveStart(attempt.x, attempt.target, attempt.radius, attempt.wide, attempt.near)
+        return self._solver.solve(start)
 
     def all(self, rng: np.random.Generator) -> None:
         """The front's points, then ends and middle in turns while attempts last; then what lies

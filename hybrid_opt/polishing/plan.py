@@ -28,7 +28,7 @@ class Attempt:
     Attributes:
         aim, parent, start: as in `hybrid_opt.polishing.records.PolishOutcome`.
         x: (n_var,) decision vector to start from.
-        target, radius, wide, near: see `hybrid_opt.polishing.point.SolveTask`.
+        target, radius, wide, near: see `hybrid_opt.polishing.point.SolveStart`.
     """
 
     aim: Aim

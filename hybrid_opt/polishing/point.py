@@ -36,7 +36,7 @@ from symbolic.array import Array
 
 
 @dataclass(frozen=True)
-class SolveTask:
+class SolveStart:
     """A start and a target.
 
     Attributes:
@@ -118,16 +118,16 @@ class PolishSolver:
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
         self._reader = CarryReader(evaluator, grid, functions.rows, robust)
 
-    def solve(self, task: SolveTask) -> Solution:
-        """Improve towards the task's target."""
-        x = np.clip(task.x, self._cell.task.lower, self._cell.task.upper)
+    def solve(self, start: SolveStart) -> Solution:
+        """Improve towards the target."""
+        x = np.clip(start.x, self._cell.task.lower, self._cell.task.upper)
         best = _Best(x, self._reader.read(x), Learned(self._active, self._settings.stricter))
-        region = TrustRegion(self._settings.trust, task.radius)
-        solution, settings = Solution(x), self._settings_for(task)
+        region = TrustRegion(self._settings.trust, start.radius)
+        solution, settings = Solution(x), self._settings_for(start)
         while solution.rounds < settings.rounds and not region.is_spent:
-            required = best.learned.required(best.carry, task.target, lenient=solution.rounds == 0)
+            required = best.learned.required(best.carry, start.target, lenient=solution.rounds == 0)
             program = SmoothProgram(
-                self._cell, required, task.target, best.carry, best.x, region.radius
+                self._cell, required, start.target, best.carry, best.x, region.radius
             )
             answer = self._solve(program, settings)
             solution.add(answer)
@@ -140,12 +140,12 @@ class PolishSolver:
             if violated or not carry.is_followed:
                 learned = best.learned.refuse(carry, best.carry, violated, required)
                 region.refused(learned and carry.is_followed)
-                if (part := self._part(best, x, required, task.target)) is not None:
+                if (part := self._part(best, x, required, start.target)) is not None:
                     self._move(best, *part)
                     solution.x = best.x
                     solution.residuals = program.residuals_at(best.x, best.carry, answer)
-            elif level(task.target, carry.peak) >= level(task.target, best.carry.peak):
-                higher = self._active.forces.higher(carry, task.target) - required.keys()
+            elif level(start.target, carry.peak) >= level(start.target, best.carry.peak):
+                higher = self._active.forces.higher(carry, start.target) - required.keys()
                 best.learned.ask(higher)
                 if answer.converged and not higher and not region.holds(step):
                     solution.converged = True
@@ -164,10 +164,10 @@ class PolishSolver:
                 solution.residuals = answer.residuals
         return solution
 
-    def _settings_for(self, task: SolveTask) -> PolishSettings:
-        if task.near:
+    def _settings_for(self, start: SolveStart) -> PolishSettings:
+        if start.near:
             return self._near
-        return self._wide if task.wide else self._settings
+        return self._wide if start.wide else self._settings
 
     def _part(
         self, best: _Best, x: Array, required: dict[Row, float], target: Target

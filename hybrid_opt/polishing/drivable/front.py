@@ -20,7 +20,7 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.drivable.certified import second_opinion
-from hybrid_opt.polishing.drivable.point import DrivableSolver, DriveTask
+from hybrid_opt.polishing.drivable.point import DrivableSolver, DriveStart
 from hybrid_opt.polishing.drivable.timed import Goal
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.point import Solution
@@ -208,7 +208,7 @@ class DriveRun(PolishRun[DriveAttempt]):
 
     def _solution(self, attempt: DriveAttempt) -> Solution:
         radius = self._settings.drivable.first_radius
-        return self._solver.solve(DriveTask(attempt.x, attempt.goal, radius))
+        return self._solver.solve(DriveStart(attempt.x, attempt.goal, radius))
 
     def _worth(
         self, attempt: DriveAttempt, answer: Solution, objectives: Array

@@ -34,7 +34,7 @@ from symbolic.workcell.records import Task
 
 
 @dataclass(frozen=True)
-class DriveTask:
+class DriveStart:
     """A start and a goal.
 
     Attributes:
@@ -78,10 +78,10 @@ class DrivableSolver:
         self._half = self._cell.unit.half[: task.n_path]
         self.judge = PathJudge(driver.timer, task.force_limit)
 
-    def solve(self, task: DriveTask) -> Solution:
-        """Improve towards the task's goal."""
-        goal, radius = task.goal, task.radius
-        x = np.clip(task.x, self._task.lower, self._task.upper)
+    def solve(self, start: DriveStart) -> Solution:
+        """Improve towards the goal."""
+        goal, radius = start.goal, start.radius
+        x = np.clip(start.x, self._task.lower, self._task.upper)
         timed = self.judge.timed(x[: self._task.n_path], goal)
         x = self._with_force(x, timed)
         learned = Learned(self._active, self._settings.stricter)

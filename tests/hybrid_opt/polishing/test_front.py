@@ -15,7 +15,7 @@ from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing import front as front_module
 from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.front import FrontPolisher, polish_front
-from hybrid_opt.polishing.point import PolishSolver, Solution, SolveTask
+from hybrid_opt.polishing.point import PolishSolver, Solution, SolveStart
 from hybrid_opt.polishing.records import (
     PolishedFront,
     PolishOutcome,
@@ -190,9 +190,9 @@ def test_other_objectives_are_refused() -> None:
 class Broken(PolishSolver):
     """A solver whose attempts end in every bad way in turn."""
 
-    def solve(self, task: SolveTask) -> Solution:
-        found = super().solve(task)
-        mood = int(1e6 * task.x[0]) % 3
+    def solve(self, start: SolveStart) -> Solution:
+        found = super().solve(start)
+        mood = int(1e6 * start.x[0]) % 3
         if mood == 0:
             os.kill(os.getpid(), signal.SIGKILL)
         if mood == 1:

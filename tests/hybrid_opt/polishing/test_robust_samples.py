@@ -13,7 +13,7 @@ from hybrid_opt.polishing.functions import polish_functions
 from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.layout import ForceRow, Row
 from hybrid_opt.polishing.placed_carry import CarryReader
-from hybrid_opt.polishing.point import PolishSolver, SolveTask
+from hybrid_opt.polishing.point import PolishSolver, SolveStart
 from hybrid_opt.polishing.program import SmoothCell, SmoothProgram
 from hybrid_opt.polishing.robust_samples import RobustSamples
 from hybrid_opt.polishing.settings import PolishSettings
@@ -76,7 +76,7 @@ def test_a_carry_is_polished_for_its_robust_forces() -> None:
     x = initial_decision(judge.workcell.task)
     start = judge.evaluate(x).objectives[0]
     target = balance(start, np.full(2, 0.01))
-    found = PolishSolver(judge, functions, settings).solve(SolveTask(x, target))
+    found = PolishSolver(judge, functions, settings).solve(SolveStart(x, target))
     after = judge.evaluate(found.x)
     assert after.feasible[0]
     assert after.objectives[0].max() < start.max() - 0.005

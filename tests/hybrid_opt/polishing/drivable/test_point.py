@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.polishing.drivable.certified import second_opinion
-from hybrid_opt.polishing.drivable.point import DriveTask
+from hybrid_opt.polishing.drivable.point import DriveStart
 from hybrid_opt.polishing.drivable.timed import DriveAim, Goal
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.timing import TimingLimits, TimingModel, time_path
@@ -19,7 +19,7 @@ RADIUS = 0.3
 
 @cache
 def solved(aim: DriveAim, limit: float) -> Solution:
-    return polisher().drivable.solve(DriveTask(start(limit), Goal(aim, limit), RADIUS))
+    return polisher().drivable.solve(DriveStart(start(limit), Goal(aim, limit), RADIUS))
 
 
 @cache
@@ -54,14 +54,14 @@ def test_an_answer_is_nearly_stationary() -> None:
 
 def test_least_force_and_least_duration_are_two_sides_of_one_front() -> None:
     fast = solved("duration", 52.0)
-    gentle = polisher().drivable.solve(DriveTask(fast.x, Goal("force", duration(fast.x)), RADIUS))
+    gentle = polisher().drivable.solve(DriveStart(fast.x, Goal("force", duration(fast.x)), RADIUS))
     assert gentle.x[-1] == pytest.approx(52.0, rel=2e-3)
     assert duration(gentle.x) <= duration(fast.x) * 1.002
 
 
 def test_a_start_that_cannot_be_driven_is_told() -> None:
     x = start(52.0)
-    solution = polisher().drivable.solve(DriveTask(x, Goal("force", 0.5), RADIUS))
+    solution = polisher().drivable.solve(DriveStart(x, Goal("force", 0.5), RADIUS))
     assert not solution.usable
     assert solution.message == "the start has no timing"
     np.testing.assert_array_equal(solution.x[:-1], x[:-1])

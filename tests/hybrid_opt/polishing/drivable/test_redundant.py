@@ -10,7 +10,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.drivable.certified import second_opinion
 from hybrid_opt.polishing.drivable.front import DrivablePolisher
-from hybrid_opt.polishing.drivable.point import DriveTask
+from hybrid_opt.polishing.drivable.point import DriveStart
 from hybrid_opt.polishing.drivable.timed import Goal
 from hybrid_opt.polishing.functions import polish_functions
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
@@ -54,7 +54,7 @@ def test_a_carry_with_a_redundant_joint_is_driven_better_and_believed(rail: Poli
     evaluator, solver = polisher.evaluator, polisher.drivable
     x = start_in(evaluator.workcell, FORCE, 0)
     begun = solver.judge.timed(x[:-1], Goal("duration", FORCE)).duration
-    found = solver.solve(DriveTask(x, Goal("duration", FORCE), 0.3))
+    found = solver.solve(DriveStart(x, Goal("duration", FORCE), 0.3))
     assert solver.judge.timed(found.x[:-1], Goal("duration", FORCE)).duration < 0.9 * begun
     # The slide's values are used, not only the box's path.
     assert np.abs(found.x[18:-1] - x[18:-1]).max() > 1e-3

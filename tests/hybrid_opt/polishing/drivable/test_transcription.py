@@ -15,7 +15,7 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.drivable.front import DrivablePolisher
-from hybrid_opt.polishing.drivable.point import DriveTask
+from hybrid_opt.polishing.drivable.point import DriveStart
 from hybrid_opt.polishing.drivable.timed import Goal
 from hybrid_opt.polishing.functions import polish_functions
 from hybrid_opt.polishing.settings import PolishSettings
@@ -80,7 +80,7 @@ def duration(path: Array, force: float) -> float:
 )
 def test_least_duration_at_a_force(force: float, seed: int, polished_first: bool) -> None:
     x = start_in(compiled().workcell, force, seed)
-    polished = polisher().drivable.solve(DriveTask(x, Goal("duration", force), 0.3)).x
+    polished = polisher().drivable.solve(DriveStart(x, Goal("duration", force), 0.3)).x
     other = transcription().solve(guess(polished if polished_first else x, force), force)
     ours = duration(polished[:-1], force)
     assert ours < 0.9 * duration(x[:-1], force)
