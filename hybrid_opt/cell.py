@@ -22,9 +22,9 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.workcell.archive import archive_cell, unpack_cell
+from symbolic.workcell.cell_files import collect_cell, unpack_cell
 from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.drivable import drivable_archive
+from symbolic.workcell.drivable import drivable_files
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
 
@@ -102,7 +102,7 @@ class Cell:
             BundleError: the workcell file cannot be changed, or was since it was read.
         """
         folder = TemporaryDirectory()
-        workcell = unpack_cell(drivable_archive(archive_cell(self.workcell)), Path(folder.name))
+        workcell = unpack_cell(drivable_files(collect_cell(self.workcell)), Path(folder.name))
         cell = Cell(workcell, DRIVABLE_OBJECTIVES, self.threads)
         cell._folder = folder
         return cell

@@ -33,7 +33,7 @@ SHIFTED_EVALUATIONS = 1000
 
 
 @dataclass(frozen=True)
-class Row:
+class Score:
     """One algorithm on one problem with one budget, over all seeds.
 
     Attributes:
@@ -98,9 +98,9 @@ def _band(problem: str, evaluations: int, algorithm: str, population: int) -> Ba
     return BANDS.get((problem, evaluations)) if applies else None
 
 
-def _row(
+def _score(
     problem: str, evaluations: int, algorithm: str, population: int, runs: Sequence[_Run]
-) -> Row:
+) -> Score:
     hypervolume = summarise([run.hypervolume for run in runs])
     distance = summarise([run.igd for run in runs])
     band = _band(problem, evaluations, algorithm, population)
@@ -110,7 +110,7 @@ def _row(
             judge(hypervolume, band.hypervolume, higher_is_better=True),
             judge(distance, band.igd, higher_is_better=False, std=band.igd_std),
         )
-    return Row(
+    return Score(
         problem,
         evaluations,
         algorithm,
@@ -127,11 +127,11 @@ def _row(
 
 @dataclass(frozen=True)
 class AlgorithmTest:
-    """All rows, and the rank tests of the first algorithm against each other one on the
+    """All scores, and the rank tests of the first algorithm against each other one on the
     problem with its optimum inside the bounds (hypervolume, then IGD; Holm-corrected)."""
 
     seeds: int
-    rows: tuple[Row, ...]
+    scores: tuple[Score, ...]
     tests: tuple[RankTest, ...]
 
 
@@ -170,12 +170,12 @@ def compare(
         if target.name == SHIFTED
         for name in names
     ]
-    rows: list[Row] = []
+    scores: list[Score] = []
     shifted: dict[str, list[_Run]] = {}
     start = time.perf_counter()
     for done, (target, budget, name, size) in enumerate(tasks, 1):
         runs = [_run(target, name, budget, size, seed) for seed in range(seeds)]
-        rows.append(_row(target.name, budget, name, size, runs))
+        scores.append(_score(target.name, budget, name, size, runs))
         if target.name == SHIFTED:
             shifted[name] = runs
         if progress:
@@ -184,7 +184,7 @@ def compare(
                 f"{done}/{len(tasks)} {target.name} {budget} {name}, {elapsed:.0f} s",
                 file=sys.stderr,
             )
-    return AlgorithmTest(seeds, tuple(rows), _tests(shifted))
+    return AlgorithmTest(seeds, tuple(scores), _tests(shifted))
 
 
 def _tests(shifted: dict[str, list[_Run]]) -> tuple[RankTest, ...]:
@@ -205,15 +205,16 @@ def table(result: AlgorithmTest) -> str:
         f"Mean over {result.seeds} seeds of the final front (limited size) and of all evaluated "
         "points",
         f"Bands: {BAND_SOURCE}",
-        text_table([_HEADINGS, *map(_cells, result.rows)], left=(0, 3, 7, 11)),
+        text_table([_HEADINGS, *map(_cells, result.scores)], left=(0, 3, 7, 11)),
     ]
-    for name in dict.fromkeys(row.algorithm for row in result.rows):
-        rows = [row for row in result.rows if row.algorithm == name]
-        verdicts = [v for row in rows for v in (row.hypervolume_verdict, row.igd_verdict) if v]
+    for name in dict.fromkeys(score.algorithm for score in result.scores):
+        scores = [score for score in result.scores if score.algorithm == name]
+        judged = ((score.hypervolume_verdict, score.igd_verdict) for score in scores)
+        verdicts = [verdict for both in judged for verdict in both if verdict]
         if verdicts:
             counts = ", ".join(f"{verdicts.count(v)} {v}" for v in ("inside", "better", "worse"))
             lines.append(f"{name} against the bands: {counts}")
-    infeasible = sum(row.infeasible_in_front for row in result.rows)
+    infeasible = sum(score.infeasible_in_front for score in result.scores)
     lines.append(f"infeasible members of final fronts: {infeasible}")
     if result.tests:
         lines.append(
@@ -234,24 +235,24 @@ _HEADINGS = (
 )
 
 
-def _cells(row: Row) -> tuple[str, ...]:
-    band = _band(row.problem, row.evaluations, row.algorithm, row.population)
+def _cells(score: Score) -> tuple[str, ...]:
+    band = _band(score.problem, score.evaluations, score.algorithm, score.population)
     return (
-        row.problem,
-        str(row.evaluations),
-        str(row.population),
-        row.algorithm,
-        number(row.hypervolume.mean, 3),
-        number(row.hypervolume.std, 3),
+        score.problem,
+        str(score.evaluations),
+        str(score.population),
+        score.algorithm,
+        number(score.hypervolume.mean, 3),
+        number(score.hypervolume.std, 3),
         number(band.hypervolume, 3) if band else "",
-        row.hypervolume_verdict or "",
-        number(row.igd.mean, 4),
-        number(row.igd.std, 4),
+        score.hypervolume_verdict or "",
+        number(score.igd.mean, 4),
+        number(score.igd.std, 4),
         number(band.igd, 4) if band else "",
-        row.igd_verdict or "",
-        number(row.archive_hypervolume.mean, 3),
-        number(row.archive_igd.mean, 4),
-        number(row.overhead_us, 1),
+        score.igd_verdict or "",
+        number(score.archive_hypervolume.mean, 3),
+        number(score.archive_igd.mean, 4),
+        number(score.overhead_us, 1),
     )
 
 

@@ -143,7 +143,7 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         "--report",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="write figures, tables and report.html (default: yes)",
+        help="write pictures, tables and report.html (default: yes)",
     )
     work = parser.add_argument_group("work (does not change the results)")
     work.add_argument(

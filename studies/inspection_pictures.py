@@ -12,8 +12,8 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.display.view import CarryView, Look
 from hybrid_opt.evaluate.explanation import Explanation
 from studies.report.data import shown
-from studies.report.figures_cell import environment, reachable_regions
-from studies.report.figures_meeting import meeting
+from studies.report.pictures_cell import environment, reachable_regions
+from studies.report.pictures_meeting import meeting
 from studies.report.reach import reach_map
 from studies.report.style import in_style, save, settled
 from symbolic.errors import SettingsError

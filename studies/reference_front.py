@@ -35,7 +35,7 @@ from studies.program import add_verbose, carried_out, run_program
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.archive import archive_cell
+from symbolic.workcell.cell_files import collect_cell
 from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.file import load
 
@@ -96,7 +96,7 @@ def compute_reference_front(
             "most as many starts"
         )
     begins = [initial_decision(evaluator.workcell.task), *candidates[feasible[:starts]]]
-    cell = PackedCell.of(archive_cell(evaluator.workcell))
+    cell = PackedCell.of(collect_cell(evaluator.workcell))
     count = itertools.count(1)
     executor = local_executor(jobs)
     parts = answer_all(

@@ -44,7 +44,7 @@ def _run(folder: CampaignFolder, progress: Progress, force_limit: float | None, 
             path for path in files if f"{path.parent}{POLISHED_SUFFIX}/{path.name}" not in known
         ]
     found = {file: read_trajectory(selected / file).x for file in files}
-    job = Job(TimingModelSource(PackedCell.of(folder.archive)), _document)
+    job = Job(TimingModelSource(PackedCell.of(folder.files)), _document)
     requests = [(x, force_limit) for x in found.values()]
     with progress.stage(TIMING, len(requests), "trajectories") as advance:
         executor = executor_for(folder.execution)

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TypeVar
 
-from symbolic.workcell.archive import CellArchive, archive_from_json, archive_to_json, unpack_cell
+from symbolic.workcell.cell_files import CellFiles, cell_from_json, cell_to_json, unpack_cell
 from symbolic.workcell.records import Workcell
 
 Made = TypeVar("Made")
@@ -20,17 +20,17 @@ class PackedCell:
     """A workcell with its files.
 
     Attributes:
-        text: JSON of `symbolic.workcell.archive.archive_to_json`.
+        text: JSON of `symbolic.workcell.cell_files.cell_to_json`.
     """
 
     text: str
 
     @classmethod
-    def of(cls, archive: CellArchive) -> PackedCell:
+    def of(cls, files: CellFiles) -> PackedCell:
         """The value for a stored workcell."""
-        return cls(json.dumps(archive_to_json(archive)))
+        return cls(json.dumps(cell_to_json(files)))
 
     def make(self, of_workcell: Callable[[Workcell], Made]) -> Made:
         """What a function makes of the workcell, whose files exist only as long as it runs."""
         with TemporaryDirectory() as folder:
-            return of_workcell(unpack_cell(archive_from_json(json.loads(self.text)), Path(folder)))
+            return of_workcell(unpack_cell(cell_from_json(json.loads(self.text)), Path(folder)))

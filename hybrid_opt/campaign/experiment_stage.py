@@ -13,8 +13,8 @@ from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Stage, run_stages
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
-from symbolic.workcell.archive import unpack_cell
-from symbolic.workcell.drivable import drivable_archive
+from symbolic.workcell.cell_files import unpack_cell
+from symbolic.workcell.drivable import drivable_files
 
 
 def drivable_settings(settings: CampaignSettings) -> CampaignSettings:
@@ -36,7 +36,7 @@ def drivable_stage(stages: Sequence[Stage]) -> Stage:
         resume = (root / CONFIGURATION).exists()
         execution = replace(folder.execution, output=root, resume=resume)
         with TemporaryDirectory() as files:
-            workcell = unpack_cell(drivable_archive(folder.archive), Path(files))
+            workcell = unpack_cell(drivable_files(folder.files), Path(files))
             settings = drivable_settings(folder.settings)
             with open_folder(settings, execution, workcell) as inner:
                 run_stages(inner, stages, Progress(progress.shown, DRIVABLE))

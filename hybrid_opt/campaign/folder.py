@@ -17,7 +17,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import locked, read_json, storing, write_json
 from symbolic.replacing import sync_folder
-from symbolic.workcell.archive import CellArchive, archive_cell, unpack_cell
+from symbolic.workcell.cell_files import CellFiles, collect_cell, unpack_cell
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
 
@@ -31,14 +31,14 @@ class CampaignFolder:
         settings: what is computed.
         execution: how.
         cell: of the folder's own copy of the workcell, with the settings' objectives.
-        archive: the workcell's files.
+        files: the workcell's files.
     """
 
     root: Path
     settings: CampaignSettings
     execution: ExecutionSettings
     cell: Cell
-    archive: CellArchive
+    files: CellFiles
 
     @property
     def workcell(self) -> Workcell:
@@ -57,7 +57,7 @@ def open_folder(
             made from another workcell, with other settings or other software.
     """
     root = execution.output
-    archive = archive_cell(workcell)
+    files = collect_cell(workcell)
     with storing(root):
         root.mkdir(parents=True, exist_ok=True)
     with locked(root):
@@ -67,19 +67,19 @@ def open_folder(
         if exists:
             stored = read_json(configuration)
             digest = stored.get("workcell", {}).get("digest") if isinstance(stored, dict) else None
-            if digest == archive.digest:
+            if digest == files.digest:
                 require_equal(
-                    stored, identity(settings, root, _stored_cell(root, archive)), str(root)
+                    stored, identity(settings, root, _stored_cell(root, files)), str(root)
                 )
             else:
                 raise ResultsError(
                     f"{root}: holds results of another workcell, or of this one before a change; "
                     "choose another --output"
                 )
-        copy = _stored_cell(root, archive)
+        copy = _stored_cell(root, files)
         if not exists:
             write_json(configuration, identity(settings, root, copy))
-        yield CampaignFolder(root, settings, execution, Cell(copy, settings.objectives), archive)
+        yield CampaignFolder(root, settings, execution, Cell(copy, settings.objectives), files)
 
 
 def _check_use(root: Path, exists: bool, resume: bool) -> None:
@@ -97,7 +97,7 @@ def _check_use(root: Path, exists: bool, resume: bool) -> None:
         )
 
 
-def _stored_cell(root: Path, archive: CellArchive) -> Workcell:
+def _stored_cell(root: Path, files: CellFiles) -> Workcell:
     """The folder's copy of the workcell, made where it is missing."""
     folder = root / WORKCELL
     if not folder.exists():
@@ -105,11 +105,11 @@ def _stored_cell(root: Path, archive: CellArchive) -> Workcell:
         with storing(folder):
             shutil.rmtree(draft, ignore_errors=True)
             draft.mkdir()
-            unpack_cell(archive, draft)
+            unpack_cell(files, draft)
             os.replace(draft, folder)
             sync_folder(root)
-    workcell = load(folder / archive.workcell)
-    if workcell.digest != archive.digest:
+    workcell = load(folder / files.workcell)
+    if workcell.digest != files.digest:
         raise ResultsError(
             f"{folder}: was changed after the campaign began; choose another --output"
         )

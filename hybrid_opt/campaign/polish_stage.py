@@ -201,7 +201,7 @@ class _Polish:
 
     def __init__(self, folder: CampaignFolder, settings: PolishSettings) -> None:
         self._folder, self._settings = folder, settings
-        cell = PackedCell.of(folder.archive)
+        cell = PackedCell.of(folder.files)
         self._job = Job(
             PolisherSource(cell, folder.settings.objectives, settings),
             polish_replica,

@@ -38,7 +38,7 @@ def search_stage(source: EvaluatorSource | None = None) -> Stage:
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        cell = PackedCell.of(folder.archive)
+        cell = PackedCell.of(folder.files)
         maker = source or CellEvaluatorSource(cell, folder.settings.objectives)
         _Search(folder, maker).run(executor_for(folder.execution), progress)
 

@@ -35,7 +35,7 @@ PROOF_DEPTH = 12
 
 
 @dataclass(frozen=True)
-class PassingContact:
+class PassingTouch:
     """A collision between samples, or an interval that could not be decided.
 
     Attributes:
@@ -57,14 +57,14 @@ class MotionVerdict:
     Attributes:
         status: 'free' is proven; 'collision' was found by FCL; 'undecided' where a clearance is
             too small to be told at the finest subdivision.
-        contact: the earliest collision, else the earliest undecided interval, else None.
+        touch: the earliest collision, else the earliest undecided interval, else None.
         unsafe: (n - 1,) intervals with a collision or undecided.
         intervals: intervals examined, halves included.
         added: configurations added between the samples.
     """
 
     status: Status
-    contact: PassingContact | None
+    touch: PassingTouch | None
     unsafe: NDArray[np.bool_]
     intervals: int
     added: int
@@ -181,7 +181,7 @@ class _Sweep:
         configuration, clearance = self.sampled.configuration, self.sampled.clearance
         n, n_motions = len(self.owner), len(self.sampled.lengths)
         unsafe = np.zeros(n, dtype=bool)
-        hits: list[PassingContact] = []
+        hits: list[PassingTouch] = []
         examined, added = np.zeros(n_motions, dtype=int), np.zeros(n_motions, dtype=int)
         ends = _End(configuration, clearance.copy(), np.zeros(clearance.shape, dtype=bool))
         lasts = np.cumsum(self.sampled.lengths) - 1
@@ -198,14 +198,14 @@ class _Sweep:
                 hit = self._measure(work, end, level == depth)
                 for row in np.flatnonzero(hit >= 0).tolist():
                     unsafe[work.index[row]] = True
-                    hits.append(self._contact(work, row, int(hit[row]), fraction))
+                    hits.append(self._touch(work, row, int(hit[row]), fraction))
             work = self._uncleared(work[~unsafe[work.index]])
             if not len(work.index) or level == depth:
                 break
             added += self._per_motion(work)
             work = self._halves(work)
         left = [
-            self._contact(work, row, int(np.flatnonzero(work.pending[row])[0]), 0.5)
+            self._touch(work, row, int(np.flatnonzero(work.pending[row])[0]), 0.5)
             for row in range(len(work.index))
         ]
         unsafe[work.index] = True
@@ -222,7 +222,7 @@ class _Sweep:
         self,
         motion: int,
         unsafe: NDArray[np.bool_],
-        contacts: tuple[list[PassingContact], list[PassingContact]],
+        touches: tuple[list[PassingTouch], list[PassingTouch]],
         examined: int,
         added: int,
     ) -> MotionVerdict:
@@ -231,13 +231,13 @@ class _Sweep:
         hits, left = (
             sorted(
                 (
-                    replace(contact, interval=contact.interval - first)
-                    for contact in found
-                    if self.owner[contact.interval] == motion
+                    replace(touch, interval=touch.interval - first)
+                    for touch in found
+                    if self.owner[touch.interval] == motion
                 ),
-                key=lambda contact: (contact.interval, contact.fraction),
+                key=lambda touch: (touch.interval, touch.fraction),
             )
-            for found in contacts
+            for found in touches
         )
         status: Status = "collision" if hits else "undecided" if left else "free"
         earliest = next(iter(hits or left), None)
@@ -292,10 +292,10 @@ class _Sweep:
             np.repeat(work.pending, 2, axis=0),
         )
 
-    def _contact(self, work: _Intervals, row: int, pair: int, fraction: float) -> PassingContact:
+    def _touch(self, work: _Intervals, row: int, pair: int, fraction: float) -> PassingTouch:
         first, second = self.checker.geometry.pair_names[pair]
         place = float(work.start[row]) + work.width * fraction
-        return PassingContact(int(work.index[row]), place, first, second)
+        return PassingTouch(int(work.index[row]), place, first, second)
 
 
 def _alternating(first: Array, second: Array) -> Array:

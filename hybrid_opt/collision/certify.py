@@ -42,7 +42,7 @@ class Certificate:
         at_sample: a collision at a grid point, or None.
         at_parameter: path parameter of the earliest collision or undecided place; NaN if free.
         motion: the verdict between the grid points; None where a grid point collides.
-        points: grid points used.
+        grid_points: how many were used.
         deviation: largest measured distance of a pair from straight motion between them [m].
         lost: an arm does not follow the path, at `at_parameter`.
     """
@@ -51,17 +51,17 @@ class Certificate:
     at_sample: Touch | None
     at_parameter: float
     motion: MotionVerdict | None
-    points: int
+    grid_points: int
     deviation: float
     lost: bool = False
 
     def __repr__(self) -> str:
         if self.is_free:
-            return f"Certificate: free of collisions along the whole path ({self.points} points)"
+            return f"Certificate: free of collisions along the path ({self.grid_points} places)"
         if self.lost:
             return f"Certificate: an arm does not follow the path at u = {self.at_parameter:.4f}"
-        contact = self.at_sample or (None if self.motion is None else self.motion.contact)
-        who = f"{contact.first} and {contact.second}" if contact is not None else "undecided"
+        touch = self.at_sample or (None if self.motion is None else self.motion.touch)
+        who = f"{touch.first} and {touch.second}" if touch is not None else "undecided"
         return f"Certificate: not free at u = {self.at_parameter:.4f}, {who}"
 
 
@@ -215,7 +215,7 @@ def _failed_on_grid(
     if lost.any():
         place = float(u[int(np.argmax(lost))])
         return Certificate(False, None, place, None, len(u), deviation, lost=True)
-    hit = checker.check(*checker.split(placed), u, clearance[rows]).first_contact
+    hit = checker.check(*checker.split(placed), u, clearance[rows]).first_touch
     if hit is None:
         return None
     return Certificate(False, hit, float(u[hit.sample]), None, len(u), deviation)
@@ -223,7 +223,7 @@ def _failed_on_grid(
 
 def _certificate_of(motion: MotionVerdict, u: Array, deviation: float) -> Certificate:
     where = float("nan")
-    if motion.contact is not None:
-        k = motion.contact.interval
-        where = float(u[k] + motion.contact.fraction * (u[k + 1] - u[k]))
+    if motion.touch is not None:
+        k = motion.touch.interval
+        where = float(u[k] + motion.touch.fraction * (u[k + 1] - u[k]))
     return Certificate(motion.status == "free", None, where, motion, len(u), float(deviation))

@@ -125,7 +125,7 @@ class CollisionChecker:
         return Verdict(
             colliding=colliding,
             collision_time=float(durations[colliding].sum()),
-            first_contact=None if first is None else self._contact(*first, time),
+            first_touch=None if first is None else self._touch(*first, time),
             min_clearance=float(np.min(clearance, initial=np.inf)),
             open_samples=len(suspects),
             fcl_calls=self.judge.calls - calls,
@@ -236,7 +236,7 @@ class CollisionChecker:
                 break
             distance = self.judge.distance(sample, *self._pairs[pair])
             if distance < best:
-                best, where = distance, self._contact(sample, pair, None)
+                best, where = distance, self._touch(sample, pair, None)
         return best, where
 
     def _place(self, pose: Array, q_1: Array, q_2: Array) -> None:
@@ -255,7 +255,7 @@ class CollisionChecker:
             return self.judge.collides(local, i, j)
         return self.judge.intersects(local, self.judge.shrunk_payload, j)
 
-    def _contact(self, sample: int, pair: int, time: Array | None) -> Touch:
+    def _touch(self, sample: int, pair: int, time: Array | None) -> Touch:
         first, second = self._names[pair]
         moment = float("nan") if time is None else float(time[sample])
         return Touch(sample, moment, first, second)

@@ -34,7 +34,7 @@ class Verdict:
         colliding: (n,) samples in collision.
         collision_time: time that the colliding samples stand for [s]; each stands for half of
             its two neighbouring steps.
-        first_contact: the earliest collision, or None.
+        first_touch: the earliest collision, or None.
         min_clearance: lower bound of the least distance over all pairs and samples [m]; at most
             the collision tolerance where something collides or the bounds cannot tell.
         open_samples: samples that the bounds left to FCL.
@@ -43,7 +43,7 @@ class Verdict:
 
     colliding: NDArray[np.bool_]
     collision_time: float
-    first_contact: Touch | None
+    first_touch: Touch | None
     min_clearance: float
     open_samples: int
     fcl_calls: int
@@ -51,7 +51,7 @@ class Verdict:
     @property
     def is_free(self) -> bool:
         """Whether no sample collides."""
-        return self.first_contact is None
+        return self.first_touch is None
 
 
 def sample_durations(time: Array) -> Array:

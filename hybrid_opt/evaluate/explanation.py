@@ -103,9 +103,9 @@ def _explained(
         pose, q_1, q_2, time = (
             outputs[name][0, :reached] for name in ("pose", "q_1", "q_2", "time")
         )
-        contact = evaluator.checker.check(pose, q_1, q_2, time).first_contact
-        if contact is not None:
-            return Explanation(reason, position, sample, pair=(contact.first, contact.second))
+        touch = evaluator.checker.check(pose, q_1, q_2, time).first_touch
+        if touch is not None:
+            return Explanation(reason, position, sample, pair=(touch.first, touch.second))
     elif kind == "joint_limits":
         robot = workcell.robots[int(arm) - 1]
         q = outputs[f"q_{arm}"][0, sample]

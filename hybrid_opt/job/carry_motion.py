@@ -6,7 +6,7 @@ import numpy as np
 
 from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.job.profile import at_even_steps
-from hybrid_opt.job.records import Motion
+from hybrid_opt.job.records import PhaseMotion
 from hybrid_opt.job.straight import TICK
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
@@ -14,7 +14,7 @@ from symbolic.array import Array
 _MOVING = ("rate", "second_rate", "q_rate", "q_second")
 
 
-def carry_motion(model: TimingModel, carry: Carry) -> Motion:
+def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:
     """The carry as it is timed, then at rest until a whole number of ticks is over."""
     q = np.ascontiguousarray(carry.q)
     pose = np.ascontiguousarray(carry.pose)
@@ -35,7 +35,7 @@ def carry_motion(model: TimingModel, carry: Carry) -> Motion:
     }
     last["own_torque"] = still
     ends = np.array([time[-1], max(at_even_steps(float(time[-1]), TICK), time[-1])])
-    return Motion(
+    return PhaseMotion(
         first=carry.arms[0].q.shape[1],
         time=np.concatenate([time, ends]),
         **{

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hybrid_opt.job.profile import PEAK_RATE, at_even_steps, rise
-from hybrid_opt.job.records import Force, Motion
+from hybrid_opt.job.records import Force, PhaseMotion
 from hybrid_opt.job.straight import SAMPLES, TICK
 from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.squeeze import Squeeze, extra_force
@@ -18,7 +18,7 @@ from symbolic.physics.pose import box_rotation
 from symbolic.workcell.records import Workcell
 
 
-def held(model: TimingModel, squeeze: Squeeze, motions: Sequence[Motion]) -> list[Force]:
+def held(model: TimingModel, squeeze: Squeeze, motions: Sequence[PhaseMotion]) -> list[Force]:
     """Forces of phases that follow one another, with the box held in all of them.
 
     Raises:
@@ -67,7 +67,7 @@ def pressing(hold: Force, sample: int, rate: float) -> tuple[float, Force]:
     return duration, Force(scaled(hold.normal), scaled(hold.least), scaled(hold.wrench))
 
 
-def without_force(motion: Motion) -> Force:
+def without_force(motion: PhaseMotion) -> Force:
     """Pads that touch nothing."""
     n = len(motion.time)
     return Force(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 6)))

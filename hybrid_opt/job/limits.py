@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybrid_opt.job.records import Force, Motion, contact_effort
+from hybrid_opt.job.records import Force, PhaseMotion, contact_effort
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
@@ -18,7 +18,7 @@ _NO_JUMP = 1e-6
 
 
 def phase_use(
-    workcell: Workcell, motion: Motion, force: Force, jerk: JerkLimits | None = None
+    workcell: Workcell, motion: PhaseMotion, force: Force, jerk: JerkLimits | None = None
 ) -> dict[str, float]:
     """Largest value over its limit by constraint, of what every phase has.
 
@@ -44,7 +44,7 @@ def phase_use(
     }
 
 
-def _jerk_use(motion: Motion, limits: JerkLimits) -> dict[str, float]:
+def _jerk_use(motion: PhaseMotion, limits: JerkLimits) -> dict[str, float]:
     joints = _jerk(motion.time, motion.q_second)
     box = _length(_jerk(motion.time, motion.second_rate))
     use = {"joint jerk": _most(joints / limits.joints), "payload jerk": _most(box / limits.payload)}

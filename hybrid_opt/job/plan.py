@@ -24,7 +24,7 @@ from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.job.forces import held, pressing, without_force
 from hybrid_opt.job.limits import EXCESS, phase_use
 from hybrid_opt.job.profile import rise
-from hybrid_opt.job.records import Force, Job, Motion, Phase
+from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
 from hybrid_opt.job.smooth import WIDEST, WIDTH, limits_of, rests_at_ends, smoothed
 from hybrid_opt.job.straight import (
     SAMPLES,
@@ -65,7 +65,7 @@ class _Part:
     """A phase before its forces are known."""
 
     name: str
-    motion: Motion
+    motion: PhaseMotion
     proof: Certificate
 
 
@@ -251,7 +251,7 @@ class JobModel:
         path = SampledPath(task, extended_waypoints(task, carry.x), *joints_of(self.workcell, q))
         return certificates(checker, self._posture, [path])[0]
 
-    def _free(self, checker: CollisionChecker, line: Straight, motion: Motion) -> Certificate:
+    def _free(self, checker: CollisionChecker, line: Straight, motion: PhaseMotion) -> Certificate:
         """The continuous verdict on a straight motion."""
         share = rise(1.0, SAMPLES).value
 
@@ -270,7 +270,7 @@ class JobModel:
 
     def _phases(
         self,
-        planned: Sequence[tuple[str, Motion, Force, Certificate]],
+        planned: Sequence[tuple[str, PhaseMotion, Force, Certificate]],
         timing: Timing,
         jerk: JerkLimits | None,
     ) -> Iterator[Phase]:
@@ -286,7 +286,7 @@ class JobModel:
             begin += motion.duration
 
 
-def _pressed(motion: Motion, hold: Force, end: int, rate: float) -> tuple[Motion, Force]:
+def _pressed(motion: PhaseMotion, hold: Force, end: int, rate: float) -> tuple[PhaseMotion, Force]:
     """The forces of one end of a phase (0 or -1), put on or taken off while all stand still."""
     duration, force = pressing(hold, end, rate)
     return standing_still(motion, end, duration), force

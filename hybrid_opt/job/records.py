@@ -21,7 +21,7 @@ _STATIC = ("friction", "path speed", "joint position", "least normal force")
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class PhaseMotion:
     """How box and arms move in a phase at n samples; world frame, both arms' joints side by side.
 
     A sample may stand twice where an acceleration jumps, once for each side.
@@ -83,7 +83,7 @@ class Phase:
 
     name: str
     begin: float
-    motion: Motion
+    motion: PhaseMotion
     force: Force
     certificate: Certificate
     use: dict[str, float]
@@ -112,7 +112,7 @@ class Phase:
                     value.setflags(write=False)
 
 
-def contact_effort(motion: Motion, wrench: Array) -> Array:
+def contact_effort(motion: PhaseMotion, wrench: Array) -> Array:
     """(n, joints) joint torques that exert wrenches (n, 2, 6) on the box [N m]."""
     parts = (motion.wrench_torque[:, : motion.first], motion.wrench_torque[:, motion.first :])
     torques = [np.einsum("njk,nk->nj", part, wrench[:, arm]) for arm, part in enumerate(parts)]

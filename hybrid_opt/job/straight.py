@@ -11,7 +11,7 @@ from codegen.function import NumericFunction
 from hybrid_opt.carry import joints_of
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.profile import PEAK_RATE, at_even_steps, rise
-from hybrid_opt.job.records import Motion
+from hybrid_opt.job.records import PhaseMotion
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array
@@ -144,7 +144,7 @@ def _step(
     return np.concatenate(found)
 
 
-def timed(model: TimingModel, line: Straight, q: Array) -> Motion:
+def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     """The motion along a line from rest to rest, as fast as its speed and the limits allow.
 
     Args:
@@ -179,7 +179,7 @@ def timed(model: TimingModel, line: Straight, q: Array) -> Motion:
     )
     T = max(at_even_steps(duration, TICK), TICK)
     moving = both("torque_by_acceleration") * a + both("torque_by_speed") * w
-    return Motion(
+    return PhaseMotion(
         first=own[0].shape[1],
         time=T * unit.time,
         pose=box,
@@ -193,7 +193,7 @@ def timed(model: TimingModel, line: Straight, q: Array) -> Motion:
     )
 
 
-def standing_still(motion: Motion, sample: int, duration: float) -> Motion:
+def standing_still(motion: PhaseMotion, sample: int, duration: float) -> PhaseMotion:
     """What a motion is at one sample, held for a duration [s]."""
     k = sample % len(motion.time)
 
@@ -203,7 +203,7 @@ def standing_still(motion: Motion, sample: int, duration: float) -> Motion:
     def same(values: Array) -> Array:
         return np.repeat(values[k][None], SAMPLES, axis=0)
 
-    return Motion(
+    return PhaseMotion(
         first=motion.first,
         time=np.linspace(0.0, duration, SAMPLES),
         pose=same(motion.pose),

@@ -55,8 +55,8 @@ class PoseJudge:
     def colliding(self, pose: Array, q_1: Array, q_2: Array) -> NDArray[np.bool_]:
         """(n,) of box poses (n, 6) and both arms' joints (n, joints)."""
         found = self._checker.check(pose, q_1, q_2, np.arange(len(pose), dtype=float))
-        if found.first_contact is not None:
-            self.met[found.first_contact.first, found.first_contact.second] += 1
+        if found.first_touch is not None:
+            self.met[found.first_touch.first, found.first_touch.second] += 1
         return found.colliding
 
     def without_screening(self, pose: Array, q_1: Array, q_2: Array) -> NDArray[np.bool_]:
@@ -95,7 +95,7 @@ class PoseJudge:
         bounds = self._checker.bounds(pose, q_1, q_2)
         if arm is not None:
             bounds[:, self._others[arm]] = np.inf
-        touch = self._checker.check(pose, q_1, q_2, np.zeros(1), bounds).first_contact
+        touch = self._checker.check(pose, q_1, q_2, np.zeros(1), bounds).first_touch
         return None if touch is None else (touch.first, touch.second)
 
 

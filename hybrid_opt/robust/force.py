@@ -46,7 +46,7 @@ class BoxMotion:
     second_rate: Array
 
 
-Motion = BoxMotion | Carry
+HeldMotion = BoxMotion | Carry
 """What robust forces are asked for."""
 
 
@@ -120,7 +120,7 @@ class RobustModel:
         """Bound of the multiples of the workcell's set that leave friction and patches."""
         return allowed_factor(self.workcell, self.workcell.uncertainty)
 
-    def least_squeeze(self, motion: Motion, cases: Array) -> Array:
+    def least_squeeze(self, motion: HeldMotion, cases: Array) -> Array:
         """(k, n, 2) least normal forces [N] that hold each of k cases (k, 15) at n samples."""
         n = len(motion.pose)
         found = np.empty((len(cases), n, 2))
@@ -134,7 +134,7 @@ class RobustModel:
         return found
 
     def hold(
-        self, motion: Motion, uncertainty: Uncertainty, leader: int = 0
+        self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
     ) -> tuple[Array, Array]:
         """Least normal force to command, and the largest that the leader then feels, (n,) [N].
 
@@ -153,7 +153,7 @@ class RobustModel:
         return force[:, follower], force[:, leader]
 
     def robust_force(
-        self, motion: Motion, uncertainty: Uncertainty | None = None, leader: int = 0
+        self, motion: HeldMotion, uncertainty: Uncertainty | None = None, leader: int = 0
     ) -> RobustForce:
         """The least commanded forces that hold for every case.
 
@@ -170,7 +170,7 @@ class RobustModel:
         return RobustForce(leader, chosen, nominal, commanded, leading)
 
     def check(
-        self, motion: Motion, force: RobustForce, n: int, rng: np.random.Generator
+        self, motion: HeldMotion, force: RobustForce, n: int, rng: np.random.Generator
     ) -> SampledCheck:
         """Hold n random cases of the set against the commanded forces, at every sample."""
         failing, closest, left = 0, SCREENED, n
@@ -183,7 +183,7 @@ class RobustModel:
             left -= len(cases)
         return SampledCheck(n, failing, closest)
 
-    def _shares(self, motion: Motion, force: RobustForce, cases: Array) -> Array:
+    def _shares(self, motion: HeldMotion, force: RobustForce, cases: Array) -> Array:
         """(k,) largest share of the commanded force that each case needs; `SCREENED` for less."""
         n, k = len(motion.pose), len(cases)
         rows = [np.tile(v, (k, 1)) for v in (motion.pose, motion.rate, motion.second_rate)]
@@ -199,7 +199,7 @@ class RobustModel:
 
     def price(
         self,
-        motion: Motion,
+        motion: HeldMotion,
         factors: Array,
         leader: int = 0,
         uncertainty: Uncertainty | None = None,
@@ -211,7 +211,7 @@ class RobustModel:
 
     def largest_factor(
         self,
-        motion: Motion,
+        motion: HeldMotion,
         limit: Array,
         leader: int = 0,
         uncertainty: Uncertainty | None = None,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from hybrid_opt.robust.force import Motion, robust_model
+from hybrid_opt.robust.force import HeldMotion, robust_model
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Uncertainty, Workcell
@@ -90,7 +90,7 @@ def chosen_squeeze(workcell: Workcell, settings: SqueezeSettings) -> Squeeze:
 
 
 def extra_force(
-    workcell: Workcell, squeeze: Squeeze, time: Array, motion: Motion, least: Array
+    workcell: Workcell, squeeze: Squeeze, time: Array, motion: HeldMotion, least: Array
 ) -> Array:
     """(n,) what both robots press with beyond the planned normal forces [N].
 

@@ -23,11 +23,11 @@ from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import BundleError, OutsideError
 from symbolic.replacing import replace_file
-from symbolic.workcell.archive import (
-    CellArchive,
-    archive_cell,
-    archive_from_json,
-    archive_to_json,
+from symbolic.workcell.cell_files import (
+    CellFiles,
+    cell_from_json,
+    cell_to_json,
+    collect_cell,
     unpack_cell,
 )
 from symbolic.workcell.problems import shown, text_problem
@@ -62,7 +62,7 @@ class StoredTrajectory:
     start: tuple[Array, Array]
     figures: Mapping[str, float]
     provenance: Mapping[str, Any]
-    cell: CellArchive
+    cell: CellFiles
 
     def unpack(self, folder: Path) -> Workcell:
         """Write the workcell's files below a folder and read it.
@@ -114,7 +114,7 @@ def write_trajectory(
         "start": [outputs["q_1"][0].tolist(), outputs["q_2"][0].tolist()],
         "figures": {name: _figure(name, value) for name, value in figures.items()},
         "provenance": dict(provenance),
-        "cell": archive_to_json(archive_cell(workcell)),
+        "cell": cell_to_json(collect_cell(workcell)),
     }
     try:
         text = json.dumps(document, indent=1, allow_nan=False)
@@ -173,7 +173,7 @@ def _checked(data: Any) -> StoredTrajectory:
         start=(_vector(start[0], "start[0]"), _vector(start[1], "start[1]")),
         figures=_figures(data["figures"]),
         provenance=data["provenance"],
-        cell=archive_from_json(data["cell"]),
+        cell=cell_from_json(data["cell"]),
     )
 
 

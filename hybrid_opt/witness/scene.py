@@ -48,7 +48,7 @@ class SimulationSettings:
         time_step: [s].
         contact_time: time constant of a contact [s]; at least a few time steps. The stiffer, the
             more a threshold depends on the time step.
-        points: contact points on the rim of each patch.
+        rim_points: contact points on the rim of each patch.
         noslip_iterations: of MuJoCo's solver against the creep of frictional contacts.
         tilt_stiffness: of each pad about the axes in its plane, where it is driven by the planned
             moments; None for pads that keep their planned orientation, whatever they feel
@@ -59,7 +59,7 @@ class SimulationSettings:
 
     time_step: float = 2e-4
     contact_time: float = 0.01
-    points: int = 8
+    rim_points: int = 8
     noslip_iterations: int = 30
     tilt_stiffness: float | None = None
     settle: float = 0.15
@@ -71,7 +71,7 @@ class SimulationSettings:
                 f"time step {self.time_step:g} s with contacts of {self.contact_time:g} s: give a "
                 "contact time of at least two time steps"
             )
-        if self.points < 3 or self.noslip_iterations < 0:
+        if self.rim_points < 3 or self.noslip_iterations < 0:
             raise SettingsError("give at least three contact points and no negative iterations")
         if self.tilt_stiffness is not None and not self.tilt_stiffness > 0.0:
             raise SettingsError("give a positive stiffness of the pads' tilt, or none")
@@ -232,7 +232,7 @@ def _pad_text(contact: Contact, name: str, settings: SimulationSettings, slides:
     return f"""<body name="{name}" gravcomp="1" {placed(contact.T_box_pad)}>
         {joint}
         <inertial pos="0 0 0" mass="{PAD_MASS!r}" diaginertia="{mjcf_text([PAD_INERTIA] * 3)}"/>
-        {contact_points(contact, settings.points, np.eye(4))}
+        {contact_points(contact, settings.rim_points, np.eye(4))}
       </body>"""
 
 

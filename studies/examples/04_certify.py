@@ -5,7 +5,7 @@ import hybrid_opt as ho
 cell = ho.Cell.load("studies/workcells/rack.toml")
 certificate = cell.certify(cell.initial)
 print(certificate)
-print("free:", certificate.is_free, "- grid points:", certificate.points)
+print("free:", certificate.is_free, "- grid points:", certificate.grid_points)
 lowered = cell.initial.copy()
 lowered[2::6] -= 0.1
 print(cell.carry(lowered).judgement)

@@ -1,1 +1,1 @@
-"""The report of a study: figures for print, tables, a self-contained page, an animation."""
+"""The report of a study: pictures for print, tables, a self-contained page, an animation."""

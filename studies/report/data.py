@@ -45,7 +45,7 @@ from studies.report.records import (
 from studies.terminal_summary import title
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
-from symbolic.workcell.archive import archive_cell
+from symbolic.workcell.cell_files import collect_cell
 from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.records import Workcell
 
@@ -78,14 +78,14 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     slow: list[Callable[[JobModel], Any]] = [partial(_reach, geometry)]
     slow += [partial(_timing, carry.label, carry.x) for carry in carries]
     slow += [partial(_job, request) for request in _job_requests(carries, drivable, workcell)]
-    archive = archive_cell(workcell)
-    job = Job(JobModelSource(PackedCell.of(archive)), _called)
+    files = collect_cell(workcell)
+    job = Job(JobModelSource(PackedCell.of(files)), _called)
     reach, *found = answer_all(executor or SerialExecutor(), job, slow)
     timings, jobs = found[: len(carries)], found[len(carries) :]
     return ReportData(
         root=results.root,
         workcell=workcell,
-        archive=archive,
+        files=files,
         geometry=geometry,
         summary=summary,
         objectives=results.objectives,

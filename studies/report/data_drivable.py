@@ -13,7 +13,7 @@ from studies.drivable import ReplicaFront, drivable_fronts, drivable_root
 from studies.jerk_costs import jerk_costs
 from studies.report.records import DrivableFront, DrivableReport
 from symbolic.array import Array
-from symbolic.workcell.archive import archive_cell
+from symbolic.workcell.cell_files import collect_cell
 
 
 def gather_drivable(study: CampaignResults, summary: CampaignSummary) -> DrivableReport | None:
@@ -39,8 +39,8 @@ def gather_drivable(study: CampaignResults, summary: CampaignSummary) -> Drivabl
     if summary.recommendation is not None:
         recommended = read_trajectory(study.root / RECOMMENDED).x
     workcell = found.results.workcell
-    archive, jerk = archive_cell(workcell), jerk_costs(place)
-    return DrivableReport(workcell, archive, own, tuple(shown), recommended, jerk)
+    files, jerk = collect_cell(workcell), jerk_costs(place)
+    return DrivableReport(workcell, files, own, tuple(shown), recommended, jerk)
 
 
 def _front(results: CampaignResults, front: ReplicaFront) -> DrivableFront:

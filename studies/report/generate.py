@@ -1,4 +1,4 @@
-"""Writes a report into a results folder: figures, tables and the page."""
+"""Writes a report into a results folder: pictures, tables and the page."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.store.files import write_atomically
 from hybrid_opt.work.job import Emit, Executor, Job, answer_all
 from hybrid_opt.work.serial import SerialExecutor
-from studies.report.figures import ReportFigure, report_figures
 from studies.report.page import render_page
 from studies.report.page_data import PageData
+from studies.report.pictures import ReportPicture, report_pictures
 from studies.report.records import ReportData
 from studies.report.style import files_of
 from studies.report.tables import report_tables
 
 PAGE = "report.html"
-FIGURES = "figures"
+PICTURES = "figures"
 TABLES = "tables"
 
 
@@ -37,21 +37,21 @@ def write_report(
         data: from `studies.report.data.gather`.
         cell: of the first experiment; its functions give the trajectories of whole fronts.
         with_paper: whether figures that the paper states of its rack stand beside ours.
-        done: called after every figure and after the page.
+        done: called after every picture and after the page.
         executor: who draws, None for this process.
 
     Raises:
         ResultsError: the folder cannot be written.
         ReportError: the page cannot be made.
     """
-    figures = list(report_figures(data))
+    listed = list(report_pictures(data))
     job = Job(DrawingBoard(data), _drawn)
-    drawn = answer_all(executor or SerialExecutor(), job, range(len(figures)), done)
+    drawn = answer_all(executor or SerialExecutor(), job, range(len(listed)), done)
     pictures = []
-    for figure, files in zip(figures, drawn, strict=True):
+    for picture, files in zip(listed, drawn, strict=True):
         for suffix, content in files.items():
-            write_atomically(root / FIGURES / f"{figure.name}.{suffix}", content)
-        pictures.append((root / FIGURES / f"{figure.name}.png", figure.caption))
+            write_atomically(root / PICTURES / f"{picture.name}.{suffix}", content)
+        pictures.append((root / PICTURES / f"{picture.name}.png", picture.caption))
     tables = report_tables(data, with_paper)
     for table in tables:
         for suffix, text in (
@@ -69,7 +69,7 @@ def write_report(
 
 @dataclass(frozen=True)
 class DrawingBoard:
-    """Makes the figures of a report, in any process.
+    """Makes the pictures of a report, in any process.
 
     Attributes:
         data: what they show.
@@ -77,11 +77,11 @@ class DrawingBoard:
 
     data: ReportData
 
-    def __call__(self) -> list[ReportFigure]:
-        """All figures, not yet drawn."""
-        return list(report_figures(self.data))
+    def __call__(self) -> list[ReportPicture]:
+        """All pictures, not yet drawn."""
+        return list(report_pictures(self.data))
 
 
-def _drawn(figures: list[ReportFigure], index: int, emit: Emit) -> dict[str, bytes]:
-    """Draw a figure; returns its files by suffix."""
-    return files_of(figures[index].draw())
+def _drawn(pictures: list[ReportPicture], index: int, emit: Emit) -> dict[str, bytes]:
+    """Draw a picture; returns its files by suffix."""
+    return files_of(pictures[index].draw())

@@ -54,7 +54,7 @@ def render_page(
         facts=_facts(data),
         style=(texts / "page.css").read_text("utf-8"),
         tables="".join(table.html() for table in tables),
-        figures="".join(_picture(path, caption) for path, caption in pictures),
+        pictures="".join(_picture(path, caption) for path, caption in pictures),
         configuration=html.escape(json.dumps(settings, indent=2, ensure_ascii=False)),
         workcell=html.escape(data.workcell.source.read_text("utf-8")),
         data=embedded_json(document),

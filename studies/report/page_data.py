@@ -20,7 +20,7 @@ from studies.report.page_views import FrontView, drive_look
 from studies.report.records import AlgorithmRuns, DrawnCarry, DrivableReport, Front, ReportData
 from studies.report.style import HAND_MADE, LineStyle, series
 from symbolic.array import Array
-from symbolic.workcell.archive import CellArchive, archive_to_json
+from symbolic.workcell.cell_files import CellFiles, cell_to_json
 
 MAX_CLOUD = 1500
 """Feasible candidates per algorithm in the background of the fronts."""
@@ -62,7 +62,7 @@ class PageData:
         self._collected = Collected(data.workcell.task.n_var)
         self._planned = {job.label: job for job in data.jobs}
         self._lists: list[dict[str, Any]] = []
-        self._cells: list[CellArchive] = []
+        self._cells: list[CellFiles] = []
 
     def document(self, executor: Executor | None = None) -> dict[str, Any]:
         """The page's data as JSON values.
@@ -94,25 +94,25 @@ class PageData:
             "trajectories": self._collected.trajectories,
             "views": views,
             "lists": self._lists,
-            "cells": [_cell_json(archive) for archive in self._cells],
+            "cells": [_cell_json(files) for files in self._cells],
             **scene_data(data.geometry, data.carries[-1].timed),
         }
 
     def _plan_jobs(self, executor: Executor) -> None:
         """Plan the whole job around every trajectory that robots can drive."""
         jobs = self._collected.jobs
-        plan = Job(JobModelSource(PackedCell.of(self._data.archive)), drawn_job)
+        plan = Job(JobModelSource(PackedCell.of(self._data.files)), drawn_job)
         for number, job in zip(jobs, answer_all(executor, plan, list(jobs.values())), strict=True):
             self._collected.add_job(number, job)
 
-    def _carries(self, cell: ho.Cell, archive: CellArchive) -> PageCarries:
-        self._cells.append(archive)
+    def _carries(self, cell: ho.Cell, files: CellFiles) -> PageCarries:
+        self._cells.append(files)
         return PageCarries(cell, len(self._cells) - 1, self._collected)
 
     def _drive_view(self, drivable: DrivableReport) -> dict[str, Any]:
         """Time against force of hand-made path, the other experiment's optimum and the fronts."""
         cell = ho.Cell(drivable.workcell, DRIVABLE_OBJECTIVES)
-        carries = self._carries(cell, drivable.archive)
+        carries = self._carries(cell, drivable.files)
         view = FrontView(
             "Time against force", "largest normal force [N]", "duration [s]", clouds=[]
         )
@@ -185,7 +185,7 @@ class PageData:
     def _search_view(self) -> tuple[dict[str, Any], int]:
         """The fronts of the first experiment; also the trajectory to begin with."""
         data = self._data
-        carries = self._carries(self._cell, data.archive)
+        carries = self._carries(self._cell, data.files)
         titles = [*data.objective_titles, "", ""]
         view = FrontView("The search's objectives", f"{titles[0]} [-]", f"{titles[1]} [-]")
         picked = []
@@ -250,7 +250,7 @@ def _spread(count: int, most: int) -> Sequence[int]:
     return [int(row) for row in np.unique(rows)]
 
 
-def _cell_json(archive: CellArchive) -> dict[str, Any] | None:
-    if sum(map(len, archive.files.values())) > MAX_CELL_BYTES:
+def _cell_json(files: CellFiles) -> dict[str, Any] | None:
+    if sum(map(len, files.files.values())) > MAX_CELL_BYTES:
         return None
-    return archive_to_json(archive)
+    return cell_to_json(files)

@@ -20,7 +20,7 @@ from studies.jerk_costs import JerkCosts
 from studies.report.jobs import DrawnJob
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.workcell.archive import CellArchive
+from symbolic.workcell.cell_files import CellFiles
 from symbolic.workcell.records import Workcell
 
 
@@ -151,7 +151,7 @@ class DrivableReport:
 
     Attributes:
         workcell: the cell under the time law 'optimal'.
-        archive: its files.
+        files: its files.
         summary: of that experiment.
         fronts: searched and polished.
         recommended: decision vector of the carry to run, None without one.
@@ -159,7 +159,7 @@ class DrivableReport:
     """
 
     workcell: Workcell
-    archive: CellArchive
+    files: CellFiles
     summary: CampaignSummary
     fronts: tuple[DrivableFront, ...]
     recommended: Array | None
@@ -173,7 +173,7 @@ class ReportData:
     Attributes:
         root: the results folder.
         workcell: the cell.
-        archive: its files.
+        files: its files.
         geometry: its collision bodies and pairs.
         summary: the content of summary.json.
         objectives: names of what the search minimised.
@@ -192,7 +192,7 @@ class ReportData:
 
     root: Path
     workcell: Workcell
-    archive: CellArchive
+    files: CellFiles
     geometry: CellGeometry
     summary: CampaignSummary
     objectives: tuple[str, ...]

@@ -13,7 +13,7 @@ from hybrid_opt.work.processes import local_executor
 
 
 def report_stage(with_paper: bool) -> Stage:
-    """The stage that writes figures, tables and the page into the results folder.
+    """The stage that writes pictures, tables and the page into the results folder.
 
     Args:
         with_paper: whether figures that the paper states of its rack stand beside ours.
@@ -63,12 +63,12 @@ def follow_report_options(root: Path, options: argparse.Namespace) -> None:
 def _write(root: Path, with_paper: bool, progress: Progress, executor: Executor) -> None:
     from hybrid_opt.campaign.results import read_campaign
     from studies.report.data import gather
-    from studies.report.figures import report_figures
     from studies.report.generate import write_report
+    from studies.report.pictures import report_pictures
 
     results = read_campaign(root)
     data = gather(results, executor)
-    count = len(list(report_figures(data))) + 1
+    count = len(list(report_pictures(data))) + 1
     with progress.stage("report", count, "pictures") as advance:
         write_report(root, data, results.cell, with_paper, lambda: advance(1), executor)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from symbolic.errors import BundleError
-from symbolic.workcell.archive import CellArchive, unpack_cell
+from symbolic.workcell.cell_files import CellFiles, unpack_cell
 from symbolic.workcell.references import parse_toml
 
 LAW = "optimal"
@@ -21,14 +21,14 @@ _LAW = re.compile(r"^([ \t]*)time_law[ \t]*=[^\n]*$", re.MULTILINE)
 _TABLE = re.compile(r"^[ \t]*\[{1,2}[ \t]*[A-Za-z_][\w. \t-]*\]{1,2}[ \t]*(#.*)?$", re.MULTILINE)
 
 
-def drivable_archive(archive: CellArchive) -> CellArchive:
-    """The archive of a cell (`symbolic.workcell.archive.archive_cell`) under 'optimal'.
+def drivable_files(stored: CellFiles) -> CellFiles:
+    """The files of a cell (`symbolic.workcell.cell_files.collect_cell`) under 'optimal'.
 
     Raises:
         BundleError: the file writes the task in a way that cannot be changed line by line, or the
             changed cell is not valid.
     """
-    content = archive.files[archive.workcell]
+    content = stored.files[stored.workcell]
     wanted = copy.deepcopy(parse_toml(content))
     if isinstance(wanted.get("task"), dict):
         wanted["task"]["time_law"] = LAW
@@ -39,10 +39,10 @@ def drivable_archive(archive: CellArchive) -> CellArchive:
         as_wanted = False
     if not as_wanted:
         raise BundleError(
-            f"{archive.workcell}: the time law cannot be changed in it; begin its task with a line "
+            f"{stored.workcell}: the time law cannot be changed in it; begin its task with a line "
             "[task], and write time_law = ... on a line of its own"
         )
-    draft = replace(archive, files={**archive.files, archive.workcell: changed}, digest="")
+    draft = replace(stored, files={**stored.files, stored.workcell: changed}, digest="")
     with TemporaryDirectory() as folder:
         digest = unpack_cell(draft, Path(folder), check_digest=False).digest
     return replace(draft, digest=digest)

@@ -15,7 +15,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import front_rows, hypervolume
 from symbolic.errors import SettingsError
-from symbolic.workcell.archive import archive_cell, unpack_cell
+from symbolic.workcell.cell_files import collect_cell, unpack_cell
 from symbolic.workcell.file import load
 from symbolic.workcell.records import SEARCHED
 from tests.symbolic.workcell.samples import RACK
@@ -115,6 +115,6 @@ def test_a_decision_is_kept_and_travels_with_the_cell(
     assert read_branches(tmp_path) is None
     assert decided.start_branch == found.winner
     assert decided.digest != load(path).digest
-    unpacked = unpack_cell(archive_cell(decided), tmp_path / "unpacked")
+    unpacked = unpack_cell(collect_cell(decided), tmp_path / "unpacked")
     assert unpacked.start_branch == found.winner
-    assert unpack_cell(archive_cell(load(path)), tmp_path / "open").start_branch == (-2, -2)
+    assert unpack_cell(collect_cell(load(path)), tmp_path / "open").start_branch == (-2, -2)

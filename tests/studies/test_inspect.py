@@ -21,7 +21,7 @@ from studies import inspection
 from studies.inspect import as_text, main
 from studies.inspection import Inspection, Optimum, inspect
 from studies.inspection_pictures import show
-from studies.report.figures_meeting import meeting_place
+from studies.report.pictures_meeting import meeting_place
 from symbolic.workcell.decision import straight_line
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell

@@ -24,8 +24,8 @@ from hybrid_opt.timing.document import read_timing
 from studies import rack, recommend, run
 from studies.cli import campaign_parser, campaign_settings
 from studies.recommendation_text import recommendation_text
-from symbolic.workcell.archive import archive_cell, unpack_cell
-from symbolic.workcell.drivable import drivable_archive
+from symbolic.workcell.cell_files import collect_cell, unpack_cell
+from symbolic.workcell.drivable import drivable_files
 from symbolic.workcell.file import load
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
 
@@ -229,7 +229,7 @@ def test_a_missing_workcell_is_told(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_a_cell_whose_own_law_is_optimal_has_one_experiment(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    drivable = unpack_cell(drivable_archive(archive_cell(load(Path(CELL)))), tmp_path / "cell")
+    drivable = unpack_cell(drivable_files(collect_cell(load(Path(CELL)))), tmp_path / "cell")
     root = tmp_path / "results"
     options = ["--algorithm", "nsga2", "--no-report", "--quiet", "--output", str(root), *SMALL]
     assert run.main([str(drivable.source), *options]) == 0

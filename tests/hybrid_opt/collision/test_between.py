@@ -59,17 +59,17 @@ def test_a_thin_plate_between_two_samples_is_found() -> None:
     verdict = check_between(judge, np.hstack(samples))
     assert verdict.status == "collision"
     assert verdict.unsafe.tolist() == [False, True, False]
-    contact = verdict.contact
-    assert contact is not None
-    assert (contact.interval, contact.first, contact.second) == (1, "payload", "plate")
-    assert abs(-0.2 + 0.4 * contact.fraction) <= 0.15 + 0.001
+    touch = verdict.touch
+    assert touch is not None
+    assert (touch.interval, touch.first, touch.second) == (1, "payload", "plate")
+    assert abs(-0.2 + 0.4 * touch.fraction) <= 0.15 + 0.001
     assert verdict.added > 0
     assert judge.judge.calls > calls
 
 
 def test_the_same_motion_without_the_plate_is_free() -> None:
     verdict = check_between(checker(), np.hstack(passing(np.array([-0.6, -0.2, 0.2, 0.6]))))
-    assert (verdict.status, verdict.contact) == ("free", None)
+    assert (verdict.status, verdict.touch) == ("free", None)
     assert not verdict.unsafe.any()
 
 
@@ -94,9 +94,9 @@ def test_a_link_that_sweeps_through_a_plate_is_found() -> None:
     assert blocked.check(*samples, np.arange(2.0)).is_free
     verdict = check_between(blocked, np.hstack(samples))
     assert verdict.status == "collision"
-    assert verdict.contact is not None
-    assert verdict.contact.second == "plate"
-    assert verdict.contact.first.startswith("left/")
+    assert verdict.touch is not None
+    assert verdict.touch.second == "plate"
+    assert verdict.touch.first.startswith("left/")
 
 
 @pytest.mark.parametrize(("gap", "status"), [(0.002, "free"), (2e-6, "undecided")])
@@ -109,8 +109,8 @@ def test_a_slit_is_passed_if_the_clearance_can_be_told(gap: float, status: str) 
     assert verdict.status == status
     assert verdict.unsafe.any() == (status == "undecided")
     if status == "undecided":
-        assert verdict.contact is not None
-        assert verdict.contact.second in ("near wall", "far wall")
+        assert verdict.touch is not None
+        assert verdict.touch.second in ("near wall", "far wall")
 
 
 def test_colliding_samples_are_not_missed() -> None:
@@ -155,7 +155,7 @@ def test_a_curved_path_around_the_plate_is_certified() -> None:
     assert certificate.is_free
     assert np.isnan(certificate.at_parameter)
     assert certificate.deviation <= 1e-4
-    assert certificate.points > 8
+    assert certificate.grid_points > 8
 
 
 def test_a_path_that_jumps_is_refused() -> None:

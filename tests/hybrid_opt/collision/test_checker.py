@@ -1,4 +1,4 @@
-"""The verdict: screened against unscreened FCL, FCL against Coal, tolerance, resting, contacts."""
+"""The verdict: screened against unscreened FCL, FCL against Coal, tolerance, resting, touches."""
 
 from __future__ import annotations
 
@@ -105,16 +105,16 @@ def assert_screening_changes_nothing(name: str, folder: Path, n: int, seed: int)
     screened = judge.check(*at, time, bounds)
     plain = judge.check(*at, time, bounds, screened=False)
     assert screened.colliding.tolist() == plain.colliding.tolist() == mask.any(axis=1).tolist()
-    assert screened.first_contact == plain.first_contact
+    assert screened.first_touch == plain.first_touch
     assert screened.collision_time == plain.collision_time
     assert screened.fcl_calls < 0.2 * plain.fcl_calls
-    contact = screened.first_contact
-    assert contact is not None
+    touch = screened.first_touch
+    assert touch is not None
     names = judge.geometry.pair_names
-    hit = [names[i] for i in np.flatnonzero(mask[contact.sample])]
-    assert contact.sample == np.flatnonzero(mask.any(axis=1))[0]
-    assert (contact.first, contact.second) in hit
-    assert contact.time == time[contact.sample]
+    hit = [names[i] for i in np.flatnonzero(mask[touch.sample])]
+    assert touch.sample == np.flatnonzero(mask.any(axis=1))[0]
+    assert (touch.first, touch.second) in hit
+    assert touch.time == time[touch.sample]
 
 
 @pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
@@ -274,9 +274,9 @@ def test_collision_time_is_what_the_colliding_samples_stand_for() -> None:
     assert verdict.colliding.tolist() == [True, False, True, True, False]
     assert verdict.collision_time == pytest.approx(0.5 + 1.25 + 1.25)
     assert sample_durations(time).sum() == pytest.approx(4.0)
-    assert verdict.first_contact is not None
-    assert (verdict.first_contact.sample, verdict.first_contact.time) == (0, 0.0)
-    assert (verdict.first_contact.first, verdict.first_contact.second) == (
+    assert verdict.first_touch is not None
+    assert (verdict.first_touch.sample, verdict.first_touch.time) == (0, 0.0)
+    assert (verdict.first_touch.first, verdict.first_touch.second) == (
         "payload",
         "middle board",
     )

@@ -112,19 +112,19 @@ def test_certificates_are_the_same_together_and_alone(evaluator: CandidateEvalua
         (False, True, True),
     }
     for a, b in zip(together, alone, strict=True):
-        for name in ("is_free", "lost", "at_sample", "points"):
+        for name in ("is_free", "lost", "at_sample", "grid_points"):
             assert getattr(a, name) == getattr(b, name)
         np.testing.assert_array_equal([a.at_parameter, a.deviation], [b.at_parameter, b.deviation])
         assert (a.motion is None) == (b.motion is None)
         if a.motion is not None and b.motion is not None:
-            assert (a.motion.status, a.motion.contact) == (b.motion.status, b.motion.contact)
+            assert (a.motion.status, a.motion.touch) == (b.motion.status, b.motion.touch)
             np.testing.assert_array_equal(a.motion.unsafe, b.motion.unsafe)
 
 
 def test_the_initial_trajectory_is_proven_free(evaluator: CandidateEvaluator) -> None:
     verdict = evaluator.certificate(evaluator.workcell.task.initial.reshape(-1))
     assert verdict.is_free
-    assert verdict.points > evaluator.workcell.task.samples
+    assert verdict.grid_points > evaluator.workcell.task.samples
 
 
 def test_every_member_of_a_certified_front_is_proven_free(evaluator: CandidateEvaluator) -> None:

@@ -222,8 +222,8 @@ def test_archive_and_front_respect_the_capacity() -> None:
 def test_inside_the_bands_at_1000() -> None:
     problems = ("zdt1", "zdt2", "zdt3", "tnk", "srn", "osy")
     result = compare(problems, [1000], ["mopso", "mopso-turbulent"], seeds=10)
-    assert len(result.rows) == 12
-    for row in result.rows:
+    assert len(result.scores) == 12
+    for row in result.scores:
         assert row.hypervolume_verdict in ("inside", "better"), row
         assert row.igd_verdict in ("inside", "better"), row
         assert row.infeasible_in_front == 0
@@ -231,7 +231,7 @@ def test_inside_the_bands_at_1000() -> None:
 
 @pytest.mark.parametrize(("problem", "evaluations"), [("tnk", 10_000), ("zdt1", 25_000)])
 def test_inside_the_bands_of_longer_runs(problem: str, evaluations: int) -> None:
-    (row,) = compare([problem], [evaluations], ["mopso"], seeds=4).rows
+    (row,) = compare([problem], [evaluations], ["mopso"], seeds=4).scores
     assert row.hypervolume_verdict in ("inside", "better")
     assert row.igd_verdict in ("inside", "better")
 

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from symbolic.errors import WorkcellError
-from symbolic.workcell.archive import archive_cell, unpack_cell
+from symbolic.workcell.cell_files import collect_cell, unpack_cell
 from symbolic.workcell.contacts import pad_rotation
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Cylinder, Mesh, Workcell
@@ -106,7 +106,7 @@ def test_a_mesh(tmp_path: Path) -> None:
     digest = found.digest
     there = tmp_path / "elsewhere"
     there.mkdir()
-    unpacked = unpack_cell(archive_cell(found), there)
+    unpacked = unpack_cell(collect_cell(found), there)
     np.testing.assert_array_equal(unpacked.payload.inertia, found.payload.inertia)
     solid.apply_translation([0.0, 0.0, 1.0])
     solid.export(tmp_path / "part.stl")

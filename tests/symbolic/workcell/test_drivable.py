@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from symbolic.errors import BundleError
-from symbolic.workcell.archive import archive_cell, unpack_cell
-from symbolic.workcell.drivable import drivable_archive
+from symbolic.workcell.cell_files import collect_cell, unpack_cell
+from symbolic.workcell.drivable import drivable_files
 from symbolic.workcell.file import load
 from tests.studies.conftest import TRANSFER
 from tests.symbolic.workcell.samples import RACK
@@ -20,14 +20,14 @@ from tests.symbolic.workcell.samples import RACK
 @pytest.mark.parametrize("path", [RACK, TRANSFER])
 def test_only_the_time_law_differs(path: Path, tmp_path: Path) -> None:
     cell = load(path)
-    original = archive_cell(cell)
-    drivable = unpack_cell(drivable_archive(original), tmp_path)
+    original = collect_cell(cell)
+    drivable = unpack_cell(drivable_files(original), tmp_path)
     assert drivable.task.time_law == "optimal"
     assert drivable.task.n_var == cell.task.n_var + 1
     assert drivable.digest != cell.digest
     first, second = (
-        tomllib.loads(archive.files[archive.workcell].decode())
-        for archive in (original, drivable_archive(original))
+        tomllib.loads(stored.files[stored.workcell].decode())
+        for stored in (original, drivable_files(original))
     )
     assert second["task"].pop("time_law") == "optimal"
     first["task"].pop("time_law")
@@ -46,20 +46,20 @@ def test_only_the_time_law_differs(path: Path, tmp_path: Path) -> None:
     ],
 )
 def test_the_key_may_stand_anywhere_in_its_table(rewrite: object) -> None:
-    archive = archive_cell(load(RACK))
-    text = archive.files[archive.workcell].decode()
+    stored = collect_cell(load(RACK))
+    text = stored.files[stored.workcell].decode()
     assert callable(rewrite)
     changed = rewrite(text)
     assert changed != text
-    variant = replace(archive, files={**archive.files, archive.workcell: changed.encode()})
-    made = drivable_archive(variant)
+    variant = replace(stored, files={**stored.files, stored.workcell: changed.encode()})
+    made = drivable_files(variant)
     assert tomllib.loads(made.files[made.workcell].decode())["task"]["time_law"] == "optimal"
 
 
 def test_a_task_written_otherwise_is_refused() -> None:
-    archive = archive_cell(load(RACK))
-    text = archive.files[archive.workcell].decode()
+    stored = collect_cell(load(RACK))
+    text = stored.files[stored.workcell].decode()
     odd = text.replace("[task]\n", "", 1).replace("start =", "task.start =", 1)
-    variant = replace(archive, files={**archive.files, archive.workcell: odd.encode()})
+    variant = replace(stored, files={**stored.files, stored.workcell: odd.encode()})
     with pytest.raises(BundleError, match="time_law"):
-        drivable_archive(variant)
+        drivable_files(variant)

@@ -1,4 +1,4 @@
-"""Figures of the cell: reachable regions, the environment, the arm, motion sequences."""
+"""Pictures of the cell: reachable regions, the environment, the arm, motion sequences."""
 
 from __future__ import annotations
 

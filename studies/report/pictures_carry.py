@@ -1,4 +1,4 @@
-"""Figures of selected trajectories: forces, joint torques, pressure shift, payload, timing."""
+"""Pictures of selected trajectories: forces, joint torques, pressure shift, payload, timing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of the search: histories, what made candidates infeasible, indicators."""
+"""Pictures of the search: histories, what made candidates infeasible, indicators."""
 
 from __future__ import annotations
 

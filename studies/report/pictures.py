@@ -1,4 +1,4 @@
-"""The list of a report's figures: name, caption, and how to draw each from the data."""
+"""The list of a report's pictures: name, caption, and how to draw each from the data."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from dataclasses import dataclass
 from matplotlib.figure import Figure
 
 from studies.report import (
-    figures_carry,
-    figures_cell,
-    figures_fronts,
-    figures_robust,
-    figures_search,
-    figures_simulation,
+    pictures_carry,
+    pictures_cell,
+    pictures_fronts,
+    pictures_robust,
+    pictures_search,
+    pictures_simulation,
 )
 from studies.report.records import DrawnCarry, ReportData
 from studies.report.style import in_style, settled
 
 
 @dataclass(frozen=True)
-class ReportFigure:
-    """One figure of the report.
+class ReportPicture:
+    """One picture of the report.
 
     Attributes:
         name: of its files, without suffix.
@@ -34,112 +34,112 @@ class ReportFigure:
     make: Callable[[], Figure]
 
     def draw(self) -> Figure:
-        """The figure in the common style."""
+        """It in the common style."""
         with in_style():
             return settled(self.make())
 
 
-def report_figures(data: ReportData) -> Iterator[ReportFigure]:
-    """All figures that the data allows, in the paper's order, then those beyond the paper."""
+def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
+    """All pictures that the data allows, in the paper's order, then those beyond the paper."""
     geometry = data.geometry
-    yield ReportFigure(
+    yield ReportPicture(
         "fig04_reachable_regions",
         "Reach of both pads (positions, sampled within the joint limits), the common region of the "
         "box centre, and the bounds of the free waypoints (paper Figure 4).",
-        lambda: figures_cell.reachable_regions(geometry, data.reach, data.initial),
+        lambda: pictures_cell.reachable_regions(geometry, data.reach, data.initial),
     )
-    yield ReportFigure(
+    yield ReportPicture(
         "fig05_cell",
         "The cell at the start of the carry (paper Figure 5).",
-        lambda: figures_cell.environment(geometry, data.initial),
+        lambda: pictures_cell.environment(geometry, data.initial),
     )
-    yield ReportFigure(
+    yield ReportPicture(
         "fig06_arm",
         f"The arm {data.workcell.robots[0].name} as its collision shapes, and the reach of its pad "
         "(paper Figure 6).",
-        lambda: figures_cell.arm_and_reach(geometry, data.reach, data.initial),
+        lambda: pictures_cell.arm_and_reach(geometry, data.reach, data.initial),
     )
     if data.solved:
-        yield from _search_figures(data)
-    yield ReportFigure(
+        yield from _search_pictures(data)
+    yield ReportPicture(
         "infeasibility",
         "What made candidates infeasible: the constraint violated first, over all replicas, and "
         "where on the path.",
-        lambda: figures_search.infeasibility(data),
+        lambda: pictures_search.infeasibility(data),
     )
-    yield from _carry_figures(data)
+    yield from _carry_pictures(data)
 
 
-def _search_figures(data: ReportData) -> Iterator[ReportFigure]:
+def _search_pictures(data: ReportData) -> Iterator[ReportPicture]:
     if len(data.objective_titles) >= 2:
-        yield ReportFigure(
+        yield ReportPicture(
             "fig07_fronts",
             "Feasible candidates and non-dominated ones of each algorithm's run with the largest "
             "hypervolume (paper Figure 7). The star is the level payload at rest.",
-            lambda: figures_fronts.fronts(data),
+            lambda: pictures_fronts.fronts(data),
         )
-    yield ReportFigure(
+    yield ReportPicture(
         "fig08_best_so_far",
         "Best feasible value of each objective so far, in the same runs; the inset enlarges the "
         "second half (paper Figure 8).",
-        lambda: figures_search.histories(data),
+        lambda: pictures_search.histories(data),
     )
     if len(data.objective_titles) == 2:
-        yield ReportFigure(
+        yield ReportPicture(
             "attainment",
             "Empirical attainment surfaces: what a quarter, half and three quarters of the "
             "replicas reached or bettered.",
-            lambda: figures_fronts.attainment(data),
+            lambda: pictures_fronts.attainment(data),
         )
-    yield ReportFigure(
+    yield ReportPicture(
         "indicators",
         "Indicators of every replica, with medians and quartiles.",
-        lambda: figures_search.indicators(data),
+        lambda: pictures_search.indicators(data),
     )
     if data.has_hybrid and len(data.objective_titles) >= 2:
-        yield ReportFigure(
+        yield ReportPicture(
             "polish",
             "Fronts before and after the polish, and the hypervolume of every replica.",
-            lambda: figures_fronts.polish(data),
+            lambda: pictures_fronts.polish(data),
         )
 
 
-def _carry_figures(data: ReportData) -> Iterator[ReportFigure]:
-    yield ReportFigure(
+def _carry_pictures(data: ReportData) -> Iterator[ReportPicture]:
+    yield ReportPicture(
         "fig09_normal_forces",
         "Normal contact forces along the selected trajectories (paper Figure 9).",
-        lambda: figures_carry.normal_forces(data),
+        lambda: pictures_carry.normal_forces(data),
     )
-    yield ReportFigure(
+    yield ReportPicture(
         "fig10_joint_torques",
         "Largest joint torque over its maximum: of the contact wrench alone, and with the arm's "
         "own weight and motion (paper Figure 10).",
-        lambda: figures_carry.joint_torques(data),
+        lambda: pictures_carry.joint_torques(data),
     )
-    yield ReportFigure(
+    yield ReportPicture(
         "fig11_pressure_shift",
         "Shift of the centres of pressure that balances the moments, and the radius of the contact "
         "patch (paper Figure 11).",
-        lambda: figures_carry.pressure_shift(data),
+        lambda: pictures_carry.pressure_shift(data),
     )
-    yield ReportFigure(
+    yield ReportPicture(
         "residual_moments",
         "Moment that is missing with forces at the nominal contact points, and with the centres of "
         "pressure shifted.",
-        lambda: figures_carry.residual_moments(data),
+        lambda: pictures_carry.residual_moments(data),
     )
-    yield ReportFigure(
+    yield ReportPicture(
         "fig12_payload",
         "Largest contact force of each robot against the payload's mass, for unchanged motion "
         "(paper Figure 12).",
-        lambda: figures_carry.payload(data),
+        lambda: pictures_carry.payload(data),
     )
-    yield ReportFigure(
+    yield ReportPicture(
         "fig13_paths",
         "Paths of the box centre (paper Figure 13).",
-        lambda: figures_cell.paths(
+        lambda: pictures_cell.paths(
             data.geometry,
-            tuple((carry, look.colour, look.line) for carry, look in figures_carry.styled(data)),
+            tuple((carry, look.colour, look.line) for carry, look in pictures_carry.styled(data)),
         ),
     )
     for algorithm in data.solved:
@@ -147,40 +147,40 @@ def _carry_figures(data: ReportData) -> Iterator[ReportFigure]:
         assert carry is not None
         yield _motion(data, carry, f"motion_{algorithm.name}")
     if data.timings:
-        yield ReportFigure(
+        yield ReportPicture(
             "duration_against_force",
             "Drivable durations against the limit on the normal forces: single paths timed anew "
             "at every limit, and the members of the drivable fronts. All other limits hold "
             "throughout.",
-            lambda: figures_carry.duration_against_force(data),
+            lambda: pictures_carry.duration_against_force(data),
         )
-    yield from _price_figure(data)
+    yield from _price_picture(data)
     if any(len(found.time) for found in data.simulations):
-        yield ReportFigure(
+        yield ReportPicture(
             "simulated_forces",
             "Normal forces in the simulated cell, arms under force control, beside those that were "
             "predicted for how the carries were pressed there.",
-            lambda: figures_simulation.simulated_forces(data),
+            lambda: pictures_simulation.simulated_forces(data),
         )
 
 
-def _price_figure(data: ReportData) -> Iterator[ReportFigure]:
+def _price_picture(data: ReportData) -> Iterator[ReportPicture]:
     choice = data.summary.recommendation
     if choice is not None and choice.price is not None:
         price = choice.price
         whose = "the workcell's [uncertainty]" if price.stated else "a usual set of cases"
-        yield ReportFigure(
+        yield ReportPicture(
             "robust_price",
             "The price of robustness: largest normal forces of the recommended carry that hold in "
             f"every case of {whose} ({price.text}), times a factor.",
-            lambda: figures_robust.robust_price(data, price),
+            lambda: pictures_robust.robust_price(data, price),
         )
 
 
-def _motion(data: ReportData, carry: DrawnCarry, name: str) -> ReportFigure:
-    return ReportFigure(
+def _motion(data: ReportData, carry: DrawnCarry, name: str) -> ReportPicture:
+    return ReportPicture(
         name,
         f"The trajectory selected from {carry.label} at 0, 33, 66 and 100 % of its duration (paper "
         "Figures 14 and 15).",
-        lambda: figures_cell.motion_sequence(data.geometry, carry),
+        lambda: pictures_cell.motion_sequence(data.geometry, carry),
     )

@@ -2,7 +2,7 @@
 
 The layout keeps the file's own relative references valid, so that the workcell's digest stays
 the same. Absolute references are replaced by relative ones. Unpacking writes below one folder
-only, and refuses an archive that refers to anything outside it.
+only, and refuses files that refer to anything outside it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SAFE_PART = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
 
 
 @dataclass(frozen=True)
-class CellArchive:
+class CellFiles:
     """A workcell's files.
 
     Attributes:
@@ -53,18 +53,18 @@ class CellArchive:
     digest: str
 
 
-def archive_cell(workcell: Workcell) -> CellArchive:
+def collect_cell(workcell: Workcell) -> CellFiles:
     """Collect the files of a workcell that was read with `symbolic.workcell.file.load`.
 
     Raises:
         BundleError: the file on disk no longer describes this workcell, or a reference cannot
             be made relative.
     """
-    return _archive(workcell.source, workcell.digest, workcell.start_branch)
+    return _collected(workcell.source, workcell.digest, workcell.start_branch)
 
 
 @lru_cache(maxsize=4)
-def _archive(source: Path, digest: str, branches: tuple[int, int]) -> CellArchive:
+def _collected(source: Path, digest: str, branches: tuple[int, int]) -> CellFiles:
     try:
         current = load(source, decided=branches)
     except DualArmError as error:
@@ -76,30 +76,30 @@ def _archive(source: Path, digest: str, branches: tuple[int, int]) -> CellArchiv
         )
     collector = CellCollector(source)
     collector.collect(current)
-    draft = CellArchive(*collector.layout(), digest="")
+    draft = CellFiles(*collector.layout(), digest="")
     with TemporaryDirectory() as folder:
         unpacked = unpack_cell(draft, Path(folder), check_digest=False)
-    return CellArchive(draft.workcell, draft.files, draft.folders, unpacked.digest)
+    return CellFiles(draft.workcell, draft.files, draft.folders, unpacked.digest)
 
 
-def unpack_cell(archive: CellArchive, folder: Path, check_digest: bool = True) -> Workcell:
-    """Write an archive's files below a folder and read the workcell from there.
+def unpack_cell(stored: CellFiles, folder: Path, check_digest: bool = True) -> Workcell:
+    """Write a cell's files below a folder and read the workcell from there.
 
     Raises:
         BundleError: a path would leave the folder, a reference points outside of it, or the
             workcell is not the one that was stored.
     """
     root = folder.resolve()
-    for name in (*archive.files, *archive.folders, archive.workcell):
+    for name in (*stored.files, *stored.folders, stored.workcell):
         _check_name(name)
-    for name in archive.folders:
+    for name in stored.folders:
         try:
             (root / name).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise BundleError(
                 f"stored folder {shown(name)} cannot be unpacked ({error.strerror})"
             ) from error
-    for name, content in archive.files.items():
+    for name, content in stored.files.items():
         target = root / name
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -109,28 +109,28 @@ def unpack_cell(archive: CellArchive, folder: Path, check_digest: bool = True) -
             raise BundleError(
                 f"stored file {shown(name)} cannot be unpacked ({error.strerror})"
             ) from error
-    _check_references(archive, root)
+    _check_references(stored, root)
     try:
-        workcell = load(root / archive.workcell, stored=True)
+        workcell = load(root / stored.workcell, stored=True)
     except DualArmError as error:
         raise BundleError(f"the stored workcell is not valid: {error}") from error
-    if check_digest and workcell.digest != archive.digest:
+    if check_digest and workcell.digest != stored.digest:
         raise BundleError("the stored workcell's digest does not match its files")
     return workcell
 
 
-def archive_to_json(archive: CellArchive) -> dict[str, Any]:
-    """The archive as JSON values: text as it is, binary and large files compressed."""
+def cell_to_json(stored: CellFiles) -> dict[str, Any]:
+    """The files as JSON values: text as it is, binary and large files compressed."""
     return {
-        "workcell": archive.workcell,
-        "digest": archive.digest,
-        "folders": list(archive.folders),
-        "files": [_file_to_json(name, archive.files[name]) for name in sorted(archive.files)],
+        "workcell": stored.workcell,
+        "digest": stored.digest,
+        "folders": list(stored.folders),
+        "files": [_file_to_json(name, stored.files[name]) for name in sorted(stored.files)],
     }
 
 
-def archive_from_json(data: Any) -> CellArchive:
-    """The archive from JSON values, every field checked.
+def cell_from_json(data: Any) -> CellFiles:
+    """The files from JSON values, every field checked.
 
     Raises:
         BundleError: with the field that is wrong.
@@ -156,7 +156,7 @@ def archive_from_json(data: Any) -> CellArchive:
         room -= len(content)
     if data["workcell"] not in files:
         raise BundleError("cell.workcell: names no stored file")
-    return CellArchive(data["workcell"], files, tuple(folders), data["digest"])
+    return CellFiles(data["workcell"], files, tuple(folders), data["digest"])
 
 
 def _file_to_json(name: str, content: bytes) -> dict[str, Any]:
@@ -202,18 +202,18 @@ def _check_name(name: str) -> None:
         )
 
 
-def _check_references(archive: CellArchive, root: Path) -> None:
-    """No reference of the workcell or of its URDFs may lead out of the archive."""
-    base = posixpath.dirname(archive.workcell)
-    for reference, package_dirs in references(parse_toml(archive.files[archive.workcell])):
+def _check_references(stored: CellFiles, root: Path) -> None:
+    """No reference of the workcell or of its URDFs may lead out of the files."""
+    base = posixpath.dirname(stored.workcell)
+    for reference, package_dirs in references(parse_toml(stored.files[stored.workcell])):
         target = joined(base, reference)
-        if target not in archive.files:
+        if target not in stored.files:
             raise BundleError(f"the stored workcell names {shown(reference)}, which is not stored")
         if package_dirs is None:
             continue
         folders = [joined(base, entry) for entry in package_dirs]
         try:
-            if is_xacro(archive.files[target]):
+            if is_xacro(stored.files[target]):
                 raise OutsideError(
                     "holds xacro macros, which are never expanded from a stored cell"
                 )

@@ -1,4 +1,4 @@
-"""Figures of fronts: of single runs, over the replicas, before and after the polish."""
+"""Pictures of fronts: of single runs, over the replicas, before and after the polish."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from studies.report.figures import ReportFigure, report_figures
+from studies.report.pictures import ReportPicture, report_pictures
 from studies.report.records import ReportData, Run
 from studies.report.style import ARMS, HAND_MADE, SERIES, in_style, save
 from symbolic.array import Array
@@ -48,11 +48,14 @@ HYBRID = ("polish", "simulated_forces")
 """What `hybrid_data` has besides."""
 
 
+Drawn = dict[str, tuple[ReportPicture, Figure]]
+
+
 @pytest.fixture(scope="module")
-def drawn(hybrid_data: ReportData) -> dict[str, tuple[ReportFigure, Figure]]:
+def drawn(hybrid_data: ReportData) -> Drawn:
     figures = {}
     with in_style():
-        for entry in report_figures(hybrid_data):
+        for entry in report_pictures(hybrid_data):
             figure = entry.draw()
             FigureCanvasAgg(figure).draw()  # type: ignore[no-untyped-call]
             figures[entry.name] = (entry, figure)
@@ -88,21 +91,21 @@ def box_of(text: Text) -> Bbox:
     return text.get_window_extent()
 
 
-def test_the_report_has_every_figure(drawn: dict[str, tuple[ReportFigure, Figure]]) -> None:
+def test_the_report_has_every_figure(drawn: Drawn) -> None:
     assert tuple(drawn) == NAMES
 
 
 def test_without_a_polish_there_is_no_figure_of_it(data: ReportData) -> None:
-    names = [entry.name for entry in report_figures(data)]
+    names = [entry.name for entry in report_pictures(data)]
     assert tuple(names) == tuple(name for name in NAMES if name not in HYBRID)
 
 
 def test_without_a_feasible_candidate_the_rest_is_drawn(data: ReportData) -> None:
     failed = tuple(replace(algorithm, selected=None) for algorithm in data.algorithms)
     shown = replace(data, algorithms=failed, timings=data.timings[:1])
-    names = [entry.name for entry in report_figures(shown)]
+    names = [entry.name for entry in report_pictures(shown)]
     assert "fig07_fronts" not in names
-    for entry in report_figures(shown):
+    for entry in report_pictures(shown):
         assert entry.draw().axes
 
 
@@ -116,7 +119,7 @@ def clipped(figure: Figure) -> list[str]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_text_is_clipped(name: str, drawn: dict[str, tuple[ReportFigure, Figure]]) -> None:
+def test_no_text_is_clipped(name: str, drawn: Drawn) -> None:
     assert clipped(drawn[name][1]) == []
 
 
@@ -128,9 +131,7 @@ def test_a_clipped_label_would_be_found() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_titles_or_labels_overlap(
-    name: str, drawn: dict[str, tuple[ReportFigure, Figure]]
-) -> None:
+def test_no_titles_or_labels_overlap(name: str, drawn: Drawn) -> None:
     _, figure = drawn[name]
     marked = []
     for axes in figure.findobj(Axes):
@@ -175,9 +176,7 @@ def overlapping_ticks(figure: Figure) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_tick_labels_do_not_overlap(
-    name: str, drawn: dict[str, tuple[ReportFigure, Figure]]
-) -> None:
+def test_tick_labels_do_not_overlap(name: str, drawn: Drawn) -> None:
     assert overlapping_ticks(drawn[name][1]) == []
 
 
@@ -198,7 +197,7 @@ def test_tick_labels_of_narrow_fronts_do_not_overlap(hybrid_data: ReportData, sp
         for algorithm in hybrid_data.algorithms
     )
     shown = replace(hybrid_data, algorithms=algorithms, static=np.full(2, np.nan))
-    for entry in report_figures(shown):
+    for entry in report_pictures(shown):
         if entry.name in ("fig07_fronts", "attainment", "polish"):
             with in_style():
                 figure = entry.draw()
@@ -207,7 +206,7 @@ def test_tick_labels_of_narrow_fronts_do_not_overlap(hybrid_data: ReportData, sp
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_axis_says_its_unit(name: str, drawn: dict[str, tuple[ReportFigure, Figure]]) -> None:
+def test_every_axis_says_its_unit(name: str, drawn: Drawn) -> None:
     _, figure = drawn[name]
     for axes in figure.axes:
         if axes.name == "polar":
@@ -227,7 +226,7 @@ def test_every_axis_says_its_unit(name: str, drawn: dict[str, tuple[ReportFigure
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_panel_is_empty(name: str, drawn: dict[str, tuple[ReportFigure, Figure]]) -> None:
+def test_no_panel_is_empty(name: str, drawn: Drawn) -> None:
     _, figure = drawn[name]
     pixels = np.asarray(figure.canvas.buffer_rgba())[:, :, :3]  # type: ignore[attr-defined]
     for axes in figure.axes:
@@ -241,9 +240,7 @@ def test_no_panel_is_empty(name: str, drawn: dict[str, tuple[ReportFigure, Figur
         assert coloured.mean() > 1e-4
 
 
-def test_saves_print_and_screen_files(
-    drawn: dict[str, tuple[ReportFigure, Figure]], tmp_path: Path
-) -> None:
+def test_saves_print_and_screen_files(drawn: Drawn, tmp_path: Path) -> None:
     _, figure = drawn["fig07_fronts"]
     png, pdf = save(figure, tmp_path, "figure")
     width, height = Image.open(png).size
@@ -256,7 +253,7 @@ def test_saves_print_and_screen_files(
 def test_saving_repeats_to_the_byte(data: ReportData, tmp_path: Path) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
-        entry = next(f for f in report_figures(data) if f.name == "fig09_normal_forces")
+        entry = next(f for f in report_pictures(data) if f.name == "fig09_normal_forces")
         save(entry.draw(), tmp_path / folder, "figure")
     for suffix in ("png", "pdf"):
         first, second = (tmp_path / f / f"figure.{suffix}" for f in ("a", "b"))

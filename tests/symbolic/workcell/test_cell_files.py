@@ -1,4 +1,4 @@
-"""Workcells packed with their files, unpacked elsewhere, and archives that mean harm."""
+"""Workcells packed with their files, unpacked elsewhere, and files that mean harm."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ import trimesh
 
 from symbolic.errors import BundleError, WorkcellError
 from symbolic.robot.urdf import resolve_mesh, robot_urdf
-from symbolic.workcell.archive import (
-    CellArchive,
-    archive_cell,
-    archive_from_json,
-    archive_to_json,
+from symbolic.workcell.cell_files import (
+    CellFiles,
+    cell_from_json,
+    cell_to_json,
+    collect_cell,
     unpack_cell,
 )
 from symbolic.workcell.file import load
@@ -30,10 +30,10 @@ from tests.symbolic.cells import GOFA, RACK, rack_cell
 BODY = '\n[[environment]]\nname = "stone"\nkind = "mesh"\npath = {path}\nxyz = [2.0, 2.0, 0.0]\n'
 
 
-def round_trip(workcell: Workcell, folder: Path) -> tuple[Workcell, CellArchive]:
-    text = json.dumps(archive_to_json(archive_cell(workcell)))
-    archive = archive_from_json(json.loads(text))
-    return unpack_cell(archive, folder), archive
+def round_trip(workcell: Workcell, folder: Path) -> tuple[Workcell, CellFiles]:
+    text = json.dumps(cell_to_json(collect_cell(workcell)))
+    stored = cell_from_json(json.loads(text))
+    return unpack_cell(stored, folder), stored
 
 
 def write_cell(folder: Path, mesh: str, urdf: str = "../robots/gofa12.urdf") -> Path:
@@ -49,11 +49,11 @@ def write_cell(folder: Path, mesh: str, urdf: str = "../robots/gofa12.urdf") -> 
 
 def test_the_rack_survives_with_its_digest(tmp_path: Path) -> None:
     cell = rack_cell()
-    unpacked, archive = round_trip(cell, tmp_path)
+    unpacked, stored = round_trip(cell, tmp_path)
     assert unpacked.digest == cell.digest
     assert unpacked.source.is_relative_to(tmp_path)
     assert all(robot.urdf.is_relative_to(tmp_path) for robot in unpacked.robots)
-    assert str(RACK.parent) not in json.dumps(archive_to_json(archive))
+    assert str(RACK.parent) not in json.dumps(cell_to_json(stored))
 
 
 def test_binary_meshes_travel_along(tmp_path: Path) -> None:
@@ -76,10 +76,10 @@ def test_absolute_references_become_relative(tmp_path: Path) -> None:
     mesh = here / "stone.stl"
     path = write_cell(here, f"'{mesh}'", urdf=str(here / "robots" / "gofa12.urdf"))
     trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
-    unpacked, archive = round_trip(load(path), there)
-    assert str(here) not in archive.files[archive.workcell].decode()
+    unpacked, stored = round_trip(load(path), there)
+    assert str(here) not in stored.files[stored.workcell].decode()
     shutil.rmtree(here)
-    assert unpack_cell(archive, tmp_path / "again").name == unpacked.name
+    assert unpack_cell(stored, tmp_path / "again").name == unpacked.name
 
 
 def test_meshes_of_a_urdf_travel_along(tmp_path: Path) -> None:
@@ -101,16 +101,16 @@ def test_meshes_of_a_urdf_travel_along(tmp_path: Path) -> None:
     line = 'urdf = "../robots/gofa12.urdf"\n'
     path.write_text(cell_text.replace(line, line + 'package_dirs = ["../packages"]\n'))
     cell = load(path)
-    unpacked, archive = round_trip(cell, tmp_path / "there")
+    unpacked, stored = round_trip(cell, tmp_path / "there")
     assert unpacked.digest == cell.digest
-    assert {name.split("/")[-1] for name in archive.files} >= {"near.stl", "far.stl"}
+    assert {name.split("/")[-1] for name in stored.files} >= {"near.stl", "far.stl"}
 
 
 def test_a_workcell_changed_in_memory_is_refused() -> None:
     cell = rack_cell()
     changed = replace(cell, payload=replace(cell.payload, mass=11.0))
     with pytest.raises(BundleError, match="changed after reading"):
-        archive_cell(changed)
+        collect_cell(changed)
 
 
 def test_a_workcell_file_changed_on_disk_is_refused(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_a_workcell_file_changed_on_disk_is_refused(tmp_path: Path) -> None:
     cell = load(path)
     path.write_text(path.read_text(encoding="utf-8") + "# later\n", encoding="utf-8")
     with pytest.raises(BundleError, match="changed after reading"):
-        archive_cell(cell)
+        collect_cell(cell)
 
 
 def entry(name: str, content: bytes) -> dict[str, str]:
@@ -132,7 +132,7 @@ def entry(name: str, content: bytes) -> dict[str, str]:
 
 
 def document(**changes: Any) -> dict[str, Any]:
-    return archive_to_json(archive_cell(rack_cell())) | changes
+    return cell_to_json(collect_cell(rack_cell())) | changes
 
 
 @pytest.mark.parametrize(
@@ -143,11 +143,11 @@ def test_paths_that_leave_the_folder_are_refused(name: str, tmp_path: Path) -> N
     data = document()
     data["files"] = [*data["files"], entry(name, b"x")]
     with pytest.raises(BundleError, match="not allowed"):
-        archive_from_json(data)
+        cell_from_json(data)
     with pytest.raises(BundleError, match="not allowed"):
-        unpack_cell(CellArchive("a", {"a": b"", name: b""}, (), ""), tmp_path)
+        unpack_cell(CellFiles("a", {"a": b"", name: b""}, (), ""), tmp_path)
     with pytest.raises(BundleError, match="not allowed"):
-        unpack_cell(CellArchive("a", {"a": b""}, (name,), ""), tmp_path)
+        unpack_cell(CellFiles("a", {"a": b""}, (name,), ""), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -162,44 +162,44 @@ def test_paths_that_leave_the_folder_are_refused(name: str, tmp_path: Path) -> N
     ],
 )
 def test_a_tampered_workcell_is_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
-    archive = archive_cell(rack_cell())
-    text = archive.files[archive.workcell].decode()
+    stored = collect_cell(rack_cell())
+    text = stored.files[stored.workcell].decode()
     assert old in text
-    files = {**archive.files, archive.workcell: text.replace(old, new).encode()}
+    files = {**stored.files, stored.workcell: text.replace(old, new).encode()}
     with pytest.raises(BundleError, match=message):
-        unpack_cell(replace(archive, files=files), tmp_path)
+        unpack_cell(replace(stored, files=files), tmp_path)
 
 
 def test_a_urdf_that_names_files_outside_is_refused(tmp_path: Path) -> None:
-    archive = archive_cell(rack_cell())
-    (urdf,) = (name for name in archive.files if name.endswith(".urdf"))
+    stored = collect_cell(rack_cell())
+    (urdf,) = (name for name in stored.files if name.endswith(".urdf"))
     box = b'<box size="0.205 0.2 0.03"/>'
     # A character reference must not hide the path.
     for address in (b"/etc/passwd", b"&#46;./../../x.stl", b"file:///etc/passwd"):
-        bad = archive.files[urdf].replace(box, b'<mesh filename="' + address + b'"/>')
+        bad = stored.files[urdf].replace(box, b'<mesh filename="' + address + b'"/>')
         folder = tmp_path / hashlib.sha256(address).hexdigest()
         with pytest.raises(BundleError, match="not stored with it"):
-            unpack_cell(replace(archive, files={**archive.files, urdf: bad}), folder)
+            unpack_cell(replace(stored, files={**stored.files, urdf: bad}), folder)
 
 
 def test_damaged_and_exploding_content_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     data = document()
     data["files"][0] = data["files"][0] | {"sha256": "0" * 64}
     with pytest.raises(BundleError, match="damaged"):
-        archive_from_json(data)
+        cell_from_json(data)
     data = document()
     data["files"][0] = data["files"][0] | {"encoding": "pickle"}
     with pytest.raises(BundleError, match="encoding"):
-        archive_from_json(data)
+        cell_from_json(data)
     data = document()
     data["files"][0] = entry("bomb", b"x") | {"content": "!!!"}
     with pytest.raises(BundleError, match="decoded"):
-        archive_from_json(data)
-    monkeypatch.setattr("symbolic.workcell.archive.MAX_TOTAL_BYTES", 10**6)
+        cell_from_json(data)
+    monkeypatch.setattr("symbolic.workcell.cell_files.MAX_TOTAL_BYTES", 10**6)
     data = document()
     data["files"].append(entry("bomb", bytes(10**8)))
     with pytest.raises(BundleError, match="exceed"):
-        archive_from_json(data)
+        cell_from_json(data)
 
 
 @pytest.mark.parametrize(
@@ -218,10 +218,10 @@ def test_damaged_and_exploding_content_is_refused(monkeypatch: pytest.MonkeyPatc
 )
 def test_wrong_fields_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(BundleError, match="cell"):
-        archive_from_json(document(**changes))
+        cell_from_json(document(**changes))
 
 
-def test_xacro_and_packages_of_this_machine_become_part_of_the_archive(
+def test_xacro_and_packages_of_this_machine_become_part_of_the_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = tmp_path / "here"
@@ -243,23 +243,23 @@ def test_xacro_and_packages_of_this_machine_become_part_of_the_archive(
     line = 'urdf = "../robots/gofa12.urdf"\n'
     more = 'xacro_arguments = { package = "gofa" }\nsrdf = "gofa.srdf"\n'
     path.write_text(path.read_text(encoding="utf-8").replace(line, line + more), encoding="utf-8")
-    _, archive = round_trip(load(path), tmp_path / "there")
+    _, stored = round_trip(load(path), tmp_path / "there")
     shutil.rmtree(here)
     monkeypatch.delenv("AMENT_PREFIX_PATH")
-    unpacked = unpack_cell(archive, tmp_path / "again")
+    unpacked = unpack_cell(stored, tmp_path / "again")
     (address,) = robot_urdf(unpacked.robots[0]).collision_meshes
     assert "package://" not in address
-    assert str(here) not in json.dumps(archive_to_json(archive))
+    assert str(here) not in json.dumps(cell_to_json(stored))
     harmful = {
         name: content.replace(b"<link", b'<link name="${1}"/><link').replace(
             b"<robot ", b'<robot xmlns:xacro="http://www.ros.org/wiki/xacro" '
         )
         if name.endswith(".urdf")
         else content
-        for name, content in archive.files.items()
+        for name, content in stored.files.items()
     }
     with pytest.raises(BundleError, match="xacro macros"):
-        unpack_cell(replace(archive, files=harmful), tmp_path / "harm")
+        unpack_cell(replace(stored, files=harmful), tmp_path / "harm")
 
 
 def test_a_robot_of_a_package_travels_along(tmp_path: Path) -> None:
@@ -274,8 +274,8 @@ def test_a_robot_of_a_package_travels_along(tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8")
     cell = load(path)
     assert cell.robots[0].urdf.name == "ur5_robot.urdf"
-    unpacked, archive = round_trip(cell, tmp_path / "there")
-    assert "package://" not in archive.files[archive.workcell].decode()
+    unpacked, stored = round_trip(cell, tmp_path / "there")
+    assert "package://" not in stored.files[stored.workcell].decode()
     for robot in unpacked.robots:
         assert robot.urdf.is_relative_to(tmp_path)
         assert robot.srdf is not None
