@@ -180,7 +180,7 @@ def _straight_grid(
         chords = checker.motion(checker.split(middle), checker.split(straight)).chord
         off = np.max(chords, axis=1, initial=0.0)
         bent, lost = off > straightness, ~np.isfinite(middle).all(axis=1)
-        straight_enough = ~(bent | lost)
+        straight_enough = off <= straightness  # not where an end is lost: nothing is known of it
         np.maximum.at(deviation, work.owner[straight_enough], off[straight_enough])
         places.append(tuple(array[bent | lost] for array in (work.owner, between, middle)))
         if not bent.any():

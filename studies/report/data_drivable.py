@@ -51,5 +51,5 @@ def _front(results: CampaignResults, front: ReplicaFront) -> DrivableFront:
     if not front.polished:
         found = results.of(front.algorithm)[front.replica].evaluations
         cloud = found.objectives[found.feasible][:, ::-1] * scale
-    duration = front.objectives[:, 0] * scale[1]
-    return DrivableFront(index, front, front.x[:, -1], duration, cloud)
+    duration, force = (front.objectives * scale[::-1]).T
+    return DrivableFront(index, front, force, duration, cloud)

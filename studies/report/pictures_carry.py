@@ -9,7 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from hybrid_opt.campaign.recommended import StoredRecommendation
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
+from studies.drivable import POLISHED
 from studies.report.page_views import drive_look, limits
 from studies.report.records import DrawnCarry, DrivableReport, ReportData
 from studies.report.style import (
@@ -228,7 +230,8 @@ def _note_limits(axes: Axes, data: ReportData, i: int) -> None:
 
 def duration_against_force(data: ReportData) -> Figure:
     """Durations for each limit on the normal forces: of single paths, and of the drivable fronts
-    where there are any."""
+    where there are any: members at their peak forces, and the fastest of a replica's paths at
+    every force (median and range of the replicas)."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     axes = figure.subplots()
     looks: Sequence[LineStyle] = [look for _, look in styled(data)]
@@ -246,9 +249,10 @@ def duration_against_force(data: ReportData) -> Figure:
         )
     if data.drivable is not None:
         curves += _draw_fronts(axes, data.drivable)
-    _draw_still(axes, data)
-    _look_at(axes, np.concatenate(curves))
-    axes.set_xlabel("limit on the normal forces [N]")
+        curves += _draw_replicas(axes, data.drivable, data.summary.recommendation)
+    chosen = _draw_still(axes, data)
+    _look_at(axes, np.concatenate(curves), chosen)
+    axes.set_xlabel("largest normal force [N]")
     axes.set_ylabel("duration [s]")
     axes.legend(loc="upper right")
     return figure
@@ -282,8 +286,40 @@ def _draw_fronts(axes: Axes, drivable: DrivableReport) -> list[Array]:
     return found
 
 
-def _draw_still(axes: Axes, data: ReportData) -> None:
-    """The carry to run, and the force that holds the payload still."""
+def _draw_replicas(
+    axes: Axes, drivable: DrivableReport, recommendation: StoredRecommendation | None
+) -> list[Array]:
+    """Durations of the best fronts' paths at the same forces; returns the points of the medians."""
+    if recommendation is None:
+        return []
+    looks = {entry.front.label: series(entry.index) for entry in drivable.fronts}
+    polished = any(entry.front.polished for entry in drivable.fronts)
+    table = recommendation.durations
+    drawn = []
+    for row in table.rows:
+        if row.label not in looks or (polished and not row.label.endswith(POLISHED)):
+            continue
+        look = looks[row.label]
+        force = np.array(table.forces)
+        median, least, largest = (
+            np.array(values, dtype=float) for values in (row.median, row.least, row.largest)
+        )
+        axes.plot(
+            force,
+            median,
+            color=look.colour,
+            linestyle="-",
+            linewidth=0.9,
+            label=f"{row.label}: {row.replicas} replicas",
+        )
+        axes.fill_between(force, least, largest, color=look.colour, alpha=0.2, linewidth=0.0)
+        drawn.append(np.stack([force, median], axis=1)[np.isfinite(median)])
+    return drawn
+
+
+def _draw_still(axes: Axes, data: ReportData) -> Array:
+    """The carry to run, whose point (k, 2) is returned, and the force that holds the payload
+    still."""
     choice = data.summary.recommendation
     if choice is not None:
         axes.plot(
@@ -296,12 +332,13 @@ def _draw_still(axes: Axes, data: ReportData) -> None:
         )
     still = max(data.summary.static_hold.normal_force)
     axes.axvline(still, color=STATIC_COLOUR, linewidth=0.8, linestyle=(0, (2, 2)), label="at rest")
+    return np.array([] if choice is None else [choice.force_limit, choice.duration]).reshape(-1, 2)
 
 
-def _look_at(axes: Axes, points: Array) -> None:
-    """Limits of the axes around what a reader chooses between."""
+def _look_at(axes: Axes, points: Array, always: Array) -> None:
+    """Limits of the axes around what a reader chooses between, and what is always seen (k, 2)."""
     if len(points) == 0:
         return
-    (low, high), (least, most) = limits(drive_look(points, np.zeros((0, 2))))
+    (low, high), (least, most) = limits(drive_look(points, always))
     axes.set_xlim(low, high)
     axes.set_ylim(least, most)

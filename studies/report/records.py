@@ -134,7 +134,7 @@ class DrivableFront:
     Attributes:
         index: of the algorithm, which decides its look.
         front: of the replica with the largest hypervolume, as searched or as polished.
-        force, duration: (k,) limits on the normal forces [N] and durations [s] of its members.
+        force, duration: (k,) peak normal forces [N] and durations [s] of its members.
         cloud: (n, 2) force [N] and duration [s] of feasible candidates, empty for a polished one.
     """
 
