@@ -30,10 +30,13 @@ class RowKinds:
     Attributes:
         mix: (k, quantities) coefficients.
         is_force: (k,) whether the bound is the force limit; it is 1 otherwise.
+        where, weight: (k, terms) the coefficients that are not zero.
     """
 
     mix: Array
     is_force: NDArray[np.bool_]
+    where: NDArray[np.intp]
+    weight: Array
 
     @classmethod
     def of(cls, workcell: Workcell) -> RowKinds:
@@ -57,7 +60,19 @@ class RowKinds:
             forces.reshape(-1, layout.size),
         ]
         mix = np.concatenate(blocks)
-        return cls(mix, np.arange(len(mix)) >= len(mix) - forces.shape[0] * forces.shape[1])
+        is_force = np.arange(len(mix)) >= len(mix) - forces.shape[0] * forces.shape[1]
+        terms = int(np.count_nonzero(mix, axis=1).max())
+        where = np.argsort(mix == 0.0, axis=1, kind="stable")[:, :terms]
+        return cls(mix, is_force, where, np.take_along_axis(mix, where, axis=1))
+
+    def slopes(self, slope: Array, point: NDArray[np.intp], kind: NDArray[np.intp]) -> Array:
+        """(rows, ...) of some inequalities at some points, from those of the quantities
+        (points, quantities, ...)."""
+        terms = zip(self.where.T, self.weight.T, strict=True)
+        return sum(
+            (slope[point, where[kind]] * weight[kind, None] for where, weight in terms),
+            start=np.zeros((len(point), slope.shape[2])),
+        )
 
 
 class IntervalGrid:
@@ -86,6 +101,22 @@ class IntervalGrid:
             self.carry_over[:, at[0], at[1]] = basis_of[self.sample][:, rows]
         self.kinds = RowKinds.of(workcell)
         self.layout = driven_layout(workcell)
+
+    def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
+        """(rows, n_path) slopes by the path's variables of slopes (rows, moving) at points."""
+        rows, columns = self.workcell.task.free_entries
+        at = self.sample[points]
+        return sum(
+            (
+                basis[at][:, rows] * slope[:, k * self.pose + columns]
+                for k, basis in enumerate(self._bases)
+            ),
+            start=np.zeros((len(points), len(rows))),
+        )
+
+    def moved(self, step: Array) -> Array:
+        """(points, moving) how a step (n_path,) of the path's variables moves the points."""
+        return np.asarray(self.carry_over @ step)
 
     def path(self, x: Array) -> tuple[Array, Array, Array]:
         """Extended pose and both derivatives (intervals + 1, 6 + m) of a decision vector."""

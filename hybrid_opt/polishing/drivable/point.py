@@ -100,7 +100,7 @@ class DrivableSolver:
             solution.iterations += 1
             solution.residuals = found.residuals
             solution.rows = sum(isinstance(row, PlaceRow) for row in found.required)
-            step = float(np.abs(found.d[: self._task.n_path]).max())
+            step = float(np.abs(found.d).max())
             if self._is_optimal(solution.residuals):
                 solution.converged, solution.message = True, "stationary"
                 break
@@ -131,9 +131,7 @@ class DrivableSolver:
         """Judge a proposal and go on from it where it is better; the next radius."""
         n = self._task.n_path
         x = best.x.copy()
-        x[:n] = np.clip(
-            x[:n] + self._half * found.d[:n], self._task.lower[:n], self._task.upper[:n]
-        )
+        x[:n] = np.clip(x[:n] + self._half * found.d, self._task.lower[:n], self._task.upper[:n])
         timed = self.judge.timed(x[:n], goal)
         before, after = best.timed.level(goal), timed.level(goal)
         gain = 1.0 - after / before

@@ -1,26 +1,28 @@
 """Path and speed profile as one program, and its quadratic model about an iterate.
 
-Variables z = (xi, omega, phi): the free waypoints scaled to [-1, 1] by their bounds, the squared
-speeds at the grid points between both ends as u'^2_i = w_i (1 + omega_i), the force limit as
-F (1 + phi). With T the duration, and all of it about the iterate (xi, w, F) with duration T_0,
+Variables z = (xi, phi, omega): the free waypoints scaled to [-1, 1] by their bounds, the force
+limit as F (1 + phi), the squared speeds at the grid points between both ends as
+u'^2_i = w_i (1 + omega_i). With T the duration, and all of it about the iterate (xi, F, w) with
+duration T_0,
 
-    minimise    T / T_0  (aim 'duration', phi = 0)   or   phi  (aim 'force', T <= T_wanted)
+    minimise    T / T_0  (aim 'duration', without phi)   or   phi  (aim 'force', T <= T_wanted)
     subject to  every limit at both ends of every interval <= 1, normal forces <= F (1 + phi)
                 c_r(x) / scale_r >= required_r / scale_r   chosen geometric rows, as in
                 `hybrid_opt.polishing.program`.
 
 Derivatives are exact, first and second. Rows of the timing are scaled so that their slope by omega
-is around one.
+is around one. Every row but that of the duration holds the speeds of one interval only, so that
+matrices are those of `hybrid_opt.polishing.drivable.bordered`, the speeds being the chain.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_opt.polishing.drivable.bordered import BorderedMatrix, BorderedRows
 from hybrid_opt.polishing.drivable.intervals import IntervalGrid, IntervalValues
 from hybrid_opt.polishing.layout import PlaceRow
 from hybrid_opt.polishing.place_values import PlaceValues
@@ -48,12 +50,12 @@ class Multipliers:
 
     Attributes:
         timing: (points, kinds), of the unscaled rows.
-        geometry: by row, of the scaled values.
+        geometry: (geometric rows,), of the scaled values.
         duration: of the duration's row.
     """
 
     timing: Array
-    geometry: Mapping[PlaceRow, float]
+    geometry: Array
     duration: float
 
 
@@ -76,22 +78,32 @@ class Iterate:
 
 @dataclass(frozen=True)
 class Linear:
-    """Rows A d <= b with their names.
+    """Rows A d <= b: the chosen ones of the timing, the geometric ones, a wanted duration's.
 
     Attributes:
-        A: (rows, n_variables).
-        b: (rows,).
+        A: the rows but the duration's.
+        b: (rows,) of these.
+        scale: (rows,) what they were divided by.
+        point, kind: (timing rows,) which ones they are.
+        whole: (n_variables,) the duration's, None without.
+        most: its bound.
     """
 
-    A: Array
+    A: BorderedRows
     b: Array
+    scale: Array
+    point: NDArray[np.intp]
+    kind: NDArray[np.intp]
+    whole: Array | None
+    most: float
 
 
 class JointProgram:
     """The program about one iterate.
 
     Attributes:
-        n_path, n_speeds: variables of each block; the force limit is the last variable.
+        n_path, n_border: variables of the path, and with the force limit where it is one.
+        speeds: place of the squared speeds among the variables.
         total: duration of the iterate [s].
         rows: (points, kinds) values of the timing's rows less their bounds, unscaled.
     """
@@ -112,16 +124,16 @@ class JointProgram:
             places: geometric rows, their values, and what each has to keep.
         """
         self._grid, self._at, self._values, self._half = grid, at, values, half
-        self.n_path, self.n_speeds = len(half), grid.intervals - 1
-        self.n = self.n_path + self.n_speeds + 1
+        self.n_path = len(half)
+        self.n_border = self.n_path + (at.duration is not None)
+        self.n = self.n_border + grid.intervals - 1
+        self.speeds = slice(self.n_border, self.n)
         kinds = grid.kinds
         self.scale = np.where(kinds.is_force, at.force, 1.0)
         self.rows = values.rows() / self.scale - 1.0
-        self._mix = kinds.mix / self.scale[:, None]
         self._geometric(places, at)
         self._still(values)
         self._speeds()
-        self._carry_over = grid.carry_over * half
 
     def _geometric(
         self, places: tuple[tuple[PlaceRow, ...], PlaceValues, Array], at: Iterate
@@ -140,7 +152,7 @@ class JointProgram:
         share, slope = values.pressure_at_rest()
         near = np.flatnonzero(share > NEAR)
         begins = 2 * (near // (len(share) // self._grid.intervals))
-        by_path = np.matmul(slope[near, None], self._grid.carry_over[begins])[:, 0] * self._half
+        by_path = self._grid.by_path(slope[near], begins) * self._half
         self.geometry = np.append(self.geometry, share[near] - 1.0 + REST_MARGIN)
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
@@ -159,17 +171,17 @@ class JointProgram:
         own = 2.0 * share * (1.0 / pair[:-1] ** 3 + 1.0 / pair[1:] ** 3)
         self.cost_diagonal = own * inner**2 / 4.0 - by_root * inner / 4.0
         self.cost_beside = 2.0 * share / pair[1:-1] ** 3 * inner[:-1] * inner[1:] / 4.0
-        # By omega at both ends of the point's interval; those of the path's ends are fixed.
+        # By omega at two neighbours, of the beginning and the end of the point's interval; those of
+        # both ends of the path are fixed.
         begins, ends = np.repeat(w[:-1], 2), np.repeat(w[1:], 2)
         at_end = np.tile([0.0, 1.0], n)
-        self._local = np.zeros((2 * n, 2, 2))
-        self._local[:, 0, 0], self._local[:, 0, 1] = -begins * n / 2.0, ends * n / 2.0
-        self._local[:, 1, 0], self._local[:, 1, 1] = (1.0 - at_end) * begins, at_end * ends
-        interval = np.repeat(np.arange(n), 2)
-        self._column = np.stack([interval - 1, interval], axis=1)
-        self._held = (self._column < 0) | (self._column >= self.n_speeds)
-        self._local[np.broadcast_to(self._held[:, None, :], self._local.shape)] = 0.0
-        self._column = np.clip(self._column, 0, self.n_speeds - 1)
+        local = np.zeros((2 * n, 2, 2))
+        local[:, 0, 0], local[:, 0, 1] = -begins * n / 2.0, ends * n / 2.0
+        local[:, 1, 0], local[:, 1, 1] = (1.0 - at_end) * begins, at_end * ends
+        local[:2, :, 0], local[:2, :, 1] = local[:2, :, 1], 0.0
+        local[-2:, :, 1], local[-2:, :, 0] = local[-2:, :, 0], 0.0
+        self._local = local
+        self._column = np.clip(np.repeat(np.arange(n), 2) - 1, 0, n - 3)
 
     def geometry_after(self, d: Array) -> Array:
         """(geometric rows,) what they lack after a step, beyond what their slopes foretell."""
@@ -193,114 +205,105 @@ class JointProgram:
 
     def predicted(self, d: Array) -> Array:
         """(points, kinds) linear prediction of the timing's rows after a step."""
-        moving = self._grid.moving
-        local = np.zeros((len(self._local), moving + 2))
-        local[:, :moving] = self._carry_over @ d[: self.n_path]
-        omega = d[self.n_path : -1]
-        local[:, moving:] = (self._local * omega[self._column][:, None, :]).sum(axis=2)
-        change = np.matmul(self._values.slope, local[:, :, None])[:, :, 0]
-        phi = np.where(self._grid.kinds.is_force, d[-1], 0.0)
-        return np.asarray(self.rows + change @ self._mix.T - phi)
+        omega = d[self.speeds]
+        moved = self._grid.moved(self._half * d[: self.n_path])
+        beside = np.stack([omega[self._column], omega[self._column + 1]], axis=1)
+        speeds = np.matmul(self._local, beside[:, :, None])[:, :, 0]
+        change = np.matmul(self._values.slope, np.hstack([moved, speeds])[:, :, None])[:, :, 0]
+        phi = d[self.n_path] * self._grid.kinds.is_force if self.n_border > self.n_path else 0.0
+        return np.asarray(self.rows + change @ self._grid.kinds.mix.T / self.scale - phi)
 
-    def linear(self, chosen: NDArray[np.bool_], bent: Array | float = 0.0) -> tuple[Linear, Array]:
-        """The chosen timing rows, then the geometric ones, then a wanted duration's.
+    def linear(self, chosen: NDArray[np.bool_], bent: Array | float = 0.0) -> Linear:
+        """Chosen rows of the timing (points, kinds), and all others.
 
         Args:
             bent: (geometric rows,) what these lack after a step beyond what is foretold.
-
-        Returns:
-            The rows, and the scales (rows,) that they were divided by.
         """
         point, kind = np.nonzero(chosen)
-        local = np.matmul(self._mix[kind][:, None, :], self._values.slope[point])[:, 0]
-        A = np.zeros((len(point) + len(self.geometry) + self.has_duration, self.n))
-        m, moving = len(point), self._grid.moving
-        A[:m, : self.n_path] = np.matmul(local[:, None, :moving], self._carry_over[point])[:, 0]
+        kinds, m, count = self._grid.kinds, len(point), len(self.geometry)
+        local = kinds.slopes(self._values.slope, point, kind) / self.scale[kind, None]
+        moving, n = self._grid.moving, self.n_path
         by_speed = np.matmul(local[:, None, moving:], self._local[point])[:, 0]
-        rows = np.arange(m)
-        for side in (0, 1):
-            columns = self.n_path + self._column[point, side]
-            np.add.at(A, (rows, columns), by_speed[:, side])
-        A[:m, -1] = np.where(self._grid.kinds.is_force[kind], -1.0, 0.0)
-        scales = np.ones(len(A))
-        scales[:m] = np.maximum(np.abs(by_speed).max(axis=1), LEAST_SCALE)
-        b = np.zeros(len(A))
-        b[:m] = -self.rows[point, kind]
-        A[m : m + len(self.geometry), : self.n_path] = self._geometry_slope
-        b[m : m + len(self.geometry)] = -self.geometry - bent
+        border = np.zeros((m + count, self.n_border))
+        border[:m, :n] = self._grid.by_path(local[:, :moving], point) * self._half
+        border[m:, :n] = self._geometry_slope
+        if self.n_border > n:
+            border[:m, n] = -1.0 * kinds.is_force[kind]
+        scale = np.ones(m + count)
+        scale[:m] = np.maximum(np.abs(by_speed).max(axis=1, initial=0.0), LEAST_SCALE)
+        sides = np.zeros((2, m + count))
+        sides[:, :m] = (by_speed / scale[:m, None]).T
+        column = np.zeros(m + count, dtype=np.intp)
+        column[:m] = self._column[point]
+        b = -np.concatenate([self.rows[point, kind], self.geometry + bent]) / scale
+        whole, most = None, 0.0
         if self._at.duration is not None:
-            A[-1, self.n_path : -1] = self.cost
-            b[-1] = self._at.duration / self.total - 1.0
-        return Linear(A / scales[:, None], b / scales), scales
-
-    @property
-    def has_duration(self) -> int:
-        """Whether a wanted duration is the last row."""
-        return int(self._at.duration is not None)
+            whole, most = np.zeros(self.n), self._at.duration / self.total - 1.0
+            whole[self.speeds] = self.cost
+        left, right = sides
+        A = BorderedRows(border / scale[:, None], column, left, right, len(self.cost))
+        return Linear(A, b, scale, point, kind, whole, most)
 
     def gradient(self) -> Array:
         """(n_variables,) of the objective."""
         g = np.zeros(self.n)
         if self._at.duration is None:
-            g[self.n_path : -1] = self.cost
+            g[self.speeds] = self.cost
         else:
-            g[-1] = 1.0
+            g[self.n_path] = 1.0
         return g
 
     def gain(self, d: Array) -> float:
         """What a step is to take off the objective, as a share of it."""
         if self._at.duration is not None:
-            return -float(d[-1])
-        omega = d[self.n_path : -1]
+            return -float(d[self.n_path])
+        omega = d[self.speeds]
         bent = self.cost_diagonal @ omega**2 / 2.0 + self.cost_beside @ (omega[:-1] * omega[1:])
         return -float(self.cost @ omega + bent)
 
-    def curvature(self, multipliers: Multipliers | None) -> Array:
-        """(n_variables, n_variables) second derivatives of the Lagrangian; of the objective alone
-        without multipliers."""
-        H = np.zeros((self.n, self.n))
-        share = 1.0 if self._at.duration is None else 0.0
-        if multipliers is not None:
-            share += multipliers.duration
-        elif self._at.duration is not None:
-            share = 1.0
-        k = np.arange(self.n_path, self.n - 1)
-        H[k, k] = share * self.cost_diagonal
-        H[k[:-1], k[1:]] = H[k[1:], k[:-1]] = share * self.cost_beside
+    def curvature(self, multipliers: Multipliers | None) -> BorderedMatrix:
+        """Second derivatives of the Lagrangian; of the duration alone without multipliers."""
+        share = float(self._at.duration is None)
         if multipliers is None:
-            return H
-        at, local = self._values.curvature(multipliers.timing @ self._mix)
-        over, speeds = self._carry_over[at], self._local[at]
-        x, m = slice(0, self.n_path), self._grid.moving
-        H[x, x] += np.einsum("pia,pij->aj", over, np.matmul(local[:, :m, :m], over), optimize=True)
-        mixed = np.swapaxes(over, 1, 2) @ local[:, :m, m:] @ speeds
+            share = 1.0
+        else:
+            share += multipliers.duration
+        corner, beside = np.zeros((self.n_border,) * 2), np.zeros((len(self.cost), self.n_border))
+        diagonal, off = share * self.cost_diagonal, share * self.cost_beside
+        if multipliers is None:
+            return BorderedMatrix(corner, beside, diagonal, off)
+        x, m, n = slice(0, self.n_path), self._grid.moving, len(diagonal)
+        at, local = self._values.curvature((multipliers.timing / self.scale) @ self._grid.kinds.mix)
+        over, speeds, column = self._grid.carry_over[at], self._local[at], self._column[at]
+        corner[x, x] = np.einsum("pia,pij->aj", over, local[:, :m, :m] @ over, optimize=True)
+        mixed = np.swapaxes(speeds, 1, 2) @ local[:, m:, :m] @ over
         own = np.swapaxes(speeds, 1, 2) @ local[:, m:, m:] @ speeds
-        columns = self.n_path + self._column[at]
         for side in (0, 1):
-            by_speed = np.zeros((self.n, self.n_path))
-            np.add.at(by_speed, columns[:, side], mixed[:, :, side])
-            H[:, x] += by_speed
-            H[x, :] += by_speed.T
-            for other in (0, 1):
-                np.add.at(H, (columns[:, side], columns[:, other]), own[:, side, other])
-        weight = np.array([multipliers.geometry.get(row, 0.0) for row in self.place_rows])
+            np.add.at(beside[:, x], column + side, mixed[:, side] * self._half)
+            diagonal += np.bincount(column + side, own[:, side, side], n)
+        off += np.bincount(column, own[:, 0, 1], n)[:-1]
+        corner[x, x] *= np.outer(self._half, self._half)
+        weight = multipliers.geometry[: len(self.place_rows)]
         if weight.any():
-            H[x, x] -= self._places.second(weight / self._place_scale) * np.outer(
+            corner[x, x] -= self._places.second(weight / self._place_scale) * np.outer(
                 self._half, self._half
             )
-        return H
+        return BorderedMatrix(corner, beside, diagonal, off)
 
-    def residuals(self, d_bounds: Array, A: Linear, multipliers: Array) -> Residuals:
+    def residuals(self, bounds: Array, linear: Linear, multipliers: Array) -> Residuals:
         """How well the iterate satisfies the optimality conditions with a step's multipliers.
 
         Args:
-            d_bounds: (n_variables,) multipliers of the path's own bounds, signed.
-            A: the step's rows at the iterate.
-            multipliers: (rows,) theirs.
+            bounds: (n_variables,) multipliers of the path's own bounds, signed.
+            linear: the step's rows at the iterate.
+            multipliers: (all rows,) theirs, the duration's last.
         """
-        lagrangian = self.gradient() + A.A.T @ multipliers + d_bounds
-        if self._at.duration is None:
-            lagrangian[-1] = 0.0
+        m = len(linear.b)
+        lagrangian = self.gradient() + linear.A.pulled(multipliers[:m]) + bounds
+        products = multipliers[:m] * linear.b
+        if linear.whole is not None:
+            lagrangian += multipliers[m] * linear.whole
+            products = np.append(products, multipliers[m] * linear.most)
         worst = float(max(self.rows.max(), self.geometry.max(initial=-1.0), 0.0))
-        product = float(np.abs(multipliers * A.b).max(initial=0.0))
+        product = float(np.abs(products).max(initial=0.0))
         return Residuals(float(np.abs(lagrangian).max()), worst, product)

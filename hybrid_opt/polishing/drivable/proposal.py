@@ -7,14 +7,16 @@ geometric rows bend along the step, it is corrected for that.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.polishing.constraints.learned import Learned
 from hybrid_opt.polishing.drivable import quadratic
+from hybrid_opt.polishing.drivable.bordered import BorderedMatrix
 from hybrid_opt.polishing.drivable.functions import DrivenFunctions
+from hybrid_opt.polishing.drivable.interior import QuadraticProgram
 from hybrid_opt.polishing.drivable.intervals import IntervalGrid, IntervalValues
 from hybrid_opt.polishing.drivable.program import Iterate, JointProgram, Linear, Multipliers
 from hybrid_opt.polishing.drivable.timed import Goal, TimedPath
@@ -46,8 +48,29 @@ class Reached:
 
 
 @dataclass(frozen=True)
+class _Found:
+    """A quadratic program's answer, and the rows that it was given."""
+
+    step: quadratic.Step
+    linear: Linear
+
+    def active(self, negligible: float) -> NDArray[np.bool_]:
+        """(rows but the duration's,) which ones have a multiplier."""
+        return np.asarray(self.step.rows[: len(self.linear.b)] > negligible)
+
+    def multipliers(self, program: JointProgram, negligible: float) -> Multipliers:
+        """Of the unscaled rows; negligible ones of the timing are none."""
+        linear, m = self.linear, len(self.linear.point)
+        rows = self.step.rows[: len(linear.b)] / linear.scale
+        timing = np.zeros(program.rows.shape)
+        timing[linear.point, linear.kind] = np.where(self.active(negligible)[:m], rows[:m], 0.0)
+        duration = 0.0 if linear.whole is None else float(self.step.rows[-1])
+        return Multipliers(timing, rows[m:], duration)
+
+
+@dataclass(frozen=True)
 class Proposal:
-    """A step of a program and what it promises."""
+    """A step of a program's path, with the squared speeds, and what it promises."""
 
     d: Array
     squared: Array
@@ -75,20 +98,18 @@ class Proposer:
     def step(self, best: Reached, goal: Goal, radius: float, lenient: bool) -> Proposal | None:
         """A step within the box; None where there is none."""
         program, required = self._program(best, goal, lenient)
-        low, high = self._box(best, goal, radius)
+        box = self._box(best, goal, radius)
         chosen = program.near()
-        n = program.n_path
-        plain = program.curvature(None)
-        plain[:n, :n] += self._driven.steadiness * np.eye(n)
-        first = self._step(program, chosen, (plain, np.zeros(program.n)), low, high)
+        steady = np.zeros(program.n)
+        steady[: program.n_path] = self._driven.steadiness
+        plain = program.curvature(None).raised(steady)
+        first = self._step(program, chosen, (plain, np.zeros(program.n)), box)
         if first is None:
             return None
-        multipliers = first[1]
-        H = program.curvature(multipliers)
-        linear, scales = program.linear(chosen)
-        active = self._named(program, chosen, multipliers, scales) > 0.0
-        model = quadratic.convex(H, linear.A[active], linear.b[active], n)
-        second = self._step(program, chosen, model, low, high)
+        H = program.curvature(first.multipliers(program, self._driven.negligible))
+        active = first.active(self._driven.negligible)
+        model = quadratic.convex(H, first.linear.A.of(active), first.linear.b[active])
+        second = self._step(program, chosen, model, box)
         if second is None:
             return None
         residuals = min(
@@ -97,38 +118,41 @@ class Proposer:
         )
         bent = np.zeros(len(program.geometry))
         for _ in range(self._driven.corrections):
-            change = program.geometry_after(second[0].d) - bent
+            change = program.geometry_after(second.step.d) - bent
             if np.abs(change).max(initial=0.0) <= self._driven.bend:
                 break
             bent = bent + change
-            corrected = self._step(program, chosen, model, low, high, bent)
+            corrected = self._step(program, chosen, model, box, bent)
             if corrected is None:
                 break
             second = corrected
-        step = second[0]
-        d = step.d
+        d = second.step.d
         squared = best.squared.copy()
-        squared[1:-1] *= 1.0 + d[program.n_path : -1]
-        return Proposal(d, squared, max(program.gain(d), 0.0), required, residuals)
+        squared[1:-1] *= 1.0 + d[program.speeds]
+        return Proposal(
+            d[: program.n_path], squared, max(program.gain(d), 0.0), required, residuals
+        )
 
     def _step(
         self,
         program: JointProgram,
         chosen: NDArray[np.bool_],
-        model: tuple[Array, Array],
-        low: Array,
-        high: Array,
+        model: tuple[BorderedMatrix, Array],
+        box: tuple[Array, Array],
         bent: Array | float = 0.0,
-    ) -> tuple[quadratic.Step, Multipliers, Linear] | None:
+    ) -> _Found | None:
         """Solve a quadratic model; rows that its answer violates are added. `chosen` grows."""
+        g = program.gradient() + model[1]
         for left in reversed(range(self._driven.row_rounds)):
-            linear, scales = program.linear(chosen, bent)
-            H, g = model[0], program.gradient() + model[1]
-            step = quadratic.solve(H, g, linear.A, linear.b, low, high)
+            linear = program.linear(chosen, bent)
+            asked = QuadraticProgram(
+                model[0], g, linear.A, linear.b, *box, linear.whole, linear.most
+            )
+            step = quadratic.solve(asked)
             if not step.solved:
                 # What the box has no room for is asked for as far as it is kept now.
-                b = np.maximum(linear.b, 0.0)
-                step = quadratic.solve(H, g, linear.A, b, low, high)
+                most = max(linear.most, 0.0)
+                step = quadratic.solve(replace(asked, b=np.maximum(linear.b, 0.0), most=most))
             if not step.solved:
                 return None
             fresh = (program.predicted(step.d) > self._driven.row_tolerance) & ~chosen
@@ -137,34 +161,7 @@ class Proposer:
             chosen |= fresh
             if not left:
                 chosen &= ~fresh
-        point, kind = np.nonzero(chosen)
-        timing = np.zeros(chosen.shape)
-        m, unscaled = len(point), step.rows / scales
-        timing[point, kind] = np.where(
-            unscaled[:m] * scales[:m] > self._driven.negligible, unscaled[:m], 0.0
-        )
-        geometry = dict(
-            zip(program.place_rows, unscaled[m : m + len(program.place_rows)].tolist(), strict=True)
-        )
-        duration = float(unscaled[-1]) if program.has_duration else 0.0
-        return step, Multipliers(timing, geometry, duration), linear
-
-    def _named(
-        self,
-        program: JointProgram,
-        chosen: NDArray[np.bool_],
-        multipliers: Multipliers,
-        scales: Array,
-    ) -> Array:
-        """(rows,) the last multipliers in the order of a program's rows."""
-        point, kind = np.nonzero(chosen)
-        geometry = [multipliers.geometry.get(row, 0.0) for row in program.place_rows]
-        values = np.zeros(len(scales))
-        values[: len(point)] = multipliers.timing[point, kind] * scales[: len(point)]
-        values[len(point) : len(point) + len(geometry)] = geometry
-        if program.has_duration:
-            values[-1] = multipliers.duration
-        return np.where(values > self._driven.negligible, values, 0.0)
+        return _Found(step, linear)
 
     def _program(
         self, best: Reached, goal: Goal, lenient: bool
@@ -193,30 +190,21 @@ class Proposer:
 
     def _box(self, best: Reached, goal: Goal, radius: float) -> tuple[Array, Array]:
         """Bounds of a step."""
-        n = self._task.n_path
-        low = np.full(n + self._intervals.intervals, -LEAST_SQUARED)
-        high = np.full(len(low), LARGEST_SQUARED)
-        xi = best.x[:n]
-        low[:n] = np.maximum((self._task.lower[:n] - xi) / self._half, -radius)
-        high[:n] = np.minimum((self._task.upper[:n] - xi) / self._half, radius)
-        least, largest = self._task.force_limit
-        force = best.timed.force
-        low[-1], high[-1] = (
-            (0.0, 0.0)
-            if goal.aim == "duration"
-            else (min(least / force - 1.0, 0.0), max(largest / force - 1.0, 0.0))
-        )
-        return low, high
+        n, xi = self._task.n_path, best.x[: self._task.n_path]
+        low = [np.maximum((self._task.lower[:n] - xi) / self._half, -radius)]
+        high = [np.minimum((self._task.upper[:n] - xi) / self._half, radius)]
+        if goal.aim == "force":
+            share = np.array(self._task.force_limit) / best.timed.force - 1.0
+            low.append(np.minimum(share[:1], 0.0))
+            high.append(np.maximum(share[1:], 0.0))
+        speeds = np.ones(self._intervals.intervals - 1)
+        low, high = [*low, -LEAST_SQUARED * speeds], [*high, LARGEST_SQUARED * speeds]
+        return np.concatenate(low), np.concatenate(high)
 
-    def _residuals(
-        self,
-        program: JointProgram,
-        best: Reached,
-        found: tuple[quadratic.Step, Multipliers, Linear],
-    ) -> Residuals:
+    def _residuals(self, program: JointProgram, best: Reached, found: _Found) -> Residuals:
         """Of the program at its iterate, with the multipliers of a step."""
-        step, _, linear = found
-        return program.residuals(self._own_bounds(best, step), linear, step.rows)
+        bounds = self._own_bounds(best, found.step)
+        return program.residuals(bounds, found.linear, found.step.rows)
 
     def _own_bounds(self, best: Reached, step: quadratic.Step) -> Array:
         """Multipliers of the variables' own bounds: those of the box of trust do not count."""
