@@ -30,6 +30,7 @@ from hybrid_opt.job.straight import (
     SAMPLES,
     Straight,
     followed,
+    held_at,
     lift_line,
     pad_line,
     standing_still,
@@ -42,7 +43,6 @@ from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.workcell.decision import extended_waypoints
 from symbolic.workcell.handling import Handling
 from symbolic.workcell.records import Workcell
@@ -256,15 +256,9 @@ class JobModel:
         share = rise(1.0, SAMPLES).value
 
         def at(u: Array) -> tuple[Array, Array, Array]:
-            box, *targets = line.at(u)
             guess = np.column_stack([np.interp(u, share, column) for column in motion.q.T])
-            guesses = [np.ascontiguousarray(own) for own in joints_of(self.workcell, guess)]
-            placed = []
-            for arm, poses in enumerate(targets, start=1):
-                found = self._posture.batch(poses, *guesses)
-                lost = np.ravel(found[f"residual_{arm}"]) > REACH_TOLERANCE
-                placed.append(np.where(lost[:, None], np.nan, found[f"q_{arm}"]))
-            return box, placed[0], placed[1]
+            q = held_at(self.workcell, self._posture, line, u, guess)
+            return line.at(u)[0], *joints_of(self.workcell, q)
 
         return certify(checker, at, np.linspace(0.0, 1.0, FIRST_POINTS))
 

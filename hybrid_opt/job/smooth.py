@@ -10,8 +10,10 @@ speeds are passed a little earlier or later, is mended by slowing down uniformly
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
+from scipy.optimize import brentq
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import JobError
@@ -35,8 +37,9 @@ EVERY = 4
 RESTS = 1e-3
 """Share of an acceleration limit below which a joint counts as at rest."""
 
-_BISECTIONS = 12
 _SLOWEST = 0.5
+_RESOLUTION = 1e-4
+"""Of the factor by which a timing is slowed."""
 
 
 def rests_at_ends(timing: Timing) -> bool:
@@ -74,26 +77,24 @@ def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing
         time = np.asarray(EVERY * STEP / factor * np.arange(len(u)))
         return model.carry(motion, time, factor * rate, factor**2 * second)
 
-    def within(factor: float) -> bool:
+    @cache
+    def excess(factor: float) -> float:
         use = limit_use(driven(factor), model.workcell, limits, model.joint_names)
-        return worst(use).ratio <= 1.0
+        return worst(use).ratio - 1.0
 
-    fast, slow = 1.0, _SLOWEST
-    if within(fast):
-        slow = fast
-    elif not within(slow):
-        raise JobError(
-            "the carry's timing cannot be smoothed within its limits; choose a slower timing"
-        )
-    else:
-        for _ in range(_BISECTIONS):
-            middle = (slow + fast) / 2.0
-            slow, fast = (middle, fast) if within(middle) else (slow, middle)
-    found = driven(slow)
+    factor = 1.0
+    if excess(factor) > 0.0:
+        if excess(_SLOWEST) > 0.0:
+            raise JobError(
+                "the carry's timing cannot be smoothed within its limits; choose a slower timing"
+            )
+        # A root within _RESOLUTION that lies on the slow side.
+        factor = brentq(excess, _SLOWEST, 1.0, xtol=_RESOLUTION / 2.0) - _RESOLUTION
+    found = driven(factor)
     use = limit_use(found, model.workcell, limits, model.joint_names)
     place = worst(use).place
     reason = f"{found.duration:.3f} s without jumps of the acceleration; most used: {place}"
-    slowed = timing.slowed * slow
+    slowed = timing.slowed * factor
     return replace(
         timing, reason=reason, place=place, carry=found, use=use, grid_speed=None, slowed=slowed
     )

@@ -22,6 +22,9 @@ from symbolic.workcell.records import Workcell
 SAMPLES = 401
 """Samples of a phase."""
 
+STEP = 0.005
+"""Of Newton's method from place to place along a line [m]."""
+
 TICK = 0.008
 """Phases last a whole number of these [s], so that controllers of 125, 250, 500 and 1000 Hz meet
 their ends."""
@@ -95,8 +98,9 @@ def followed(
 ) -> Array:
     """(SAMPLES, joints) both arms' joints along a line, by Newton's method from a known end.
 
-    Samples are at the places that the profile of `rise` passes at even times. Redundant joints
-    stay where they are at the known end.
+    Samples are at the places that the profile of `rise` passes at even times. Newton's method goes
+    from place to place every `STEP`, then from between these to all samples at once. Redundant
+    joints stay where they are at the known end.
 
     Args:
         posture: compiled `symbolic.robot.arm.posture_function`.
@@ -105,22 +109,34 @@ def followed(
     Raises:
         JobError: an arm does not reach a place within its joint range.
     """
-    share = rise(1.0, SAMPLES).value[:: -1 if at_end else 1]
-    _, *targets = line.at(share)
-    q = np.empty((SAMPLES, len(known)))
-    first, last = len(workcell.robots[0].torque_max), known
-    for k in range(SAMPLES):
-        last = _step(posture, (targets[0][k], targets[1][k]), (last[:first], last[first:]))
-        if not np.isfinite(last).all():
-            raise JobError(_unreached(line, share[k], "does not reach"))
-        q[k] = last
+
+    def share(way: Array) -> Array:
+        """Of the line, where this share of it lies behind when one begins at the known end."""
+        return 1.0 - way if at_end else way
+
+    ways, passed = np.linspace(0.0, 1.0, int(np.ceil(line.length / STEP)) + 1), [known]
+    for way in ways:
+        passed.append(held_at(workcell, posture, line, share(way[None]), passed[-1][None])[0])
+        if not np.isfinite(passed[-1]).all():
+            break
+    reached = np.array([q for q in passed[1:] if np.isfinite(q).all()] or [known])
+    samples = rise(1.0, SAMPLES).value
+    guess = np.column_stack(
+        [np.interp(samples, ways[: len(reached)], column) for column in reached.T]
+    )
+    q = held_at(workcell, posture, line, share(samples), guess)
+    lost = ~np.isfinite(q).all(axis=1)
+    if lost.any():
+        place = share(samples[lost][0])
+        raise JobError(_unreached(line, float(place), "does not reach"))
     lower, upper = (
         np.concatenate([getattr(robot, name) for robot in workcell.robots])
         for name in ("position_lower", "position_upper")
     )
     outside = ((q < lower) | (q > upper)).any(axis=1)
     if outside.any():
-        raise JobError(_unreached(line, share[int(np.argmax(outside))], "leaves its joints' range"))
+        place = share(samples[outside][0])
+        raise JobError(_unreached(line, float(place), "leaves its joints' range"))
     return q[:: -1 if at_end else 1]
 
 
@@ -131,17 +147,20 @@ def _unreached(line: Straight, share: float, what: str) -> str:
     )
 
 
-def _step(
-    posture: NumericFunction, poses: tuple[Array, Array], guesses: tuple[Array, Array]
+def held_at(
+    workcell: Workcell, posture: NumericFunction, line: Straight, share: Array, guess: Array
 ) -> Array:
-    """Both arms' joints that hold boxes at poses of their own; NaN where one does not arrive."""
+    """(n, joints) both arms' joints at shares (n,) of a line, from guesses (n, joints) [rad].
+
+    Where an arm does not arrive its joints are NaN.
+    """
+    guesses = [np.ascontiguousarray(own) for own in joints_of(workcell, guess)]
     found = []
-    for arm in (0, 1):
-        solved = posture.batch(poses[arm][None], guesses[0][None], guesses[1][None])
-        reached = float(np.ravel(solved[f"residual_{arm + 1}"])[0]) <= REACH_TOLERANCE
-        q = solved[f"q_{arm + 1}"][0]
-        found.append(q if reached else np.full_like(q, np.nan))
-    return np.concatenate(found)
+    for arm, poses in enumerate(line.at(share)[1:], start=1):
+        solved = posture.batch(poses, *guesses)
+        lost = np.ravel(solved[f"residual_{arm}"]) > REACH_TOLERANCE
+        found.append(np.where(lost[:, None], np.nan, solved[f"q_{arm}"]))
+    return np.concatenate(found, axis=1)
 
 
 def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:

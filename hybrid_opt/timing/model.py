@@ -29,6 +29,9 @@ INTERVALS = 200
 REFINEMENT = 10
 """Samples per piece at which a timing is recomputed."""
 
+_SPLINE_EVERY = 2
+"""Samples from one knot of the splines between them to the next."""
+
 
 @dataclass(frozen=True)
 class PathMotion:
@@ -67,21 +70,32 @@ class PathMotion:
 
     def between(self, u: Array) -> PathMotion:
         """The geometry at parameters u (n,) in [0, 1], by cubic splines through the samples."""
-        values = {name: spline(u) for name, spline in self._splines.items()}
-        return PathMotion(self.x, u, **values)
+        spline, parts = self._spline
+        values = np.split(spline(u), parts, axis=1)
+        shaped = {
+            name: value.reshape(len(u), *getattr(self, name).shape[1:])
+            for name, value in zip(_SAMPLED, values, strict=True)
+        }
+        return PathMotion(self.x, u, **shaped)
 
     def third(self, u: Array) -> tuple[Array, Array]:
         """Third derivatives by the parameter at u (n,): joints (n, joints), box position (n, 3)."""
-        joints, pose = (self._splines[name].derivative()(u) for name in ("q_second", "pose_second"))
-        return joints, pose[:, :3]
+        joints = self.q_second.shape[1]
+        both = self._third(u)
+        return both[:, :joints], both[:, joints : joints + 3]
 
     @cached_property
-    def _splines(self) -> dict[str, CubicSpline]:
-        return {
-            field.name: CubicSpline(self.parameter, getattr(self, field.name))
-            for field in fields(self)
-            if field.name not in ("x", "parameter")
-        }
+    def _spline(self) -> tuple[CubicSpline, Array]:
+        """One spline through all quantities side by side, and where one ends and the next begins."""
+        u = self.parameter[::_SPLINE_EVERY]
+        columns = [getattr(self, name)[::_SPLINE_EVERY].reshape(len(u), -1) for name in _SAMPLED]
+        parts = np.cumsum([column.shape[1] for column in columns])[:-1]
+        return CubicSpline(u, np.concatenate(columns, axis=1)), parts
+
+    @cached_property
+    def _third(self) -> CubicSpline:
+        both = np.concatenate([self.q_second, self.pose_second], axis=1)
+        return CubicSpline(self.parameter, both).derivative()
 
 
 if TYPE_CHECKING:
@@ -99,7 +113,8 @@ _BOX = (
     "force_by_acceleration",
     "force_by_speed",
 )
-_ARMS = tuple(f.name for f in fields(PathMotion) if f.name not in (*_BOX, "x", "parameter"))
+_SAMPLED = tuple(f.name for f in fields(PathMotion) if f.name not in ("x", "parameter"))
+_ARMS = tuple(name for name in _SAMPLED if name not in _BOX)
 
 
 class TimingModel:
@@ -133,6 +148,7 @@ class TimingModel:
         self.intervals = intervals
         self.joint_names = (joint_names(workcell.robots[0]), joint_names(workcell.robots[1]))
         samples = REFINEMENT * intervals + 1
+        self._latest: PathMotion | None = None
 
         def make(model: CellModel) -> dict[str, ca.Function]:
             return timing_functions(model, samples)
@@ -142,10 +158,17 @@ class TimingModel:
     def path_motion(self, x: Array) -> PathMotion:
         """The geometry at `REFINEMENT` samples per interval, uniform in u.
 
+        A path is mostly asked for several times in a row: the last one is remembered.
+
         Raises:
             SettingsError: x has the wrong shape or is not finite.
         """
         x = self._checked(x)
+        if self._latest is None or not np.array_equal(self._latest.x, x):
+            self._latest = self._path_motion(x.copy())
+        return self._latest
+
+    def _path_motion(self, x: Array) -> PathMotion:
         out = self._functions["path_motion"](x)
         n = len(out["pose"])
         values = {name: out[name] for name in _BOX}
