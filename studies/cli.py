@@ -49,7 +49,7 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         "--quick",
         action="store_true",
         help=f"a small but complete study: {QUICK_REPLICAS} replicas of {QUICK_EVALUATIONS} "
-        "evaluations where no other numbers are given (default: off)",
+        "evaluations where no other numbers are given, its pictures as PNG only (default: off)",
     )
     search.add_argument(
         "--evaluations",

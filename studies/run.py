@@ -74,6 +74,7 @@ class StudySettings:
         simulate: whether the selected carries are driven in the simulated cell.
         report: whether figures, tables and the page are written.
         with_paper: whether the figures stand beside those that the paper states.
+        pdf: whether pictures are also written as PDF.
     """
 
     polish: PolishSettings | None = None
@@ -83,6 +84,7 @@ class StudySettings:
     simulate: bool = False
     report: bool = True
     with_paper: bool = False
+    pdf: bool = True
 
 
 def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
@@ -104,7 +106,7 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
     if study.simulate:
         every.append(simulation_stage())
     if study.report:
-        every.append(report_stage(study.with_paper))
+        every.append(report_stage(study.with_paper, study.pdf))
     return tuple(every)
 
 
@@ -207,6 +209,7 @@ def main(
             simulate=options.simulate,
             report=options.report,
             with_paper=bool(workcell),
+            pdf=not options.quick,
         )
         print(run_study(cell, settings, execution, Progress(not options.quiet), study))
         print(f"\nResults: {execution.output}")

@@ -86,7 +86,7 @@ class PathMotion:
 
     @cached_property
     def _spline(self) -> tuple[CubicSpline, Array]:
-        """One spline through all quantities side by side, and where one ends and the next begins."""
+        """One spline through all quantities side by side, and where each but the first begins."""
         u = self.parameter[::_SPLINE_EVERY]
         columns = [getattr(self, name)[::_SPLINE_EVERY].reshape(len(u), -1) for name in _SAMPLED]
         parts = np.cumsum([column.shape[1] for column in columns])[:-1]

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hybrid_opt.campaign import Progress
+from hybrid_opt.work.processes import warm_up
 from studies.program import add_verbose, carried_out, run_program
 from studies.report.stage import add_report_options, follow_report_options, rewrite
 
@@ -29,6 +30,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="FILE",
         help="put Tables 1 and 2 between the markers of this Markdown file (default: none)",
     )
+    parser.add_argument(
+        "--pdf",
+        action="store_true",
+        help="write pictures as PDF, too (default: as the study did, all but a --quick one)",
+    )
     add_report_options(parser)
     add_verbose(parser)
     options = parser.parse_args(arguments)
@@ -39,7 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     elif options.animation or options.view:
         follow_report_options(options.results, options)
     else:
-        rewrite(options.results, Progress(not options.quiet))
+        warm_up("studies.report.generate")
+        rewrite(options.results, Progress(not options.quiet), options.pdf)
         print(f"Report: {options.results / 'report.html'}")
     return 0
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from hybrid_opt.cell import Cell
 from hybrid_opt.store.files import write_atomically
 from hybrid_opt.work.job import Emit, Executor, Job, answer_all
 from hybrid_opt.work.serial import SerialExecutor
@@ -25,8 +24,8 @@ TABLES = "tables"
 def write_report(
     root: Path,
     data: ReportData,
-    cell: Cell,
     with_paper: bool,
+    pdf: bool = True,
     done: Callable[[], None] = lambda: None,
     executor: Executor | None = None,
 ) -> Path:
@@ -35,8 +34,8 @@ def write_report(
     Args:
         root: the results folder.
         data: from `studies.report.data.gather`.
-        cell: of the first experiment; its functions give the trajectories of whole fronts.
         with_paper: whether figures that the paper states of its rack stand beside ours.
+        pdf: whether pictures are also written as PDF, which takes as long as to draw them.
         done: called after every picture and after the page.
         executor: who draws, None for this process.
 
@@ -45,7 +44,7 @@ def write_report(
         ReportError: the page cannot be made.
     """
     listed = list(report_pictures(data))
-    job = Job(DrawingBoard(data), _drawn)
+    job = Job(DrawingBoard(data, pdf), _drawn)
     drawn = answer_all(executor or SerialExecutor(), job, range(len(listed)), done)
     pictures = []
     for picture, files in zip(listed, drawn, strict=True):
@@ -60,7 +59,7 @@ def write_report(
             ("tex", table.latex()),
         ):
             write_atomically(root / TABLES / f"{table.name}.{suffix}", text.encode())
-    document = PageData(data, cell).document(executor)
+    document = PageData(data).document(executor)
     page = root / PAGE
     write_atomically(page, render_page(data, document, tables, pictures).encode())
     done()
@@ -73,15 +72,18 @@ class DrawingBoard:
 
     Attributes:
         data: what they show.
+        pdf: whether also as PDF.
     """
 
     data: ReportData
+    pdf: bool
 
-    def __call__(self) -> list[ReportPicture]:
-        """All pictures, not yet drawn."""
-        return list(report_pictures(self.data))
+    def __call__(self) -> tuple[list[ReportPicture], bool]:
+        """All pictures, not yet drawn, and whether they are wanted as PDF."""
+        return list(report_pictures(self.data)), self.pdf
 
 
-def _drawn(pictures: list[ReportPicture], index: int, emit: Emit) -> dict[str, bytes]:
+def _drawn(board: tuple[list[ReportPicture], bool], index: int, emit: Emit) -> dict[str, bytes]:
     """Draw a picture; returns its files by suffix."""
-    return files_of(pictures[index].draw())
+    pictures, pdf = board
+    return files_of(pictures[index].draw(), pdf)

@@ -12,7 +12,7 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase, contact_effort
 from hybrid_opt.store.export.manifest import phase_documents
-from hybrid_opt.timing import JerkLimits, TimingLimits, TimingModel, time_path
+from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, TimingModel, time_path
 from hybrid_opt.work.job import Emit
 from symbolic.array import Array
 from symbolic.errors import DualArmError
@@ -104,6 +104,14 @@ def drawn_job(model: JobModel, request: JobRequest, emit: Emit | None = None) ->
     """The job around a path, with the forces that an export commands by default."""
     try:
         timing = time_path(model.timing, request.x, request.limits)
+    except DualArmError as error:
+        return DrawnJob(request.label, str(error))
+    return drawn(model, request, timing)
+
+
+def drawn(model: JobModel, request: JobRequest, timing: Timing) -> DrawnJob:
+    """The same around a path that is timed already."""
+    try:
         job = model.plan(timing, within_jerk=request.within_jerk)
     except DualArmError as error:
         return DrawnJob(request.label, str(error))

@@ -1,20 +1,29 @@
-"""The trajectories on the page: what robots drive, what the search assumed, and what is saved."""
+"""The trajectories on the page: what robots drive, what the search assumed, and what is saved.
+
+Each is worked out for itself, in any process: `PageCarries` is what workers do it with.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 import hybrid_opt as ho
+from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.display.scene import packed
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
+from hybrid_opt.job.plan import JobModel
 from hybrid_opt.store.trajectory_figures import trajectory_figures
+from hybrid_opt.timing import time_path
 from hybrid_opt.timing.jerk import drive_with_jerk
-from studies.report.jobs import DrawnJob, JobRequest
+from hybrid_opt.work.job import Emit
+from studies.report.jobs import DrawnJob, JobRequest, drawn
 from symbolic.array import Array
+from symbolic.workcell.records import Workcell
 
 MAX_SAMPLES = 60
 """Samples of a trajectory on the page; its force peaks are kept besides."""
@@ -23,6 +32,9 @@ DRIVEN = "as robots drive it"
 WITHIN_JERK = "within the limits on jerk"
 ASSUMED = "as the search assumed"
 WHOLE_JOB = "the whole job"
+
+NO_JOB = "shown of selected carries and of time against force only; an export plans any"
+"""Why a trajectory that can be driven has none."""
 
 LAWS = {"constant": "constant speed", "ramped": "ramped speed"}
 
@@ -35,53 +47,70 @@ class Shown:
         label: whose it is.
         x: (n_var,) decision vector.
         provenance: how it came about, stored with a saved file.
+        cell: number of its cell among those of the page.
         jerk: whether it is also shown within the cell's limits on jerk, where it has any.
         job: the whole job around it, where it is planned already.
+        has_job: whether one is planned where it is not.
     """
 
     label: str
     x: Array
     provenance: str
+    cell: int = 0
     jerk: bool = False
     job: DrawnJob | None = None
+    has_job: bool = True
 
 
-@dataclass
-class Collected:
-    """The trajectories of a page, as they are put together.
+@dataclass(frozen=True)
+class PageCarriesSource:
+    """Makes what works out a page's trajectories, in any process.
 
     Attributes:
-        n_var: length of the report's first experiment's decision vectors.
-        trajectories: JSON values.
-        jobs: what to plan a job around, by the trajectory's number.
+        cells: of the page in order, the first experiment's first, each with its objectives.
     """
 
-    n_var: int
-    trajectories: list[dict[str, Any]] = field(default_factory=list)
-    jobs: dict[int, JobRequest] = field(default_factory=dict)
+    cells: tuple[tuple[PackedCell, tuple[str, ...]], ...]
 
-    def add_job(self, number: int, job: DrawnJob) -> None:
-        """Add a planned job as one more motion of its trajectory, or say why there is none."""
-        trajectory = self.trajectories[number]
-        if job.samples is None:
-            trajectory["jobProblem"] = job.problem
-            return
-        assert job.torque_use is not None, "a planned job uses torques"
-        assert job.contact_torque_use is not None, "a planned job presses"
-        trajectory["motions"].insert(
-            1,
-            {
-                "name": WHOLE_JOB,
-                "peaks": [round(value, 4) for value in job.peaks],
-                "duration": round(job.duration, 5),
-                "payloadLimit": trajectory["motions"][0]["payloadLimit"],
-                "torqueUse": (100.0 * job.torque_use).round(3).tolist(),
-                "contactTorqueUse": (100.0 * job.contact_torque_use).round(3).tolist(),
-                "data": packed(job.samples, np.float32),
-                "remark": job.remark,
-                "phases": [_phase(phase) for phase in job.phases],
-            },
-        )
+    def __call__(self) -> PageCarries:
+        """Load the compiled functions, or build them where they are missing."""
+        made = [cell.make(partial(_loaded, names)) for cell, names in self.cells]
+        return PageCarries([cell for cell, _ in made], made[0][1])
+
+
+def _loaded(objectives: tuple[str, ...], workcell: Workcell) -> tuple[ho.Cell, JobModel]:
+    cell = ho.Cell(workcell, objectives)
+    # The cell's files are there only now: what is loaded when it is first needed is needed now.
+    cell.carry(cell.initial)
+    return cell, JobModel(cell.compiled, cell.timing_model)
+
+
+def page_trajectory(carries: PageCarries, shown: Shown, emit: Emit | None = None) -> dict[str, Any]:
+    """A trajectory of the page as JSON values."""
+    return carries.trajectory(shown)
+
+
+def _with_job(trajectory: dict[str, Any], job: DrawnJob) -> None:
+    """Add a planned job as one more motion of a trajectory, or say why there is none."""
+    if job.samples is None:
+        trajectory["jobProblem"] = job.problem
+        return
+    assert job.torque_use is not None, "a planned job uses torques"
+    assert job.contact_torque_use is not None, "a planned job presses"
+    trajectory["motions"].insert(
+        1,
+        {
+            "name": WHOLE_JOB,
+            "peaks": [round(value, 4) for value in job.peaks],
+            "duration": round(job.duration, 5),
+            "payloadLimit": trajectory["motions"][0]["payloadLimit"],
+            "torqueUse": (100.0 * job.torque_use).round(3).tolist(),
+            "contactTorqueUse": (100.0 * job.contact_torque_use).round(3).tolist(),
+            "data": packed(job.samples, np.float32),
+            "remark": job.remark,
+            "phases": [_phase(phase) for phase in job.phases],
+        },
+    )
 
 
 def _phase(phase: Mapping[str, Any]) -> dict[str, Any]:
@@ -98,94 +127,62 @@ def _phase(phase: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class PageCarries:
-    """Collects the trajectories of one cell for the page."""
+    """Works out the trajectories of a page. A resource: one per process."""
 
-    def __init__(self, cell: ho.Cell, number: int, sink: Collected) -> None:
-        """Take trajectories of a cell.
+    def __init__(self, cells: Sequence[ho.Cell], jobs: JobModel) -> None:
+        """Take the cells.
 
         Args:
-            cell: the cell; under 'optimal' its carries are timed within their force limits, else
-                as close to the reference speeds as limits allow.
-            number: of the cell among those whose files the page holds.
-            sink: takes the trajectories.
+            cells: of the page; under 'optimal' their carries are timed within their force limits,
+                else as close to the reference speeds as limits allow.
+            jobs: plans jobs; its timing is that of all cells, which differ in time laws only.
         """
-        self._cell, self._number, self._sink = cell, number, sink
-        self._limit = np.concatenate([robot.torque_max for robot in cell.workcell.robots])
-        self._optimal = cell.workcell.task.time_law == "optimal"
+        self._cells, self._jobs = cells, jobs
+        self._n_var = jobs.workcell.task.n_var
+        self._limit = np.concatenate([robot.torque_max for robot in jobs.workcell.robots])
 
-    def add(self, shown: Shown) -> int:
-        """Add a trajectory; returns its number on the page."""
-        judged = self._cell.carry(shown.x)
+    def trajectory(self, shown: Shown) -> dict[str, Any]:
+        """A trajectory as JSON values: its motions, and all that is said of it."""
+        cell = self._cells[shown.cell]
+        law = cell.workcell.task.time_law
+        judged = cell.carry(shown.x)
         assert judged.judgement is not None, "carries of a cell are judged"
-        limits = self._limits(shown.x)
-        driven, problem = self._driven(shown.x, limits)
+        request = JobRequest(shown.label, shown.x[: self._n_var], _limits(law, shown.x))
+        timing = time_path(self._jobs.timing, request.x, request.limits)
+        driven = timing.carry
         motions = [] if driven is None else [self._motion(DRIVEN, driven)]
         if shown.jerk:
-            motions += self._within_jerk(shown.x)
-        if not self._optimal:
-            law = LAWS[self._cell.workcell.task.time_law]
-            motions.append(self._motion(f"{ASSUMED}: {law}", judged))
+            motions += self._within_jerk(cell, shown.x)
+        if law != "optimal":
+            motions.append(self._motion(f"{ASSUMED}: {LAWS[law]}", judged))
         if not motions:
             motions.append(self._motion(ASSUMED, judged))
         name, values = shown.label, judged.judgement.objectives
         if not judged.judgement.feasible:
             name = f"{name} (infeasible)"
         figures = trajectory_figures(judged).items()
-        number = len(self._sink.trajectories)
-        if not problem and shown.job is None:
-            x = shown.x[: self._sink.n_var]
-            self._sink.jobs[number] = JobRequest(shown.label, x, limits)
-        self._sink.trajectories.append(
-            {
-                "label": f"{name}: {self._values(judged, driven)}",
-                "objectives": [float(value) for value in values.values()],
-                "problem": problem,
-                "motions": motions,
-                "cell": self._number,
-                "decision": shown.x.tolist(),
-                "start": [arm.q[0].tolist() for arm in judged.arms],
-                "figures": {key: float(value) for key, value in figures if np.isfinite(value)},
-                "provenance": {"source": shown.provenance},
-            }
-        )
+        found = {
+            "label": f"{name}: {_values(cell, judged, driven)}",
+            "objectives": [float(value) for value in values.values()],
+            "problem": "" if timing.ok else f"robots cannot drive it: {timing.reason}",
+            "motions": motions,
+            "cell": shown.cell,
+            "decision": shown.x.tolist(),
+            "start": [arm.q[0].tolist() for arm in judged.arms],
+            "figures": {key: float(value) for key, value in figures if np.isfinite(value)},
+            "provenance": {"source": shown.provenance},
+        }
         if shown.job is not None:
-            self._sink.add_job(number, shown.job)
-        return number
+            _with_job(found, shown.job)
+        elif not shown.has_job:
+            found["jobProblem"] = NO_JOB
+        elif timing.ok:
+            _with_job(found, drawn(self._jobs, request, timing))
+        return found
 
-    def point(self, number: int) -> tuple[float, float]:
-        """Largest normal force [N] and duration [s] of a trajectory as its robots drive it."""
-        motion = self._sink.trajectories[number]["motions"][0]
-        return max(motion["peaks"]), motion["duration"]
-
-    def _values(self, judged: ho.Carry, driven: ho.Carry | None) -> str:
-        """What it is named by: what is minimised, forces and times with their units."""
-        if self._optimal:
-            carry = driven or judged
-            return f"{carry.duration:.2f} s, {carry.peak_normal_force.max():.2f} N"
-        assert judged.judgement is not None, "carries of a cell are judged"
-        found = judged.judgement.objectives
-        if tuple(found) != PAPER_OBJECTIVES:
-            return ", ".join(f"{name.replace('_', ' ')} {found[name]:.4f}" for name in found)
-        return ", ".join(
-            f"{robot.name} {force:.2f} N"
-            for robot, force in zip(
-                self._cell.workcell.robots, judged.peak_normal_force, strict=True
-            )
-        )
-
-    def _limits(self, x: Array) -> ho.TimingLimits:
-        if self._optimal:
-            return ho.TimingLimits(force=float(x[-1]))
-        return ho.TimingLimits(reference_speed=True)
-
-    def _driven(self, x: Array, limits: ho.TimingLimits) -> tuple[ho.Carry | None, str]:
-        """The carry as robots drive it, or why they cannot."""
-        timing = ho.time_path(self._cell, x, limits)
-        return timing.carry, "" if timing.ok else f"robots cannot drive it: {timing.reason}"
-
-    def _within_jerk(self, x: Array) -> list[dict[str, Any]]:
+    def _within_jerk(self, cell: ho.Cell, x: Array) -> list[dict[str, Any]]:
         """The carry within the cell's limits on jerk, where it has any."""
-        found = drive_with_jerk(self._cell.timing_model, x)
+        found = drive_with_jerk(cell.timing_model, x)
         carry = None if found is None else found.timing.carry
         return [] if carry is None else [self._motion(WITHIN_JERK, carry)]
 
@@ -201,6 +198,33 @@ class PageCarries:
             "contactTorqueUse": [round(float(value), 3) for value in contact],
             "data": packed(_samples(carry), np.float32),
         }
+
+
+def driven_point(trajectory: Mapping[str, Any]) -> tuple[float, float]:
+    """Largest normal force [N] and duration [s] of a trajectory as its robots drive it."""
+    motion = trajectory["motions"][0]
+    return max(motion["peaks"]), motion["duration"]
+
+
+def _limits(law: str, x: Array) -> ho.TimingLimits:
+    if law == "optimal":
+        return ho.TimingLimits(force=float(x[-1]))
+    return ho.TimingLimits(reference_speed=True)
+
+
+def _values(cell: ho.Cell, judged: ho.Carry, driven: ho.Carry | None) -> str:
+    """What a trajectory is named by: what is minimised, forces and times with their units."""
+    if cell.workcell.task.time_law == "optimal":
+        carry = driven or judged
+        return f"{carry.duration:.2f} s, {carry.peak_normal_force.max():.2f} N"
+    assert judged.judgement is not None, "carries of a cell are judged"
+    found = judged.judgement.objectives
+    if tuple(found) != PAPER_OBJECTIVES:
+        return ", ".join(f"{name.replace('_', ' ')} {found[name]:.4f}" for name in found)
+    return ", ".join(
+        f"{robot.name} {force:.2f} N"
+        for robot, force in zip(cell.workcell.robots, judged.peak_normal_force, strict=True)
+    )
 
 
 def _samples(carry: ho.Carry) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
@@ -12,17 +13,19 @@ from hybrid_opt.work.processes import local_executor
 # Drawing libraries are heavy: they are imported when something is drawn.
 
 
-def report_stage(with_paper: bool) -> Stage:
+def report_stage(with_paper: bool, pdf: bool = True) -> Stage:
     """The stage that writes pictures, tables and the page into the results folder.
 
     Args:
         with_paper: whether figures that the paper states of its rack stand beside ours.
+        pdf: whether pictures are also written as PDF.
     """
+    settings = {"with_paper": with_paper, "pdf": pdf}
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        _write(folder.root, with_paper, progress, executor_for(folder.execution))
+        _write(folder.root, settings, progress, executor_for(folder.execution))
 
-    return Stage("report", run, {"with_paper": with_paper})
+    return Stage("report", run, settings)
 
 
 def add_report_options(parser: argparse.ArgumentParser) -> None:
@@ -60,7 +63,9 @@ def follow_report_options(root: Path, options: argparse.Namespace) -> None:
         watch(root, options.port)
 
 
-def _write(root: Path, with_paper: bool, progress: Progress, executor: Executor) -> None:
+def _write(
+    root: Path, settings: Mapping[str, bool], progress: Progress, executor: Executor
+) -> None:
     from hybrid_opt.campaign.results import read_campaign
     from studies.report.data import gather
     from studies.report.generate import write_report
@@ -70,11 +75,16 @@ def _write(root: Path, with_paper: bool, progress: Progress, executor: Executor)
     data = gather(results, executor)
     count = len(list(report_pictures(data))) + 1
     with progress.stage("report", count, "pictures") as advance:
-        write_report(root, data, results.cell, with_paper, lambda: advance(1), executor)
+        write_report(
+            root, data, settings["with_paper"], settings["pdf"], lambda: advance(1), executor
+        )
 
 
-def rewrite(root: Path, progress: Progress) -> None:
+def rewrite(root: Path, progress: Progress, pdf: bool = False) -> None:
     """Write the report of a results folder anew, as its study did, with one process per core.
+
+    Args:
+        pdf: whether pictures are written as PDF even if the study did not.
 
     Raises:
         DualArmError: the folder is not complete.
@@ -85,4 +95,8 @@ def rewrite(root: Path, progress: Progress) -> None:
     marker = root / STAGES / "report.json"
     stored = read_json(marker) if marker.exists() else {}
     settings = stored.get("settings", {}) if isinstance(stored, dict) else {}
-    _write(root, bool(settings.get("with_paper")), progress, local_executor(0))
+    asked = {
+        "with_paper": bool(settings.get("with_paper")),
+        "pdf": pdf or bool(settings.get("pdf", True)),
+    }
+    _write(root, asked, progress, local_executor(0))

@@ -125,14 +125,12 @@ def panel_label(axes: Axes, letter: str, text: str) -> None:
     axes.set_title(f"({letter}) {text}", loc="left")
 
 
-def files_of(figure: Figure) -> dict[str, bytes]:
-    """A settled figure as files, by suffix."""
+def files_of(figure: Figure, pdf: bool = True) -> dict[str, bytes]:
+    """A settled figure as files, by suffix: PNG, and PDF where it is wanted."""
+    wanted = {"png": {"Software": None}} | ({"pdf": {"CreationDate": None}} if pdf else {})
     files = {}
     with in_style():
-        for suffix, metadata in (
-            ("png", {"Software": None}),
-            ("pdf", {"CreationDate": None}),
-        ):
+        for suffix, metadata in wanted.items():
             file = io.BytesIO()
             figure.savefig(file, format=suffix, dpi=PNG_DPI, metadata=metadata)
             files[suffix] = file.getvalue()

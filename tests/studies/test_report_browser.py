@@ -17,10 +17,9 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
-from hybrid_opt.cell import Cell
 from hybrid_opt.store.replay import replay
 from hybrid_opt.store.trajectory_file import read_trajectory
-from studies.report import page_data
+from studies.report import page_groups
 from studies.report.generate import write_report
 from studies.report.records import ReportData
 from tests.studies.test_report_page import HOSTILE, with_hostile_names
@@ -36,9 +35,7 @@ if not (BROWSER and DRIVER) and not os.environ.get("CI"):
 
 @pytest.fixture(scope="module")
 def report(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_report(
-        tmp_path_factory.mktemp("page"), data, Cell(data.workcell), with_paper=False
-    )
+    return write_report(tmp_path_factory.mktemp("page"), data, with_paper=False)
 
 
 @pytest.fixture(scope="module")
@@ -324,10 +321,8 @@ def test_fits_the_window(
 def test_hostile_names_are_shown_as_text(
     browser: webdriver.Chrome, data: ReportData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page_data, "MAX_FRONT", 2)
-    hostile = write_report(
-        tmp_path, with_hostile_names(data), Cell(data.workcell), with_paper=False
-    )
+    monkeypatch.setattr(page_groups, "MAX_FRONT", 2)
+    hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False)
     logged(browser, "browser")
     opened(browser, hostile)
     assert browser.execute_script("return window.broken") is None

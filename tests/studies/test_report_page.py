@@ -21,10 +21,10 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.robust.squeeze import SqueezeSettings
 from studies.recommendation_text import recommendation_text
-from studies.report import page_data
+from studies.report import page_carries, page_groups
 from studies.report.generate import write_report
-from studies.report.jobs import pressure_shift
-from studies.report.page_carries import Collected, PageCarries, Shown
+from studies.report.jobs import DrawnJob, pressure_shift
+from studies.report.page_carries import PageCarries, Shown
 from studies.report.page_data import PageData
 from studies.report.records import ReportData
 
@@ -56,9 +56,7 @@ def with_hostile_names(data: ReportData) -> ReportData:
 
 @pytest.fixture(scope="module")
 def report(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_report(
-        tmp_path_factory.mktemp("report"), data, Cell(data.workcell), with_paper=True
-    )
+    return write_report(tmp_path_factory.mktemp("report"), data, with_paper=True)
 
 
 @pytest.fixture(scope="module")
@@ -115,10 +113,8 @@ def test_the_policy_allows_exactly_the_pages_scripts(text: str) -> None:
 def test_hostile_names_stay_text(
     data: ReportData, tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page_data, "MAX_FRONT", 2)
-    hostile = write_report(
-        tmp_path, with_hostile_names(data), Cell(data.workcell), with_paper=False
-    ).read_text("utf-8")
+    monkeypatch.setattr(page_groups, "MAX_FRONT", 2)
+    hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False).read_text("utf-8")
     assert HOSTILE not in hostile
     assert html.escape(HOSTILE) in hostile
     assert "Start branches 2 and 0, best of 2 pairs" in hostile
@@ -132,7 +128,7 @@ def test_hostile_names_stay_text(
 
 @pytest.fixture(scope="module")
 def document(data: ReportData) -> dict[str, Any]:
-    return PageData(data, Cell(data.workcell)).document()
+    return PageData(data).document()
 
 
 def test_data_of_the_page_are_the_trajectories(data: ReportData, document: dict[str, Any]) -> None:
@@ -180,9 +176,9 @@ def test_every_point_shows_what_robots_drive(data: ReportData, document: dict[st
     searched = document["trajectories"][document["views"][1]["groups"][0]["members"][0]]
     assert [motion["name"] for motion in searched["motions"]] == [
         "as robots drive it",
-        "the whole job",
         "as the search assumed: ramped speed",
     ]
+    assert "an export plans any" in searched["jobProblem"]
 
 
 def test_every_point_has_the_phases_of_its_job(
@@ -224,9 +220,8 @@ def test_every_point_has_the_phases_of_its_job(
 
 def test_points_are_named_by_what_was_minimised(data: ReportData) -> None:
     cell = Cell(data.workcell, ("mean_force", "friction_use"))
-    found = Collected(data.workcell.task.n_var)
-    PageCarries(cell, 0, found).add(Shown("NSGA-II, replica 1", data.initial.x, ""))
-    (trajectory,) = found.trajectories
+    carries = PageCarries([cell], JobModel(cell.compiled, cell.timing_model))
+    trajectory = carries.trajectory(Shown("NSGA-II, replica 1", data.initial.x, ""))
     mean, friction = trajectory["objectives"]
     assert trajectory["label"] == (
         f"NSGA-II, replica 1: mean force {mean:.4f}, friction use {friction:.4f}"
@@ -289,8 +284,9 @@ def test_the_first_look_is_not_squashed(document: dict[str, Any], data: ReportDa
 def test_polished_fronts_stand_beside_the_searchs(
     hybrid_data: ReportData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(PageData, "_plan_jobs", lambda *_: None)  # not what is looked at
-    document = PageData(hybrid_data, Cell(hybrid_data.workcell)).document()
+    no_job = DrawnJob("", "not what is looked at")
+    monkeypatch.setattr(page_carries, "drawn", lambda *_: no_job)
+    document = PageData(hybrid_data).document()
     groups = document["views"][1]["groups"]
     assert [group["label"] for group in groups] == [
         f"{title}{stage}" for title in ("NSGA-II", "MOPSO") for stage in ("", ", polished")
