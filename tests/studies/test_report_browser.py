@@ -199,7 +199,9 @@ def test_pictures_and_timings_can_be_switched(browser: webdriver.Chrome, report:
     browser.find_element(By.ID, "whole").click()
     whole = browser.execute_script(ranges)
     assert whole[1] - whole[0] >= near[1] - near[0]
-    browser.execute_script("report.select(report.data.views[1].groups[0].members[0])")
+    # A selected trajectory: driven, with its whole job, and as the search assumed.
+    selected = "report.data.lists.find((l) => l.label.startsWith('Hand-made and')).members[1]"
+    browser.execute_script(f"report.select({selected})")
     moments = []
     for option in browser.find_elements(By.CSS_SELECTOR, "#motion option"):
         option.click()
