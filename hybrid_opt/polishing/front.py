@@ -66,6 +66,7 @@ class FrontPolisher(Polisher):
         archive: GrowingFront,
         recorded: list[PolishOutcome | Lost],
         emit: Callable[[PolishOutcome], None],
+        paths: Array,
     ) -> ForceRun:
         return ForceRun(self, archive, recorded, emit)
 

@@ -124,6 +124,10 @@ class PolishRun(ABC, Generic[AnyAttempt]):
             return "failed", answer.message, attempt.start
         if np.array_equal(answer.x, attempt.x):
             return self._not_improved(answer, attempt)
+        return self._recomputed(attempt, answer)
+
+    def _recomputed(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
+        """What the full evaluator and the certificate between the samples say of an answer."""
         found = self._evaluator.certified(self._evaluator.evaluate(answer.x))
         reason = int(found.reason[0])
         if reason != FEASIBLE:
@@ -167,8 +171,9 @@ class Polisher(ABC):
         archive: GrowingFront,
         recorded: list[PolishOutcome | Lost],
         emit: Callable[[PolishOutcome], None],
+        paths: Array,
     ) -> PolishRun[Any]:
-        """A polish of one front, about to begin."""
+        """A polish of one front, about to begin; see `polish`."""
 
     def polish(
         self,
@@ -176,6 +181,7 @@ class Polisher(ABC):
         rng: np.random.Generator,
         recorded: Sequence[PolishOutcome | Lost] = (),
         emit: Callable[[PolishOutcome], None] = lambda outcome: None,
+        paths: Array | None = None,
     ) -> PolishedFront:
         """Polish a front.
 
@@ -185,6 +191,8 @@ class Polisher(ABC):
             recorded: outcomes of an earlier, interrupted polish of the same front, not repeated;
                 `Lost` for an attempt that ended its process.
             emit: takes each new outcome.
+            paths: (m, n_path) free waypoints that are known to be good, and need not be on the
+                front; only the polish of drivable carries uses them. None for none.
         """
         begin = time.perf_counter()
         x = np.asarray(front_x, dtype=float).reshape(-1, self.evaluator.n_var)
@@ -192,7 +200,8 @@ class Polisher(ABC):
         found = self.evaluator.certified(self.evaluator.evaluate(x))
         feasible = np.flatnonzero(found.feasible)
         archive = GrowingFront(x[feasible], found.objectives[feasible], feasible.tolist())
-        run = self._run(archive, list(recorded), emit)
+        known = np.empty((0, self.evaluator.workcell.task.n_path)) if paths is None else paths
+        run = self._run(archive, list(recorded), emit, known)
         if len(feasible) and self.settings.attempts:
             run.all(rng)
         rows = archive.rows() if len(feasible) else []

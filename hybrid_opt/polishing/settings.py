@@ -196,8 +196,9 @@ class DrivableSettings:
         steadiness: curvature by the path of the program that finds multipliers.
         corrections: of a step by how geometric rows bend along it, at most.
         bend: of a scaled geometric row that is left uncorrected.
-        candidates: random ones among which starts far from a front are looked for.
-        far_share: of the attempts that go to such starts.
+        turn: rounds of each start in a turn of a tournament of starts.
+        members: force limits, spread over their range, at which the front gets a point where the
+            best known path wins one.
     """
 
     first_radius: float = 0.3
@@ -213,8 +214,8 @@ class DrivableSettings:
     steadiness: float = 1.0
     corrections: int = 3
     bend: float = 0.01
-    candidates: int = 600
-    far_share: float = 0.3
+    turn: int = 4
+    members: int = 24
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
 """The polish of a whole front of drivable carries: duration against force.
 
-Every attempt is at one force limit, or at one duration. It starts from the path that is driven
-best there of all that are known, so that what one attempt finds serves the others. Points of the
-given front come first, evenly spread; then random paths far from all that is known, because a
-search's front often lies in one basin of several; then both ends and the widest gaps, and where
-these are narrow, points again from other paths.
+Every attempt is at one force limit. It starts from the path that is driven best there of all that
+are known, the hand-made one among them, so that what one attempt finds serves the others. The first
+is a tournament of starts in several basins, because a search's front often lies in one. Then come
+points of the given front, evenly spread; both ends and the widest gaps, and where these are narrow,
+points again from other paths. In the end the best known path becomes a point at force limits all
+over their range.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.drivable.certified import second_opinion
 from hybrid_opt.polishing.drivable.point import DrivableSolver, DriveStart
+from hybrid_opt.polishing.drivable.tilts import turned
 from hybrid_opt.polishing.drivable.timed import Goal
+from hybrid_opt.polishing.drivable.tournament import best_of
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
@@ -30,9 +33,14 @@ from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.workcell.decision import initial_decision
 
 STILL = 1e-3
 """The least force limit is this share above the force that holds the box at rest."""
+
+FAST = 0.75
+"""Where between the least and the front's largest force limit the tournament is: basins differ most
+where carries are fast."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +50,8 @@ class DriveAttempt:
     Attributes:
         x: (n_var,) decision vector to start from.
         goal: what is wanted.
+        rivals: starts of a tournament in place of x, none where there is none.
+        solved: whether x is to be improved; otherwise it is judged as it is.
     """
 
     aim: Aim
@@ -49,6 +59,8 @@ class DriveAttempt:
     x: Array
     start: Array
     goal: Goal
+    rivals: tuple[Array, ...] = ()
+    solved: bool = True
 
 
 class DrivablePolisher(Polisher):
@@ -88,8 +100,9 @@ class DrivablePolisher(Polisher):
         archive: GrowingFront,
         recorded: list[PolishOutcome | Lost],
         emit: Callable[[PolishOutcome], None],
+        paths: Array,
     ) -> DriveRun:
-        return DriveRun(self, archive, recorded, emit)
+        return DriveRun(self, archive, recorded, emit, paths)
 
 
 class DriveRun(PolishRun[DriveAttempt]):
@@ -101,6 +114,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         archive: GrowingFront,
         recorded: list[PolishOutcome | Lost],
         emit: Callable[[PolishOutcome], None],
+        paths: Array,
     ) -> None:
         super().__init__(polisher.evaluator, polisher.settings, archive, recorded, emit)
         self._solver, self._doubt = polisher.drivable, polisher.doubt
@@ -109,26 +123,30 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._reference = float(task.reference_force.min())
         self._by_force = polisher.evaluator.objective_names.index("peak_force")
         self._tried: set[float] = set()
+        self._hand_made = initial_decision(task)[: self._n_path]
+        self._others = self._sound(np.vstack([self._hand_made, paths]))
 
     def all(self, rng: np.random.Generator) -> None:
-        """The front's points, starts far away, ends and gaps, other starts, while attempts last."""
+        """A tournament, the front's points, ends and gaps, other starts, while attempts last; then
+        the best known paths all over the range of forces."""
         rows = self._archive.rows()
         count = min(len(rows), ceil(self._settings.attempts * self._settings.front.own_share))
         forces = [
             self._force(rows[k]) for k in np.linspace(0, len(rows) - 1, count).round().astype(int)
         ]
+        largest = max(*map(self._force, rows), self._range[0])
+        self._tournament(self._range[0] + FAST * (largest - self._range[0]))
         for force in forces:
             self._at("point", force)
-        # Not at the front's largest force, where attempts from far away need most rounds.
-        self._far_away(rng, 0.5 * (self._range[0] + max(*forces, self._range[0])))
         self._at("extreme", self._range[1])
-        self._at("extreme", self._between(self._range[0], min(map(self._force, rows))))
+        self._at("extreme", self._range[0])
         while self._left() > 0:
             middle = self._widest_gap()
             if middle is None:
                 self._elsewhere(rng)
             else:
                 self._at("gap", middle)
+        self._spread(largest)
 
     def _force(self, index: int) -> float:
         """Force limit of a known carry that it uses fully [N]."""
@@ -142,51 +160,63 @@ class DriveRun(PolishRun[DriveAttempt]):
 
     def _at(self, aim: Aim, force: float) -> None:
         """An attempt at a force limit from the path that is driven best there."""
-        durations = self._durations(force)
-        self._attempt(aim, int(np.argmin(durations)), force)
+        paths, durations = self._driven(force)
+        self._attempt(aim, paths[int(np.argmin(durations))], force)
 
     def _elsewhere(self, rng: np.random.Generator) -> None:
         """An attempt at the force limit of a member of the front, from another known path."""
         rows = self._archive.rows()
         force = max(self._force(rows[int(rng.integers(len(rows)))]), self._range[0])
-        durations = self._durations(force)
+        paths, durations = self._driven(force)
         others = np.flatnonzero(np.isfinite(durations) & (durations > durations.min()))
         chosen = int(rng.choice(others)) if len(others) else int(np.argmin(durations))
-        self._attempt("extreme", chosen, force)
+        self._attempt("extreme", paths[chosen], force)
 
-    def _far_away(self, rng: np.random.Generator, force: float) -> None:
-        """Attempts from random feasible paths that are driven well and lie far from known ones."""
-        settings, low, high = self._settings.drivable, self._evaluator.lower, self._evaluator.upper
-        count = int(settings.far_share * self._settings.attempts)
-        if not count:
-            return
-        x = rng.uniform(low, high, (settings.candidates, len(low)))
-        x[:, -1] = force
-        found = self._evaluator.evaluate(x)
-        order = np.flatnonzero(found.feasible)
-        order = order[np.argsort(found.objectives[order, 1 - self._by_force], kind="stable")]
-        x, objectives = x[order], found.objectives[order]
-        unit = (high - low)[: self._n_path]
-        for _ in range(min(count, len(x))):
-            faster = len(x) - len(x) // 2
-            known = np.array([path[: self._n_path] for path in self._archive.x])
-            away = x[:faster, None, : self._n_path] - known
-            distance = np.sqrt(((away / np.where(unit > 0.0, unit, 1.0)) ** 2).mean(axis=2))
-            k = int(np.argmax(distance.min(axis=1)))
-            goal = Goal("duration", force)
-            self._do([DriveAttempt("extreme", -1, x[k], objectives[k], goal)])
-            x, objectives = np.delete(x, k, axis=0), np.delete(objectives, k, axis=0)
+    def _tournament(self, force: float) -> None:
+        """An attempt from the best of several starts: the best known path and the hand-made one,
+        turned in every sense."""
+        paths, durations = self._driven(force)
+        best = paths[int(np.argmin(durations))]
+        starts = [
+            np.append(path, force)
+            for base in (best, self._hand_made)
+            for path in turned(self._evaluator.workcell.task, self._solver.judge, base, force)
+        ]
+        if starts:
+            self._attempt("extreme", best, force, tuple(starts))
 
-    def _attempt(self, aim: Aim, index: int, force: float) -> None:
+    def _attempt(self, aim: Aim, path: Array, force: float, rivals: tuple[Array, ...] = ()) -> None:
         self._tried.add(force)
-        x = np.append(self._archive.x[index][: self._n_path], force)
-        start = self._archive.objectives[index]
-        self._do([DriveAttempt(aim, -1, x, start, Goal("duration", force))])
+        x = np.append(path, force)
+        start = self._evaluator.evaluate(x[None]).objectives[0]
+        self._do([DriveAttempt(aim, -1, x, start, Goal("duration", force), rivals)])
 
-    def _durations(self, force: float) -> Array:
-        """(members,) of all known paths within a force."""
-        paths = np.array([x[: self._n_path] for x in self._archive.x])
-        return self._solver.judge.durations(paths, force)
+    def _spread(self, largest: float) -> None:
+        """Points of the best known paths at force limits up to the front's largest."""
+        members = self._settings.drivable.members
+        self._most += members
+        least, still = self._range[0], self._range[0] * (1.0 - STILL)
+        # What a limit leaves above the box at rest decides how long a carry takes.
+        above = np.geomspace(least - still, max(largest, least) - still, members)
+        for force in np.maximum(still + above, least).tolist():
+            paths, durations = self._driven(force)
+            x = np.append(paths[int(np.argmin(durations))], force)
+            found = self._evaluator.evaluate(x)
+            objectives = found.objectives[0]
+            if found.feasible[0] and not self._archive.dominates(objectives):
+                goal = Goal("duration", force)
+                self._do([DriveAttempt("gap", -1, x, objectives, goal, solved=False)])
+
+    def _sound(self, paths: Array) -> Array:
+        """Those of some paths (n, n_path) that are feasible when pressed hard enough."""
+        x = np.hstack([paths, np.full((len(paths), 1), self._range[1])])
+        return paths[self._evaluator.evaluate(x).feasible]
+
+    def _driven(self, force: float) -> tuple[Array, Array]:
+        """All known paths (n, n_path), and how long they take within a force."""
+        known = [x[: self._n_path] for x in self._archive.x]
+        paths = np.unique(np.vstack([*known, self._others]), axis=0)
+        return paths, self._solver.judge.durations(paths, force)
 
     def _widest_gap(self) -> float | None:
         """A force limit in the middle of the largest gap between neighbours; None without any."""
@@ -207,8 +237,17 @@ class DriveRun(PolishRun[DriveAttempt]):
         return None
 
     def _solution(self, attempt: DriveAttempt) -> Solution:
+        if not attempt.solved:
+            return Solution(attempt.x, usable=True)
+        if attempt.rivals:
+            return best_of(self._solver, attempt.rivals, attempt.goal)
         radius = self._settings.drivable.first_radius
         return self._solver.solve(DriveStart(attempt.x, attempt.goal, radius))
+
+    def _verdict(self, attempt: DriveAttempt, answer: Solution | Lost) -> tuple[Status, str, Array]:
+        if not attempt.solved and isinstance(answer, Solution):
+            return self._recomputed(attempt, answer)
+        return super()._verdict(attempt, answer)
 
     def _worth(
         self, attempt: DriveAttempt, answer: Solution, objectives: Array

@@ -23,7 +23,7 @@ from hybrid_opt.polishing.drivable.timed import Goal, PathJudge, TimedPath
 from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.layout import PlaceRow
-from hybrid_opt.polishing.placed_carry import CarryReader
+from hybrid_opt.polishing.placed_carry import CarryReader, PlacedCarry
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.program import SmoothCell
 from hybrid_opt.polishing.residuals import Residuals
@@ -31,6 +31,9 @@ from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Task
+
+LENGTHENED = (2.0, 4.0, 8.0)
+"""Times a step that brought more than it promised."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,14 @@ def is_polishable(task: Task) -> bool:
 
 
 class DrivableSolver:
-    """Solves for one evaluator's cell. A resource: one per process."""
+    """Solves for one evaluator's cell. A resource: one per process.
+
+    Attributes:
+        evaluator, task, settings: of the cell, and of the polish.
+        driver, judge: how carries and paths are timed.
+        half: (n_path,) half ranges of the path's variables.
+        active, reader, proposer: geometric rows, carries with their places, steps.
+    """
 
     def __init__(
         self, evaluator: CandidateEvaluator, functions: PolishFunctions, settings: PolishSettings
@@ -67,49 +77,94 @@ class DrivableSolver:
                 "allocation of forces: switch the polish off"
             )
         grid = Grid(task)
-        self._cell = SmoothCell(evaluator.workcell, functions, grid)
-        self._task, self._settings, self._driven = task, settings, settings.drivable
-        self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
-        self._reader = CarryReader(evaluator, grid, functions.rows)
-        self._proposer = Proposer(
-            self._cell, functions.driven, driver.timer.intervals, settings.drivable
-        )
+        cell = SmoothCell(evaluator.workcell, functions, grid)
+        self.evaluator, self.task, self.settings = evaluator, task, settings
+        self.active = ActiveSet(Surroundings(evaluator, cell, settings))
+        self.reader = CarryReader(evaluator, grid, functions.rows)
+        self.proposer = Proposer(cell, functions.driven, driver.timer.intervals, settings.drivable)
         self.driver = driver
-        self._half = self._cell.unit.half[: task.n_path]
+        self.half = cell.unit.half[: task.n_path]
         self.judge = PathJudge(driver.timer, task.force_limit)
 
     def solve(self, start: DriveStart) -> Solution:
-        """Improve towards the goal."""
-        goal, radius = start.goal, start.radius
-        x = np.clip(start.x, self._task.lower, self._task.upper)
-        timed = self.judge.timed(x[: self._task.n_path], goal)
+        """Improve towards the goal, in as many rounds as the settings allow."""
+        climb = Climb(self, start.x, start.goal, start.radius)
+        climb.go_on(self.settings.drivable.rounds)
+        return climb.solution
+
+
+class Climb:
+    """One point's polish, which may be left and gone on with.
+
+    Attributes:
+        solution: what it has come to.
+        last_gain: what the later half of the rounds that were asked for last took off the level.
+    """
+
+    def __init__(
+        self, solver: DrivableSolver, x: Array, goal: Goal, radius: float | None = None
+    ) -> None:
+        """Time the start; arguments as in `DriveStart`, the radius that of the settings."""
+        self._driven, self._task, self._half = solver.settings.drivable, solver.task, solver.half
+        self._solver, self._goal = solver, goal
+        self._radius = self._driven.first_radius if radius is None else radius
+        x = np.clip(x, self._task.lower, self._task.upper)
+        timed = solver.judge.timed(x[: self._task.n_path], self._goal)
         x = self._with_force(x, timed)
-        learned = Learned(self._active, self._settings.stricter)
-        best = Reached(timed, timed.squared, x, self._reader.read(x), timed.level(goal), learned)
-        solution = Solution(x)
-        if not np.isfinite(timed.duration):
-            solution.message = "the start has no timing"
-            return solution
-        solution.usable = True
-        while solution.rounds < self._driven.rounds and radius > self._driven.least_radius:
-            solution.rounds += 1
-            found = self._proposer.step(best, goal, radius, lenient=solution.rounds == 1)
-            if found is None:
-                radius *= 0.25
-                continue
-            solution.iterations += 1
-            solution.residuals = found.residuals
-            solution.rows = sum(isinstance(row, PlaceRow) for row in found.required)
-            step = float(np.abs(found.d).max())
-            if self._is_optimal(solution.residuals):
-                solution.converged, solution.message = True, "stationary"
+        learned = Learned(solver.active, solver.settings.stricter)
+        carry, level = solver.reader.read(x), timed.level(self._goal)
+        self._best = Reached(timed, timed.squared, x, carry, level, learned)
+        self.solution = Solution(x, usable=bool(np.isfinite(timed.duration)))
+        self.last_gain = 0.0
+
+    @property
+    def x(self) -> Array:
+        """(n_var,) the best decision vector so far."""
+        return self._best.x
+
+    @property
+    def level(self) -> float:
+        """What the goal minimises."""
+        return self._best.timed.level(self._goal)
+
+    @property
+    def ended(self) -> bool:
+        """Whether more rounds bring nothing."""
+        spent = self._radius <= self._driven.least_radius
+        return self.solution.converged or spent or not self.solution.usable
+
+    def go_on(self, rounds: int) -> None:
+        """Some more rounds, fewer where it ends."""
+        solution, before = self.solution, self.level
+        for k in range(rounds):
+            if self.ended:
                 break
-            radius = self._try(best, goal, found, step, radius, solution)
-        if not solution.message:
-            short = radius <= self._driven.least_radius
-            solution.message = "the box of trust is spent" if short else "out of rounds"
-        solution.x = best.x
-        return solution
+            before = self.level if k == rounds // 2 else before
+            solution.rounds += 1
+            self._round()
+        solution.x = self._best.x
+        self.last_gain = before - self.level
+        if not solution.usable:
+            solution.message = "the start has no timing"
+        elif solution.converged:
+            solution.message = "stationary"
+        else:
+            solution.message = "the box of trust is spent" if self.ended else "out of rounds"
+
+    def _round(self) -> None:
+        solution, best = self.solution, self._best
+        lenient = solution.rounds == 1
+        found = self._solver.proposer.step(best, self._goal, self._radius, lenient)
+        if found is None:
+            self._radius *= 0.25
+            return
+        solution.iterations += 1
+        solution.residuals = found.residuals
+        solution.rows = sum(isinstance(row, PlaceRow) for row in found.required)
+        if self._is_optimal(solution.residuals):
+            solution.converged = True
+        else:
+            self._radius = self._try(found)
 
     def _is_optimal(self, residuals: Residuals) -> bool:
         limit = self._driven
@@ -119,40 +174,60 @@ class DrivableSolver:
             and residuals.feasibility <= limit.feasible
         )
 
-    def _try(
-        self,
-        best: Reached,
-        goal: Goal,
-        found: Proposal,
-        step: float,
-        radius: float,
-        solution: Solution,
-    ) -> float:
+    def _try(self, found: Proposal) -> float:
         """Judge a proposal and go on from it where it is better; the next radius."""
-        n = self._task.n_path
-        x = best.x.copy()
-        x[:n] = np.clip(x[:n] + self._half * found.d, self._task.lower[:n], self._task.upper[:n])
-        timed = self.judge.timed(x[:n], goal)
-        before, after = best.timed.level(goal), timed.level(goal)
+        best, driven, radius = self._best, self._driven, self._radius
+        step = float(np.abs(found.d).max())
+        start, before = best.x, self.level
+        timed = self._timed(start, found.d)
+        after = timed.level(self._goal)
         gain = 1.0 - after / before
         # What the timing rounds off may hide a small gain, but must not add up.
-        tiny = found.gain <= self._driven.noise
-        kept = after <= best.lowest * (1.0 + self._driven.noise)
+        tiny = found.gain <= driven.noise
+        kept = after <= best.lowest * (1.0 + driven.noise)
         if gain < 0.1 * found.gain and not (tiny and kept):
             return 0.5 * min(radius, step) if np.isfinite(after) else 0.25 * min(radius, step)
-        x = self._with_force(x, timed)
-        carry = self._reader.read(x)
-        violated = self._active.violated(carry, best.carry, found.required)
+        x = self._with_force(self._moved(start, found.d), timed)
+        carry = self._solver.reader.read(x)
+        violated = self._solver.active.violated(carry, best.carry, found.required)
         if violated or not carry.is_followed:
             learned = best.learned.refuse(carry, best.carry, violated, found.required)
             return radius if learned and carry.is_followed else 0.5 * min(radius, step)
-        best.timed, best.x, best.carry = timed, x, carry
-        best.lowest = min(best.lowest, after)
-        best.squared = found.squared if step <= self._driven.newton else timed.squared
+        squared = found.squared if step <= driven.newton else timed.squared
+        self._take(x, timed, carry, squared)
+        if gain > found.gain and not tiny:
+            self._lengthen(start, found)
         best.learned.move()
         if gain > 0.7 * found.gain and step > 0.9 * radius:
-            return min(2.0 * radius, self._settings.trust.largest)
+            return min(2.0 * radius, self._solver.settings.trust.largest)
         return radius if gain > 0.3 * found.gain or tiny else 0.5 * radius
+
+    def _lengthen(self, start: Array, found: Proposal) -> None:
+        """Go farther along a step that brought more than it promised, while that brings more:
+        judging costs a tenth of a round."""
+        for share in LENGTHENED:
+            timed = self._timed(start, share * found.d)
+            if timed.level(self._goal) >= self.level * (1.0 - self._driven.noise):
+                return
+            x = self._with_force(self._moved(start, share * found.d), timed)
+            carry = self._solver.reader.read(x)
+            asked = self._solver.active.violated(carry, self._best.carry, found.required)
+            if asked or not carry.is_followed:
+                return
+            self._take(x, timed, carry, timed.squared)
+
+    def _take(self, x: Array, timed: TimedPath, carry: PlacedCarry, squared: Array) -> None:
+        best = self._best
+        best.x, best.timed, best.carry, best.squared = x, timed, carry, squared
+        best.lowest = min(best.lowest, self.level)
+
+    def _moved(self, x: Array, d: Array) -> Array:
+        """(n_path,) the path after a scaled step."""
+        n = len(d)
+        return np.clip(x[:n] + self._half * d, self._task.lower[:n], self._task.upper[:n])
+
+    def _timed(self, x: Array, d: Array) -> TimedPath:
+        return self._solver.judge.timed(self._moved(x, d), self._goal)
 
     def _with_force(self, x: Array, timed: TimedPath) -> Array:
         """The decision vector whose force limit is that of a timing."""

@@ -25,6 +25,10 @@ CHECKED = 1e-6
 LEAST_CURVATURE = 1e-6
 """Curvature by the path that is left where the Lagrangian has less."""
 
+TURNED = 0.1
+"""Share of a negative curvature that is kept, positive: enough to be convex, and little enough that
+the box of trust ends steps along it."""
+
 
 @dataclass(frozen=True)
 class Step:
@@ -125,7 +129,7 @@ def convex(H: BorderedMatrix, A: BorderedRows, b: Array) -> tuple[BorderedMatrix
         total = total.raised(np.concatenate([np.zeros(len(total.corner)), lift]))
     reduced = Factors(total).reduced
     values, vectors = np.linalg.eigh((reduced + reduced.T) / 2.0)
-    lifted = np.maximum(np.abs(values), LEAST_CURVATURE)
+    lifted = np.maximum(np.where(values < 0.0, -TURNED * values, values), LEAST_CURVATURE)
     corner = total.corner + (vectors * (lifted - values)) @ vectors.T
     corner = (corner + corner.T) / 2.0
     model = BorderedMatrix(corner, total.beside, total.diagonal, total.off)

@@ -49,7 +49,9 @@ def functions() -> PolishFunctions:
 @cache
 def polisher(rounds: int = 40) -> DrivablePolisher:
     """Of the drivable rack."""
-    settings = PolishSettings(attempts=3, drivable=DrivableSettings(rounds=rounds))
+    settings = PolishSettings(
+        attempts=3, drivable=DrivableSettings(rounds=rounds, turn=2, members=8)
+    )
     return DrivablePolisher(evaluator(), settings, functions())
 
 

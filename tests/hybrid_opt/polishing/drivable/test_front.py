@@ -8,19 +8,24 @@ import numpy as np
 import pytest
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import duration_unit
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.drivable.front import DrivablePolisher
+from hybrid_opt.polishing.drivable.point import Climb
+from hybrid_opt.polishing.drivable.timed import Goal
 from hybrid_opt.polishing.polisher import polisher_for
 from hybrid_opt.polishing.records import PolishedFront, outcome_from_json, outcome_to_json
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.workcell.decision import initial_decision
 from tests.hybrid_opt.polishing.drivable.cells import (
     drivable_rack,
     evaluator,
     functions,
     polisher,
     start,
+    tilted,
 )
 
 BOUND = np.full(2, 1.1)
@@ -53,6 +58,46 @@ def test_a_polish_goes_on_where_it_was_interrupted() -> None:
     again = polisher(ROUNDS).polish(starts(), np.random.default_rng(0), recorded=recorded)
     np.testing.assert_array_equal(again.x, polished().x)
     np.testing.assert_array_equal(again.objectives, polished().objectives)
+
+
+def fastest(paths: Array, forces: Array) -> Array:
+    """(n,) [s] of any of some paths (k, n_path) within each force."""
+    judge = polisher(ROUNDS).drivable.judge
+    return np.array([judge.durations(paths, float(force)).min() for force in forces])
+
+
+def test_the_front_reaches_from_the_gentlest_end_and_is_nowhere_behind_the_hand_made_path() -> None:
+    x, task = polished().x, drivable_rack().task
+    least = task.force_limit[0]
+    assert x[:, -1].min() == pytest.approx(least)
+    forces = np.geomspace(least - 0.999 * least, 60.0 - 0.999 * least, 40) + 0.999 * least
+    hand_made = fastest(initial_decision(task)[None, :-1], forces)
+    assert (fastest(x[:, :-1], forces) <= hand_made * (1.0 + 1e-9)).all()
+    # Not only its paths, its points are: each at its own force.
+    duration = x[:, -1], polished().objectives[:, 0] * duration_unit(drivable_rack())
+    by_own = fastest(initial_decision(task)[None, :-1], duration[0])
+    assert (duration[1] <= by_own * (1.0 + 1e-3)).all()
+
+
+def test_known_paths_take_part() -> None:
+    """Given a better path than all others, the front is nowhere behind it; given one that touches
+    something, it does not notice."""
+    climb = Climb(polisher(ROUNDS).drivable, tilted(55.0), Goal("duration", 55.0))
+    climb.go_on(4)
+    known = climb.x[None, :-1]
+    assert evaluator().evaluate(climb.x).feasible[0]
+    sunk = known.copy()
+    sunk[0, [2, 8, 14]] -= 0.2
+    settings = DrivableSettings(rounds=1, turn=1, members=4)
+    owner = DrivablePolisher(
+        evaluator(), PolishSettings(attempts=1, drivable=settings), functions()
+    )
+    rng = np.random.default_rng
+    front = owner.polish(starts(), rng(0), paths=np.vstack([known, sunk]))
+    forces = np.array([50.0, 53.0, 55.0])
+    assert (fastest(front.x[:, :-1], forces) <= fastest(known, forces) * (1.0 + 1e-9)).all()
+    alone = owner.polish(starts(), rng(0), paths=known)
+    np.testing.assert_array_equal(alone.x, front.x)
 
 
 def test_an_empty_front_stays_empty() -> None:
