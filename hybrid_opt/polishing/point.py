@@ -103,7 +103,8 @@ class PolishSolver:
         robust = None
         if evaluator.objective_names == ROBUST_OBJECTIVES:
             robust = RobustSamples(evaluator.workcell)
-        self._cell = SmoothCell(evaluator.workcell, functions, grid, robust)
+        rounding = settings.solve.rounding
+        self._cell = SmoothCell(evaluator.workcell, functions, grid, robust, rounding)
         self._settings = settings
         wide = replace(settings.solve, barrier=settings.solve.wide_barrier)
         self._wide = replace(settings, solve=wide)

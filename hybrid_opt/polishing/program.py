@@ -35,6 +35,7 @@ from hybrid_opt.polishing.sample_values import SampleValues
 from hybrid_opt.polishing.solvers import Answer
 from hybrid_opt.polishing.targets import Target, needed_level
 from symbolic.array import Array
+from symbolic.smooth.keys import Quantity
 from symbolic.smooth.samples import branch_coefficients, sample_blocks
 from symbolic.workcell.decision import POSE_SIZE, extended_waypoints
 from symbolic.workcell.records import Workcell
@@ -79,6 +80,7 @@ class SmoothCell:
         blocks: how samples are divided among functions.
         coefficients: see `branch_coefficients`.
         robust: robust forces where they are minimised, None for the planned ones.
+        rounding: of the time law's kinks, see `SolveSettings.rounding`.
     """
 
     def __init__(
@@ -87,8 +89,9 @@ class SmoothCell:
         functions: PolishFunctions,
         grid: Grid,
         robust: RobustSamples | None = None,
+        rounding: float = 0.0,
     ) -> None:
-        self.robust = robust
+        self.rounding, self.robust = rounding, robust
         self.workcell, self.task = workcell, workcell.task
         self.functions, self.grid = functions, grid
         self.unit = UnitBox.of(workcell.task)
@@ -149,13 +152,12 @@ class SmoothProgram:
         """
         self._cell, self._target = cell, target
         self.layout = layout = Layout.of(cell.task.n_var, required)
-        ruled = {row.sample for row in layout.force_rows}
-        self._forces = SampleValues("force", cell.blocks, cell.functions.samples, ruled)
-        pressed = {row.sample for row in layout.pressure_rows}
-        self._patches = SampleValues("pressure", cell.blocks, cell.functions.samples, pressed)
+        self._forces = self._samples("force", {row.sample for row in layout.force_rows})
+        self._patches = self._samples("pressure", {row.sample for row in layout.pressure_rows})
         self._places = place_values(cell, layout.place_rows, carry)
         self._index_rows()
-        self._correct_forces(x)
+        self._correct_forces(x, carry)
+        self._correct_pressure(x, carry)
 
         phi = (carry.peak - target.anchor) / target.span + SLACK
         xi, low, high = (cell.unit.scaled(v) for v in (x, cell.task.lower, cell.task.upper))
@@ -191,22 +193,37 @@ class SmoothProgram:
         self._pressed_column = self._patches.column[sample]
         self._scale = np.array([row.constraint.scale for row in self.layout.place_rows])
 
-    def _correct_forces(self, x: Array) -> None:
-        """What the rows' planned forces lack at the candidate to be robust ones, and their slopes:
-        see `hybrid_opt.polishing.robust_samples`."""
+    def _samples(self, quantity: Quantity, wanted: set[int]) -> SampleValues:
+        cell = self._cell
+        return SampleValues(quantity, cell.blocks, cell.functions.samples, wanted, cell.rounding)
+
+    def _correct_forces(self, x: Array, carry: PlacedCarry) -> None:
+        """What the rows' forces lack at the candidate: what the rounded time law takes off them, or
+        what makes planned forces robust ones, with their slopes
+        (see `hybrid_opt.polishing.robust_samples`)."""
         self._x, robust, layout = x, self._cell.robust, self.layout
         self._lacking = np.zeros(len(layout.force_rows))
         self._lacking_slope = np.zeros((len(layout.force_rows), len(x)))
-        if robust is None:
-            return
         split, slope = self._forces.first(x)
         at, sample = self._force_column, [row.sample for row in layout.force_rows]
+        if robust is None:
+            self._lacking = np.einsum("rk,rk->r", self._mix, carry.split[sample] - split[at])
+            return
         force, by_x = robust.first(x)
         unit = self._cell.task.reference_force[self._owner] * self._target.span[self._owner]
         self._lacking = force[sample, self._owner] / unit
         self._lacking -= np.einsum("rk,rk->r", self._mix, split[at])
         self._lacking_slope = by_x[sample, self._owner] / unit[:, None]
         self._lacking_slope -= np.einsum("rk,rkx->rx", self._mix, slope[at])
+
+    def _correct_pressure(self, x: Array, carry: PlacedCarry) -> None:
+        """What the rounded time law takes off the rows' pressure at the candidate."""
+        self._patch_lacking = np.zeros(len(self._pressed))
+        if len(self._pressed):
+            sample = [row.sample for row in self.layout.pressure_rows]
+            margin = 1.0 - carry.shift[sample, self._pressed] ** 2
+            found = self._patches.first(x)[0]
+            self._patch_lacking = margin - found[self._pressed_column, self._pressed]
 
     def _fixed_part(self) -> Array:
         """The Jacobian's constant columns, of the peaks and the level."""
@@ -244,6 +261,7 @@ class SmoothProgram:
         if len(self._pressed):
             margin, slope = self._patches.first(x)
             values[layout.patches] = margin[self._pressed_column, self._pressed]
+            values[layout.patches] += self._patch_lacking
             jacobian[layout.patches, layout.decision] = (
                 slope[self._pressed_column, self._pressed] * half
             )

@@ -19,6 +19,10 @@ NEGLIGIBLE = 1e-7
 far from ruling, whose multipliers vanish. It changes steps by as much, no solution."""
 
 
+SHARED = ["x", "rounding"]
+"""Inputs that all samples have in common."""
+
+
 @dataclass(frozen=True)
 class _Call:
     """One function over some of its samples, which each evaluation serves `served` of: both its
@@ -44,8 +48,14 @@ class SampleValues:
         blocks: tuple[SampleBlock, ...],
         functions: Mapping[SampleKey, NumericFunction],
         wanted: Collection[int],
+        rounding: float,
     ) -> None:
-        """wanted: samples without which a call is left out."""
+        """A program's samples.
+
+        Args:
+            wanted: samples without which a call is left out.
+            rounding: of the time law's kinks, see `symbolic.smooth.samples.sample_functions`.
+        """
         self._calls: list[_Call] = []
         order: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)]
         for block in blocks:
@@ -55,10 +65,12 @@ class SampleValues:
             order.append(block.samples[chosen].ravel())
             basis = block.basis[chosen]
             first, second = (
-                functions[SampleKey(quantity, block.block, o)].prepared(len(basis), ["x"])
+                functions[SampleKey(quantity, block.block, o)].prepared(len(basis), SHARED)
                 for o in get_args(Order)
             )
             first.inputs["basis"][...] = basis
+            for prepared in (first, second):
+                prepared.inputs["rounding"][...] = rounding
             self._calls.append(_Call(first, second, basis, block.samples.shape[1]))
         served = np.concatenate(order)
         self.count = len(served)

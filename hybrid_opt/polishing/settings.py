@@ -98,6 +98,8 @@ class SolveSettings:
             what is feasible first.
         tolerance: of the optimality conditions, in the program's scaled rows and variables.
         feasible: violation of a scaled row at which an iterate counts as feasible.
+        rounding: share of a step's duration by which the paper's time law is rounded where rotation
+            takes over from translation: the least forces at the ends of a path lie in that kink.
         patience: times the wanted number of iterations that a solve may take to become feasible:
             cut off wherever it stands, it ends in an obstacle more often than not.
     """
@@ -107,6 +109,7 @@ class SolveSettings:
     wide_barrier: float = 3e-2
     tolerance: float = 1e-6
     feasible: float = 1e-3
+    rounding: float = 1e-3
     patience: int = 3
 
 

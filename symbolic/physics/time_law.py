@@ -50,15 +50,19 @@ class TimedPath:
     second_rate: ca.MX
 
 
-def timed_path(task: Task, basis: PathBasis, waypoints: ca.MX) -> TimedPath:
+def timed_path(
+    task: Task, basis: PathBasis, waypoints: ca.MX, rounding: ca.MX | None = None
+) -> TimedPath:
     """Poses at the samples of `basis` with the task's time law.
 
     Args:
         waypoints: (6, n_waypoints) from `symbolic.physics.path.waypoint_matrix`.
+        rounding: share of a step's duration by which the constant-speed law's kink is rounded,
+            where rotation takes over from translation; None for none.
     """
     pose = ca.mtimes(waypoints, ca.DM(basis.position.T))
     if task.time_law == "constant":
-        return _constant(task, pose)
+        return _constant(task, pose, rounding)
     first = ca.mtimes(waypoints, ca.DM(basis.first.T))
     second = ca.mtimes(waypoints, ca.DM(basis.second.T))
     return _ramped(task, basis, pose, first, second)
@@ -86,22 +90,32 @@ def driven_path(
     )
 
 
-def _constant(task: Task, pose: ca.MX) -> TimedPath:
-    step = _step_time_function(task).map(pose.shape[1] - 1)
-    durations = step(pose[:, :-1], pose[:, 1:])
+def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None) -> TimedPath:
+    count = pose.shape[1] - 1
+    step = _step_time_function(task, rounding is not None).map(count)
+    rounded = [] if rounding is None else [ca.repmat(rounding, 1, count)]
+    durations = step(pose[:, :-1], pose[:, 1:], *rounded)
     time = ca.horzcat(0.0, ca.cumsum(durations, 1))
     rate = _gradient(pose, durations)
     return TimedPath(time, pose, rate, _gradient(rate, durations))
 
 
-def _step_time_function(task: Task) -> ca.Function:
-    """Duration of the step between two neighbouring poses (paper Eqs. 23-24)."""
+def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
+    """Duration of the step between two neighbouring poses (paper Eqs. 23-24), and by which share
+    its kink is rounded, if it is."""
     start, end = ca.SX.sym("start", 6), ca.SX.sym("end", 6)
     step = end - start
     length = _smooth_norm(step[:3])
     angle = _smooth_norm(angular_velocity(task.orientation, (start[3:] + end[3:]) / 2.0, step[3:]))
-    duration = ca.fmax(length / task.reference_speed, angle / task.reference_angular_speed)
-    return ca.Function("step_time", [start, end], [ca.fmax(duration, STEP_TIME_FLOOR)])
+    moving, turning = length / task.reference_speed, angle / task.reference_angular_speed
+    if not is_rounded:
+        duration = ca.fmax(ca.fmax(moving, turning), STEP_TIME_FLOOR)
+        return ca.Function("step_time", [start, end], [duration])
+    rounding, both = ca.SX.sym("rounding"), moving + turning
+    # A hyperbola; the floor keeps its slope finite where there is no rounding.
+    width = ca.sqrt((moving - turning) ** 2 + (rounding * both) ** 2 + LENGTH_FLOOR**2)
+    duration = ca.fmax((both + width) / 2.0, STEP_TIME_FLOOR)
+    return ca.Function("step_time", [start, end, rounding], [duration])
 
 
 def _gradient(values: ca.MX, durations: ca.MX) -> ca.MX:

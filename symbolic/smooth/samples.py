@@ -28,6 +28,9 @@ from symbolic.physics.time_law import timed_path
 from symbolic.smooth.keys import Block, Quantity, SampleKey
 from symbolic.workcell.records import Task, Workcell
 
+INPUTS = ("x", "basis", "rounding")
+"""Of every function of samples."""
+
 WINDOW = 5
 """Samples that the motion at one of them depends on with the constant-speed law."""
 
@@ -76,11 +79,11 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[SampleKey, 
     """Two values of each sample and their derivatives, for every block of `sample_blocks`.
 
     For a block that serves k samples, with x (n_var,) and basis (n_waypoints, width) of the
-    window, the last without effect where the block is the whole path:
+    window and rounding (see `timed_path`), both without effect where the block is the whole path:
 
-    first: x, basis -> values (2 k,), both of the first sample, both of the second, ..., and
-        gradient (n_var, 2 k), one column for each value.
-    second: x, basis, weight (2 k,) -> hessian (n_var, n_var) of weight . values.
+    first: x, basis, rounding -> values (2 k,), both of the first sample, both of the second, ...,
+        and gradient (n_var, 2 k), one column for each value.
+    second: x, basis, rounding, weight (2 k,) -> hessian (n_var, n_var) of weight . values.
     """
     sample = _split_function(workcell) if quantity == "force" else _margin_function(workcell)
     if workcell.task.time_law != "constant":
@@ -115,13 +118,14 @@ def _window_functions(
     task = workcell.task
     n_waypoints = len(task.waypoints)
     x, basis = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", n_waypoints, WINDOW)
+    rounding = ca.MX.sym("rounding")
     # The window's poses are handed to the time law as waypoints of an identity basis.
     identity = np.eye(WINDOW)
     window = ca.mtimes(waypoint_matrix(task, x), basis)
     own = PathBasis(np.linspace(0.0, 1.0, WINDOW), identity, identity, identity)
-    values = _values(workcell, sample, own, window, columns)
-    flat = ca.Function("values", [x, basis], [values]).expand()
-    inputs = [ca.SX.sym("x", task.n_var), ca.SX.sym("basis", n_waypoints, WINDOW)]
+    values = _values(workcell, sample, own, window, columns, rounding)
+    flat = ca.Function("values", [x, basis, rounding], [values]).expand()
+    inputs = [ca.SX.sym(name, *flat.size_in(k)) for k, name in enumerate(INPUTS)]
     return _derivatives(flat(*inputs), inputs, quantity, block)
 
 
@@ -130,9 +134,10 @@ def _whole_path(
 ) -> dict[SampleKey, ca.Function]:
     task = workcell.task
     x, unused = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", len(task.waypoints), task.samples)
+    rounding = ca.MX.sym("rounding")
     every = tuple(range(task.samples))
-    values = _values(workcell, sample, sample_basis(task), waypoint_matrix(task, x), every)
-    return _derivatives(values, [x, unused], quantity, "path")
+    values = _values(workcell, sample, sample_basis(task), waypoint_matrix(task, x), every, None)
+    return _derivatives(values, [x, unused, rounding], quantity, "path")
 
 
 def _values(
@@ -141,9 +146,10 @@ def _values(
     basis: PathBasis,
     waypoints: ca.MX,
     columns: tuple[int, ...],
+    rounding: ca.MX | None,
 ) -> ca.MX:
     """A sample's two values (2 k,) at the chosen columns of the timed path."""
-    path = timed_path(workcell.task, basis, waypoints)
+    path = timed_path(workcell.task, basis, waypoints, rounding)
     at = list(columns)
     each = sample.map(len(at))
     return ca.vec(each(path.pose[:, at], path.rate[:, at], path.second_rate[:, at]))
@@ -184,7 +190,7 @@ def _derivatives(
     weight = type(x).sym("weight", values.shape[0])
     hessian, _ = ca.hessian(ca.dot(weight, values), x)
     first, second = (SampleKey(quantity, block, order) for order in ("first", "second"))
-    names = ["x", "basis"]
+    names = list(INPUTS)
     results = ca.cse([ca.densify(r) for r in (values, ca.jacobian(values, x).T)])
     return {
         first: ca.Function(first.name, inputs, results, names, ["values", "gradient"]),

@@ -53,6 +53,18 @@ def test_constant_law_differentiates_as_numpy_does(seed: int, samples: int) -> N
     np.testing.assert_allclose(result["second_rate"], second, atol=1e-9 * np.abs(second).max())
 
 
+def test_a_rounded_step_takes_longer_by_at_most_the_rounding() -> None:
+    """The hyperbola exceeds the longer of both times by that share where they agree."""
+    task, rounding = random_task(7, samples=40), 0.05
+    path = timed_path(
+        task, sample_basis(task), waypoint_matrix(task, ca.MX.sym("x", 0)), ca.MX(rounding)
+    )
+    rounded = np.diff(np.array(ca.evalf(path.time)).ravel())
+    sharp = np.diff(timed(task)["time"])
+    assert (rounded > sharp).all()
+    assert (rounded <= sharp * (1.0 + rounding) * (1.0 + 1e-12)).all()
+
+
 def test_constant_law_moves_every_step_at_the_reference_speed() -> None:
     task = task_through([0, 0, 0, 0, 0, 0], [0.3, 0.1, 0.2, 0, 0, 0], [0.5, -0.2, 0.4, 0, 0, 0])
     result = timed(task)

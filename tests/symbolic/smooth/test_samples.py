@@ -26,13 +26,15 @@ def random_x(cell: Workcell, seed: int) -> Array:
     return np.random.default_rng(seed).uniform(cell.task.lower, cell.task.upper)
 
 
-def split_of(cell: Workcell, functions: Mapping[SampleKey, ca.Function], x: Array) -> Array:
+def split_of(
+    cell: Workcell, functions: Mapping[SampleKey, ca.Function], x: Array, rounding: float = 0.0
+) -> Array:
     """(samples, 2) from the blocks, put in the samples' order."""
     split = np.full((cell.task.samples, 2), np.nan)
     for block in sample_blocks(cell.task):
         values = functions[SampleKey("force", block.block, "first")]
         for samples, basis in zip(block.samples, block.basis, strict=True):
-            split[samples] = np.array(values(x, basis.T)[0]).reshape(-1, 2)
+            split[samples] = np.array(values(x, basis.T, rounding)[0]).reshape(-1, 2)
     return split
 
 
@@ -50,9 +52,23 @@ def test_the_largest_branch_is_the_evaluators_normal_force(time_law: TimeLaw, sa
         np.testing.assert_allclose(forces, expected, rtol=1e-10, atol=1e-9)
 
 
+def test_a_rounded_time_law_is_near_the_sharp_one_and_nearer_the_less_it_is_rounded() -> None:
+    cell = cell_with("constant")
+    functions, x = sample_functions(cell, "force"), random_x(cell, 0)
+    sharp = split_of(cell, functions, x)
+    errors = [
+        np.abs(split_of(cell, functions, x, rounding) - sharp).max()
+        for rounding in (1e-2, 1e-3, 1e-4)
+    ]
+    assert 0.0 < errors[2] < errors[1] < errors[0] < 0.05 * np.abs(sharp).max()
+
+
+@pytest.mark.parametrize("rounding", [0.0, 0.02])
 @pytest.mark.parametrize("quantity", ["force", "pressure"])
 @pytest.mark.parametrize("time_law", ["constant", "ramped"])
-def test_derivatives_are_those_of_the_values(time_law: TimeLaw, quantity: Quantity) -> None:
+def test_derivatives_are_those_of_the_values(
+    time_law: TimeLaw, quantity: Quantity, rounding: float
+) -> None:
     cell = cell_with(time_law)
     functions = sample_functions(cell, quantity)
     rng = np.random.default_rng(3)
@@ -65,14 +81,14 @@ def test_derivatives_are_those_of_the_values(time_law: TimeLaw, quantity: Quanti
         weight = rng.normal(size=first.size1_out(0))
         slopes, curvature = [], []
         for direction in np.eye(cell.task.n_var):
-            ahead, behind = (first(x + sign * step * direction, basis) for sign in (1.0, -1.0))
+            ahead, behind = (first(x + sign * step * direction, basis, rounding) for sign in (1.0, -1.0))
             slopes.append((np.array(ahead[0]) - np.array(behind[0]))[:, 0])
             curvature.append((np.array(ahead[1]) - np.array(behind[1])) @ weight)
-        exact = np.array(first(x, basis)[1])
+        exact = np.array(first(x, basis, rounding)[1])
         np.testing.assert_allclose(np.array(slopes) / (2 * step), exact, rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(
             np.array(curvature) / (2 * step),
-            np.array(second(x, basis, weight)),
+            np.array(second(x, basis, rounding, weight)),
             rtol=1e-5,
             atol=1e-3,
         )
