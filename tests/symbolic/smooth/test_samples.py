@@ -81,7 +81,8 @@ def test_derivatives_are_those_of_the_values(
         weight = rng.normal(size=first.size1_out(0))
         slopes, curvature = [], []
         for direction in np.eye(cell.task.n_var):
-            ahead, behind = (first(x + sign * step * direction, basis, rounding) for sign in (1.0, -1.0))
+            moves = step * direction, -step * direction
+            ahead, behind = (first(x + move, basis, rounding) for move in moves)
             slopes.append((np.array(ahead[0]) - np.array(behind[0]))[:, 0])
             curvature.append((np.array(ahead[1]) - np.array(behind[1])) @ weight)
         exact = np.array(first(x, basis, rounding)[1])
