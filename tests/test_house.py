@@ -14,10 +14,10 @@ PACKAGES = ("symbolic", "codegen", "hybrid_opt", "studies")
 MOST_PARAMETERS = 6
 """Of a function; what needs more takes a record."""
 
-MOST_LINES = 340
+MOST_LINES = 330
 """About 300, with room for what belongs together."""
 
-MOST_TEST_LINES = 360
+MOST_TEST_LINES = 335
 """Tests of one module stay in one file."""
 
 

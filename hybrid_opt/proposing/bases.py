@@ -14,9 +14,9 @@ from hybrid_opt.proposing.holding import Task, find_holds
 from hybrid_opt.proposing.kinematics import ArmKinematics
 from hybrid_opt.proposing.problem import Problem
 from symbolic.array import Array
-from symbolic.geometry.bodies import MeshReader, shape_pieces
 from symbolic.geometry.coal_shapes import coal_distance
 from symbolic.geometry.pieces import Piece
+from symbolic.geometry.shape_reader import MeshReader, shape_pieces
 from symbolic.physics.pose import box_placement, pose_matrix
 from symbolic.workcell.checks import stretched_length
 from symbolic.workcell.records import Cylinder, Workcell

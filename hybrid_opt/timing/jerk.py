@@ -26,9 +26,11 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.timing.jerk_program import Point, convex_step
-from hybrid_opt.timing.model import PathMotion, TimingModel
+from hybrid_opt.timing.jerk_program import Point
+from hybrid_opt.timing.jerk_step import convex_step
+from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_check import path_failure
+from hybrid_opt.timing.path_motion import PathMotion
 from hybrid_opt.timing.records import (
     JerkLimits,
     JerkTiming,

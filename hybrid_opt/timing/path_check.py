@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.timing.model import PathMotion, TimingModel
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.path_motion import PathMotion
 from hybrid_opt.timing.records import Place, Timing, TimingStatus
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell

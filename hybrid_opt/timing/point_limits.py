@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from hybrid_opt.robust.path_force import robust_path
 from hybrid_opt.timing import rows as rows_of
-from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel, contact_torque
+from hybrid_opt.timing.model import REFINEMENT, TimingModel, contact_torque
+from hybrid_opt.timing.path_motion import PathMotion
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.rows import INTERVAL_ENDS, PointRows
 from hybrid_opt.timing.use import limits_pressure

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
+from hybrid_opt.timing.model import REFINEMENT, TimingModel
 from hybrid_opt.timing.path_check import path_failure
+from hybrid_opt.timing.path_motion import PathMotion
 from hybrid_opt.timing.records import Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_use, worst
 from symbolic.array import Array

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from hybrid_opt.timing.adapter import SPEED_CEILING, IntervalRows
-from hybrid_opt.timing.model import PathMotion
+from hybrid_opt.timing.path_motion import PathMotion
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.physics.contact_forces import GRAVITY, normal_force_branches

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from hybrid_opt.carry import Carry
 from hybrid_opt.timing import rows as rows_of
 from hybrid_opt.timing.adapter import SolverFailure, fastest_speed
-from hybrid_opt.timing.model import PathMotion, TimingModel
+from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_check import path_failure
+from hybrid_opt.timing.path_motion import PathMotion
 from hybrid_opt.timing.point_limits import POINT_TOLERANCE, PointLimits
 from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.refined import refined_carry

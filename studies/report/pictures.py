@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from studies.report import (
     pictures_carry,
     pictures_cell,
+    pictures_drive,
     pictures_fronts,
     pictures_robust,
     pictures_search,
@@ -152,7 +153,7 @@ def _carry_pictures(data: ReportData) -> Iterator[ReportPicture]:
             "Drivable durations against the limit on the normal forces: single paths timed anew "
             "at every limit, and the members of the drivable fronts. All other limits hold "
             "throughout.",
-            lambda: pictures_carry.duration_against_force(data),
+            lambda: pictures_drive.duration_against_force(data),
         )
     yield from _price_picture(data)
     if any(len(found.time) for found in data.simulations):

@@ -9,8 +9,9 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.geometry.bodies import CollisionBody
+from symbolic.geometry.enclosing import axes_with_z
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.geometry.pieces import Piece, axes_with_z, edges, support
+from symbolic.geometry.pieces import Piece, edges, support
 from symbolic.geometry.placements import clean
 
 Interval = tuple[ca.SX, ca.SX]

@@ -20,6 +20,7 @@ from scipy.spatial import ConvexHull, QhullError
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError, DualArmWarning, OutsideError
+from symbolic.geometry.decomposition import decompose, hull_of, hull_volume
 from symbolic.geometry.pieces import SMALLEST_SIZE, Hull
 
 FORMATS = ("stl", "dae", "obj", "ply", "off")
@@ -43,15 +44,6 @@ MOST_PARTS = 400
 
 LARGEST_EXTENT = 100.0
 """Largest extent and coordinate of a mesh [m]: more is a file in millimetres without its scale."""
-
-CUTS = np.linspace(0.125, 0.875, 7)
-"""Where planes are tried, as fractions of a part's extent."""
-
-MOST_PIECES = 8
-"""Most convex pieces per connected component."""
-
-WORTHWHILE = 0.05
-"""A cut is made if it removes at least this part of the component's hull volume."""
 
 
 # What it has to say is in the errors below; its log would add tracebacks on the terminal.
@@ -90,12 +82,12 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
     try:
         for component in mesh.split(only_watertight=False, repair=False):
             triangles = np.asarray(component.triangles, dtype=float)
-            hull_volume = _volume(triangles)
-            if component.is_watertight and component.is_winding_consistent and hull_volume > 0.0:
-                pieces.extend(_decompose(triangles, abs(float(component.volume))))
+            filled = hull_volume(triangles)
+            if component.is_watertight and component.is_winding_consistent and filled > 0.0:
+                pieces.extend(decompose(triangles, abs(float(component.volume))))
             else:
                 open_components += 1
-                pieces.append(_hull(triangles if hull_volume > 0.0 else _thickened(triangles)))
+                pieces.append(hull_of(triangles if filled > 0.0 else _thickened(triangles)))
     except QhullError as error:
         raise CollisionModelError(
             f"{path}: a part of the mesh has no convex hull; remove triangles that are points or "
@@ -115,7 +107,7 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
 
 def _outermost(pieces: list[Hull]) -> tuple[Hull, ...]:
     """The pieces without those that lie in another: screws and bearings inside a housing."""
-    volumes = [_volume(piece.vertices[piece.faces]) for piece in pieces]
+    volumes = [hull_volume(piece.vertices[piece.faces]) for piece in pieces]
     kept: list[tuple[Hull, Array]] = []
     for k in np.argsort(volumes, kind="stable")[::-1]:
         piece = pieces[k]
@@ -246,79 +238,3 @@ def _collada_unit(mesh: trimesh.Trimesh) -> float:
     """Metres per unit; trimesh tells a COLLADA file's as '0.01 * meters' and does not apply it."""
     factor, _, unit = str(mesh.units or "").partition(" * ")
     return float(factor) if unit == "meters" else 1.0
-
-
-def _hull(points: Array) -> Hull:
-    hull = ConvexHull(points.reshape(-1, 3))
-    vertices = hull.points[hull.vertices]
-    index = np.full(len(hull.points), -1)
-    index[hull.vertices] = np.arange(len(hull.vertices))
-    faces = index[hull.simplices]
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0.0
-    faces[inward] = faces[inward][:, ::-1]
-    vertices.setflags(write=False)
-    faces.setflags(write=False)
-    return Hull(vertices, faces)
-
-
-def _decompose(triangles: Array, solid: float) -> list[Hull]:
-    """Cut greedily, always the part whose best cut removes the most empty volume.
-
-    Args:
-        triangles: (n, 3, 3) of a watertight surface.
-        solid: the volume that it encloses [m^3].
-    """
-    whole = _volume(triangles)
-    if whole - solid < WORTHWHILE * whole:
-        return [_hull(triangles)]
-    parts = [(triangles, *_best_cut(triangles))]
-    while len(parts) < MOST_PIECES:
-        k = int(np.argmax([gain for _, gain, _ in parts]))
-        _, gain, halves = parts[k]
-        if gain < WORTHWHILE * whole:
-            break
-        parts[k : k + 1] = [(half, *_best_cut(half)) for half in halves]
-    return [_hull(part) for part, _, _ in parts]
-
-
-def _volume(triangles: Array) -> float:
-    """Volume of the convex hull; zero where it is flat."""
-    try:
-        return float(ConvexHull(triangles.reshape(-1, 3)).volume)
-    except (QhullError, ValueError):
-        return 0.0
-
-
-def _best_cut(triangles: Array) -> tuple[float, tuple[Array, ...]]:
-    """The gain [m^3] of the best plane across a coordinate axis, and the two halves."""
-    volume = _volume(triangles)
-    lower, upper = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    best: tuple[float, tuple[Array, ...]] = (0.0, ())
-    for axis in range(3):
-        for level in lower[axis] + CUTS * (upper[axis] - lower[axis]):
-            halves = (_clip(triangles, axis, level, 1.0), _clip(triangles, axis, level, -1.0))
-            gain = volume - sum(_volume(half) for half in halves)
-            if gain > best[0]:
-                best = (gain, halves)
-    return best
-
-
-def _clip(triangles: Array, axis: int, level: float, side: float) -> Array:
-    """The parts of triangles (n, 3, 3) where side * (coordinate - level) >= 0, as triangles."""
-    height = side * (triangles[:, :, axis] - level)
-    inside = height >= 0.0
-    count = inside.sum(axis=1)
-    kept = [triangles[count == 3]]
-    for lone_is_inside, chosen in ((True, count == 1), (False, count == 2)):
-        lone = np.argmax(inside[chosen] == lone_is_inside, axis=1)
-        order = (lone[:, None] + np.arange(3)) % 3
-        a, b, c = np.moveaxis(np.take_along_axis(triangles[chosen], order[:, :, None], 1), 1, 0)
-        ha, hb, hc = np.take_along_axis(height[chosen], order, 1).T[:, :, None]
-        ab, ac = a + ha / (ha - hb) * (b - a), a + ha / (ha - hc) * (c - a)
-        if lone_is_inside:
-            kept.append(np.stack([a, ab, ac], axis=1))
-        else:
-            kept += [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
-    return np.concatenate(kept)

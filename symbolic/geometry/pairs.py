@@ -12,27 +12,19 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-import pinocchio as pin
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
+from symbolic.geometry.apart import anchor, never_meet, out_of_reach, relative_placement
 from symbolic.geometry.bodies import (
     ArmGeometry,
     CollisionBody,
-    Frame,
     arm_geometry,
     collision_bodies,
 )
 from symbolic.geometry.coal_shapes import coal_distance
 from symbolic.geometry.ignored import ignored_pairs
-from symbolic.geometry.pieces import (
-    Piece,
-    ball,
-    farthest_from_axis,
-    farthest_from_point,
-    shrunk,
-    swept_cylinder,
-)
+from symbolic.geometry.pieces import shrunk
 from symbolic.workcell.records import Workcell
 
 MOST_ENTERED = 1e-3
@@ -132,8 +124,8 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
             ignored.get(frozenset((a.name, b.name)), "")
             or _rigid(a, b, arms)
             or _neighbours(a, b, bodies)
-            or _out_of_reach(a, b, arms, tolerance)
-            or _never_meet(a, b, arms, tolerance)
+            or out_of_reach(a, b, arms, tolerance)
+            or never_meet(a, b, arms, tolerance)
             or always.reason(a, b)
         )
         if reason:
@@ -159,22 +151,10 @@ def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, Arm
             )
 
 
-def _anchor(
-    body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int
-) -> CollisionBody:
-    """The body with a carried box seen as part of a robot's last link."""
-    if body.frame.kind != "box":
-        return body
-    pieces = tuple(piece.moved(arms[robot].T_joint_box) for piece in body.pieces)
-    return CollisionBody(
-        body.name, body.group, Frame("link", robot, arms[robot].joints - 1), pieces
-    )
-
-
 def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:
     """The pair does not move against each other: fixed, or held by the exact grasp."""
     for robot in (0, 1):
-        left, right = _anchor(a, arms, robot), _anchor(b, arms, robot)
+        left, right = anchor(a, arms, robot), anchor(b, arms, robot)
         if left.frame == right.frame:
             gap = coal_distance(left.pieces, right.pieces)
             state = f"gap {1e3 * gap:.1f} mm" if gap > 0.0 else "touching"
@@ -202,95 +182,6 @@ def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody,
     return "neighbours in the arm, they overlap at their joint" if not between else ""
 
 
-def _out_of_reach(
-    a: CollisionBody,
-    b: CollisionBody,
-    arms: tuple[ArmGeometry, ArmGeometry],
-    tolerance: float,
-) -> str:
-    """A bound of the motion of one about the other keeps them apart."""
-    margin = tolerance + 1e-3
-    if {a.frame.robot, b.frame.robot} == {0, 1}:
-        zones = [_zone(body, arms[body.frame.robot], -1) for body in (a, b)]
-        gap = coal_distance((zones[0],), (zones[1],))
-        return f"out of reach: their zones stay {1e3 * gap:.0f} mm apart" if gap > margin else ""
-    for robot in (0, 1):
-        left, right = _anchor(a, arms, robot), _anchor(b, arms, robot)
-        low, high = sorted((left, right), key=lambda body: body.frame.joint)
-        if high.frame.robot != robot or low.frame.robot not in (robot, -1):
-            continue
-        gap = coal_distance((_zone(high, arms[robot], low.frame.joint),), low.pieces)
-        if gap > margin:
-            return f"out of reach: the zone of {high.name} stays {1e3 * gap:.0f} mm away"
-    return ""
-
-
-def _never_meet(
-    a: CollisionBody,
-    b: CollisionBody,
-    arms: tuple[ArmGeometry, ArmGeometry],
-    tolerance: float,
-) -> str:
-    """Bodies two joints apart that no position of the two joints brings together.
-
-    The farther body is replaced by its swept cylinder about the second joint's axis; the first
-    joint's range is cut into intervals, each cleared by the distance at its middle, which is
-    more than the body can move within half the interval.
-    """
-    for robot, arm in enumerate(arms):
-        left, right = _anchor(a, arms, robot), _anchor(b, arms, robot)
-        low, high = sorted((left, right), key=lambda body: body.frame.joint)
-        own_base = (
-            low.frame.robot == robot or low.group == f"robot {robot + 1}" or low.carries is not None
-        )
-        if high.frame.robot != robot or not own_base or high.frame.joint - low.frame.joint != 2:
-            continue
-        first = low.frame.joint + 1
-        if not all(arm.turning[first : first + 2]):
-            continue
-        swept = _zone(high, arm, first)
-        reach = farthest_from_axis(swept, np.zeros(3), arm.axes[first])
-        turn = min(float(arm.upper[first] - arm.lower[first]), 2.0 * np.pi)
-        ranges = [(float(arm.lower[first]), float(arm.lower[first]) + turn)]
-        least = np.inf
-        while ranges:
-            start, end = ranges.pop()
-            q = np.zeros(arm.joints)
-            q[first] = (start + end) / 2.0
-            T = relative_placement(arm, low.frame.joint, first, q)
-            gap = coal_distance((swept.moved(T),), low.pieces)
-            if gap <= tolerance + 1e-3:
-                return ""
-            kept = gap - reach * (end - start) / 2.0
-            if kept > tolerance:
-                least = min(least, kept)
-            else:
-                ranges += [(start, q[first]), (q[first], end)]
-        return f"never meet: at least {1e3 * least:.1f} mm apart at all positions of both joints"
-    return ""
-
-
-def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
-    """What a body behind joint `body.frame.joint` can reach, seen from joint `below` (-1: world).
-
-    One joint that turns between them: the swept cylinder about its axis. Else the ball about the
-    first joint's origin whose radius is the stretched chain.
-    """
-    first = below + 1
-    T = arm.T_world_root @ arm.origins[0] if first == 0 else arm.origins[first]
-    if body.frame.joint == first and arm.turning[first]:
-        return swept_cylinder(body.pieces, np.zeros(3), arm.axes[first]).moved(T)
-    return ball(T[:3, 3], chain_radius(body, arm, first) + float(arm.slides[first]))
-
-
-def chain_radius(body: CollisionBody, arm: ArmGeometry, first: int) -> float:
-    """Distance from the origin of joint `first` that no point of a body behind it exceeds [m]."""
-    behind = slice(first + 1, body.frame.joint + 1)
-    offsets = np.linalg.norm(arm.origins[behind, :3, 3], axis=1) + arm.slides[behind]
-    own = max(farthest_from_point(piece, np.zeros(3)) for piece in body.pieces)
-    return float(offsets.sum()) + own
-
-
 class _AlwaysTouching:
     """Pairs within an arm (the box it holds included) that touch in every sampled posture."""
 
@@ -303,7 +194,7 @@ class _AlwaysTouching:
 
     def reason(self, a: CollisionBody, b: CollisionBody) -> str:
         for robot in (0, 1):
-            left, right = _anchor(a, self.arms, robot), _anchor(b, self.arms, robot)
+            left, right = anchor(a, self.arms, robot), anchor(b, self.arms, robot)
             group = f"robot {robot + 1}"
             own = {body.group for body in (a, b) if body.carries is None}
             if group not in own or own - {group, "payload"}:
@@ -316,16 +207,3 @@ class _AlwaysTouching:
             else:
                 return f"touch in all of {POSTURES} random postures"
         return ""
-
-
-def relative_placement(arm: ArmGeometry, below: int, joint: int, q: Array) -> Array:
-    """(4, 4) of a joint's frame in the frame of an earlier joint (-1: world) at q (n,)."""
-    T: Array = arm.T_world_root if below < 0 else np.eye(4)
-    for k in range(below + 1, joint + 1):
-        moved = np.eye(4)
-        if arm.turning[k]:
-            moved[:3, :3] = pin.exp3(arm.axes[k] * q[k])
-        else:
-            moved[:3, 3] = arm.axes[k] * q[k]
-        T = T @ arm.origins[k] @ moved
-    return T

@@ -20,8 +20,9 @@ from symbolic.geometry.directions import (
     fixed_intervals,
     slanted_matters,
 )
+from symbolic.geometry.enclosing import SphereChain
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.geometry.pieces import Capsule, Piece, SphereChain, bounding_box, support
+from symbolic.geometry.pieces import Capsule, Piece, bounding_box, support
 from symbolic.geometry.placements import clean, world_placements
 from symbolic.geometry.softness import Softness
 from symbolic.workcell.records import Box, Cylinder, Sphere

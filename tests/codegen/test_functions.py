@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -24,35 +20,9 @@ from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from symbolic.array import Array
+from tests.codegen.samples import random_function, small
 
 Make = Callable[[ca.Function], NumericFunction]
-
-BINARY = [
-    lambda a, b: a + b,
-    lambda a, b: a * b,
-    lambda a, b: a - ca.cos(b),
-    lambda a, b: a / (1.0 + b * b),
-    lambda a, b: ca.atan2(a, 1.0 + b * b),
-    lambda a, b: ca.if_else(a > b, ca.sin(a), ca.sqrt(1.0 + b * b)),
-    lambda a, b: ca.fmax(a, ca.fabs(b)),
-]
-
-
-def random_function(rng: np.random.Generator, symbol: Any) -> ca.Function:
-    """A random expression graph of a matrix and a vector, as SX or MX, with three outputs."""
-    matrix, vector = symbol.sym("matrix", 2, 3), symbol.sym("vector", 3)
-    terms = [matrix @ vector, matrix[:, 0] * vector[0], ca.sin(vector[1:])]
-    for _ in range(rng.integers(5, 40)):
-        first, second = rng.integers(len(terms), size=2)
-        terms.append(BINARY[rng.integers(len(BINARY))](terms[first], terms[second]))
-    tail = terms[-3:]
-    return ca.Function(
-        "random_graph",
-        [matrix, vector],
-        [tail[0], ca.horzcat(*tail), ca.dot(tail[1], tail[2])],
-        ["matrix", "vector"],
-        ["column", "table", "number"],
-    )
 
 
 @pytest.fixture(params=["compiled", "interpreted"])
@@ -61,13 +31,6 @@ def make(request: pytest.FixtureRequest, cache: Cache) -> Make:
     if request.param == "interpreted":
         return lambda function: InterpretedFunction(dense(function))
     return lambda function: compile_function(function, cache)
-
-
-def small() -> ca.Function:
-    x, y = ca.MX.sym("x", 3), ca.MX.sym("y", 2, 4)
-    return ca.Function(
-        "small", [x, y], [2.0 * y, ca.sumsqr(x) * x, ca.sum1(x)], ["x", "y"], ["a", "b", "c"]
-    )
 
 
 @settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
@@ -251,63 +214,6 @@ def test_zero_size_arguments(make: Make) -> None:
     np.testing.assert_array_equal(found["y"], [3.0, 3.0])
 
 
-def test_many_threads_share_one_function(cache: Cache) -> None:
-    function = compile_function(random_function(np.random.default_rng(2), ca.MX), cache)
-    rng = np.random.default_rng(3)
-    cases = [[rng.standard_normal(s) for s in function.input_shapes] for _ in range(400)]
-    expected = [function(*case) for case in cases]
-    with ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(lambda case: function(*case), cases))
-    for one, other in zip(expected, found, strict=True):
-        for name in function.output_names:
-            np.testing.assert_array_equal(one[name], other[name])
-
-
-def test_other_threads_run_during_a_batch(cache: Cache) -> None:
-    """The interpreter's lock is free while candidates are computed, so that cores add up."""
-    x = ca.SX.sym("x")
-    step = ca.Function("step", [x], [ca.sin(x) + 0.5])
-    slow = compile_function(step.mapaccum("slow", 1000), cache)
-    with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(slow.batch, np.zeros(40_000))
-        turns = 0
-        while not running.done():
-            time.sleep(0.001)
-            turns += 1
-    # The lock held, this thread would get a turn before and one after.
-    assert turns > 10
-
-
-def test_functions_with_memory_in_threads(cache: Cache, capfd: pytest.CaptureFixture[str]) -> None:
-    """A solver keeps state in its generated code; each thread must have its own."""
-    x, target = ca.SX.sym("x", 2), ca.SX.sym("p", 2)
-    solver = ca.nlpsol(
-        "solver",
-        "sqpmethod",
-        {"x": x, "p": target, "f": ca.sumsqr(x - target) + ca.sumsqr(x) ** 2},
-        {
-            "qpsol": "qrqp",
-            "print_header": False,
-            "print_iteration": False,
-            "print_time": False,
-            "print_status": False,
-            "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False},
-        },
-    )
-    p = ca.MX.sym("p", 2)
-    function = compile_function(
-        ca.Function("nearest", [p], [solver(x0=[0.0, 0.0], p=p)["x"]], ["p"], ["x"]), cache
-    )
-    assert isinstance(function, CompiledFunction)
-    points = np.random.default_rng(4).standard_normal((64, 2))
-    serial = function.batch(points, threads=1)["x"]
-    parallel = function.batch(points, threads=4)["x"]
-    capfd.readouterr()
-    np.testing.assert_array_equal(serial, parallel)
-    gradient = 2.0 * (serial - points) + 4.0 * np.sum(serial**2, axis=1, keepdims=True) * serial
-    assert np.abs(gradient).max() < 1e-5
-
-
 def test_loaded_twice_from_one_library(cache: Cache) -> None:
     first, second = compile_function(small(), cache), compile_function(small(), cache)
     assert isinstance(first, CompiledFunction)
@@ -316,19 +222,6 @@ def test_loaded_twice_from_one_library(cache: Cache) -> None:
     np.testing.assert_array_equal(
         first(np.ones(3), np.ones((4, 2)))["b"], second(np.ones(3), np.ones((4, 2)))["b"]
     )
-
-
-def test_a_forked_child_has_threads_of_its_own(cache: Cache, tmp_path: Path) -> None:
-    function = compile_function(small(), cache)
-    inputs = (np.ones((16, 3)), np.ones((4, 2)))
-    expected = function.batch(*inputs, threads=2)["b"]
-    reply = tmp_path / "reply.npy"
-    child = os.fork()
-    if child == 0:
-        np.save(reply, function.batch(*inputs, threads=2)["b"])
-        os._exit(0)
-    assert os.waitpid(child, 0)[1] == 0
-    np.testing.assert_array_equal(np.load(reply), expected)
 
 
 def test_maximum_and_minimum_yield_to_numbers(cache: Cache) -> None:

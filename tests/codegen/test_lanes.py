@@ -17,7 +17,7 @@ from codegen.compiled import CompiledFunction
 from codegen.lanes import lane_text
 from codegen.source import generated_c
 from symbolic.array import Array
-from tests.codegen.test_functions import random_function
+from tests.codegen.samples import random_function
 
 WIDTHS = (2, 4, 8)
 

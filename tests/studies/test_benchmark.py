@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from studies import benchmark, benchmark_collisions, benchmark_study
+from studies.benchmark_text import report
 from studies.benchmark_turns import Evaluate, interleaved, summary
 from symbolic.array import Array
 from tests.symbolic.cells import RACK, hand_cell
@@ -96,7 +97,7 @@ def test_measures_the_rack_and_keeps_its_promises(
     assert [entry["samples"] for entry in scaling["samples"]] == [25, 50, 100]
     assert [entry["waypoints"] for entry in scaling["waypoints"]] == [1, 3]
     assert scaling["samples_line"]["largest_relative_deviation"] < 0.25
-    assert benchmark._report(result).startswith(result["workcell"])
+    assert report(result).startswith(result["workcell"])
 
 
 @pytest.mark.parametrize(

@@ -303,7 +303,7 @@ def test_hulls_and_their_pieces_reach_fcl_unchanged() -> None:
     import fcl
 
     from hybrid_opt.collision.judge import fcl_object
-    from symbolic.geometry.pieces import ball
+    from symbolic.geometry.enclosing import ball
 
     probe = ball(np.array([0.7, -0.6, 0.9]), 0.05)
     for body in geometry_of("ur10").bodies[:8]:

@@ -12,10 +12,11 @@ import trimesh
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
-from symbolic.geometry.bodies import MeshReader, _link_pieces, collision_bodies
+from symbolic.geometry.bodies import _link_pieces, collision_bodies
 from symbolic.geometry.coal_shapes import coal_distance
 from symbolic.geometry.pairs import build_geometry
 from symbolic.geometry.pieces import Capsule, Hull, Piece, support
+from symbolic.geometry.shape_reader import MeshReader
 from symbolic.workcell.file import load
 from symbolic.workcell.records import (
     Body,

@@ -1,0 +1,157 @@
+"""One convex step towards a timing within limits on jerk: the limits as rows of its program."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybrid_opt.timing.jerk_program import Point, Rows
+from hybrid_opt.timing.model import TimingModel, contact_torque
+from hybrid_opt.timing.path_motion import PathMotion
+from hybrid_opt.timing.records import JerkLimits, TimingLimits
+from hybrid_opt.timing.rows import squared_speed_limit
+from hybrid_opt.timing.use import limits_pressure
+from symbolic.array import Array
+from symbolic.physics.contact_forces import GRAVITY
+
+LEAST_SHARE = 0.05
+"""Of its last value that a coefficient keeps at least."""
+
+
+NEAR = 0.6
+"""Torques and shifts that stay below this share of their limit get no rows."""
+
+
+def convex_step(
+    model: TimingModel, at: Point, c: Array, limits: TimingLimits, jerk: JerkLimits
+) -> Array | None:
+    """Better coefficients than c (k,), which satisfy all limits at the points; None without any."""
+    rows = Rows(len(c))
+    _motion_rows(model, at, limits, rows)
+    _force_rows(model, at, limits, rows)
+    _ratio_rows(model, at, c, limits, rows)
+    _jerk_rows(at, c, jerk, rows)
+    rows.below(-np.eye(len(c)), -LEAST_SHARE * c)
+    gradient, H = at.objective(c)
+    answer = rows.assembled().minimised(H, gradient - H @ c, c)
+    if answer is None:
+        return None
+    # The quadratic model promises too much far away: c and the answer are both allowed, and so is
+    # everything between them.
+    share = 1.0
+    while at.duration(c + share * (answer - c)) > at.duration(c) and share > 1e-3:
+        share *= 0.5
+    return np.asarray(c + share * (answer - c))
+
+
+def _motion_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows) -> None:
+    """Speeds and accelerations of joints and box."""
+    workcell, m, keep = model.workcell, at.motion, at.keep
+    ceiling = np.minimum(squared_speed_limit(m, workcell, limits), 1e6)
+    rows.below(at.squared_by / ceiling[:, None], keep)
+    limit = np.concatenate([robot.acceleration_max for robot in workcell.robots])
+    by = (m.q_first / limit)[:, :, None] * at.acceleration_by[:, None, :]
+    by = by + (m.q_second / limit)[:, :, None] * at.squared_by[:, None, :]
+    flat = by.reshape(-1, by.shape[2])
+    for sign in (1.0, -1.0):
+        rows.below(sign * flat, np.repeat(keep, len(limit)))
+    payload = workcell.payload
+    for first, second, most in (
+        (m.pose_first[:, :3], m.pose_second[:, :3], payload.acceleration_max),
+        (m.angular_first, m.angular_second, payload.angular_acceleration_max),
+    ):
+        A = first[:, :, None] * at.acceleration_by[:, None] + (
+            second[:, :, None] * at.squared_by[:, None]
+        )
+        n, k = len(at.s), at.value.shape[1]
+        rows.within(A / most, np.zeros((n, 3)), np.zeros((n, k)), keep)
+
+
+def _force_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows) -> None:
+    """Both normal forces, each branch a cone: share_n F_n + share_t |F_t| <= the limit."""
+    if limits.force is None:
+        return
+    import casadi as ca
+
+    from symbolic.physics.contact_forces import normal_force_branches
+
+    workcell, m, force = model.workcell, at.motion, limits.force
+    friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
+    by_normal, by_tangent = (
+        np.array(normal_force_branches(ca.DM(n), ca.DM(1 - n), friction)).reshape(-1)
+        for n in (1, 0)
+    )
+    weight = workcell.payload.mass * np.array(GRAVITY)
+    A = m.force_by_acceleration[:, :, None] * at.acceleration_by[:, None] + (
+        m.force_by_speed[:, :, None] * at.squared_by[:, None]
+    )
+    along = np.einsum("nd,ndk->nk", m.normal, A)
+    still = -(m.normal @ weight)
+    across = A - m.normal[:, :, None] * along[:, None]
+    rest = -weight - m.normal * still[:, None]
+    for extra in (1.0, 0.0):  # N_1 = N_2 + F_n
+        for share_n, share_t in zip(by_normal + extra, by_tangent, strict=True):
+            room = at.keep * force - share_n * still
+            if share_t > 0.0:
+                rows.within(
+                    share_t * across / force,
+                    share_t * rest / force,
+                    share_n * along / force,
+                    room / force,
+                )
+            elif share_n:
+                rows.below(share_n * along / force, room / force)
+
+
+def _ratio_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, rows: Rows) -> None:
+    """Joint torques and shifts of the pressure, linearised at c."""
+    a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
+    value = _ratios(model, at.motion, a, w, limits)
+    near = (np.abs(value) > NEAR).any(axis=0)
+    if not near.any():
+        return
+    step_a, step_w = 1e-5 * max(float(np.abs(a).max()), 1e-6), 1e-5 * max(float(w.max()), 1e-6)
+    by_a = (_ratios(model, at.motion, a + step_a, w, limits) - value)[:, near] / step_a
+    by_w = (_ratios(model, at.motion, a, w + step_w, limits) - value)[:, near] / step_w
+    by = by_a[:, :, None] * at.acceleration_by[:, None] + by_w[:, :, None] * at.squared_by[:, None]
+    chosen = value[:, near]
+    for sign in (1.0, -1.0):
+        # What is exceeded between rounds, because it is not convex, may stay as it is for one.
+        bound = np.maximum(at.keep[:, None], sign * chosen) - sign * chosen + sign * (by @ c)
+        rows.below(sign * by.reshape(-1, by.shape[2]), bound.reshape(-1))
+
+
+def _ratios(
+    model: TimingModel, motion: PathMotion, a: Array, w: Array, limits: TimingLimits
+) -> Array:
+    """(n, ...) joint torques and shifts over their limits, as far as they are limited."""
+    workcell = model.workcell
+    load = model.drive(motion, np.sqrt(w), a)
+    own = motion.torque_by_acceleration * a[:, None] + motion.torque_by_speed * w[:, None]
+    torque = contact_torque(workcell, motion.wrench_torque, load) + own + motion.torque_at_rest
+    columns = [np.zeros((len(a), 0))]
+    if limits.torque:
+        columns.append(torque / np.concatenate([r.torque_max for r in workcell.robots]))
+    if limits_pressure(workcell, limits):
+        radius = np.array([contact.patch_radius for contact in workcell.contacts])
+        columns.append(load["pressure_shift"] / radius)
+    return np.concatenate(columns, axis=1)
+
+
+def _jerk_rows(at: Point, c: Array, jerk: JerkLimits, rows: Rows) -> None:
+    """Jerk over sqrt(v) below the tangent of the limit over sqrt(v) at c."""
+    v = at.value @ c
+    level, slope = 1.5 / np.sqrt(v), 0.5 * v**-1.5
+    # Multiplied by sqrt(v) of the last round, so that rows are of order one.
+    root = np.sqrt(v)
+    head = (at.keep * slope * root)[:, None] * at.value
+    level = at.keep * level * root
+    limited = np.isfinite(jerk.joints)
+    by = at.joint_jerk_by[:, limited] / jerk.joints[limited, None] * root[:, None, None]
+    joints = by.shape[1]
+    bound = np.repeat(level, joints)
+    below = np.repeat(head, joints, axis=0)
+    for sign in (1.0, -1.0):
+        rows.below(sign * by.reshape(-1, by.shape[2]) + below, bound)
+    if np.isfinite(jerk.payload):
+        box = at.box_jerk_by / jerk.payload * root[:, None, None]
+        rows.within(box, np.zeros((len(v), 3)), head, level)
