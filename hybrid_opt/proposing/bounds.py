@@ -25,6 +25,15 @@ CONFIRMED = 250
 ROUNDS = 7
 """Rounds of the bisection."""
 
+BATCH = 32
+"""Candidates that are judged before the clock is looked at."""
+
+STEPS = (0.8, 1.2)
+"""Factor of the next bounds where too few, or too many, are feasible."""
+
+EMPTY_STEP = 0.5
+"""The same where none is."""
+
 CENTRING = 3
 """Times that bounds may move to where feasible candidates lie."""
 
@@ -91,14 +100,18 @@ def find_bounds(centre: Array, sampling: Sampling) -> Bounds:
         if not sampling.certain(moved):
             break
         centre = moved
+    wanted = 1.3 * sampling.low, 0.85 * sampling.high
+    tried: list[tuple[float, float, int]] = []
     for _ in range(ROUNDS):
-        x = _drawn(centre, scale, sampling, CONFIRMED)
-        share = float(sampling.feasible(x).mean())
-        if 1.3 * sampling.low <= share <= 0.85 * sampling.high or sampling.out_of_time():
+        _, fine = _judged(centre, scale, sampling, CONFIRMED, wanted)
+        share = float(fine.mean())
+        tried.append((scale, share, len(fine)))
+        if wanted[0] <= share <= wanted[1] or sampling.out_of_time():
             break
-        scale *= 0.8 if share < aim else 1.2
-        scale = float(np.clip(scale, NARROWEST, WIDEST))
-    return Bounds(centre, *_box(centre, scale, sampling), share, len(x))
+        step = EMPTY_STEP if share == 0.0 else STEPS[share > aim]
+        scale = float(np.clip(step * scale, NARROWEST, WIDEST))
+    scale, share, count = min(tried, key=lambda one: abs(np.log((one[1] + 1e-3) / aim)))
+    return Bounds(centre, *_box(centre, scale, sampling), share, count)
 
 
 def _bisected(centre: Array, scale: float, aim: float, sampling: Sampling) -> tuple[float, Array]:
@@ -106,8 +119,7 @@ def _bisected(centre: Array, scale: float, aim: float, sampling: Sampling) -> tu
     low, high = NARROWEST, WIDEST
     good = np.empty((0, len(centre)))
     for _ in range(ROUNDS):
-        x = _drawn(centre, scale, sampling, DRAWN)
-        fine = sampling.feasible(x)
+        x, fine = _judged(centre, scale, sampling, DRAWN, (0.65 * aim, 1.35 * aim))
         share = float(fine.mean())
         if share >= aim:
             low, good = scale, x[fine]
@@ -119,9 +131,25 @@ def _bisected(centre: Array, scale: float, aim: float, sampling: Sampling) -> tu
     return scale, good
 
 
+def _judged(
+    centre: Array, scale: float, sampling: Sampling, most: int, wanted: tuple[float, float]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Candidates (n, n_var) and verdicts (n,): at most so many, fewer where the share of feasible
+    ones is surely outside of what is wanted, or the time is up."""
+    x, fine = np.empty((0, len(centre))), np.empty(0, dtype=bool)
+    while len(x) < most:
+        more = _drawn(centre, scale, sampling, min(BATCH, most - len(x)))
+        x, fine = np.vstack([x, more]), np.append(fine, sampling.feasible(more))
+        found, spread = int(fine.sum()), 2.0 * np.sqrt(fine.sum() + 1.0)
+        beyond = found + spread < wanted[0] * len(x) or found - spread > wanted[1] * len(x)
+        if beyond or sampling.out_of_time():
+            break
+    return x, fine
+
+
 def _box(centre: Array, scale: float, sampling: Sampling) -> tuple[Array, Array]:
     half = scale * sampling.unit
-    least, most = sampling.limits
+    least, most = np.minimum(sampling.limits[0], centre), np.maximum(sampling.limits[1], centre)
     return np.maximum(centre - half, least), np.minimum(centre + half, most)
 
 

@@ -19,11 +19,17 @@ UNIT = np.array([0.10, 0.10, 0.10, 0.08, 0.08, 0.08])
 REDUNDANT_UNIT = 0.15
 """Half-width of a redundant joint's value [rad or m]."""
 
-LIMITS = np.array([10.0, 10.0, 10.0, np.pi, 0.5 * np.pi, np.pi])
-"""Beyond which no pose of a workcell file may be, or should be (angles) [m, rad]."""
+LIMITS = np.array([10.0, 10.0, 10.0, 3.14, 1.57, 3.14])
+"""Beyond which no pose of a workcell file may be, or should need to be (angles) [m, rad]."""
 
-VECTOR_LIMITS = np.array([10.0, 10.0, 10.0, 4.0, 4.0, 4.0])
-"""The same of poses with rotation vectors: a turn over, and room beside it [m, rad]."""
+ROOM = 0.5
+"""What angles may vary by where a carry itself is beyond these [rad]."""
+
+ANGLE_LIMIT = 6.28
+"""Beyond which no angle of a workcell file may be [rad]."""
+
+VECTOR_LIMIT = 4.99
+"""The same of a rotation vector's length [rad]."""
 
 DRAFTED = 0.01
 """Half-width of bounds that nothing is known of yet [m, rad]."""
@@ -90,7 +96,7 @@ def changes(problem: Problem, found: Found) -> dict[str, Any]:
         spin = float(problem.data["contacts"][i].get("spin", 0.0)) + found.spins[i]
         contacts.append(
             {
-                **problem.contacts[i],
+                **found.given.get("contacts", problem.contacts)[i],
                 "spin": round(float(np.remainder(spin + np.pi, 2 * np.pi) - np.pi), 9),
             }
         )
@@ -101,19 +107,35 @@ def changes(problem: Problem, found: Found) -> dict[str, Any]:
 
 
 def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
-    """Half-widths (n_var,) that are scaled together, and limits (2, n_var) of bounds."""
+    """Half-widths (n_var,) that are scaled together, and limits (2, n_var) of bounds around the
+    workcell's hand-made trajectory."""
     task, n = workcell.task, len(workcell.task.waypoints)
-    poses = len(task.free_indices)
-    unit = [np.tile(UNIT, poses)]
-    limits = VECTOR_LIMITS if task.orientation.is_vector else LIMITS
-    least, most = [np.tile(-limits, poses)], [np.tile(limits, poses)]
+    unit = [np.tile(UNIT, len(task.free_indices))]
+    least, most = [], []
+    for pose in task.initial:
+        low, high = _pose_limits(pose, task.orientation.is_vector)
+        least.append(low)
+        most.append(high)
     for joint in task.redundant:
         arm = 0 if joint.drives[0] >= 0 else 1
         robot, index = workcell.robots[arm], joint.drives[arm]
         unit.append(np.full(n, REDUNDANT_UNIT))
-        least.append(np.full(n, robot.position_lower[index]))
-        most.append(np.full(n, robot.position_upper[index]))
+        # Rounded inwards, because the file holds four decimals.
+        least.append(np.full(n, np.ceil(1e4 * robot.position_lower[index]) / 1e4))
+        most.append(np.full(n, np.floor(1e4 * robot.position_upper[index]) / 1e4))
     return np.concatenate(unit), np.array([np.concatenate(least), np.concatenate(most)])
+
+
+def _pose_limits(pose: Array, is_vector: bool) -> tuple[Array, Array]:
+    """Limits (6,) of bounds around a pose (6,), which lies between them."""
+    low, high = -LIMITS, LIMITS.copy()
+    if is_vector:  # the farthest corner of such a cube is no longer than allowed
+        room = max((VECTOR_LIMIT - np.linalg.norm(pose[3:])) / np.sqrt(3.0), 1e-3)
+        low[3:], high[3:] = pose[3:] - room, pose[3:] + room
+        return low, high
+    low[3:] = np.maximum(np.minimum(low[3:], pose[3:] - ROOM), -ANGLE_LIMIT)
+    high[3:] = np.minimum(np.maximum(high[3:], pose[3:] + ROOM), ANGLE_LIMIT)
+    return low, high
 
 
 def _boxes(found: Found) -> tuple[Array, Array]:

@@ -15,6 +15,7 @@ from hybrid_opt.proposing.kinematics import (
     ArmKinematics,
     box_poses,
     box_to_last_joint,
+    possible_spins,
     spun,
 )
 from symbolic.array import Array
@@ -125,12 +126,11 @@ def find_holds(
 ) -> HoldSearch:
     """The ways in which an arm can hold the box from start to goal, the other arm left out."""
     finder = _Finder(task, arm, kinematics, rng)
-    found = finder.found
+    found, contact = finder.found, task.workcell.contacts[arm]
+    spins = possible_spins(contact, task.spins)
     T_box_joint = [
-        box_to_last_joint(
-            task.workcell, kinematics.geometry, spun(task.workcell.contacts[arm], spin), arm
-        )
-        for spin in task.spins
+        box_to_last_joint(task.workcell, kinematics.geometry, spun(contact, spin), arm)
+        for spin in spins
     ]
     q, which = finder.start_postures(T_box_joint)
     if not len(q):
@@ -141,7 +141,7 @@ def find_holds(
     for spin, T in enumerate(T_box_joint):
         rows = np.flatnonzero(which == spin)
         if len(rows):
-            finder.lead(float(task.spins[spin]), T, q[rows])
+            finder.lead(float(spins[spin]), T, q[rows])
     found.holds.sort(key=lambda hold: -hold.score)
     compared = kinematics.geometry.joints - spins_the_pad(task.workcell, arm, kinematics)
     found.holds = _diverse(found.holds, compared)[:MOST_HOLDS]

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from symbolic.array import Array
 from symbolic.geometry.bodies import ArmGeometry, arm_geometry
 from symbolic.physics.pose import inverse, pose_matrix
+from symbolic.robot.machine import common_joints
+from symbolic.robot.urdf import arm_model
 from symbolic.workcell.records import Contact, Workcell
 
 REACHED = 1e-6
@@ -196,6 +198,29 @@ def spun(contact: Contact, spin: float) -> Contact:
     """A contact whose pad is turned about its normal by so much more [rad]."""
     turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
     return replace(contact, T_box_pad=contact.T_box_pad @ turn)
+
+
+def shoulders(workcell: Workcell) -> Array:
+    """(2, 3) where each arm's first joint of its own is in the world, all joints at the middle of
+    their ranges [m]."""
+    found = []
+    for i, robot in enumerate(workcell.robots):
+        arm = ArmKinematics.of(workcell, i, ())
+        names = list(arm_model(robot).names)[1:]
+        own = [k for k, name in enumerate(names) if name not in common_joints(workcell.robots)]
+        frames, _ = arm.chain((arm.lower + arm.upper)[None] / 2.0)
+        found.append(frames[0, own[0], :3])
+    return np.array(found)
+
+
+def possible_spins(contact: Contact, spins: Array) -> Array:
+    """Those of spins (n,) [rad] that leave a robot's patches where they are: all of one round pad,
+    half turns of a rectangular one, none beside 0 where further pads stand beside the first."""
+    if contact.further:
+        return np.zeros(1)
+    if contact.half_sides is None:
+        return spins
+    return np.asarray(spins[np.abs(np.sin(spins)) < 1e-9])
 
 
 def box_poses(start: Array, goal: Array, steps: int) -> Array:

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 
+from hybrid_opt.proposing.agreement import Agreement
 from hybrid_opt.proposing.closed_chain import ClosedChain, Place
 from hybrid_opt.proposing.holding import GUIDE_POSES, GUIDES, Hold
 from hybrid_opt.proposing.judge import MARGINS, PoseJudge
@@ -56,8 +57,12 @@ def ranked_pairs(
     scored.sort(key=lambda item: -item[0])
     judges = cache(judge.with_margin)
     models = (arm_model(workcell.robots[0]), arm_model(workcell.robots[1]))
-    found = []
-    for score, pair in scored[:MOST_PAIRS]:
+    agreement = Agreement(workcell, ends)
+    found: list[tuple[float, Pair]] = []
+    for score, alone in scored[:MOST_PAIRS]:
+        pair = agreement.of(alone)
+        if pair is None:
+            continue
         start, goal = (_place(workcell.task, pose, pair, k) for k, pose in enumerate(ends))
         wide = next(
             (judges(margin) for margin in MARGINS if _free(judges(margin), start, goal)), None

@@ -17,12 +17,16 @@ import numpy as np
 from hybrid_opt.proposing.closed_chain import ClosedChain, Place, distance, levers, straight
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.workcell.records import POSE_SIZE
 
 RETREAT = 0.6
 """Longest straight motion out of the start, or the goal, that is tried [m]."""
 
 SHORT_RETREAT = 0.06
 """Shortest one that is of use [m]."""
+
+REDUNDANT_ASIDE = 5.0
+"""What redundant joints may stray by, in what the box may [rad/m]."""
 
 MATCH = 1e-3
 """Largest difference of joints of two trees that meet [rad]: both arms on the same branch."""
@@ -55,32 +59,35 @@ class Freedom:
 
 
 @dataclass(frozen=True)
-class Leave:
+class Stray:
     """How far a path may stray.
 
     Attributes:
-        lower, upper: (6 + m,) bounds of positions and redundant joints; those of angles are not
-            used.
         tilt: how far the box may turn away from the turn between start and goal [rad]; 0: it turns
             from the one to the other and no other way.
         range: see `Freedom`.
+        aside: how far the box may be beyond start and goal along each of the world's axes [m].
     """
 
-    lower: Array
-    upper: Array
     tilt: float
     range: float
+    aside: float
 
 
-def freedom(start: Array, goal: Array, leave: Leave) -> Freedom:
+def freedom(start: Array, goal: Array, stray: Stray, limits: Array) -> Freedom:
     """Where a path from start to goal may go.
 
     Args:
         start, goal: (6 + m,).
-        leave: how far it may stray.
+        stray: how far it may stray; redundant joints `REDUNDANT_ASIDE` times as far.
+        limits: (m, 2) of the redundant joints [rad or m].
     """
-    lower, upper, tilt = leave.lower, leave.upper, leave.tilt
-    size, weight = len(start), levers(len(start))
+    size, weight, tilt = len(start), levers(len(start)), stray.tilt
+    aside = np.full(size, stray.aside)
+    aside[POSE_SIZE:] *= REDUNDANT_ASIDE
+    lower, upper = np.minimum(start, goal) - aside, np.maximum(start, goal) + aside
+    lower[POSE_SIZE:] = np.maximum(lower[POSE_SIZE:], limits[:, 0])
+    upper[POSE_SIZE:] = np.minimum(upper[POSE_SIZE:], limits[:, 1])
     columns, low, high = [], [], []
     turn = (goal - start) * ((np.arange(size) >= 3) & (np.arange(size) < 6))
     length = float(np.linalg.norm(weight * turn))
@@ -100,7 +107,7 @@ def freedom(start: Array, goal: Array, leave: Leave) -> Freedom:
         low.append(0.0)
         high.append(length)
     bounds = np.array(low) - 1e-9, np.array(high) + 1e-9
-    return Freedom(start, np.column_stack(columns), *bounds, leave.range)
+    return Freedom(start, np.column_stack(columns), *bounds, stray.range)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.proposing.document import completed, merged
+from hybrid_opt.proposing.kinematics import shoulders
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError, WorkcellError
@@ -21,8 +23,17 @@ from symbolic.workcell.file import load
 from symbolic.workcell.orientation import Orientation
 from symbolic.workcell.records import Workcell
 
+UPRIGHT = 0.7
+"""Share of the vertical from which on an edge of the box counts as upright."""
+
+LEAST_LEVEL = 0.1
+"""How far a carry goes level, at least, for its direction to count [m]."""
+
 PROPOSED = ("waypoints", "initial", "redundant")
 """Keys of the task that are proposed anew, whatever the file has."""
+
+_TINY = {"patch_size": None, "patch_radius": 0.001, "further": None, "normal": None}
+"""A contact that fits onto any face; of no meaning."""
 
 REACH_OF_DRAFT = 0.01
 """How far beside start and goal the one free waypoint of a draft may be [m, rad]; of no meaning."""
@@ -60,20 +71,61 @@ class Problem:
         return Orientation("quaternion", reference)
 
     @property
+    def is_machine(self) -> bool:
+        """Whether both robots are arms of one machine: other chains of one file at one base, which
+        may be missing."""
+        first, second = self.data["robots"]
+        same = all(first.get(key) == second.get(key) for key in ("urdf", "xacro_arguments", "base"))
+        chains = first.get("chain"), second.get("chain")
+        return same and all(chains) and chains[0] != chains[1]
+
+    @cached_property
     def contacts(self) -> list[dict[str, Any]]:
         """Both contacts' points, the middles of opposite faces where the file has none: those that
-        face the robots, or those that the carry passes sideways where the robots have no bases."""
+        face the robots (the shoulders of a machine with both arms), or those that the carry passes
+        sideways where the robots have no bases.
+
+        Raises:
+            WorkcellError: shoulders are asked for, and the file is wrong.
+        """
         entries = self.data["contacts"]
         if all("xyz" in entry for entry in entries):
             return [{"xyz": entry["xyz"]} for entry in entries]
         found = [robot.get("base", {}).get("xyz") for robot in self.data["robots"]]
         known = all(isinstance(xyz, list) and len(xyz) == 3 for xyz in found)
         bases = np.array(found, dtype=float) if known else None
+        if known and self.is_machine:
+            draft = [{**face, **_TINY} for face in self._faces(None)]
+            bases = shoulders(self._draft({"contacts": draft}))
+        return self._faces(bases)
+
+    def _faces(self, bases: Array | None) -> list[dict[str, Any]]:
+        """Middles of faces, see `contact_points`."""
         start, goal = self.poses
         size = np.array(self.data["payload"]["size"], dtype=float)
         way = np.array([start, goal])
         points = contact_points(size, way, box_placement(self.orientation, start)[:3, :3], bases)
         return [{"xyz": point} for point in points]
+
+    def sides(self) -> list[Problem]:
+        """The same problem with each pair of upright faces that the pads may press where its
+        robots have no bases yet; itself alone where the file names the points, or a carry that
+        goes level past two robots leaves no choice."""
+        entries = self.data["contacts"]
+        start, goal = self.poses
+        level = float(np.linalg.norm((goal - start)[:2]))
+        if all("xyz" in entry for entry in entries) or not (self.is_machine or level < LEAST_LEVEL):
+            return [self]
+        R = box_placement(self.orientation, start)[:3, :3]
+        found = []
+        for axis in np.flatnonzero(np.abs(R[2]) <= UPRIGHT):
+            point = np.zeros(3)
+            point[axis] = float(self.data["payload"]["size"][axis]) / 2.0
+            data = copy.deepcopy(self.data)
+            for entry, xyz in zip(data["contacts"], (point, -point), strict=True):
+                entry["xyz"] = xyz.tolist()
+            found.append(replace(self, data=data))
+        return found
 
     def workcell(self, changes: dict[str, Any] | None = None) -> Workcell:
         """The workcell with one free waypoint halfway where nothing else is said.
@@ -84,8 +136,10 @@ class Problem:
         Raises:
             WorkcellError: with all problems of the file.
         """
+        return self._draft(merged({"contacts": self.contacts}, changes or {}))
+
+    def _draft(self, changes: dict[str, Any]) -> Workcell:
         data = with_places(self.data, self.source.parent)
-        changes = merged({"contacts": self.contacts}, changes or {})
         task = data["task"]
         if "waypoints" not in changes.get("task", {}):
             poses = np.array([task["start"], task["goal"]], dtype=float)
@@ -210,6 +264,7 @@ def with_places(data: dict[str, Any], folder: Path) -> dict[str, Any]:
             robot["package_dirs"] = [str(folder / str(entry)) for entry in folders]
         for body in robot.get("tool", []):
             placed(body, "path")
+    placed(data["payload"], "path")
     for body in data.get("environment", []):
         placed(body, "path")
     return data
@@ -228,7 +283,7 @@ def contact_points(
     """
     along = way[1, :3] - way[0, :3] if bases is None else bases[0] - bases[1]
     share = np.abs(R_world_box.T @ (along * [1.0, 1.0, 0.0]))
-    upright = np.abs(R_world_box[2]) > 0.7
+    upright = np.abs(R_world_box[2]) > UPRIGHT
     share[upright] = np.inf if bases is None else -1.0
     axis = int(np.argmin(share) if bases is None else np.argmax(share))
     side = 1.0 if bases is None else float(np.sign(along @ R_world_box[:, axis]) or 1.0)
@@ -260,7 +315,7 @@ def _relative(data: dict[str, Any], here: Path, there: Path) -> dict[str, Any]:
         if "tool" in robot:
             entry["tool"] = [moved(body, "path") for body in robot["tool"]]
         robots.append(entry)
-    found: dict[str, Any] = {"robots": robots}
+    found: dict[str, Any] = {"robots": robots, "payload": moved(data["payload"], "path")}
     if "environment" in data:
         found["environment"] = [moved(body, "path") for body in data["environment"]]
     return found

@@ -23,7 +23,7 @@ from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
 from hybrid_opt.proposing.completion import Found, changes, decision_bounds
 from hybrid_opt.proposing.pairing import Pair
-from hybrid_opt.proposing.planner import Budget, Leave, freedom, plan
+from hybrid_opt.proposing.planner import Budget, Stray, freedom, plan
 from hybrid_opt.proposing.problem import Problem, read_problem
 from hybrid_opt.proposing.reasons import no_path
 from hybrid_opt.proposing.setup import Setup, prepare
@@ -31,16 +31,19 @@ from hybrid_opt.proposing.trial import BranchLostError, Trial
 from hybrid_opt.proposing.via_points import MOST_VIA_POINTS, fit, shortened
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
-from symbolic.workcell.records import POSE_SIZE
 
-ROUNDS = ((2000, 6), (6000, 10), (20000, 16), (60000, 24))
+ROUNDS = ((2000, 2), (6000, 6), (20000, 16), (60000, 24))
 """Configurations that may be looked at for a path, and pairs of ways to hold that get so many."""
 
-STRAYS = ((0.0, 0.15), (0.0, 0.05), (0.3, 0.15), (0.3, 0.05))
-"""Tilts [rad] and ranges [m] of a planner's path, see `hybrid_opt.proposing.planner.Leave`."""
-
-ASIDE = 0.8
-"""How far beside start and goal a path may run [m]."""
+STRAYS = (
+    Stray(0.0, 0.15, 0.8),
+    Stray(0.0, 0.15, 0.3),
+    Stray(0.0, 0.05, 0.3),
+    Stray(0.0, 0.15, 0.15),
+    Stray(0.3, 0.15, 0.8),
+    Stray(0.3, 0.05, 0.8),
+)
+"""What paths are looked for among; the narrower, the sooner a gap is found, if it is there."""
 
 FEW = 3
 """Via-points that are taken at once; where a path needs more, others are tried first."""
@@ -239,18 +242,12 @@ class _Search:
             return ProposalError(begin + tried.problem)
         return ProposalError(begin + no_path(tried.setup.pairs, self.refusals))
 
-    def _via_points(
-        self, setup: Setup, pair: Pair, stray: tuple[float, float], effort: int
-    ) -> Array | None:
+    def _via_points(self, setup: Setup, pair: Pair, stray: Stray, effort: int) -> Array | None:
         """The fewest via-points of a path in one way of holding, None where none are found."""
         task = setup.workcell.task
-        lower, upper = np.full((2, task.extended_size), np.nan)
         ends = np.array([pair.start.extended, pair.goal.extended])
-        lower[:POSE_SIZE] = ends[:, :POSE_SIZE].min(axis=0) - ASIDE
-        upper[:POSE_SIZE] = ends[:, :POSE_SIZE].max(axis=0) + ASIDE
-        lower[POSE_SIZE:] = [joint.lower.min() for joint in task.redundant]
-        upper[POSE_SIZE:] = [joint.upper.max() for joint in task.redundant]
-        room = freedom(ends[0], ends[1], Leave(lower, upper, *stray))
+        limits = [(joint.lower.min(), joint.upper.max()) for joint in task.redundant]
+        room = freedom(ends[0], ends[1], stray, np.array(limits).reshape(-1, 2))
         seed = int(self.rng.integers(1, 2**31))
         budget = Budget(effort, lambda: self.too_late)
         corners = plan(pair.chain, (pair.start, pair.goal), room, budget, seed)
@@ -269,6 +266,7 @@ class _Search:
     def _judged(self, setup: Setup, pair: Pair, via: Array) -> Proposal | None:
         """The proposal with these via-points, or None where the evaluator refuses it."""
         self.tell("the evaluator's verdict")
+        begun = self.spent
         ends = np.round([pair.start.extended, pair.goal.extended], 4)
         waypoints = np.vstack([ends[0], via, ends[1]])
         spins = (pair.holds[0].spin, pair.holds[1].spin)
@@ -284,7 +282,8 @@ class _Search:
             self.refusals.append(why)
             return None
         self.tell("bounds")
-        bounds = self._bounds(trial)
+        # The verdict on the file takes as long as this one did.
+        bounds = self._bounds(trial, self.settings.seconds - 1.2 * (self.spent - begun))
         moved = replace(found, branches=trial.branches, bounds=bounds).around(bounds.centre)
         self.tell("the evaluator's verdict on the file")
         try:
@@ -308,7 +307,8 @@ class _Search:
     def _trial(self, found: Found, begin: tuple[Array, Array]) -> Trial:
         return Trial(self.problem.workcell(changes(self.problem, found)), begin)
 
-    def _bounds(self, trial: Trial) -> Bounds:
+    def _bounds(self, trial: Trial, until: float) -> Bounds:
+        """Bounds around a trial's carry, found by so many seconds from the beginning."""
         unit, limits = decision_bounds(trial.workcell)
         low, high = self.settings.feasible
         sampling = Sampling(
@@ -319,6 +319,6 @@ class _Search:
             self.rng,
             low,
             high,
-            lambda: self.out_of_time,
+            lambda: self.spent > until,
         )
         return find_bounds(trial.initial, sampling)

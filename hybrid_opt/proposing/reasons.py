@@ -49,7 +49,10 @@ def _arm_missing(task: Task, arm: int, search: HoldSearch) -> str:
         told = f"beyond limits are most often {joints}" if joints else "all are near singular"
         return f"{robot.name} has no usable posture at the start: {told}"
     if not search.free:
-        return f"{robot.name} collides at the start in every posture: {_pairs(search.pairs)}"
+        return (
+            f"{robot.name} collides at the start in every posture: {_pairs(search.pairs)}"
+            f"{_overlap_hint(search.pairs)}"
+        )
     if search.pairs and search.kept >= 1.0:
         return (
             f"{robot.name} collides in every posture that leads from the start to the goal: "
@@ -112,3 +115,11 @@ def _pairs(met: Counter[tuple[str, str]]) -> str:
         f"{' – '.join(pair)} ({100.0 * count / total:.0f} %)"
         for pair, count in met.most_common(TOLD)
     )
+
+
+def _overlap_hint(met: Counter[tuple[str, str]]) -> str:
+    """What may be done about links of one robot that meet in every posture."""
+    owners = [[name.partition("/")[0] for name in pair if "/" in name] for pair in met]
+    if not any(len(names) == 2 and names[0] == names[1] for names in owners):
+        return ""
+    return " (links that overlap by design are left out by srdf or [[collision.ignored]])"

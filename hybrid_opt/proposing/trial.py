@@ -15,6 +15,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
+from symbolic.functions.candidate import motion_function
 from symbolic.functions.cell import cell_functions
 from symbolic.robot.branches import StartBranch
 from symbolic.workcell.decision import initial_decision
@@ -26,6 +27,11 @@ branch that stands for it [rad or m]."""
 
 COARSE = 9
 """Every so many samples are judged first: most candidates that collide do so there."""
+
+LOOKED = (1, 3)
+"""Of them so many at first, and by then."""
+
+_PLACED = ("pose", "q_1", "q_2", "time")
 
 CHUNK = 32
 """Candidates whose samples are held at once."""
@@ -61,6 +67,9 @@ class Trial:
             for name, function in cell_functions(model).items()
         }
         self.evaluator = CandidateEvaluator(self.workcell, functions=functions)
+        # Forces that a solver finds take most of a candidate's time.
+        self._solved = self.workcell.task.allocation == "joint"
+        self._motion = InterpretedFunction(dense(motion_function(model))) if self._solved else None
 
     @property
     def initial(self) -> Array:
@@ -101,21 +110,38 @@ class Trial:
         return np.concatenate(parts)
 
     def _feasible(self, x: Array) -> NDArray[np.bool_]:
-        outputs = self.evaluator.outputs(x)
-        fine = np.all(outputs["violation"] <= 0.0, axis=1) & np.isfinite(outputs["time"]).all(
-            axis=tuple(range(1, outputs["time"].ndim))
+        outputs = self.evaluator.outputs(x) if self._motion is None else self._motion.batch(x)
+        fine = _satisfied(outputs)
+        for k in np.flatnonzero(fine).tolist():
+            fine[k] = not self._collides({name: outputs[name][k] for name in _PLACED})
+        if self._motion is not None and fine.any():
+            fine[fine] = _satisfied(self.evaluator.outputs(x[fine]))
+        return fine
+
+    def _collides(self, placed: dict[str, Array]) -> bool:
+        """Whether a carry collides at a sample."""
+        last = len(placed["pose"]) - 1
+        coarse = np.arange(last, -1, -COARSE)
+        return self._hit(placed, coarse) or self._hit(
+            placed, np.setdiff1d(np.arange(last + 1), coarse)
         )
-        last = outputs["q_1"].shape[1] - 1
-        coarse = np.arange(last, -1, -COARSE)[::-1]
-        for rows in (coarse, np.arange(last + 1)):
-            for k in np.flatnonzero(fine).tolist():
-                pose, q_1, q_2, time = (
-                    np.ascontiguousarray(outputs[name][k][rows])
-                    for name in ("pose", "q_1", "q_2", "time")
-                )
-                found = self.evaluator.checker.check(pose, q_1, q_2, time)
-                fine[k] = not found.colliding.any()
-        return np.asarray(fine)
+
+    def _hit(self, placed: dict[str, Array], rows: NDArray[np.intp]) -> bool:
+        """Whether one of these samples collides; those with the least bounds are judged first."""
+        checker = self.evaluator.checker
+        pose, q_1, q_2, time = (np.ascontiguousarray(placed[name][rows]) for name in _PLACED)
+        bounds = checker.bounds(pose, q_1, q_2)
+        order = np.argsort((bounds - checker.free_beyond).min(axis=1, initial=np.inf))
+        return any(
+            checker.check(pose[few], q_1[few], q_2[few], time[few], bounds[few]).colliding.any()
+            for few in np.split(order, LOOKED)
+        )
+
+
+def _satisfied(outputs: dict[str, Array]) -> NDArray[np.bool_]:
+    """(n,) whether all constraints but collisions hold at every sample."""
+    finite = np.isfinite(outputs["time"]).all(axis=tuple(range(1, outputs["time"].ndim)))
+    return np.asarray(np.all(outputs["violation"] <= 0.0, axis=1) & finite)
 
 
 class BranchLostError(Exception):

@@ -109,6 +109,37 @@ def candidate_function(model: CellModel) -> ca.Function:
     )
 
 
+def motion_function(model: CellModel) -> ca.Function:
+    """What of a candidate needs no forces, much cheaper where those are found by a solver; not for
+    'optimal'.
+
+    Outputs as of `candidate_function`: time, pose, q_1, q_2, and the violation (9,) of reach,
+    joint limits and singularity; friction and pressure count as satisfied.
+    """
+    workcell = model.workcell
+    n = workcell.task.samples
+    x = ca.MX.sym("x", workcell.task.n_var)
+    basis, waypoints = sample_basis(workcell.task), waypoint_matrix(workcell.task, x)
+    path = timed_path(workcell.task, basis, waypoints)
+    whole = extended_matrix(workcell.task, x, waypoints)
+    pose = ca.mtimes(whole, ca.DM(basis.position.T))
+    values = {name: ca.DM.zeros(2, n) for name in _CONSTRAINT_INPUTS[-3:]}
+    for i in (0, 1):
+        tracked = _track(model, i, pose, ca.DM.zeros(6, n))
+        values |= {f"{name}_{i + 1}": tracked[name] for name in TRACK_OUTPUTS}
+    inputs = [values[name] for name in _CONSTRAINT_INPUTS]
+    constraint = _constraint_function(workcell).map(n)(*inputs)
+    outputs = {
+        "time": path.time,
+        "pose": path.pose,
+        "q_1": values["q_1"],
+        "q_2": values["q_2"],
+        "violation": _row_max(ca.fmax(constraint, 0.0)),
+    }
+    names = list(outputs)
+    return ca.Function("motion_alone", [x], list(outputs.values()), ["x"], names, {"cse": True})
+
+
 _LOAD_SIZES = {
     "angular_velocity": 3,
     "angular_acceleration": 3,

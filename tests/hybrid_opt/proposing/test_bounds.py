@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from hybrid_opt.proposing.bounds import Sampling, find_bounds
+from hybrid_opt.proposing.completion import decision_bounds
 from symbolic.array import Array
+from tests.symbolic.cells import hand_cell, with_task
+from tests.turned_cells import turned_cell
 
 
 def sampling(n: int, seed: int) -> Sampling:
@@ -46,3 +51,46 @@ def test_bounds_keep_to_limits() -> None:
     how.limits[1] = 0.35
     found = find_bounds(np.full(3, 0.2), how)
     assert np.all(found.upper <= 0.35)
+
+
+def test_bounds_hold_a_carry_that_is_beyond_the_usual_limits() -> None:
+    how = sampling(3, 4)
+    how.limits[1] = 0.15
+    found = find_bounds(np.full(3, 0.2), how)
+    assert np.all(found.lower <= found.centre)
+    assert np.all(found.upper >= found.centre)
+
+
+@pytest.mark.parametrize("calls", [0, 3, 6])
+def test_when_time_is_up_the_best_bounds_so_far_are_taken(calls: int) -> None:
+    how, asked = sampling(6, 5), [0]
+
+    def out_of_time() -> bool:
+        asked[0] += 1
+        return asked[0] > calls
+
+    found = find_bounds(np.full(6, 0.2), replace(how, out_of_time=out_of_time))
+    assert found.candidates >= 32
+    assert how.feasible(found.centre[None])[0]
+
+
+@pytest.mark.parametrize("pitch", [-3.0, 0.0, 1.4, 2.0, 3.1])
+def test_limits_hold_a_box_at_any_pitch(pitch: float) -> None:
+    cell = with_task(hand_cell(), initial=np.array([[0.0, 0.0, 1.0, 0.1, pitch, -0.2]] * 3))
+    unit, limits = decision_bounds(cell)
+    x = cell.task.initial.ravel()
+    assert unit.shape == x.shape
+    assert np.all(limits[0] < x)
+    assert np.all(limits[1] > x)
+    assert np.abs(limits[:, 4]).max() <= 6.28
+
+
+@pytest.mark.parametrize("length", [0.0, 2.0, 4.5])
+def test_corners_of_limits_are_rotation_vectors_that_files_may_hold(length: float) -> None:
+    pose = np.array([0.0, 0.0, 1.0, 0.0, length, 0.0])
+    cell = turned_cell()
+    _, limits = decision_bounds(with_task(cell, initial=np.array([pose] * 3)))
+    farthest = np.abs(limits[:, 3:6]).max(axis=0)
+    assert np.linalg.norm(farthest) <= 5.0
+    assert np.all(limits[0, 3:6] <= pose[3:])
+    assert np.all(limits[1, 3:6] >= pose[3:])

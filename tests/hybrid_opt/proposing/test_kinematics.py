@@ -4,16 +4,23 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hybrid_opt.proposing.kinematics import ArmKinematics, box_to_last_joint, spun
+from hybrid_opt.proposing.kinematics import (
+    ArmKinematics,
+    box_to_last_joint,
+    possible_spins,
+    spun,
+)
 from symbolic.physics.pose import pose_matrix
 from symbolic.robot.urdf import arm_model
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
 
+RACK = "studies/workcells/rack.toml"
+
 
 @pytest.fixture(scope="module")
 def rack() -> Workcell:
-    return load("studies/workcells/rack.toml")
+    return load(RACK)
 
 
 def test_placements_and_jacobians_are_pinocchios(rack: Workcell) -> None:
@@ -71,3 +78,13 @@ def test_the_spin_turns_the_pad_as_the_file_does(rack: Workcell) -> None:
     angle = pin.log3(plain[:3, :3].T @ turned[:3, :3])
     assert np.linalg.norm(angle) == pytest.approx(0.7)
     np.testing.assert_allclose(np.linalg.inv(geometry.T_joint_box), plain, atol=1e-12)
+
+
+def test_pads_that_stand_rigidly_beside_one_another_are_not_spun() -> None:
+    spins = 2.0 * np.pi * np.arange(12) / 12
+    fork, round_pad = load("studies/workcells/fork.toml").contacts, load(RACK).contacts[0]
+    np.testing.assert_array_equal(possible_spins(round_pad, spins), spins)
+    assert fork[0].further
+    assert possible_spins(fork[0], spins).tolist() == [0.0]
+    # A rectangle covers the same patch after half a turn only.
+    np.testing.assert_allclose(possible_spins(fork[1], spins), [0.0, np.pi])

@@ -7,13 +7,14 @@ import pytest
 
 from hybrid_opt.proposing.closed_chain import Place
 from hybrid_opt.proposing.kinematics import ArmKinematics, box_to_last_joint, spun
-from hybrid_opt.proposing.planner import Budget, Leave, freedom, plan
+from hybrid_opt.proposing.planner import Budget, Stray, freedom, plan
 from hybrid_opt.proposing.problem import read_problem
 from hybrid_opt.proposing.setup import Setup, prepare
 from hybrid_opt.proposing.via_points import fit, free_share, shortened
 from symbolic.physics.pose import pose_matrix
 from tests.hybrid_opt.proposing.test_proposal import rack_problem
 
+NO_LIMITS = np.empty((0, 2))
 SPINS = np.array([0.0, np.pi / 2.0])
 
 
@@ -26,9 +27,9 @@ def rack(tmp_path_factory: pytest.TempPathFactory) -> Setup:
 def planned(setup: Setup, seed: int) -> list[Place]:
     pair = setup.pairs[0]
     ends = pair.start.extended, pair.goal.extended
-    leave = Leave(np.minimum(*ends) - 0.8, np.maximum(*ends) + 0.8, 0.0, 0.15)
     budget = Budget(20_000, lambda: False)
-    found = plan(pair.chain, (pair.start, pair.goal), freedom(*ends, leave), budget, seed)
+    room = freedom(*ends, Stray(0.0, 0.15, 0.8), NO_LIMITS)
+    found = plan(pair.chain, (pair.start, pair.goal), room, budget, seed)
     assert found is not None
     return found
 
@@ -78,20 +79,28 @@ def test_few_via_points_follow_a_path(rack: Setup) -> None:
 def test_what_may_be_spent_on_a_path_is_kept(rack: Setup) -> None:
     pair = rack.pairs[0]
     ends = pair.start.extended, pair.goal.extended
-    room = freedom(*ends, Leave(np.minimum(*ends) - 0.8, np.maximum(*ends) + 0.8, 0.0, 0.15))
+    room = freedom(*ends, Stray(0.0, 0.15, 0.8), NO_LIMITS)
     budget = Budget(10**9, lambda: True)
     assert plan(pair.chain, (pair.start, pair.goal), room, budget, 1) is None
 
 
 def test_a_tilted_path_may_turn_and_a_level_one_may_not() -> None:
     start, goal = np.zeros(6), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.3])
-    level = freedom(start, goal, Leave(start - 1.0, goal + 1.0, 0.0, 0.1))
+    level = freedom(start, goal, Stray(0.0, 0.1, 1.0), NO_LIMITS)
     assert level.directions.shape == (6, 4)
     np.testing.assert_allclose(level.extended(level.coordinates(goal)), goal, atol=1e-12)
     assert np.all(level.coordinates(goal) <= level.upper)
-    tilted = freedom(start, goal, Leave(start - 1.0, goal + 1.0, 0.2, 0.1))
+    tilted = freedom(start, goal, Stray(0.2, 0.1, 1.0), NO_LIMITS)
     assert tilted.directions.shape == (6, 6)
     turned = np.array([0.0, 0.0, 0.0, 0.15, -0.15, 0.0])
     inside = tilted.coordinates(turned)
     assert np.all((inside >= tilted.lower) & (inside <= tilted.upper))
     np.testing.assert_allclose(tilted.extended(inside), turned, atol=1e-12)
+
+
+def test_redundant_joints_stray_farther_than_the_box_and_not_beyond_their_limits() -> None:
+    start, goal = np.zeros(8), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.4, 0.0])
+    room = freedom(start, goal, Stray(0.0, 0.1, 0.2), np.array([[-0.3, 2.0], [-3.0, 3.0]]))
+    least, most = room.extended(room.lower), room.extended(room.upper)
+    np.testing.assert_allclose(least, [-0.2, -0.2, -0.2, 0, 0, 0, -0.3, -1.0], atol=1e-7)
+    np.testing.assert_allclose(most, [0.7, 0.2, 0.2, 0, 0, 0, 1.4, 1.0], atol=1e-7)

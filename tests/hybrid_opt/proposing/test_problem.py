@@ -1,17 +1,20 @@
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from hybrid_opt.proposing.document import completed
 from hybrid_opt.proposing.problem import Problem, contact_points, read_problem
 from symbolic.errors import WorkcellError
 from symbolic.physics.pose import rotation_from_rpy
 from symbolic.workcell.file import load
+from tests.hybrid_opt.proposing.problems import BAXTER, tiago_problem
 from tests.hybrid_opt.proposing.test_proposal import rack_problem
 
 POST = Path("studies/problems/past-a-post.toml")
@@ -123,3 +126,43 @@ def test_contacts_lie_on_faces_of_the_turned_reference() -> None:
     problem = problem_of(0.0, rotation="quaternion", rotation_reference=quarter)
     np.testing.assert_array_equal(problem.orientation.reference, rotation_from_rpy(quarter))
     assert problem.contacts[0]["xyz"] == [0.1, 0.0, 0.0]
+
+
+def test_contacts_face_the_shoulders_of_a_machine(tmp_path: Path) -> None:
+    """The left arm first: +y, where its shoulder is, although both arms stand at one base."""
+    problem = read_problem(tiago_problem(tmp_path))
+    assert problem.is_machine
+    assert [contact["xyz"] for contact in problem.contacts] == [[0.0, 0.18, 0.0], [0.0, -0.18, 0.0]]
+
+
+def test_two_arms_of_one_type_are_no_machine() -> None:
+    assert not read_problem(POST).is_machine
+
+
+def test_without_bases_a_machine_may_press_either_pair_of_upright_faces(tmp_path: Path) -> None:
+    path = tmp_path / "baxter.toml"
+    path.write_text(re.sub(r"\nbase = .*", "", BAXTER), encoding="utf-8")
+    sides = read_problem(path).sides()
+    found = [[contact["xyz"] for contact in side.contacts] for side in sides]
+    assert found == [[[0.1, 0, 0], [-0.1, 0, 0]], [[0, 0.15, 0], [0, -0.15, 0]]]
+    post = read_problem(POST)
+    assert post.sides() == [post]
+
+
+def test_a_mesh_of_the_payload_is_found_from_another_folder(tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box([0.3, 0.4, 0.25]).export(tmp_path / "meshes" / "box.stl")
+    changes = {"payload": {"kind": "mesh", "size": None, "path": "meshes/box.stl"}}
+    data = tomllib.loads(POST.read_text(encoding="utf-8"))
+    points = [
+        {"xyz": [0.0, side * 0.2, 0.0], "normal": [0.0, -side, 0.0], "friction": 0.8}
+        for side in (1.0, -1.0)
+    ]
+    data["contacts"] = [point | {"patch_radius": 0.04} for point in points]
+    path = tmp_path / "mesh.toml"
+    path.write_text(completed("", data, changes), encoding="utf-8")
+    problem = read_problem(path)
+    assert problem.workcell().payload.size == pytest.approx([0.3, 0.4, 0.25])
+    (tmp_path / "other").mkdir()
+    moved = tomllib.loads(problem.completed({}, tmp_path / "other"))
+    assert moved["payload"]["path"] == "../meshes/box.stl"

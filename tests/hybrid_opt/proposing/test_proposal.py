@@ -13,7 +13,14 @@ import hybrid_opt as ho
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing.document import completed
 from symbolic.errors import SettingsError, WorkcellError
+from symbolic.workcell.file import load
 from tests.hybrid_opt.proposing.generated import write_problem
+from tests.hybrid_opt.proposing.problems import (
+    BAXTER,
+    shipped_problem,
+    tiago_problem,
+    turned_problem,
+)
 
 RACK = Path("studies/workcells/rack.toml")
 
@@ -96,6 +103,33 @@ def test_generated_cells_get_carries(tmp_path: Path) -> None:
         assert 0.02 <= found.feasible_share <= 0.20
         solved += found.seconds <= 60.0
     assert solved >= 16
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tiago", "baxter", "pandas", "drum", "fork", "turned", "pitched"])
+@pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+def test_cells_of_every_kind_get_carries(name: str, tmp_path: Path) -> None:
+    """Machines with both arms in one file, portals, other payloads and pads, a box turned over."""
+    path = tmp_path / "problem.toml"
+    if name == "tiago":
+        path = tiago_problem(tmp_path)
+    elif name == "baxter":
+        path.write_text(BAXTER, encoding="utf-8")
+    elif name in ("turned", "pitched"):
+        rotation = "quaternion" if name == "turned" else "roll-pitch-yaw"
+        path = turned_problem(tmp_path, rotation)
+    else:
+        path = shipped_problem(name, tmp_path)
+    settings = ho.ProposeSettings(clock=time.process_time)
+    found = ho.propose(path, rng=np.random.default_rng(1), settings=settings)
+    assert found.judgement.feasible
+    assert 0.02 <= found.feasible_share <= 0.20
+    assert found.seconds <= settings.seconds
+    proposed = tmp_path / "proposed.toml"
+    proposed.write_text(found.text(tmp_path), encoding="utf-8")
+    contacts = load(proposed).contacts
+    if name == "fork":  # its pads stand rigidly beside one another
+        np.testing.assert_allclose(contacts[0].T_box_pad, load(path).contacts[0].T_box_pad)
 
 
 def test_settings_are_checked() -> None:
