@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import hybrid_opt as ho
+from studies import BEGUN
 from studies.options import number, seed
 from studies.program import add_verbose, carried_out, run_program
 from symbolic.errors import SettingsError
@@ -24,10 +25,13 @@ from symbolic.replacing import replace_file
 
 PROGRAM = "python -m studies.propose"
 
+_BEGUN = BEGUN if __name__ == "__main__" else None
+"""When the process began, where it is this program's own [s]: imports count."""
 
-def _teller() -> Callable[[str], None]:
+
+def _teller(begun: float) -> Callable[[str], None]:
     """Prints what is being done and when, every word once in a row."""
-    begun, last = time.monotonic(), [""]
+    last = [""]
 
     def tell(text: str) -> None:
         if text != last[0]:
@@ -58,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         type=number(1.0, 1e6),
         default=ho.ProposeSettings().seconds,
         metavar="S",
-        help="seconds that it may take (default: %(default)g)",
+        help="seconds that it may take, its start included (default: %(default)g)",
     )
     parser.add_argument(
         "--seed", type=seed, default=1, metavar="N", help="of its randomness (default: 1)"
@@ -74,11 +78,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise SettingsError(
             f"{output.parent} is no folder; make it, or name another one by --output"
         )
+    begun = time.monotonic() if _BEGUN is None else _BEGUN
+    left = max(options.time - (time.monotonic() - begun), 1.0)
     proposal = ho.propose(
         problem,
         rng=np.random.default_rng(options.seed),
-        settings=ho.ProposeSettings(seconds=options.time, bases=options.bases),
-        tell=(lambda text: None) if options.quiet else _teller(),
+        settings=ho.ProposeSettings(seconds=left, bases=options.bases),
+        tell=(lambda text: None) if options.quiet else _teller(begun),
     )
     replace_file(output, proposal.text(output.parent).encode())
     print(f"{output}: {proposal}")
