@@ -1,9 +1,9 @@
 """The whole cell as MJCF: both arms with their links' masses, pads, box and environment.
 
 Joints are as in the workcell's kinematic model, moved by torques. Each pad is a ring of small
-spheres at the rim of its patch (`hybrid_opt.witness.scene`). Pads touch the box, the box touches
-the environment; everything else is there for its mass and to be looked at: collisions of the arms
-are ruled out elsewhere (`hybrid_opt.collision`).
+spheres at the rim of its patch, or one at each corner (`hybrid_opt.witness.scene`). Pads touch the
+box, the box touches the environment; everything else is there for its mass and to be looked at:
+collisions of the arms are ruled out elsewhere (`hybrid_opt.collision`).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class ArmSettings:
         time_step: of the physics [s].
         control_period: of the controllers, a multiple of the time step [s].
         contact_time: time constant of a contact [s].
-        rim_points: contact points on the rim of each patch.
+        rim_points: contact points on the rim of each round patch; rectangles have their corners.
         noslip_iterations: of MuJoCo's solver against the creep of frictional contacts.
         slip: displacement in the plane of a pad that counts as slip [m].
         arrival: how far from its goal the box may end [m].

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.witness.scene import PAD_MASS, SimulationSettings, quaternion
+from hybrid_opt.witness.scene import PAD_MASS, SimulationSettings, quaternion, tilt_centre
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.physics.pose import box_rotation
@@ -50,7 +51,7 @@ class Drive:
 
 @dataclass(frozen=True, eq=False)
 class PlannedMoments:
-    """Moments that the pads are to exert on the box about their nominal points, world frame.
+    """Moments that each robot's pads are to exert on the box about their middle, world frame.
 
     Attributes:
         along: (n, 2, 3) at the carry's samples [N m].
@@ -68,13 +69,22 @@ def planned_moments(cell: Cell, carry: Carry) -> PlannedMoments:
     still = np.zeros_like(carry.pose[:1])
     resting = replace(carry, pose=carry.pose[:1], rate=still, second_rate=still)
     along, at_rest = (
-        np.stack([load["wrench_1"][:, 3:], load["wrench_2"][:, 3:]], axis=1)
-        for load in (
-            cell.timing_model.uncertain_load(each, friction, workcell.payload.centre_of_mass)
-            for each in (carry, resting)
+        np.stack([_about_middle(each, load, i) for i in (0, 1)], axis=1)
+        for each, load in (
+            (c, cell.timing_model.uncertain_load(c, friction, workcell.payload.centre_of_mass))
+            for c in (carry, resting)
         )
     )
     return PlannedMoments(along, at_rest[0])
+
+
+def _about_middle(carry: Carry, load: Mapping[str, Array], robot: int) -> Array:
+    """(n, 3) moments of one robot's planned wrenches about the middle of its pads."""
+    workcell, wrench = carry.workcell, load[f"wrench_{robot + 1}"]
+    contact = workcell.contacts[robot]
+    in_box = contact.T_box_pad[:3, :3] @ tilt_centre(contact)
+    arm = box_rotation(workcell.task.orientation, carry.pose) @ in_box
+    return np.asarray(wrench[:, 3:] - np.cross(arm, wrench[:, :3]))
 
 
 def drive_of(

@@ -1,8 +1,8 @@
 """The witness's scene as MJCF: a free box between two pads on a carriage.
 
-Each pad is a ring of small spheres that touch the face of the box at the rim of the patch. The
-leader's pad is fixed to the carriage, the other slides along its normal. Gravity does not act on
-carriage and pads, which are driven.
+Each pad is a ring of small spheres that touch the face of the box at the rim of the patch, or one
+at each corner of a rectangle. The leader's pad is fixed to the carriage, the other slides along its
+normal. Gravity does not act on carriage and pads, which are driven.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class SimulationSettings:
         time_step: [s].
         contact_time: time constant of a contact [s]; at least a few time steps. The stiffer, the
             more a threshold depends on the time step.
-        rim_points: contact points on the rim of each patch.
+        rim_points: contact points on the rim of each round patch; rectangles have their corners.
         noslip_iterations: of MuJoCo's solver against the creep of frictional contacts.
         tilt_stiffness: of each pad about the axes in its plane, where it is driven by the planned
             moments; None for pads that keep their planned orientation, whatever they feel
@@ -133,17 +133,17 @@ def solver_options(time_step: float, noslip_iterations: int, gravity: Array) -> 
 
 
 def contact_points(contact: Contact, points: int, T_body_pad: Array) -> str:
-    """Spheres on the rims of a robot's patches that touch their planes, as geoms of the body that
-    holds its pads.
+    """Spheres where a robot's patches press, touching their planes, as geoms of the body that holds
+    its pads.
 
     Args:
-        points: per patch; at least the corners of a rectangular one.
+        points: per round patch.
         T_body_pad: (4, 4) of the first pad.
     """
     T_body_box = T_body_pad @ inverse(contact.T_box_pad)
     places = []
     for pad in (contact, *contact.further):
-        around = rim(pad, points)
+        around = pressed_places(pad, points)
         in_pad = np.column_stack([around, np.full(len(around), -POINT_RADIUS)])
         T = T_body_pad if pad is contact else T_body_box @ pad.T_box_pad
         places.append(in_pad @ T[:3, :3].T + T[:3, 3])
@@ -152,6 +152,21 @@ def contact_points(contact: Contact, points: int, T_body_pad: Array) -> str:
         f'friction="{contact.friction!r} 0 0" pos="{mjcf_text(place)}"/>'
         for place in np.concatenate(places)
     )
+
+
+def pressed_places(contact: Contact, points: int) -> Array:
+    """(n, 2) places of a patch, in its pad's plane, that press on the payload [m]: those that the
+    planner's pressures need. Evenly around a round one's rim; the corners of a rectangle, since all
+    that presses on its sides could be shared by them and twists the less."""
+    return rim(contact, points if contact.half_sides is None else 4)
+
+
+def tilt_centre(contact: Contact) -> Array:
+    """(3,) the middle of a robot's pads, along the axes of the first from its place [m]: what
+    presses there shares itself out evenly."""
+    places = np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
+    T = contact.T_box_pad
+    return np.asarray(T[:3, :3].T @ (places - T[:3, 3]))
 
 
 def rim(contact: Contact, points: int) -> Array:
@@ -224,8 +239,10 @@ def _pad_text(contact: Contact, name: str, settings: SimulationSettings, slides:
     joint = '<joint name="press" type="slide" axis="0 0 1"/>' if slides else ""
     stiffness = settings.tilt_stiffness
     if stiffness is not None:
+        centre = mjcf_text(tilt_centre(contact))
         joint += "".join(
-            f'<joint name="{tilt}" type="hinge" axis="{axis}" stiffness="{stiffness!r}" '
+            f'<joint name="{tilt}" type="hinge" axis="{axis}" pos="{centre}" '
+            f'stiffness="{stiffness!r}" '
             f'damping="{TILT_DAMPING_TIME * stiffness!r}"/>'
             for tilt, axis in zip(tilt_names(name), ("1 0 0", "0 1 0"), strict=True)
         )

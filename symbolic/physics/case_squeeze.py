@@ -52,7 +52,9 @@ def case_gradient_function(workcell: Workcell) -> ca.Function:
     second_rate."""
     motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = ca.MX.sym("case", CASE_SIZE)
-    force = case_squeeze_function(workcell)(*motion, case)
+    friction, radius, *_ = _parts(case)
+    balance = _balance_function(workcell)(*motion, case)
+    force = least_squeeze(balance, friction, radius, differentiable=True).normal
     slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in motion]).T)
     names = ["pose", "rate", "second_rate", "case"]
     outputs = ["normal_force", "slope"]
@@ -69,7 +71,8 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     # A root has no slope at rest, what follows from its square has.
     motion = (pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w)
     friction, radius, *_ = _parts(case)
-    held = least_squeeze(_balance_function(workcell)(*motion, case), friction, radius)
+    balance = _balance_function(workcell)(*motion, case)
+    held = least_squeeze(balance, friction, radius, differentiable=True)
     slope = ca.densify(ca.jacobian(held.normal, ca.vertcat(a, w)).T)
     names = ["pose", "first", "second", "a", "w", "case"]
     outputs = ["normal_force", "slope"]

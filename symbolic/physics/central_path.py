@@ -1,18 +1,18 @@
-"""Least effort of contact patches that balance a load, by a fixed number of Newton steps.
+"""Least effort of contact patches that balance a load, by an interior-point method.
 
     minimise effort(w_1, ..., w_k)  subject to  the wrenches w_i balance the load,
                                                 each lies within its patch's cone
 
-A barrier method follows the central path with a fixed number of Newton steps, so that the whole is
-one expression and compiles. Each step aims at a lower barrier with the curvature of the present
-one, which takes the tangent of the path and the correction towards it in one solve, and goes at
-most `STEP_SHARE` of the way to a bound of the cones' boundary. The wrench of the last contact is
-what the others leave, so that 6 (k - 1) components are free.
+The method is primal-dual with a predictor and a corrector (Mehrotra, SIAM J. Optim. 2, 1992): each
+step solves for the central path's point of a smaller weight, to second order by what a first step
+to weight zero leaves out. It starts within the cones, the load balanced, and takes some ten steps;
+at most `STEPS`, each of which is passed over once the weight is small enough, so that the whole is
+one expression and compiles. The wrench of the last contact is what the others leave, so that
+6 (k - 1) components are free.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
 from typing import Protocol
@@ -20,35 +20,31 @@ from typing import Protocol
 import casadi as ca
 
 from symbolic.physics.closure import WRENCH_SIZE
-from symbolic.physics.patches import Patch, least
+from symbolic.physics.elimination import Elimination
+from symbolic.physics.patches import Patch, Step, least
 
-FINAL_BARRIER = 1e-8
+FINAL_WEIGHT = 1e-8
 """Last weight of the barriers over the effort, which ends above the least by at most the sum of
 the patches' degrees times this: 6e-8 of it for two round ones."""
 
-STEP_SHARE = 0.9
+NEAR = 2.0
+"""Multiple of the final weight at which the steps end."""
+
+CENTRING = 10
+"""Newton steps of the barriers alone from there onto the central path."""
+
+STEPS = 30
+STEP_SHARE = 0.97
+"""Of the way to the cones' boundary that a step goes at most."""
 
 PROGRAMS = 16
 """How many programs' functions are kept."""
 
 
-@dataclass(frozen=True)
-class Pace:
-    """How fast the barriers' weight falls.
-
-    Attributes:
-        steps: Newton steps before the one that is differentiated.
-        shrink: of the weight per step.
-    """
-
-    steps: int
-    shrink: float
-
-
 class Program(Protocol):
     """What a set of contacts has to balance, and at what cost.
 
-    Its scaled wrenches are those of `symbolic.physics.patches`; `cell` are its inputs, in order.
+    Its scaled wrenches are those of `symbolic.physics.closure`; `cell` are its inputs, in order.
     """
 
     @property
@@ -58,10 +54,6 @@ class Program(Protocol):
     @property
     def cell_sizes(self) -> tuple[tuple[str, int], ...]:
         """Names and sizes of the inputs."""
-
-    @property
-    def pace(self) -> Pace:
-        """Of the path."""
 
     def left(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """(6,) of the last contact: what the others leave; affine."""
@@ -79,85 +71,177 @@ class Program(Protocol):
 def least_effort(program: Program, *cell: ca.MX) -> ca.MX:
     """Scaled wrenches (6 k,) of least effort, in the order of the program's patches.
 
-    First derivatives are those of the central path's point: the last Newton step is differentiated,
-    the point it starts from is not. Second ones are not to be had so.
+    Where derivatives are wanted: `differentiable_least_effort`.
     """
-    state, _ = newton_step(program)(*central_path(program)(*cell), *cell)
-    return ca.vertcat(*[own[:WRENCH_SIZE] for own in ca.vertsplit(state, _ends(program))])
+    return _wrenches(program, central_path(program)(*cell))
+
+
+def differentiable_least_effort(program: Program, *cell: ca.MX) -> ca.MX:
+    """As `least_effort`, on the central path itself; some more steps.
+
+    First derivatives are those of the central path's point: the last step is differentiated, the
+    point it starts from is not. Second ones are not to be had so.
+    """
+    return _wrenches(program, _barrier_step(program)(_centred(program)(*cell), *cell))
 
 
 @lru_cache(PROGRAMS)
 def central_path(program: Program) -> ca.Function:
-    """States of all patches and the barriers' weight near the end of the central path.
-
-    Its derivatives count as zero.
-    """
+    """The cell to a point of all patches near the end of the central path."""
     cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
-    state, barrier = _start(program)(*cell)
-    for _ in range(program.pace.steps):
-        state, barrier = newton_step(program)(state, barrier, *cell)
-    constant = {"is_diff_in": [False] * len(cell), "is_diff_out": [False, False]}
-    return ca.Function("central_path", cell, [state, barrier], constant)
+    point, goes_on = _start(program)(*cell), ca.MX(1.0)
+    symbols = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
+    held = [ca.MX.sym("point", _ends(program)[-1]), ca.MX.sym("goes_on")]
+    keep = ca.Function("keep", [*held, *symbols], held)
+    choice = ca.Function.if_else("path_step", _step(program), keep)
+    for _ in range(STEPS):
+        point, goes_on = choice(goes_on, point, goes_on, *cell)
+    return ca.Function("central_path", cell, [point])
 
 
 @lru_cache(PROGRAMS)
-def newton_step(program: Program) -> ca.Function:
-    """State, barriers' weight and the cell to the next state and weight."""
-    patches, n = program.patches, len(program.patches)
-    state, barrier = ca.SX.sym("state", _ends(program)[-1]), ca.SX.sym("barrier")
-    cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
-    states = ca.vertsplit(state, _ends(program))
-    wrenches = [own[:WRENCH_SIZE] for own in states]
-    symbols = [ca.SX.sym(f"w_{i}", WRENCH_SIZE) for i in range(n)]
-    passed = ca.Function(
-        "effort",
-        [*symbols, *cell],
-        [
-            program.effort(symbols, cell),
-            *(ca.gradient(program.effort(symbols, cell), w) for w in symbols),
-            *(ca.hessian(program.effort(symbols, cell), w)[0] for w in symbols),
-        ],
-    ).call([*wrenches, *cell])
-    effort, gradients, hessians = passed[0], list(passed[1 : n + 1]), list(passed[n + 1 :])
-    target = ca.fmax(program.pace.shrink * barrier, FINAL_BARRIER * effort)
-    for i, (patch, own) in enumerate(zip(patches, states, strict=True)):
-        slope, curvature = patch.local(own)
-        gradients[i] += target * slope
-        hessians[i] += barrier * curvature
-    missing = program.left(wrenches[:-1], cell) - wrenches[-1]
-    passes = [ca.jacobian(program.left(symbols[:-1], cell), w) for w in symbols[:-1]]
-    on_last = gradients[-1] + ca.mtimes(hessians[-1], missing)
-    change = ca.horzcat(*passes)
-    gradient = ca.vertcat(*gradients[:-1]) + ca.mtimes(change.T, on_last)
-    hessian = ca.diagcat(*hessians[:-1]) + ca.mtimes([change.T, hessians[-1], change])
-    free = -ca.ldl_solve(gradient, *ca.ldl(hessian, False))
-    changes = [*ca.vertsplit(free, WRENCH_SIZE), missing + ca.mtimes(change, free)]
-    share = target / barrier
-    steps = [
-        patch.step(own, moved, share)
-        for patch, own, moved in zip(patches, states, changes, strict=True)
-    ]
-    lowest = [
-        patch.lowest(own, step) for patch, own, step in zip(patches, states, steps, strict=True)
-    ]
-    length = ca.fmin(1.0, STEP_SHARE / ca.fmax(-least(lowest), STEP_SHARE))
+def _centred(program: Program) -> ca.Function:
+    """The cell to a point on the central path. Its derivatives count as zero."""
+    cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
+    point = central_path(program)(*cell)
+    for _ in range(CENTRING):
+        point = _barrier_step(program)(point, *cell)
+    constant = {"is_diff_in": [False] * len(cell), "is_diff_out": [False]}
+    return ca.Function("centred", cell, [point], constant)
+
+
+@lru_cache(PROGRAMS)
+def _step(program: Program) -> ca.Function:
+    """A point, a flag that does not matter and the cell to the next point and whether to go on."""
+    point, cell = _symbols(program)
+    owns = zip(program.patches, ca.vertsplit(point, _ends(program)), strict=True)
+    local = [patch.local(own) for patch, own in owns]
+    degree = sum(patch.degree for patch in program.patches)
+    weight = sum(own.gap for own in local) / degree
+    equations = _Equations(program, cell, [(own.wrench, own.stiffness) for own in local])
+
+    def steps(aimed: ca.SX, corrections: list[ca.SX]) -> list[Step]:
+        pairs = zip(local, corrections, strict=True)
+        aims = [own.aim(aimed, correction) for own, correction in pairs]
+        changes = equations.changes([aim.pull for aim in aims])
+        return [aim.step(change) for aim, change in zip(aims, changes, strict=True)]
+
+    none = [ca.SX.zeros(patch.correction_size) for patch in program.patches]
+    first = steps(ca.SX(0.0), none)
+    far = _length([step.lowest_of_state for step in first], 1.0)
+    final = FINAL_WEIGHT * equations.effort
+    aimed = ca.fmax((1.0 - far) ** 3 * weight, final)
+    second = steps(aimed, [step.second_order for step in first])
+    length = _length([step.lowest for step in second], STEP_SHARE)
+    change = ca.vertcat(*[step.change for step in second])
+    gap = sum(step.gap_after(length) for step in second)
     return ca.Function(
-        "newton_step",
-        [state, barrier, *cell],
-        ca.cse([state + length * ca.vertcat(*steps), barrier + length * (target - barrier)]),
+        "step",
+        [point, ca.SX.sym("goes_on"), *cell],
+        ca.cse([point + length * change, gap > NEAR * degree * final]),
     )
 
 
 @lru_cache(PROGRAMS)
+def _barrier_step(program: Program) -> ca.Function:
+    """A point and the cell to the point whose state is of the final weight, by Newton's step of the
+    barriers alone; where it has arrived there, its derivatives by the cell are those of the
+    central path."""
+    point, cell = _symbols(program)
+    owns = ca.vertsplit(point, _ends(program))
+    wrenches = [own[:WRENCH_SIZE] for own in owns]
+    weight = FINAL_WEIGHT * _efforts(program, wrenches, cell)[0]
+    patches = zip(program.patches, owns, strict=True)
+    barriers = [patch.barrier(own, weight) for patch, own in patches]
+    stiff = [own.stiffness for own in barriers]
+    equations = _Equations(program, cell, list(zip(wrenches, stiff, strict=True)))
+    changes = equations.changes([own.pull for own in barriers])
+    steps = [own.step(change) for own, change in zip(barriers, changes, strict=True)]
+    length = _length([step.lowest_of_state for step in steps], STEP_SHARE)
+    found = point + length * ca.vertcat(*[step.change for step in steps])
+    return ca.Function("barrier_step", [point, *cell], ca.cse([found]))
+
+
+def _length(lowest: list[ca.SX], share: float) -> ca.SX:
+    """Of a step, at most whole, that goes at most a share of the way to the boundary."""
+    return ca.fmin(1.0, share / ca.fmax(-least(lowest), share))
+
+
+class _Equations:
+    """Newton's equations of a program, for the wrenches.
+
+    Attributes:
+        effort: at the point.
+    """
+
+    def __init__(
+        self, program: Program, cell: list[ca.SX], local: list[tuple[ca.SX, ca.SX]]
+    ) -> None:
+        """Factors.
+
+        Args:
+            local: of each patch its wrench (6,) and stiffness (6, 6).
+        """
+        wrenches = [wrench for wrench, _ in local]
+        self.effort, self._slopes, curvatures = _efforts(program, wrenches, cell)
+        stiff = [curve + own for curve, (_, own) in zip(curvatures, local, strict=True)]
+        symbols = _wrench_symbols(len(local) - 1)
+        passed = ca.vertcat(*symbols)
+        self._change = ca.jacobian(program.left(symbols, cell), passed)
+        self._missing = program.left(wrenches[:-1], cell) - wrenches[-1]
+        self._last = stiff[-1]
+        whole = ca.diagcat(*stiff[:-1]) + ca.mtimes([self._change.T, self._last, self._change])
+        size = range(whole.shape[0])
+        self._system = Elimination([[whole[i, j] for j in size] for i in size], len(size))
+
+    def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
+        """(6,) of every wrench, where the patches' multipliers pull so (6,)."""
+        right = [pull - slope for pull, slope in zip(pulls, self._slopes, strict=True)]
+        on_last = right[-1] - ca.mtimes(self._last, self._missing)
+        pulled = ca.vertcat(*right[:-1]) + ca.mtimes(self._change.T, on_last)
+        reduced = self._system.reduced(ca.vertsplit(pulled))
+        free = ca.vertcat(*self._system.first(reduced, []))
+        return [*ca.vertsplit(free, WRENCH_SIZE), self._missing + ca.mtimes(self._change, free)]
+
+
+def _efforts(
+    program: Program, wrenches: list[ca.SX], cell: list[ca.SX]
+) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
+    """The effort at wrenches, its slopes (6,) and curvatures (6, 6) by each of them."""
+    symbols = _wrench_symbols(len(wrenches))
+    effort = program.effort(symbols, cell)
+    slopes = [ca.gradient(effort, w) for w in symbols]
+    curvatures = [ca.hessian(effort, w)[0] for w in symbols]
+    passed = ca.Function("effort", [*symbols, *cell], [effort, *slopes, *curvatures])
+    found, k = passed.call([*wrenches, *cell]), len(wrenches)
+    return found[0], list(found[1 : k + 1]), list(found[k + 1 :])
+
+
+@lru_cache(PROGRAMS)
 def _start(program: Program) -> ca.Function:
-    """The program's start and the weight of its barriers there."""
+    """The program's start, as a point on the central path of a problem like it."""
     cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
     states = program.start(cell)
-    wrenches = [own[:WRENCH_SIZE] for own in states]
     degree = sum(patch.degree for patch in program.patches)
-    weight = program.effort(wrenches, cell) / degree
-    return ca.Function("start", cell, ca.cse([ca.vertcat(*states), weight]))
+    weight = program.effort([own[:WRENCH_SIZE] for own in states], cell) / degree
+    pairs = zip(program.patches, states, strict=True)
+    point = ca.vertcat(*[patch.centred(own, weight) for patch, own in pairs])
+    return ca.Function("start", cell, ca.cse([point]))
+
+
+def _wrenches(program: Program, point: ca.MX) -> ca.MX:
+    return ca.vertcat(*[own[:WRENCH_SIZE] for own in ca.vertsplit(point, _ends(program))])
+
+
+def _symbols(program: Program) -> tuple[ca.SX, list[ca.SX]]:
+    """A point and the cell."""
+    cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
+    return ca.SX.sym("point", _ends(program)[-1]), cell
+
+
+def _wrench_symbols(count: int) -> list[ca.SX]:
+    return [ca.SX.sym(f"w_{i}", WRENCH_SIZE) for i in range(count)]
 
 
 def _ends(program: Program) -> list[int]:
-    return [0, *accumulate(patch.state_size for patch in program.patches)]
+    return [0, *accumulate(patch.point_size for patch in program.patches)]

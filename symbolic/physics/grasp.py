@@ -1,7 +1,7 @@
 """The least contact forces of pads anywhere on a payload: any normals, any of the patches.
 
 The least of the sum of all squared contact forces, as `symbolic.physics.joint_allocation` has it
-for pads that face one another. The barrier method starts from an internal squeeze
+for pads that face one another. The method starts from an internal squeeze
 (`symbolic.physics.closure`), pressed as hard as the load asks.
 """
 
@@ -14,17 +14,15 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.central_path import Pace, least_effort
+from symbolic.physics.central_path import differentiable_least_effort, least_effort
 from symbolic.physics.closure import WRENCH_SIZE, closing_squeeze, state_to_box, tangential
-from symbolic.physics.patches import Patch, RectangularPatch, RoundPatch, least
+from symbolic.physics.patches import Patch, least
+from symbolic.physics.rectangular_patch import RectangularPatch
+from symbolic.physics.round_patch import RoundPatch
 from symbolic.workcell.records import Contact, Workcell
 
 LOAD_SIZE = 6
 """Force and moment about the box frame's origin, along the box's axes [N, N m]."""
-
-ROUND_PACE, RECTANGULAR_PACE, MANY_CORNERS_PACE = Pace(26, 0.2), Pace(40, 0.35), Pace(60, 0.45)
-"""With round patches alone; with some rectangular ones; with more than three of these. The more
-corners, the nearer to the central path the steps have to keep."""
 
 SCALE_FLOOR = 1e-9
 """Force scale [N] where nothing has to be carried."""
@@ -47,7 +45,7 @@ class Grasp:
 
     Attributes:
         robots: per pad the index of its robot.
-        patches, cell_sizes, pace: see `symbolic.physics.central_path.Program`.
+        patches, cell_sizes: see `symbolic.physics.central_path.Program`.
     """
 
     def __init__(self, workcell: Workcell) -> None:
@@ -66,14 +64,11 @@ class Grasp:
         self.robots = workcell.pad_robots
         self.patches = tuple(_patch(pad) for pad in pads)
         self.cell_sizes = (("load", LOAD_SIZE), ("friction", 2))
-        rectangles = sum(pad.half_sides is not None for pad in pads)
-        many = MANY_CORNERS_PACE if rectangles > 3 else RECTANGULAR_PACE
-        self.pace = many if rectangles else ROUND_PACE
         self._pads = pads
         self._squeeze = squeeze.states
         # The least states that balance a load, whether they lie within the cones or not.
         spread = np.linalg.pinv(np.hstack([state_to_box(pad) for pad in pads]))
-        ends = np.cumsum([patch.state_size for patch in self.patches])[:-1]
+        ends = np.cumsum([len(state) for state in squeeze.states])[:-1]
         self._spread = tuple(np.split(spread, ends))
         in_units = [
             state_to_box(replace(pad, friction=1.0, patch_radius=1.0, half_sides=None))
@@ -130,7 +125,9 @@ class Grasp:
         return moved
 
 
-def grasp_wrenches(grasp: Grasp, load: ca.MX, friction: ca.MX) -> ca.MX:
+def grasp_wrenches(
+    grasp: Grasp, load: ca.MX, friction: ca.MX, differentiable: bool = False
+) -> ca.MX:
     """Per pad (6,) side by side: N, T (2,) [N], the first moment N d (2,) and M [N m], of least
     effort, in its pad's axes. Friction that does not close the grasp gives normal forces beyond
     any limit.
@@ -138,9 +135,11 @@ def grasp_wrenches(grasp: Grasp, load: ca.MX, friction: ca.MX) -> ca.MX:
     Args:
         load: (6,) force and moment about the box frame's origin, along the box's axes.
         friction: (2,) Coulomb coefficients of the robots' pads.
+        differentiable: whether first derivatives are wanted.
     """
     size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
-    found = least_effort(grasp, load / size, friction)
+    solve = differentiable_least_effort if differentiable else least_effort
+    found = solve(grasp, load / size, friction)
     return _in_newtons(grasp)(found, size, friction)
 
 

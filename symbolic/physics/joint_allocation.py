@@ -20,14 +20,11 @@ from typing import Literal
 import casadi as ca
 
 from symbolic.expression import Expression
-from symbolic.physics.central_path import Pace, least_effort
+from symbolic.physics.central_path import differentiable_least_effort, least_effort
 from symbolic.physics.closure import WRENCH_SIZE
 from symbolic.physics.patch_cone import cross_2, patch_slack
-from symbolic.physics.patches import Patch, RoundPatch
-
-PACE = Pace(steps=26, shrink=0.2)
-"""Twice as fast, one case in some thousands leaves the central path so far that it does not come
-back in time."""
+from symbolic.physics.patches import Patch
+from symbolic.physics.round_patch import RoundPatch
 
 Objective = Literal["effort", "squeeze"]
 """|f_1|^2 + |f_2|^2 or N_1 + N_2."""
@@ -72,34 +69,43 @@ def balance_of(
     return ca.vertcat(force[2], force[:2], -rest[1], rest[0], rest[2], arms[0] - arms[1])
 
 
-def allocate_jointly(balance: ca.MX, friction: ca.MX, radius: ca.MX) -> JointAllocation:
+def allocate_jointly(
+    balance: ca.MX, friction: ca.MX, radius: ca.MX, differentiable: bool = False
+) -> JointAllocation:
     """The least contact forces for what the contacts have to balance.
 
     There always are some, because pressing harder carries everything, if the patches overlap when
-    seen along the normal. First derivatives are those of the central path's point: the last Newton
-    step is differentiated, the point it starts from is not. Second ones are not to be had so.
+    seen along the normal.
 
     Args:
         balance: (9,), see `balance_of`.
         friction: (2,) Coulomb coefficients of the contacts.
         radius: (2,) radii of the patches [m].
+        differentiable: whether first derivatives are wanted
+            (`symbolic.physics.central_path.differentiable_least_effort`).
     """
-    return _least(balance, friction, radius, "effort")
+    return _least((balance, friction, radius), "effort", differentiable)
 
 
-def least_squeeze(balance: ca.MX, friction: ca.MX, radius: ca.MX) -> JointAllocation:
+def least_squeeze(
+    balance: ca.MX, friction: ca.MX, radius: ca.MX, differentiable: bool = False
+) -> JointAllocation:
     """As `allocate_jointly`, with the least N_1 + N_2 in place of the least effort.
 
     The balance fixes N_1 - N_2, so that both are as small as they can be: with less of either no
     pressure on the patches carries what is asked, with more of both some does.
     """
-    return _least(balance, friction, radius, "squeeze")
+    return _least((balance, friction, radius), "squeeze", differentiable)
 
 
-def _least(balance: ca.MX, friction: ca.MX, radius: ca.MX, objective: Objective) -> JointAllocation:
+def _least(
+    cell: tuple[ca.MX, ca.MX, ca.MX], objective: Objective, differentiable: bool
+) -> JointAllocation:
+    balance, friction, radius = cell
     scale = ca.sqrt(ca.sumsqr(balance[:3]) + ca.sumsqr(balance[3:5] / balance[8]) + SCALE_FLOOR**2)
-    cell = (ca.vertcat(balance[:6] / scale, balance[6:]), friction, radius)
-    wrenches = least_effort(OppositePads(objective), *cell)
+    scaled = (ca.vertcat(balance[:6] / scale, balance[6:]), friction, radius)
+    solve = differentiable_least_effort if differentiable else least_effort
+    wrenches = solve(OppositePads(objective), *scaled)
     return JointAllocation(*_in_newtons()(wrenches, scale, friction, radius))
 
 
@@ -117,7 +123,6 @@ class OppositePads:
     objective: Objective
     patches: tuple[Patch, ...] = (RoundPatch(), RoundPatch())
     cell_sizes: tuple[tuple[str, int], ...] = CELL_SIZES
-    pace: Pace = PACE
 
     def left(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """What contact 1 leaves to contact 2, its normal force along -n."""

@@ -1,154 +1,128 @@
-"""The two kinds of contact patch as the allocation's barrier method needs them.
+"""What the allocation's interior-point method asks of a contact patch.
 
-A patch keeps a state that lies within its cone and begins with its scaled wrench, see
-`symbolic.physics.closure`. A round patch's is that wrench (`symbolic.physics.patch_cone`).
+A patch's state lies within its cone and begins with its scaled wrench, see
+`symbolic.physics.closure`. The cone is one of positive semidefinite matrices X: those of a
+rectangle's corners are real 2 by 2 (`symbolic.physics.rectangular_patch`), a disc's is complex 3 by
+3 (`symbolic.physics.round_patch`). A point of the method has such an X and as large a matrix S of
+multipliers, both positive definite, whose product is a multiple of one on the central path.
 
-A rectangular patch carries what pressures on it with Coulomb friction can: the sum of what its four
-corners carry, each a force in its circular friction cone, because a force within the rectangle can
-be shared out among the corners without changing its wrench. With pyramids in place of the circles
-this is the cone of Caron, Pham and Nakamura (Stability of surface contacts for humanoid robots:
-closed-form formulae of the contact wrench cone for rectangular support areas, ICRA 2015).
+Newton's step takes S + dS = weight / X - sym(X^-1 dX S) - correction: the direction of Helmberg,
+Rendl, Vanderbei and Wolkowicz (SIAM J. Optim. 6, 1996), seen from X.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import casadi as ca
 
-from symbolic.physics.closure import POINT_SIZE, STATE_SIZE, WRENCH_SIZE, corner_modes
-from symbolic.physics.patch_cone import BARRIER_DEGREE, patch_barrier, patch_slack
-
-CORNERS = 4
-POINT_DEGREE = 2.0
-
 
 class Patch(Protocol):
-    """What the barrier method asks of a patch."""
+    """A kind of patch."""
 
     @property
-    def state_size(self) -> int:
-        """Entries of a state."""
+    def point_size(self) -> int:
+        """Entries of a point: state, then multipliers."""
+
+    @property
+    def correction_size(self) -> int:
+        """Entries of a correction."""
 
     @property
     def degree(self) -> float:
-        """Of the barrier: a minimiser of s f + barrier is within this over s of the least f."""
+        """Pairing of X with S over the weight on the central path."""
 
-    def local(self, state: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Slope (6,) and curvature (6, 6), in the wrench, of the least barrier of its states."""
+    def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
+        """A point whose X S is the weight, from a program's state."""
 
-    def step(self, state: ca.SX, change: ca.SX, share: ca.SX) -> ca.SX:
-        """Newton's step of the state that changes the wrench by `change` (6,).
+    def local(self, point: ca.SX) -> LocalPatch:
+        """What steps from a point need."""
 
-        Args:
-            share: the barrier's weight aimed at over the present one.
-        """
+    def barrier(self, point: ca.SX, weight: ca.SX) -> BarrierPatch:
+        """The patch's weighted barrier at a point's state, whatever the multipliers."""
 
-    def lowest(self, state: ca.SX, step: ca.SX) -> ca.SX:
-        """A bound from below of what the step adds to the state's eigenvalues, over them."""
-
-    def slack(self, state: ca.SX) -> ca.SX:
-        """Positive within the cone, not so beyond its boundary."""
-
-
-@dataclass(frozen=True)
-class RoundPatch:
-    """A disc."""
-
-    state_size: int = WRENCH_SIZE
-    degree: float = BARRIER_DEGREE
-
-    def local(self, state: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Those of the barrier."""
-        slope, curvature = patch_barrier()(state)
-        return slope, curvature
-
-    def step(self, state: ca.SX, change: ca.SX, share: ca.SX) -> ca.SX:
-        """The change itself."""
-        return change
-
-    def lowest(self, state: ca.SX, step: ca.SX) -> ca.SX:
-        """By Samuelson's inequality: no eigenvalue of three lies below their mean less sqrt(2) of
-        their deviation, and the barrier's derivatives along the step are their sums."""
-        slope, curvature = patch_barrier()(state)
-        mean = -ca.dot(slope, step) / 3.0
-        variance = ca.dot(step, ca.mtimes(curvature, step)) / 3.0 - mean**2
-        return mean - ca.sqrt(2.0 * ca.fmax(variance, 0.0))
+    def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
+        """As `Step.lowest_of_state`, of a change of a program's state."""
 
     def slack(self, state: ca.SX) -> ca.SX:
-        """The least of what pressure, friction and both leave."""
-        pressure = state[0] - ca.sqrt(ca.sumsqr(state[3:5]))
-        friction = state[0] - ca.sqrt(ca.sumsqr(state[1:3]))
-        return ca.fmin(ca.fmin(pressure, friction), patch_slack(state))
+        """Positive within the cone, not so beyond its boundary; of a program's state."""
 
 
-@dataclass(frozen=True)
-class RectangularPatch:
-    """A rectangle.
+class LocalPatch(Protocol):
+    """A patch at a point.
 
     Attributes:
-        half_x, half_y: half its sides along the pad's x and y axes [m].
+        wrench: (6,) scaled.
+        stiffness: (6, 6) what the multipliers give less for a change of the wrench, the rest of the
+            state moving as is best.
+        gap: pairing of X with S.
     """
 
-    half_x: float
-    half_y: float
-    state_size: int = STATE_SIZE
-    degree: float = CORNERS * POINT_DEGREE
+    wrench: ca.SX
+    stiffness: ca.SX
+    gap: ca.SX
 
-    def local(self, state: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Those of the corners' barriers, where the rest of the state is as it is best."""
-        slope, curvature = self._barrier(state)
-        outer, inner = slice(WRENCH_SIZE), slice(WRENCH_SIZE, STATE_SIZE)
-        coupling = curvature[inner, outer]
-        solved = ca.ldl_solve(
-            ca.horzcat(slope[inner], coupling), *ca.ldl(curvature[inner, inner], False)
-        )
-        slope_left = slope[outer] - ca.mtimes(coupling.T, solved[:, 0])
-        return slope_left, curvature[outer, outer] - ca.mtimes(coupling.T, solved[:, 1:])
+    def aim(self, weight: ca.SX, correction: ca.SX) -> Aim:
+        """Prepare the step to a weight."""
 
-    def step(self, state: ca.SX, change: ca.SX, share: ca.SX) -> ca.SX:
-        """The rest of the state moves as is best with the change."""
-        slope, curvature = self._barrier(state)
-        outer, inner = slice(WRENCH_SIZE), slice(WRENCH_SIZE, STATE_SIZE)
-        asked = share * slope[inner] + ca.mtimes(curvature[inner, outer], change)
-        moved = -ca.ldl_solve(asked, *ca.ldl(curvature[inner, inner], False))
-        return ca.vertcat(change, moved)
 
-    def lowest(self, state: ca.SX, step: ca.SX) -> ca.SX:
-        """Exactly: each corner's cone has two eigenvalues."""
-        found = []
-        for point, move in zip(self._points(state), self._points(step), strict=True):
-            left = point[0] ** 2 - ca.sumsqr(point[1:])
-            mean = (point[0] * move[0] - ca.dot(point[1:], move[1:])) / left
-            product = (move[0] ** 2 - ca.sumsqr(move[1:])) / left
-            found.append(mean - ca.sqrt(ca.fmax(mean**2 - product, 0.0)))
-        return least(found)
+@dataclass(frozen=True)
+class BarrierPatch:
+    """The barrier that keeps a patch's state within the cone, over its wrench.
 
-    def slack(self, state: ca.SX) -> ca.SX:
-        """What friction leaves at the corner where it leaves least."""
-        return least([p[0] - ca.sqrt(ca.sumsqr(p[1:])) for p in self._points(state)])
+    Attributes:
+        stiffness: (6, 6) curvature.
+        pull: (6,) downhill.
+        step: that changes the wrench by (6,) and leaves the multipliers.
+    """
+
+    stiffness: ca.SX
+    pull: ca.SX
+    step: Callable[[ca.SX], StateStep]
+
+
+@dataclass(frozen=True)
+class StateStep:
+    """A step of a patch's state alone; see `Step`."""
+
+    change: ca.SX
+    lowest_of_state: ca.SX
+
+
+class Aim(Protocol):
+    """A weight and a correction that a step is to lead to.
+
+    Attributes:
+        pull: (6,) what the multipliers give to the wrench where that does not change.
+    """
+
+    pull: ca.SX
+
+    def step(self, change: ca.SX) -> Step:
+        """The step that changes the wrench by `change` (6,)."""
+
+
+class Step(Protocol):
+    """A step.
+
+    Attributes:
+        change: (point_size,) of the point.
+        lowest_of_state, lowest: bounds from below of what it adds to the eigenvalues of X, and of
+            X and S, over them.
+    """
+
+    change: ca.SX
+    lowest_of_state: ca.SX
+    lowest: ca.SX
 
     @property
-    def _modes(self) -> list[ca.DM]:
-        modes = ca.sparsify(ca.DM(corner_modes((self.half_x, self.half_y))))
-        return list(ca.vertsplit(modes, POINT_SIZE))
+    def second_order(self) -> ca.SX:
+        """(correction_size,) what the whole step leaves out: sym(X^-1 dX dS)."""
 
-    def _points(self, state: ca.SX) -> list[ca.SX]:
-        """The corners' forces (3,)."""
-        return [ca.mtimes(modes, state) for modes in self._modes]
-
-    def _barrier(self, state: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Slope (12,) and curvature (12, 12) of the sum of -log(N^2 - |T|^2) over the corners."""
-        slope, curvature = ca.SX.zeros(STATE_SIZE), ca.SX.zeros(STATE_SIZE, STATE_SIZE)
-        signs = ca.diag(ca.DM([1.0, -1.0, -1.0]))
-        for modes, point in zip(self._modes, self._points(state), strict=True):
-            left = point[0] ** 2 - ca.sumsqr(point[1:])
-            down = -2.0 * ca.mtimes(signs, point) / left
-            slope += ca.mtimes(modes.T, down)
-            own = ca.mtimes(down, down.T) - 2.0 * signs / left
-            curvature += ca.mtimes([modes.T, own, modes])
-        return slope, curvature
+    def gap_after(self, length: ca.SX) -> ca.SX:
+        """Pairing of X with S after so much of the step."""
 
 
 def least(values: list[ca.SX]) -> ca.SX:

@@ -36,9 +36,10 @@ KINDS = (
 )
 
 
-def function_of(cell: Workcell) -> ca.Function:
+def function_of(cell: Workcell, differentiable: bool = False) -> ca.Function:
     load, friction = ca.MX.sym("load", 6), ca.MX.sym("friction", 2)
-    return ca.Function("grasp", [load, friction], [grasp_wrenches(Grasp(cell), load, friction)])
+    found = grasp_wrenches(Grasp(cell), load, friction, differentiable)
+    return ca.Function("grasp", [load, friction], [found])
 
 
 def friction_of(cell: Workcell) -> list[float]:
@@ -162,7 +163,7 @@ def test_turning_all_turns_the_forces(seed: int, kinds: tuple[str, ...]) -> None
 def test_derivatives_are_those_of_the_forces(seed: int, kinds: tuple[str, ...]) -> None:
     rng = np.random.default_rng(seed)
     cell, load = random_grasp(rng, hand_cell(), kinds), random_load(rng)
-    function, friction = function_of(cell), friction_of(cell)
+    function, friction = function_of(cell, differentiable=True), friction_of(cell)
     symbol = ca.MX.sym("load", 6)
     normal = function(symbol, friction)[0]
     derivative = ca.Function("derivative", [symbol], [ca.jacobian(normal, symbol)])

@@ -1,0 +1,252 @@
+"""A round patch in the allocation's interior-point method.
+
+Its cone (`symbolic.physics.patch_cone`) is that of the positive semidefinite Hermitian matrices
+[[N, q*, T*], [q, N, .], [T, z + i M, N]] with any z: a state is the scaled wrench, and z follows.
+The multipliers' matrix has nothing real at z's place, so that eight numbers tell it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from symbolic.physics import hermitian
+from symbolic.physics.closure import WRENCH_SIZE
+from symbolic.physics.elimination import Elimination
+from symbolic.physics.hermitian import (
+    SLOTS,
+    Hermitian,
+    hermitian_part,
+    multiplied,
+    times,
+)
+from symbolic.physics.patch_cone import patch_barrier, patch_slack
+from symbolic.physics.patches import BarrierPatch, StateStep
+
+FREE_SIZE, MULTIPLIER_SIZE = WRENCH_SIZE + 1, hermitian.SIZE - 1
+"""Wrench and z; the multipliers' matrix."""
+
+COSINE = (0.50018, 0.57449, -0.09524, 0.02072)
+"""Of v, from above: cos(pi / 3 - 2 / 3 asin(v)), within 2e-4 on [0, 1]."""
+
+LEAST_SPREAD = 1e-60
+"""Square of the eigenvalues' spread that counts as none."""
+
+
+@dataclass(frozen=True)
+class RoundPatch:
+    """A disc."""
+
+    point_size: int = FREE_SIZE + MULTIPLIER_SIZE
+    correction_size: int = hermitian.SIZE
+    degree: float = 3.0
+
+    def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
+        """See `symbolic.physics.patches.Patch`."""
+        moment, tangent = state[3:5], state[1:3]
+        # The z with the largest determinant.
+        matrix = _matrix(ca.vertcat(state, ca.dot(moment, tangent) / state[0]))
+        adjugate = matrix.adjugate()
+        inverse = adjugate.scaled(weight / matrix.determinant(adjugate))
+        return ca.vertcat(state, ca.dot(moment, tangent) / state[0], *_numbers(inverse))
+
+    def local(self, point: ca.SX) -> LocalDisc:
+        """See `symbolic.physics.patches.Patch`."""
+        return LocalDisc(point)
+
+    def barrier(self, point: ca.SX, weight: ca.SX) -> BarrierPatch:
+        """See `symbolic.physics.patches.Patch`; more exact than by way of the inverse."""
+        slope, curvature = patch_barrier()(point[:WRENCH_SIZE])
+        rest = ca.SX.zeros(self.point_size - WRENCH_SIZE)
+
+        def step(change: ca.SX) -> StateStep:
+            return StateStep(ca.vertcat(change, rest), _mean_bound(slope, curvature, change))
+
+        return BarrierPatch(weight * curvature, -weight * slope, step)
+
+    def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
+        """See `symbolic.physics.patches.Patch`."""
+        slope, curvature = patch_barrier()(state)
+        return _mean_bound(slope, curvature, change)
+
+    def slack(self, state: ca.SX) -> ca.SX:
+        """The least of what pressure, friction and both leave."""
+        pressure = state[0] - ca.sqrt(ca.sumsqr(state[3:5]))
+        friction = state[0] - ca.sqrt(ca.sumsqr(state[1:3]))
+        return ca.fmin(ca.fmin(pressure, friction), patch_slack(state))
+
+
+class LocalDisc:
+    """See `symbolic.physics.patches.LocalPatch`."""
+
+    def __init__(self, point: ca.SX) -> None:
+        """The inverse, and the stiffness left by z."""
+        self.wrench = point[:WRENCH_SIZE]
+        self.matrix = _matrix(point[:FREE_SIZE])
+        numbers = ca.vertsplit(point[FREE_SIZE:])
+        self.multiplier = Hermitian.of(ca.vertcat(*numbers[:-1], 0.0, numbers[-1]))
+        self.gap = self.matrix.trace_with(self.multiplier)
+        self.adjugate = self.matrix.adjugate()
+        self.inverse = self.adjugate.scaled(1.0 / self.matrix.determinant(self.adjugate))
+        self.multiplier_adjugate = self.multiplier.adjugate()
+        self._elimination = Elimination(_stiffness(self.inverse, self.multiplier), 1)
+        self.stiffness = ca.vertcat(*[ca.horzcat(*row) for row in self._elimination.left])
+
+    def aim(self, weight: ca.SX, correction: ca.SX) -> DiscAim:
+        """See `symbolic.physics.patches.LocalPatch`."""
+        return DiscAim(self, self.inverse.scaled(weight).less(Hermitian.of(correction)))
+
+    def eliminated(self, right: ca.SX) -> list[ca.SX]:
+        """Of what acts on z and the wrench (7,), what is left for the wrench, after z's part."""
+        return self._elimination.reduced(ca.vertsplit(right))
+
+    def z_change(self, reduced: list[ca.SX], change: ca.SX) -> ca.SX:
+        """The change of z beside the wrench's (6,)."""
+        return self._elimination.first(reduced, ca.vertsplit(change))[0]
+
+
+class DiscAim:
+    """See `symbolic.physics.patches.Aim`."""
+
+    def __init__(self, local: LocalDisc, given: Hermitian) -> None:
+        """From what the multipliers become where nothing moves."""
+        self._local, self._given = local, given
+        self._reduced = local.eliminated(_paired(given))
+        self.pull = ca.vertcat(*self._reduced[1:])
+
+    def step(self, change: ca.SX) -> DiscStep:
+        """See `symbolic.physics.patches.Aim`."""
+        local = self._local
+        z = local.z_change(self._reduced, change)
+        left = self.pull - ca.mtimes(local.stiffness, change)
+        return DiscStep(local, self._given, ca.vertcat(change, z), left)
+
+
+class DiscStep:
+    """See `symbolic.physics.patches.Step`; matrix and multiplier: the changes of X and S."""
+
+    def __init__(self, local: LocalDisc, given: Hermitian, moved: ca.SX, left: ca.SX) -> None:
+        """From wrench's and z's changes and what S + dS is to give to the wrench (6,).
+
+        That tells all of S + dS but how its diagonal is shared.
+        """
+        self.matrix = _matrix(moved)
+        by_row = local.inverse.product(self.matrix)
+        shares = []
+        for k in (0, 1):
+            terms = [times(by_row[k][j], local.multiplier.at(j, k))[0] for j in range(3)]
+            shares.append(given.diagonal[k] - sum(terms))
+        half = left / 2.0
+        target = Hermitian(
+            (shares[0], shares[1], left[0] - shares[0] - shares[1]),
+            ((half[3], half[4]), (half[1], half[2]), (ca.SX(0.0), half[5])),
+        )
+        self.multiplier = target.less(local.multiplier)
+        self.change = ca.vertcat(moved, *_numbers(self.multiplier))
+        self.lowest_of_state = _lowest(local.matrix, local.adjugate, self.matrix)
+        of_multiplier = _lowest(local.multiplier, local.multiplier_adjugate, self.multiplier)
+        self.lowest = ca.fmin(self.lowest_of_state, of_multiplier)
+        self._local = local
+
+    @property
+    def second_order(self) -> ca.SX:
+        """See `symbolic.physics.patches.Step`."""
+        moved = multiplied(self._local.inverse.product(self.matrix), self.multiplier.rows)
+        return ca.vertcat(*hermitian_part(moved).entries)
+
+    def gap_after(self, length: ca.SX) -> ca.SX:
+        """See `symbolic.physics.patches.Step`."""
+        local = self._local
+        matrix = local.matrix.moved(self.matrix, length)
+        return matrix.trace_with(local.multiplier.moved(self.multiplier, length))
+
+
+def _numbers(multiplier: Hermitian) -> list[ca.SX]:
+    """Without what is zero at z's place."""
+    *first, _, last = multiplier.entries
+    return [*first, last]
+
+
+def _matrix(free: ca.SX) -> Hermitian:
+    """Of a wrench and z (7,), or of their change."""
+    n, t_x, t_y, q_x, q_y, m, z = ca.vertsplit(free)
+    return Hermitian((n, n, n), ((q_x, q_y), (t_x, t_y), (z, m)))
+
+
+def _paired(matrix: Hermitian) -> ca.SX:
+    """(7,) what a matrix of multipliers does to z and the wrench."""
+    q, t, c = matrix.below
+    trace = sum(matrix.diagonal)
+    return ca.vertcat(2.0 * c[0], trace, *[2.0 * part for part in (*t, *q, c[1])])
+
+
+def _stiffness(inverse: Hermitian, multiplier: Hermitian) -> list[list[ca.SX]]:
+    """(7, 7) Re tr(A_i X^-1 A_j S) for z and the wrench; A is what an entry adds to the matrix."""
+    # An entry's slot, and whether it is imaginary there.
+    q, t, c = SLOTS
+    entries = [(c, 0), None, (t, 0), (t, 1), (q, 0), (q, 1), (c, 1)]
+    product = multiplier.product(inverse)
+
+    def pair(one: tuple[int, int], two: tuple[int, int]) -> list[list[ca.SX]]:
+        (i, j), (m, n) = one, two
+        at, s = inverse.at, multiplier.at
+        a, b = times(at(j, m), s(n, i)), times(at(j, n), s(m, i))
+        d, e = times(at(i, m), s(n, j)), times(at(i, n), s(m, j))
+        return [
+            [a[0] + b[0] + d[0] + e[0], b[1] + e[1] - a[1] - d[1]],
+            [d[1] + e[1] - a[1] - b[1], b[0] + d[0] - a[0] - e[0]],
+        ]
+
+    pairs = {(i, j): pair(SLOTS[i], SLOTS[j]) for i in range(3) for j in range(i + 1)}
+    rows: list[list[ca.SX]] = []
+    for i, first in enumerate(entries):
+        row = []
+        for second in entries[: i + 1]:
+            if first is None or second is None:
+                row.append(_with_normal(product, first or second))
+                continue
+            (slot, part), (other, its) = first, second
+            i_1, i_2 = SLOTS.index(slot), SLOTS.index(other)
+            row.append(pairs[i_1, i_2][part][its] if i_1 >= i_2 else pairs[i_2, i_1][its][part])
+        rows.append(row)
+    return rows
+
+
+def _with_normal(
+    product: list[list[hermitian.Complex]], entry: tuple[tuple[int, int], int] | None
+) -> ca.SX:
+    """Re tr(A S X^-1) for an entry's A; the normal force's is one."""
+    if entry is None:
+        return sum(product[k][k][0] for k in range(3))
+    (i, j), imaginary = entry
+    above, below = product[j][i], product[i][j]
+    return below[1] - above[1] if imaginary else above[0] + below[0]
+
+
+def _mean_bound(slope: ca.SX, curvature: ca.SX, change: ca.SX) -> ca.SX:
+    """A bound from below by Samuelson's inequality: no eigenvalue of three lies below their mean
+    less sqrt(2) of their deviation; the barrier's derivatives along the change are their sums."""
+    mean = -ca.dot(slope, change) / 3.0
+    variance = ca.dot(change, ca.mtimes(curvature, change)) / 3.0 - mean**2
+    return mean - ca.sqrt(2.0 * ca.fmax(variance, 0.0))
+
+
+def _lowest(matrix: Hermitian, adjugate: Hermitian, change: Hermitian) -> ca.SX:
+    """A bound from below of the least eigenvalue of change over matrix, to 2e-4 of their spread.
+
+    The roots of the characteristic polynomial about their mean are those of t^3 - 3 s^2 t + q, the
+    least of which is -2 s cos(a / 3), cos(a) = q / (2 s^3): a smooth function of sin((pi - a) / 2),
+    for which a cubic from above stands.
+    """
+    over = 1.0 / matrix.determinant(adjugate)
+    of_change = change.adjugate()
+    trace = adjugate.trace_with(change) * over
+    minors = matrix.trace_with(of_change) * over
+    product = change.determinant(of_change) * over
+    mean = trace / 3.0
+    s = ca.sqrt(ca.fmax(mean**2 - minors / 3.0, LEAST_SPREAD))
+    q = ((mean - trace) * mean + minors) * mean - product
+    v = ca.sqrt(ca.fmin(ca.fmax(0.5 + q / (4.0 * s**3), 0.0), 1.0))
+    c_0, c_1, c_2, c_3 = COSINE
+    return mean - 2.0 * s * (c_0 + v * (c_1 + v * (c_2 + v * c_3)))
