@@ -4,7 +4,7 @@
                                                 each lies within its patch's cone
 
 The method is primal-dual with a predictor and a corrector (Mehrotra, SIAM J. Optim. 2, 1992): each
-step solves for the central path's point of a smaller weight, to second order by what a first step
+step aims at the central path's place of a smaller weight, to second order by what a first step
 to weight zero leaves out. It starts within the cones, the load balanced, and takes some ten steps;
 at most `STEPS`, each of which is passed over once the weight is small enough, so that the whole is
 one expression and compiles. The wrench of the last contact is what the others leave, so that
@@ -79,42 +79,42 @@ def least_effort(program: Program, *cell: ca.MX) -> ca.MX:
 def differentiable_least_effort(program: Program, *cell: ca.MX) -> ca.MX:
     """As `least_effort`, on the central path itself; some more steps.
 
-    First derivatives are those of the central path's point: the last step is differentiated, the
-    point it starts from is not. Second ones are not to be had so.
+    First derivatives are those of the central path: the last step is differentiated, the
+    iterate it starts from is not. Second ones are not to be had so.
     """
     return _wrenches(program, _barrier_step(program)(_centred(program)(*cell), *cell))
 
 
 @lru_cache(PROGRAMS)
 def central_path(program: Program) -> ca.Function:
-    """The cell to a point of all patches near the end of the central path."""
+    """The cell to an iterate of all patches near the end of the central path."""
     cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
-    point, goes_on = _start(program)(*cell), ca.MX(1.0)
+    iterate, goes_on = _start(program)(*cell), ca.MX(1.0)
     symbols = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
-    held = [ca.MX.sym("point", _ends(program)[-1]), ca.MX.sym("goes_on")]
+    held = [ca.MX.sym("iterate", _ends(program)[-1]), ca.MX.sym("goes_on")]
     keep = ca.Function("keep", [*held, *symbols], held)
     choice = ca.Function.if_else("path_step", _step(program), keep)
     for _ in range(STEPS):
-        point, goes_on = choice(goes_on, point, goes_on, *cell)
-    return ca.Function("central_path", cell, [point])
+        iterate, goes_on = choice(goes_on, iterate, goes_on, *cell)
+    return ca.Function("central_path", cell, [iterate])
 
 
 @lru_cache(PROGRAMS)
 def _centred(program: Program) -> ca.Function:
-    """The cell to a point on the central path. Its derivatives count as zero."""
+    """The cell to an iterate on the central path. Its derivatives count as zero."""
     cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
-    point = central_path(program)(*cell)
+    iterate = central_path(program)(*cell)
     for _ in range(CENTRING):
-        point = _barrier_step(program)(point, *cell)
+        iterate = _barrier_step(program)(iterate, *cell)
     constant = {"is_diff_in": [False] * len(cell), "is_diff_out": [False]}
-    return ca.Function("centred", cell, [point], constant)
+    return ca.Function("centred", cell, [iterate], constant)
 
 
 @lru_cache(PROGRAMS)
 def _step(program: Program) -> ca.Function:
-    """A point, a flag that does not matter and the cell to the next point and whether to go on."""
-    point, cell = _symbols(program)
-    owns = zip(program.patches, ca.vertsplit(point, _ends(program)), strict=True)
+    """An iterate, a flag that does not matter and the cell to the next one and whether to go on."""
+    iterate, cell = _symbols(program)
+    owns = zip(program.patches, ca.vertsplit(iterate, _ends(program)), strict=True)
     local = [patch.local(own) for patch, own in owns]
     degree = sum(patch.degree for patch in program.patches)
     weight = sum(own.gap for own in local) / degree
@@ -137,18 +137,18 @@ def _step(program: Program) -> ca.Function:
     gap = sum(step.gap_after(length) for step in second)
     return ca.Function(
         "step",
-        [point, ca.SX.sym("goes_on"), *cell],
-        ca.cse([point + length * change, gap > NEAR * degree * final]),
+        [iterate, ca.SX.sym("goes_on"), *cell],
+        ca.cse([iterate + length * change, gap > NEAR * degree * final]),
     )
 
 
 @lru_cache(PROGRAMS)
 def _barrier_step(program: Program) -> ca.Function:
-    """A point and the cell to the point whose state is of the final weight, by Newton's step of the
-    barriers alone; where it has arrived there, its derivatives by the cell are those of the
+    """An iterate and the cell to the one whose state is of the final weight, by Newton's step of
+    the barriers alone; where it has arrived there, its derivatives by the cell are those of the
     central path."""
-    point, cell = _symbols(program)
-    owns = ca.vertsplit(point, _ends(program))
+    iterate, cell = _symbols(program)
+    owns = ca.vertsplit(iterate, _ends(program))
     wrenches = [own[:WRENCH_SIZE] for own in owns]
     weight = FINAL_WEIGHT * _efforts(program, wrenches, cell)[0]
     patches = zip(program.patches, owns, strict=True)
@@ -158,8 +158,8 @@ def _barrier_step(program: Program) -> ca.Function:
     changes = equations.changes([own.pull for own in barriers])
     steps = [own.step(change) for own, change in zip(barriers, changes, strict=True)]
     length = _length([step.lowest_of_state for step in steps], STEP_SHARE)
-    found = point + length * ca.vertcat(*[step.change for step in steps])
-    return ca.Function("barrier_step", [point, *cell], ca.cse([found]))
+    found = iterate + length * ca.vertcat(*[step.change for step in steps])
+    return ca.Function("barrier_step", [iterate, *cell], ca.cse([found]))
 
 
 def _length(lowest: list[ca.SX], share: float) -> ca.SX:
@@ -171,7 +171,7 @@ class _Equations:
     """Newton's equations of a program, for the wrenches.
 
     Attributes:
-        effort: at the point.
+        effort: at the iterate.
     """
 
     def __init__(
@@ -219,24 +219,24 @@ def _efforts(
 
 @lru_cache(PROGRAMS)
 def _start(program: Program) -> ca.Function:
-    """The program's start, as a point on the central path of a problem like it."""
+    """The program's start, as an iterate on the central path of a problem like it."""
     cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
     states = program.start(cell)
     degree = sum(patch.degree for patch in program.patches)
     weight = program.effort([own[:WRENCH_SIZE] for own in states], cell) / degree
     pairs = zip(program.patches, states, strict=True)
-    point = ca.vertcat(*[patch.centred(own, weight) for patch, own in pairs])
-    return ca.Function("start", cell, ca.cse([point]))
+    iterate = ca.vertcat(*[patch.centred(own, weight) for patch, own in pairs])
+    return ca.Function("start", cell, ca.cse([iterate]))
 
 
-def _wrenches(program: Program, point: ca.MX) -> ca.MX:
-    return ca.vertcat(*[own[:WRENCH_SIZE] for own in ca.vertsplit(point, _ends(program))])
+def _wrenches(program: Program, iterate: ca.MX) -> ca.MX:
+    return ca.vertcat(*[own[:WRENCH_SIZE] for own in ca.vertsplit(iterate, _ends(program))])
 
 
 def _symbols(program: Program) -> tuple[ca.SX, list[ca.SX]]:
-    """A point and the cell."""
+    """An iterate and the cell."""
     cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
-    return ca.SX.sym("point", _ends(program)[-1]), cell
+    return ca.SX.sym("iterate", _ends(program)[-1]), cell
 
 
 def _wrench_symbols(count: int) -> list[ca.SX]:
@@ -244,4 +244,4 @@ def _wrench_symbols(count: int) -> list[ca.SX]:
 
 
 def _ends(program: Program) -> list[int]:
-    return [0, *accumulate(patch.point_size for patch in program.patches)]
+    return [0, *accumulate(patch.iterate_size for patch in program.patches)]

@@ -3,8 +3,8 @@
 A patch's state lies within its cone and begins with its scaled wrench, see
 `symbolic.physics.closure`. The cone is one of positive semidefinite matrices X: those of a
 rectangle's corners are real 2 by 2 (`symbolic.physics.rectangular_patch`), a disc's is complex 3 by
-3 (`symbolic.physics.round_patch`). A point of the method has such an X and as large a matrix S of
-multipliers, both positive definite, whose product is a multiple of one on the central path.
+3 (`symbolic.physics.round_patch`). An iterate of the method has such an X and as large a matrix S
+of multipliers, both positive definite, whose product is a multiple of one on the central path.
 
 Newton's step takes S + dS = weight / X - sym(X^-1 dX S) - correction: the direction of Helmberg,
 Rendl, Vanderbei and Wolkowicz (SIAM J. Optim. 6, 1996), seen from X.
@@ -23,8 +23,8 @@ class Patch(Protocol):
     """A kind of patch."""
 
     @property
-    def point_size(self) -> int:
-        """Entries of a point: state, then multipliers."""
+    def iterate_size(self) -> int:
+        """Entries of an iterate: state, then multipliers."""
 
     @property
     def correction_size(self) -> int:
@@ -35,13 +35,13 @@ class Patch(Protocol):
         """Pairing of X with S over the weight on the central path."""
 
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """A point whose X S is the weight, from a program's state."""
+        """An iterate whose X S is the weight, from a program's state."""
 
-    def local(self, point: ca.SX) -> LocalPatch:
-        """What steps from a point need."""
+    def local(self, iterate: ca.SX) -> LocalPatch:
+        """What steps from an iterate need."""
 
-    def barrier(self, point: ca.SX, weight: ca.SX) -> BarrierPatch:
-        """The patch's weighted barrier at a point's state, whatever the multipliers."""
+    def barrier(self, iterate: ca.SX, weight: ca.SX) -> BarrierPatch:
+        """The patch's weighted barrier at an iterate's state, whatever the multipliers."""
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
         """As `Step.lowest_of_state`, of a change of a program's state."""
@@ -51,7 +51,7 @@ class Patch(Protocol):
 
 
 class LocalPatch(Protocol):
-    """A patch at a point.
+    """A patch at an iterate.
 
     Attributes:
         wrench: (6,) scaled.
@@ -108,7 +108,7 @@ class Step(Protocol):
     """A step.
 
     Attributes:
-        change: (point_size,) of the point.
+        change: (iterate_size,) of the iterate.
         lowest_of_state, lowest: bounds from below of what it adds to the eigenvalues of X, and of
             X and S, over them.
     """

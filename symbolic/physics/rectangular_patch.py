@@ -39,7 +39,7 @@ class RectangularPatch:
 
     half_x: float
     half_y: float
-    point_size: int = 2 * STATE_SIZE
+    iterate_size: int = 2 * STATE_SIZE
     correction_size: int = STATE_SIZE
     degree: float = CORNERS
 
@@ -47,13 +47,13 @@ class RectangularPatch:
         """See `symbolic.physics.patches.Patch`."""
         return ca.vertcat(state, *[weight * _inverse(f) for f in self._corners(state)])
 
-    def local(self, point: ca.SX) -> LocalRectangle:
+    def local(self, iterate: ca.SX) -> LocalRectangle:
         """See `symbolic.physics.patches.Patch`."""
-        return LocalRectangle(self, point)
+        return LocalRectangle(self, iterate)
 
-    def barrier(self, point: ca.SX, weight: ca.SX) -> BarrierPatch:
+    def barrier(self, iterate: ca.SX, weight: ca.SX) -> BarrierPatch:
         """See `symbolic.physics.patches.Patch`."""
-        local = self.local(self.centred(point[:STATE_SIZE], weight))
+        local = self.local(self.centred(iterate[:STATE_SIZE], weight))
         aim = local.aim(weight, ca.SX.zeros(self.correction_size))
 
         def step(change: ca.SX) -> StateStep:
@@ -100,13 +100,13 @@ class RectangularPatch:
 class LocalRectangle:
     """See `symbolic.physics.patches.LocalPatch`."""
 
-    def __init__(self, patch: RectangularPatch, point: ca.SX) -> None:
+    def __init__(self, patch: RectangularPatch, iterate: ca.SX) -> None:
         """Inverses of the corners' matrices, and the stiffness left by what moves freely."""
         self.patch = patch
-        state = point[:STATE_SIZE]
+        state = iterate[:STATE_SIZE]
         self.wrench = state[:WRENCH_SIZE]
         self.force = corners_of(patch.waves(state))
-        self.multiplier = list(ca.vertsplit(point[STATE_SIZE:], POINT_SIZE))
+        self.multiplier = list(ca.vertsplit(iterate[STATE_SIZE:], POINT_SIZE))
         self.inverse = [_inverse(f) for f in self.force]
         pairs = zip(self.force, self.multiplier, strict=True)
         self.gap = sum(ca.dot(f, s) for f, s in pairs)

@@ -38,7 +38,7 @@ LEAST_SPREAD = 1e-60
 class RoundPatch:
     """A disc."""
 
-    point_size: int = FREE_SIZE + MULTIPLIER_SIZE
+    iterate_size: int = FREE_SIZE + MULTIPLIER_SIZE
     correction_size: int = hermitian.SIZE
     degree: float = 3.0
 
@@ -51,14 +51,14 @@ class RoundPatch:
         inverse = adjugate.scaled(weight / matrix.determinant(adjugate))
         return ca.vertcat(state, ca.dot(moment, tangent) / state[0], *_numbers(inverse))
 
-    def local(self, point: ca.SX) -> LocalDisc:
+    def local(self, iterate: ca.SX) -> LocalDisc:
         """See `symbolic.physics.patches.Patch`."""
-        return LocalDisc(point)
+        return LocalDisc(iterate)
 
-    def barrier(self, point: ca.SX, weight: ca.SX) -> BarrierPatch:
+    def barrier(self, iterate: ca.SX, weight: ca.SX) -> BarrierPatch:
         """See `symbolic.physics.patches.Patch`; more exact than by way of the inverse."""
-        slope, curvature = patch_barrier()(point[:WRENCH_SIZE])
-        rest = ca.SX.zeros(self.point_size - WRENCH_SIZE)
+        slope, curvature = patch_barrier()(iterate[:WRENCH_SIZE])
+        rest = ca.SX.zeros(self.iterate_size - WRENCH_SIZE)
 
         def step(change: ca.SX) -> StateStep:
             return StateStep(ca.vertcat(change, rest), _mean_bound(slope, curvature, change))
@@ -80,11 +80,11 @@ class RoundPatch:
 class LocalDisc:
     """See `symbolic.physics.patches.LocalPatch`."""
 
-    def __init__(self, point: ca.SX) -> None:
+    def __init__(self, iterate: ca.SX) -> None:
         """The inverse, and the stiffness left by z."""
-        self.wrench = point[:WRENCH_SIZE]
-        self.matrix = _matrix(point[:FREE_SIZE])
-        numbers = ca.vertsplit(point[FREE_SIZE:])
+        self.wrench = iterate[:WRENCH_SIZE]
+        self.matrix = _matrix(iterate[:FREE_SIZE])
+        numbers = ca.vertsplit(iterate[FREE_SIZE:])
         self.multiplier = Hermitian.of(ca.vertcat(*numbers[:-1], 0.0, numbers[-1]))
         self.gap = self.matrix.trace_with(self.multiplier)
         self.adjugate = self.matrix.adjugate()

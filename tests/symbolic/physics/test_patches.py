@@ -37,9 +37,9 @@ def matrix_of(patch: Patch, state: Array) -> Array:
     return np.asarray(block_diag(*[[[n + x, y], [y, n - x]] for n, x, y in corners]))
 
 
-def multipliers(patch: Patch, point: Array) -> Array:
-    """S of a point."""
-    own = point[len(STATES[patch]) :]
+def multipliers(patch: Patch, iterate: Array) -> Array:
+    """S of an iterate."""
+    own = iterate[len(STATES[patch]) :]
     if patch is DISC:
         d, (q, t) = own[:3], (own[3] + 1j * own[4], own[5] + 1j * own[6])
         c = np.complex128(1j * own[7])
@@ -47,8 +47,8 @@ def multipliers(patch: Patch, point: Array) -> Array:
     return np.asarray(block_diag(*[[[n + x, y], [y, n - x]] for n, x, y in own.reshape(4, 3)]))
 
 
-def point_of(patch: Patch) -> Array:
-    """A point off the central path: centred for another state."""
+def iterate_of(patch: Patch) -> Array:
+    """An iterate off the central path: centred for another state."""
     state, weight = ca.SX.sym("state", len(STATES[patch]) - (patch is DISC)), 0.7
     centred = ca.Function("centred", [state], [patch.centred(state, weight)])
     own = STATES[patch][: state.shape[0]]
@@ -65,8 +65,8 @@ def point_of(patch: Patch) -> Array:
 @pytest.mark.parametrize("patch", STATES, ids=["disc", "rectangle"])
 def test_a_step_solves_its_equations(patch: Patch) -> None:
     """S + dS = weight / X - sym(X^-1 dX S), paired with everything but the wrench it is zero."""
-    size, point = len(STATES[patch]), point_of(patch)
-    symbol, change = ca.SX.sym("point", patch.point_size), ca.SX.sym("change", 6)
+    size, iterate = len(STATES[patch]), iterate_of(patch)
+    symbol, change = ca.SX.sym("iterate", patch.iterate_size), ca.SX.sym("change", 6)
     local = patch.local(symbol)
     aim = local.aim(ca.SX(0.3), ca.SX.zeros(patch.correction_size))
     step = aim.step(change)
@@ -75,10 +75,10 @@ def test_a_step_solves_its_equations(patch: Patch) -> None:
     asked = 0.1 * np.random.default_rng(0).normal(size=6)
     run = ca.Function("run", [symbol, change], outputs)
     gap, stiffness, pull, moved, of_state, of_both, second = [
-        np.array(value).squeeze() for value in run(point, asked)
+        np.array(value).squeeze() for value in run(iterate, asked)
     ]
     np.testing.assert_allclose(moved[:6], asked)
-    X, S = matrix_of(patch, point[:size]), multipliers(patch, point)
+    X, S = matrix_of(patch, iterate[:size]), multipliers(patch, iterate)
     dX, dS = matrix_of(patch, moved[:size]), multipliers(patch, moved)
     inverse, share = np.linalg.inv(X), PAIRING[patch]
     assert gap == pytest.approx(share * np.trace(X @ S).real)
