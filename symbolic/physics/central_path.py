@@ -30,8 +30,9 @@ the patches' degrees times this: 6e-8 of it for two round ones."""
 NEAR = 2.0
 """Multiple of the final weight at which the steps end."""
 
-CENTRING = 10
-"""Newton steps of the barriers alone from there onto the central path."""
+CENTRING, CENTRED = 30, 1e-8
+"""Newton steps of the barriers alone, at most, from there onto the central path; the square of
+Newton's decrement, over the weight, that counts as being there."""
 
 STEPS = 30
 STEP_SHARE = 0.97
@@ -82,20 +83,15 @@ def differentiable_least_effort(program: Program, *cell: ca.MX) -> ca.MX:
     First derivatives are those of the central path: the last step is differentiated, the
     iterate it starts from is not. Second ones are not to be had so.
     """
-    return _wrenches(program, _barrier_step(program)(_centred(program)(*cell), *cell))
+    iterate, _ = _barrier_step(program)(_centred(program)(*cell), 1.0, *cell)
+    return _wrenches(program, iterate)
 
 
 @lru_cache(PROGRAMS)
 def central_path(program: Program) -> ca.Function:
     """The cell to an iterate of all patches near the end of the central path."""
     cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
-    iterate, goes_on = _start(program)(*cell), ca.MX(1.0)
-    symbols = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
-    held = [ca.MX.sym("iterate", _ends(program)[-1]), ca.MX.sym("goes_on")]
-    keep = ca.Function("keep", [*held, *symbols], held)
-    choice = ca.Function.if_else("path_step", _step(program), keep)
-    for _ in range(STEPS):
-        iterate, goes_on = choice(goes_on, iterate, goes_on, *cell)
+    iterate = _repeated(program, _step(program), STEPS, _start(program)(*cell), cell)
     return ca.Function("central_path", cell, [iterate])
 
 
@@ -103,11 +99,24 @@ def central_path(program: Program) -> ca.Function:
 def _centred(program: Program) -> ca.Function:
     """The cell to an iterate on the central path. Its derivatives count as zero."""
     cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
-    iterate = central_path(program)(*cell)
-    for _ in range(CENTRING):
-        iterate = _barrier_step(program)(iterate, *cell)
+    near = central_path(program)(*cell)
+    iterate = _repeated(program, _barrier_step(program), CENTRING, near, cell)
     constant = {"is_diff_in": [False] * len(cell), "is_diff_out": [False]}
     return ca.Function("centred", cell, [iterate], constant)
+
+
+def _repeated(
+    program: Program, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
+) -> ca.MX:
+    """The iterate after so many steps at most, as long as they go on."""
+    held = [ca.MX.sym("iterate", _ends(program)[-1]), ca.MX.sym("goes_on")]
+    unused = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
+    keep = ca.Function("keep", [*held, *unused], held)
+    choice = ca.Function.if_else(f"{step.name()}_or_not", step, keep)
+    goes_on = ca.MX(1.0)
+    for _ in range(most):
+        iterate, goes_on = choice(goes_on, iterate, goes_on, *cell)
+    return iterate
 
 
 @lru_cache(PROGRAMS)
@@ -144,9 +153,8 @@ def _step(program: Program) -> ca.Function:
 
 @lru_cache(PROGRAMS)
 def _barrier_step(program: Program) -> ca.Function:
-    """An iterate and the cell to the one whose state is of the final weight, by Newton's step of
-    the barriers alone; where it has arrived there, its derivatives by the cell are those of the
-    central path."""
+    """As `_step`, to the one whose state is of the final weight, by Newton's step of the barriers
+    alone; where it has arrived there, its derivatives by the cell are those of the central path."""
     iterate, cell = _symbols(program)
     owns = ca.vertsplit(iterate, _ends(program))
     wrenches = [own[:WRENCH_SIZE] for own in owns]
@@ -156,10 +164,12 @@ def _barrier_step(program: Program) -> ca.Function:
     stiff = [own.stiffness for own in barriers]
     equations = _Equations(program, cell, list(zip(wrenches, stiff, strict=True)))
     changes = equations.changes([own.pull for own in barriers])
+    downhill = equations.downhill([own.pull for own in barriers], changes)
     steps = [own.step(change) for own, change in zip(barriers, changes, strict=True)]
     length = _length([step.lowest_of_state for step in steps], STEP_SHARE)
     found = iterate + length * ca.vertcat(*[step.change for step in steps])
-    return ca.Function("barrier_step", [iterate, *cell], ca.cse([found]))
+    inputs = [iterate, ca.SX.sym("goes_on"), *cell]
+    return ca.Function("barrier_step", inputs, ca.cse([found, downhill > CENTRED * weight]))
 
 
 def _length(lowest: list[ca.SX], share: float) -> ca.SX:
@@ -193,6 +203,12 @@ class _Equations:
         whole = ca.diagcat(*stiff[:-1]) + ca.mtimes([self._change.T, self._last, self._change])
         size = range(whole.shape[0])
         self._system = Elimination([[whole[i, j] for j in size] for i in size], len(size))
+
+    def downhill(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
+        """How fast effort and barriers fall along changes: the decrement's square, times the
+        weight."""
+        terms = zip(pulls, self._slopes, changes, strict=True)
+        return sum(ca.dot(pull - slope, change) for pull, slope, change in terms)
 
     def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
         """(6,) of every wrench, where the patches' multipliers pull so (6,)."""
