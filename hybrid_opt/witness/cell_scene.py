@@ -15,6 +15,7 @@ import pinocchio
 
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.witness.scene import (
+    box_body,
     contact_points,
     mjcf_text,
     piece_geom,
@@ -133,7 +134,6 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
         touch = f'contype="0" conaffinity="2" {look} density="0"'
         solid = "\n".join(piece_geom(piece, touch, meshes) for piece in held.pieces)
         solid += plates(workcell, 'contype="0" conaffinity="1" group="3" density="0"')
-    about = payload.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     arms = "\n".join(_arm(workcell, settings, i, shown) for i in (0, 1))
     return f"""
 <mujoco>
@@ -148,12 +148,7 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
     <light pos="0 0 4" directional="true"/>
     {"".join(shown.get(Frame("world"), []))}
     {arms}
-    <body name="box">
-      <freejoint name="box"/>
-      <inertial pos="{mjcf_text(payload.centre_of_mass)}" mass="{payload.mass!r}"
-        fullinertia="{mjcf_text(about)}"/>
-      {solid}
-    </body>
+    {box_body(payload, solid)}
   </worldbody>
 </mujoco>"""
 

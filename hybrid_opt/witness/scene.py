@@ -18,7 +18,7 @@ from symbolic.errors import SettingsError
 from symbolic.geometry.pieces import Capsule, Hull, Piece
 from symbolic.physics.contact_forces import GRAVITY
 from symbolic.physics.pose import inverse, pose_matrix
-from symbolic.workcell.records import Box, Contact, Cylinder, Sphere, Workcell
+from symbolic.workcell.records import Box, Contact, Cylinder, Payload, Sphere, Workcell
 
 CARRIAGE_MASS = 1e5
 """[kg], and [kg m^2] about every axis: what the box does to the carriage within a step is lost in
@@ -90,8 +90,7 @@ def scene_text(
             world frame [m/s^2]; it acts like a change of gravity.
     """
     gravity = np.array(GRAVITY) - np.asarray(disturbance)
-    payload, inertia = workcell.payload, workcell.payload.inertia
-    about = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    payload = workcell.payload
     touched = 'contype="0" conaffinity="1"'
     if presses_on_box(workcell):
         faces = f'<geom type="box" size="{mjcf_text(payload.size / 2.0)}" {touched}/>'
@@ -115,14 +114,20 @@ def scene_text(
         diaginertia="{mjcf_text([CARRIAGE_MASS] * 3)}"/>
       {pads}
     </body>
-    <body name="box">
+    {box_body(payload, faces)}
+  </worldbody>
+</mujoco>"""
+
+
+def box_body(payload: Payload, geoms: str) -> str:
+    """The free body `box` with the payload's mass and inertia, and what touches it."""
+    about = payload.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return f"""<body name="box">
       <freejoint name="box"/>
       <inertial pos="{mjcf_text(payload.centre_of_mass)}" mass="{payload.mass!r}"
         fullinertia="{mjcf_text(about)}"/>
-      {faces}
-    </body>
-  </worldbody>
-</mujoco>"""
+      {geoms}
+    </body>"""
 
 
 def solver_options(time_step: float, noslip_iterations: int, gravity: Array) -> str:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 from typing import Any
+
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from symbolic.errors import DualArmError
 
@@ -16,6 +19,20 @@ LONGEST_MESSAGE = 40_000
 """A hundred problems of four hundred letters."""
 
 _PRESSURE = Path("/proc/pressure/cpu")
+
+
+Checks = Mapping[str, tuple[Callable[..., None], tuple[st.SearchStrategy[Any], ...]]]
+"""What is damaged, and with what, by name."""
+
+MANY = 1000
+"""Damages of one kind in the long tests."""
+
+
+def all_kept(checks: Checks, kind: str, examples: int) -> None:
+    """Run one check with so many examples of its strategies."""
+    check, strategies = checks[kind]
+    limited = settings(max_examples=examples, suppress_health_check=list(HealthCheck))
+    limited(given(*strategies)(check))()
 
 
 def kept(read: Callable[[], Any], *names: str) -> Any:

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hybrid_opt.store.export.bundle import MANIFEST, read_manifest, write_bundle
 from hybrid_opt.store.files import sha256
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
-from tests.fuzz.promises import kept
+from tests.fuzz.promises import MANY, Checks, all_kept, kept
 
 FILES: dict[str, str | bytes] = {"job.csv": "time\n0.0\n", "goals/1_press.yaml": b"a: 1\n"}
 ABOUT: dict[str, Any] = {
@@ -27,8 +26,7 @@ ABOUT: dict[str, Any] = {
     "warnings": ["nothing holds the box"],
 }
 
-quick = settings(max_examples=60, suppress_health_check=list(HealthCheck))
-thorough = settings(max_examples=1000, suppress_health_check=list(HealthCheck))
+FEW = 60
 
 
 def judged(name: str, damaged: Callable[[bytes], bytes]) -> None:
@@ -94,7 +92,7 @@ def encoded(tree: Any) -> bytes:
 
 
 SHARE = st.floats(0.0, 1.0, exclude_max=True)
-TESTS: dict[str, tuple[Callable[..., None], tuple[st.SearchStrategy[Any], ...]]] = {
+TESTS: Checks = {
     "bytes": (in_bytes, (SHARE, byte_damage())),
     "values": (in_values, (tree_damage(),)),
     "signed values": (with_right_checksum, (tree_damage(),)),
@@ -103,12 +101,10 @@ TESTS: dict[str, tuple[Callable[..., None], tuple[st.SearchStrategy[Any], ...]]]
 
 @pytest.mark.parametrize("kind", TESTS)
 def test_damage_is_told(kind: str) -> None:
-    check, strategies = TESTS[kind]
-    quick(given(*strategies)(check))()
+    all_kept(TESTS, kind, FEW)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", TESTS)
 def test_much_damage_is_told(kind: str) -> None:
-    check, strategies = TESTS[kind]
-    thorough(given(*strategies)(check))()
+    all_kept(TESTS, kind, MANY)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,7 +13,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from symbolic.geometry.meshes import CollisionModelWarning, convex_pieces
@@ -23,10 +22,10 @@ from symbolic.robot.xacro_file import XACRO_NAMESPACE
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage, xml_damage
-from tests.fuzz.promises import kept
+from tests.fuzz.promises import MANY, Checks, all_kept, kept
 from tests.symbolic.workcell.samples import GOFA, RACK, sample_data, write
 
-FEW, FEW_PROCESSES, MANY = 40, 8, 1000
+FEW, FEW_PROCESSES = 40, 8
 SOUND = RACK.read_bytes().replace(b"../robots/gofa12.urdf", str(GOFA).encode())
 
 ElementTree.register_namespace("xacro", XACRO_NAMESPACE.decode())
@@ -47,10 +46,6 @@ SRDF = b"""<?xml version="1.0"?><robot name="gofa"><group name="arm"><chain base
 tip_link="tool0"/></group><group_state name="home" group="arm"><joint name="joint_1" value="0"/>
 </group_state><disable_collisions link1="link_1" link2="link_3" reason="Never"/>
 <disable_collisions link1="link_2" link2="link_4" reason="Never"/></robot>"""
-
-few_processes = settings(max_examples=FEW_PROCESSES, suppress_health_check=list(HealthCheck))
-quick = settings(max_examples=FEW, suppress_health_check=list(HealthCheck))
-thorough = settings(max_examples=MANY, suppress_health_check=list(HealthCheck))
 
 
 def sound_cell(cell: Workcell) -> None:
@@ -82,42 +77,32 @@ def workcell_tree(damaged: Tree) -> None:
             sound_cell(cell)
 
 
-def urdf(damaged: Bytes) -> None:
+def judged(files: Mapping[str, bytes], **named: str) -> None:
+    """A cell with these files beside it: URDFs are those of both robots, an SRDF of the first."""
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "arm.urdf").write_bytes(damaged(GOFA.read_bytes()))
+        for name, content in files.items():
+            (Path(folder) / name).write_bytes(content)
         data: dict[str, Any] = sample_data()
-        for robot in data["robots"]:
-            robot["urdf"] = "arm.urdf"
+        for robot in data["robots"] if "urdf" in named else data["robots"][:1]:
+            robot |= named
         path = write(Path(folder), data)
         cell = kept(lambda: load(path), str(path))
         if cell is not None:
             sound_cell(cell)
+
+
+def urdf(damaged: Bytes) -> None:
+    judged({"arm.urdf": damaged(GOFA.read_bytes())}, urdf="arm.urdf")
 
 
 def xacro(share: float, damaged: Bytes) -> None:
     files = {"arm.xacro": XACRO.encode(), "parts.xacro": INCLUDED.encode()}
     name = "arm.xacro" if share < 0.5 else "parts.xacro"
-    with tempfile.TemporaryDirectory() as folder:
-        for file, content in files.items():
-            (Path(folder) / file).write_bytes(damaged(content) if file == name else content)
-        data: dict[str, Any] = sample_data()
-        for robot in data["robots"]:
-            robot["urdf"] = "arm.xacro"
-        path = write(Path(folder), data)
-        cell = kept(lambda: load(path), str(path))
-        if cell is not None:
-            sound_cell(cell)
+    judged(files | {name: damaged(files[name])}, urdf="arm.xacro")
 
 
 def srdf(damaged: Bytes) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "arm.srdf").write_bytes(damaged(SRDF))
-        data: dict[str, Any] = sample_data()
-        data["robots"][0]["srdf"] = "arm.srdf"
-        path = write(Path(folder), data)
-        cell = kept(lambda: load(path), str(path))
-        if cell is not None:
-            sound_cell(cell)
+    judged({"arm.srdf": damaged(SRDF)}, srdf="arm.srdf")
 
 
 def mesh(kind: str, damaged: Bytes) -> None:
@@ -133,7 +118,7 @@ def mesh(kind: str, damaged: Bytes) -> None:
             assert np.isfinite(piece.vertices).all()
 
 
-TESTS: dict[str, tuple[Callable[..., None], tuple[st.SearchStrategy[Any], ...]]] = {
+TESTS: Checks = {
     "workcell, bytes": (workcell_text, (byte_damage(),)),
     "workcell, values": (workcell_tree, (tree_damage(),)),
     "urdf, bytes": (urdf, (byte_damage(),)),
@@ -161,12 +146,10 @@ def test_what_is_damaged_is_sound_at_first(check: Callable[..., None]) -> None:
 
 @pytest.mark.parametrize("kind", TESTS)
 def test_damage_is_told(kind: str) -> None:
-    check, strategies = TESTS[kind]
-    (few_processes if check is xacro else quick)(given(*strategies)(check))()
+    all_kept(TESTS, kind, FEW_PROCESSES if TESTS[kind][0] is xacro else FEW)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", TESTS)
 def test_much_damage_is_told(kind: str) -> None:
-    check, strategies = TESTS[kind]
-    thorough(given(*strategies)(check))()
+    all_kept(TESTS, kind, MANY)

@@ -5,23 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hybrid_opt.store.trajectory_file import read_trajectory, write_trajectory
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
-from tests.fuzz.promises import kept
+from tests.fuzz.promises import MANY, Checks, all_kept, kept
 from tests.symbolic.cells import rack_cell
 
-quick = settings(max_examples=40, suppress_health_check=list(HealthCheck))
-thorough = settings(max_examples=1000, suppress_health_check=list(HealthCheck))
+FEW = 40
 
 
 @cache
@@ -79,7 +75,7 @@ def in_a_file_of_the_cell(index: int, damaged: Bytes) -> None:
 
 
 PARTS = st.sampled_from(["decision", "start", "figures", "provenance", "cell", "version", "format"])
-TESTS: dict[str, tuple[Callable[..., None], tuple[st.SearchStrategy[Any], ...]]] = {
+TESTS: Checks = {
     "bytes": (in_bytes, (byte_damage(),)),
     "values": (in_values, (tree_damage(),)),
     "parts": (in_one_part, (PARTS, tree_damage())),
@@ -89,12 +85,10 @@ TESTS: dict[str, tuple[Callable[..., None], tuple[st.SearchStrategy[Any], ...]]]
 
 @pytest.mark.parametrize("kind", TESTS)
 def test_damage_is_told(kind: str) -> None:
-    check, strategies = TESTS[kind]
-    quick(given(*strategies)(check))()
+    all_kept(TESTS, kind, FEW)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", TESTS)
 def test_much_damage_is_told(kind: str) -> None:
-    check, strategies = TESTS[kind]
-    thorough(given(*strategies)(check))()
+    all_kept(TESTS, kind, MANY)
