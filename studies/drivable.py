@@ -11,14 +11,19 @@ import numpy as np
 from hybrid_opt.campaign.layout import DRIVABLE
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators import metrics
+from hybrid_opt.indicators.selection import select
 from studies.terminal_summary import title
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
 
 POLISHED = ", polished"
 """After an algorithm's title."""
+
+LEAST_FORCE = "least-force"
+"""The path that the other experiment ends with, beside which the recommended carry stands."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,39 @@ class DrivableFronts:
         for front in self.fronts:
             found.setdefault(front.label, []).append(front)
         return found
+
+
+def known_paths(root: Path) -> Array:
+    """Paths (m, n_path) that another experiment ends with: of all polished fronts together the
+    balanced one, of each of them both ends and the middle.
+
+    Args:
+        root: its results folder.
+
+    Raises:
+        ResultsError: the folder is not complete or damaged.
+    """
+    campaign = read_campaign(root)
+    n = campaign.workcell.task.n_path
+    found = [path[None] for path in least_force(campaign).values()]
+    for replica in campaign.replicas:
+        polished = read_polished(root, replica, campaign.workcell)
+        if polished is not None and len(polished.x):
+            found.append(polished.x[[0, len(polished.x) // 2, -1], :n])
+    return np.unique(np.concatenate(found), axis=0) if found else np.empty((0, n))
+
+
+def least_force(campaign: CampaignResults) -> dict[str, Array]:
+    """The balanced path (n_path,) of all fronts of an experiment, by its label; empty where no
+    carry was found."""
+    fronts = [replica.front_x for replica in campaign.replicas]
+    for replica in campaign.replicas:
+        polished = read_polished(campaign.root, replica, campaign.workcell)
+        if polished is not None:
+            fronts.append(polished.x)
+    evaluator = CandidateEvaluator(campaign.workcell, campaign.objectives)
+    chosen = select(evaluator, np.concatenate(fronts))
+    return {} if chosen is None else {LEAST_FORCE: chosen.x[: campaign.workcell.task.n_path]}
 
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:

@@ -10,7 +10,6 @@ import numpy as np
 import hybrid_opt as ho
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage
 from hybrid_opt.campaign.layout import RECOMMENDATION, RECOMMENDED, STAGES
-from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.recommended import (
     ForceTable,
     StoredDurations,
@@ -20,10 +19,8 @@ from hybrid_opt.campaign.recommended import (
     stored_price,
     stored_recommendation,
 )
-from hybrid_opt.campaign.results import CampaignResults, read_campaign
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
-from hybrid_opt.indicators.selection import select
 from hybrid_opt.recommending.driven_paths import DrivenPaths
 from hybrid_opt.recommending.force_table import (
     front_durations,
@@ -39,13 +36,16 @@ from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
-from studies.drivable import DrivableFronts, drivable_fronts, drivable_root, is_drivable
+from studies.drivable import (
+    DrivableFronts,
+    drivable_fronts,
+    drivable_root,
+    is_drivable,
+    least_force,
+)
 from studies.recommendation_text import export_command
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-
-LEAST_FORCE = "least-force"
-"""The path that the other experiment ends with, beside which the recommended carry stands."""
 
 
 def recommendation_stage(wish: ho.Wish) -> Stage:
@@ -97,7 +97,7 @@ def recommend_from(root: Path, wish: ho.Wish, path: Path) -> StoredRecommendatio
         return None
     cell = ho.Cell(drivable.results.workcell, DRIVABLE_OBJECTIVES)
     alone = is_drivable(campaign.workcell, campaign.objectives)
-    others = {} if alone else _least_force(campaign)
+    others = {} if alone else least_force(campaign)
     found = ho.recommend(cell, drivable.x, wish, others)
     source = drivable.sources[found.member]
     provenance = {
@@ -146,7 +146,7 @@ def _force_table(
     paths = {HAND_MADE: cell.initial[: task.n_path]} | dict(others)
     rows = [_row(label, [durations(path[None])]) for label, path in paths.items()]
     rows += [
-        _row(label, [durations(spread_members(front.x)[:, : task.n_path]) for front in fronts])
+        _row(label, [durations(spread_members(front.x[:, : task.n_path])) for front in fronts])
         for label, fronts in drivable.labelled().items()
     ]
     return ForceTable(tuple(forces.tolist()), tuple(rows))
@@ -155,15 +155,3 @@ def _force_table(
 def _row(label: str, found: list[Array]) -> StoredDurations:
     figures = [tuple(values.tolist()) for values in over_replicas(found)]
     return StoredDurations(label, len(found), *figures)
-
-
-def _least_force(campaign: CampaignResults) -> dict[str, Array]:
-    """The balanced path of all fronts of the other experiment, by its label."""
-    fronts = [replica.front_x for replica in campaign.replicas]
-    for replica in campaign.replicas:
-        polished = read_polished(campaign.root, replica, campaign.workcell)
-        if polished is not None:
-            fronts.append(polished.x)
-    evaluator = CandidateEvaluator(campaign.workcell, campaign.objectives)
-    chosen = select(evaluator, np.concatenate(fronts))
-    return {} if chosen is None else {LEAST_FORCE: chosen.x[: campaign.workcell.task.n_path]}

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hybrid_opt.campaign import (
+    CampaignFolder,
     CampaignSettings,
     ExecutionSettings,
     Progress,
@@ -37,7 +38,7 @@ from studies.cli import (
     polish_settings,
     wish,
 )
-from studies.drivable import is_drivable
+from studies.drivable import is_drivable, known_paths
 from studies.jerk_costs import jerk_costs, jerk_text
 from studies.program import add_verbose, carry_out, run_program
 from studies.recommendation_stage import recommendation_stage
@@ -48,6 +49,7 @@ from studies.simulation_text import simulation_text
 from studies.summary_stage import summary_stage
 from studies.terminal_summary import terminal_summary
 from studies.timing_stage import timing_stage
+from symbolic.array import Array
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
 
@@ -97,7 +99,10 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
     if study.polish is not None:
         every.append(polish_stage(study.polish))
     if study.drivable and not alone:
-        inner = [] if study.drivable_polish is None else [polish_stage(study.drivable_polish)]
+        inner = []
+        if study.drivable_polish is not None:
+            beside = _paths_beside if study.polish is not None else None
+            inner.append(polish_stage(study.drivable_polish, beside))
         driven = [search_stage(), *inner, summary_stage(), timing_stage(last=True)]
         every.append(drivable_stage(driven))
     if study.drivable:
@@ -108,6 +113,11 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
     if study.report:
         every.append(report_stage(study.with_paper, study.pdf))
     return tuple(every)
+
+
+def _paths_beside(folder: CampaignFolder) -> Array:
+    """What a study's first experiment ended with, in whose folder the drivable one lies."""
+    return known_paths(folder.root.parent)
 
 
 def run_study(

@@ -83,6 +83,7 @@ class PolishRequest:
         algorithm, replica: whose front it is.
         front_x: (k, n_var) its decision vectors.
         recorded: the journal's blocks of an earlier, interrupted polish.
+        paths: (m, n_path) known beside the front, see `Polisher.polish`; None for none.
     """
 
     settings: CampaignSettings
@@ -90,13 +91,20 @@ class PolishRequest:
     replica: int
     front_x: Array
     recorded: tuple[bytes, ...]
+    paths: Array | None = None
 
 
-def polish_stage(settings: PolishSettings) -> Stage:
-    """The stage that polishes the fronts of all replicas."""
+def polish_stage(
+    settings: PolishSettings, known: Callable[[CampaignFolder], Array] | None = None
+) -> Stage:
+    """The stage that polishes the fronts of all replicas.
+
+    Args:
+        known: paths (m, n_path) that are known beside the fronts; None for none.
+    """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        _Polish(folder, settings).run(progress)
+        _Polish(folder, settings, known).run(progress)
 
     def whole(folder: CampaignFolder) -> bool:
         # A front that cannot be read is the search's to compute anew.
@@ -125,6 +133,7 @@ def polish_replica(
         rng,
         recorded=[_from_block(block, request) for block in request.recorded],
         emit=lambda outcome: emit(json.dumps(outcome_to_json(outcome)).encode()),
+        paths=request.paths,
     )
 
 
@@ -199,7 +208,12 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedR
 class _Polish:
     """The fronts that are not polished, and the journals of those that are being worked on."""
 
-    def __init__(self, folder: CampaignFolder, settings: PolishSettings) -> None:
+    def __init__(
+        self,
+        folder: CampaignFolder,
+        settings: PolishSettings,
+        known: Callable[[CampaignFolder], Array] | None,
+    ) -> None:
         self._folder, self._settings = folder, settings
         cell = PackedCell.of(folder.files)
         self._job = Job(
@@ -215,6 +229,7 @@ class _Polish:
         self._all = len(replicas)
         self._open = [replica for replica in replicas if not _is_polished(folder, replica)]
         self._journals: dict[int, Journal] = {}
+        self._paths = known(folder) if known is not None and self._open else None
 
     def run(self, progress: Progress) -> None:
         """Polish all open fronts."""
@@ -254,6 +269,7 @@ class _Polish:
             replica.replica,
             np.array(replica.front_x),
             tuple(self._journal(index).payloads),
+            self._paths,
         )
 
     def heard(self, index: int, message: bytes) -> None:
@@ -276,7 +292,9 @@ class _Polish:
 
 def polish_document(front: PolishedFront) -> PolishDocument:
     """A polished front as it is stored."""
-    accepted = [outcome for outcome in front.outcomes if outcome.status == "accepted"]
+    # Others were judged as they are, without a solver.
+    solved = [o for o in front.outcomes if o.rounds or o.status == "failed"]
+    accepted = [outcome for outcome in solved if outcome.status == "accepted"]
     points = zip(front.objectives, front.x, front.parent, front.polished, strict=True)
     return PolishDocument(
         front=tuple(
@@ -284,11 +302,11 @@ def polish_document(front: PolishedFront) -> PolishDocument:
             for objectives, x, parent, polished in points
         ),
         figures=PolishEffort(
-            attempts=len(front.outcomes),
+            attempts=len(solved),
             counts=front.counts,
             success_share=front.success_share,
             seconds=front.seconds,
-            median_attempt_seconds=_median([o.seconds for o in front.outcomes]),
+            median_attempt_seconds=_median([o.seconds for o in solved]),
             equivalent_evaluations=front.equivalent_evaluations,
             widest_gap=front.widest_gap,
             worst_stationarity=_worst([o.residuals.stationarity for o in accepted]),

@@ -30,10 +30,11 @@ def front_durations(paths: DrivenPaths, forces: Array) -> Array:
     return np.array([paths.durations(float(force)).min(initial=np.inf) for force in forces])
 
 
-def spread_members(x: Array) -> Array:
-    """At most `MEMBERS` rows of a front (k, n), both ends among them."""
-    rows = np.linspace(0, len(x) - 1, min(len(x), MEMBERS)).round().astype(int)
-    return np.asarray(x[np.unique(rows)])
+def spread_members(paths: Array) -> Array:
+    """At most `MEMBERS` different ones of a front's paths (k, n), both ends among them."""
+    different = np.sort(np.unique(paths, axis=0, return_index=True)[1])
+    rows = np.linspace(0, len(different) - 1, min(len(different), MEMBERS)).round().astype(int)
+    return np.asarray(paths[different[np.unique(rows)]])
 
 
 def over_replicas(durations: Sequence[Array]) -> tuple[Array, Array, Array]:

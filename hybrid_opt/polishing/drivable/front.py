@@ -42,6 +42,9 @@ FAST = 0.75
 """Where between the least and the front's largest force limit the tournament is: basins differ most
 where carries are fast."""
 
+COMPARED = 8
+"""Force limits at which paths from beside the front are compared."""
+
 
 @dataclass(frozen=True)
 class DriveAttempt:
@@ -124,7 +127,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._by_force = polisher.evaluator.objective_names.index("peak_force")
         self._tried: set[float] = set()
         self._hand_made = initial_decision(task)[: self._n_path]
-        self._others = self._sound(np.vstack([self._hand_made, paths]))
+        self._paths, self._others, self._largest = paths, paths[:0], self._range[0]
 
     def all(self, rng: np.random.Generator) -> None:
         """A tournament, the front's points, ends and gaps, other starts, while attempts last; then
@@ -134,8 +137,9 @@ class DriveRun(PolishRun[DriveAttempt]):
         forces = [
             self._force(rows[k]) for k in np.linspace(0, len(rows) - 1, count).round().astype(int)
         ]
-        largest = max(*map(self._force, rows), self._range[0])
-        self._tournament(self._range[0] + FAST * (largest - self._range[0]))
+        self._largest = max(*map(self._force, rows), self._range[0])
+        self._others = self._leading(np.vstack([self._hand_made, self._paths]))
+        self._tournament(self._range[0] + FAST * (self._largest - self._range[0]))
         for force in forces:
             self._at("point", force)
         self._at("extreme", self._range[1])
@@ -146,7 +150,7 @@ class DriveRun(PolishRun[DriveAttempt]):
                 self._elsewhere(rng)
             else:
                 self._at("gap", middle)
-        self._spread(largest)
+        self._spread()
 
     def _force(self, index: int) -> float:
         """Force limit of a known carry that it uses fully [N]."""
@@ -191,14 +195,10 @@ class DriveRun(PolishRun[DriveAttempt]):
         start = self._evaluator.evaluate(x[None]).objectives[0]
         self._do([DriveAttempt(aim, -1, x, start, Goal("duration", force), rivals)])
 
-    def _spread(self, largest: float) -> None:
+    def _spread(self) -> None:
         """Points of the best known paths at force limits up to the front's largest."""
-        members = self._settings.drivable.members
-        self._most += members
-        least, still = self._range[0], self._range[0] * (1.0 - STILL)
-        # What a limit leaves above the box at rest decides how long a carry takes.
-        above = np.geomspace(least - still, max(largest, least) - still, members)
-        for force in np.maximum(still + above, least).tolist():
+        self._most += self._settings.drivable.members
+        for force in self._spread_forces(self._settings.drivable.members):
             paths, durations = self._driven(force)
             x = np.append(paths[int(np.argmin(durations))], force)
             found = self._evaluator.evaluate(x)
@@ -207,14 +207,27 @@ class DriveRun(PolishRun[DriveAttempt]):
                 goal = Goal("duration", force)
                 self._do([DriveAttempt("gap", -1, x, objectives, goal, solved=False)])
 
-    def _sound(self, paths: Array) -> Array:
-        """Those of some paths (n, n_path) that are feasible when pressed hard enough."""
+    def _leading(self, paths: Array) -> Array:
+        """Of some paths (n, n_path) those that are feasible when pressed hard enough, and of these
+        the fastest within some force."""
         x = np.hstack([paths, np.full((len(paths), 1), self._range[1])])
-        return paths[self._evaluator.evaluate(x).feasible]
+        paths = paths[self._evaluator.evaluate(x).feasible]
+        if not len(paths):
+            return paths
+        durations = [self._solver.judge.durations(paths, f) for f in self._spread_forces(COMPARED)]
+        return np.asarray(paths[np.unique(np.argmin(durations, axis=1))])
+
+    def _spread_forces(self, count: int) -> list[float]:
+        """Force limits from the least to the front's largest."""
+        still = self._range[0] * (1.0 - STILL)
+        # What a limit leaves above the box at rest decides how long a carry takes.
+        above = np.geomspace(self._range[0] - still, self._largest - still, count)
+        return [float(force) for force in np.clip(still + above, self._range[0], self._largest)]
 
     def _driven(self, force: float) -> tuple[Array, Array]:
-        """All known paths (n, n_path), and how long they take within a force."""
-        known = [x[: self._n_path] for x in self._archive.x]
+        """Paths of the front and those beside it (n, n_path), and how long they take within a
+        force."""
+        known = [self._archive.x[k][: self._n_path] for k in self._archive.rows()]
         paths = np.unique(np.vstack([*known, self._others]), axis=0)
         return paths, self._solver.judge.durations(paths, force)
 

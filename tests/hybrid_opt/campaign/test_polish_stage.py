@@ -24,6 +24,7 @@ from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.layout import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.polish_stage import (
     PolishRequest,
+    polish_document,
     polish_replica,
     polish_stage,
     read_polished,
@@ -33,8 +34,15 @@ from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.front import FrontPolisher
-from hybrid_opt.polishing.records import PolishedFront, outcome_from_json, outcome_to_json
+from hybrid_opt.polishing.records import (
+    PolishedFront,
+    PolishOutcome,
+    outcome_from_json,
+    outcome_to_json,
+)
+from hybrid_opt.polishing.residuals import Residuals
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
+from symbolic.array import Array
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
@@ -73,6 +81,55 @@ def test_a_polished_front_is_feasible_certified_and_better(finished: Path) -> No
     assert 0.0 < polished.figures.widest_gap < 1.0
     assert polished.figures.equivalent_evaluations > 0
     assert not (polished_folder(finished, "nsga2", 0) / JOURNAL).exists()
+
+
+def test_a_polisher_is_given_the_paths_that_are_known_beside(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    paths, seen = np.arange(36.0).reshape(2, 18), list[Any]()
+
+    def polish(self: FrontPolisher, front_x: Array, *_: object, **options: Any) -> PolishedFront:
+        seen.append(options["paths"])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FrontPolisher, "polish", polish)
+    request = PolishRequest(SETTINGS, "nsga2", 0, np.empty((0, 18)), (), paths)
+    with pytest.raises(KeyboardInterrupt):
+        polish_replica(object.__new__(FrontPolisher), request, lambda block: None)
+    assert seen == [paths]
+
+
+def test_what_was_not_solved_counts_in_no_figure_of_solves() -> None:
+    x, unknown = np.zeros(18), Residuals(np.nan, np.nan, np.nan)
+    solved = PolishOutcome(
+        "gap",
+        -1,
+        "accepted",
+        "",
+        x,
+        np.ones(2),
+        np.ones(2),
+        Residuals(1e-5, 0.0, 0.0),
+        1,
+        1,
+        0,
+        2.0,
+    )
+    as_it_is = replace(solved, residuals=unknown, rounds=0, iterations=0, seconds=0.1)
+    lost = replace(as_it_is, status="failed", reason="killed", seconds=4.0)
+    front = PolishedFront(
+        x[None],
+        np.ones((1, 2)),
+        np.array([-1]),
+        np.array([True]),
+        (solved, as_it_is, lost),
+        1.0,
+        1.0,
+    )
+    figures = polish_document(front).figures
+    assert figures.attempts == 2
+    assert figures.median_attempt_seconds == 3.0
+    assert figures.median_stationarity == figures.worst_stationarity == 1e-5
 
 
 def test_attempts_come_back_from_their_file(finished: Path) -> None:
