@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.proposing.holding import Task, find_holds
+from hybrid_opt.proposing.holding import HoldQuery, find_holds
 from hybrid_opt.proposing.kinematics import ArmKinematics, shoulders
 from hybrid_opt.proposing.problem import Problem
 from symbolic.array import Array
@@ -75,7 +75,7 @@ def _scored(
         near = [(near[0] + near[1]) / 2.0] * 2
     draft = problem.workcell(_standing(problem, near))
     start, goal = problem.poses
-    task = Task(draft, start, goal, spins, None, STARTS, GUIDES_TRIED)
+    query = HoldQuery(draft, start, goal, spins, None, STARTS, GUIDES_TRIED)
     arms = []
     for arm in (0, 1):
         redundant = tuple(joint for joint, _ in draft.task.redundant_of(arm))
@@ -87,7 +87,7 @@ def _scored(
     def score(arm: int, base: Array) -> float:
         """How well an arm follows the box from a base, below zero where it does not."""
         T = pose_matrix(base[:3], base[3:])
-        holds = find_holds(task, arm, arms[arm].moved(T), rng).holds
+        holds = find_holds(query, arm, arms[arm].moved(T), rng).holds
         if not holds:
             return LOST
         hidden = _hidden(problem, draft, arm, (T @ np.append(at[arm], 1.0))[:3])

@@ -100,7 +100,7 @@ class HoldSearch:
 
 
 @dataclass(frozen=True)
-class Task:
+class HoldQuery:
     """What an arm has to hold.
 
     Attributes:
@@ -122,20 +122,20 @@ class Task:
 
 
 def find_holds(
-    task: Task, arm: int, kinematics: ArmKinematics, rng: np.random.Generator
+    query: HoldQuery, arm: int, kinematics: ArmKinematics, rng: np.random.Generator
 ) -> HoldSearch:
     """The ways in which an arm can hold the box from start to goal, the other arm left out."""
-    finder = _Finder(task, arm, kinematics, rng)
-    found, contact = finder.found, task.workcell.contacts[arm]
-    spins = possible_spins(contact, task.spins)
+    finder = _Finder(query, arm, kinematics, rng)
+    found, contact = finder.found, query.workcell.contacts[arm]
+    spins = possible_spins(contact, query.spins)
     T_box_joint = [
-        box_to_last_joint(task.workcell, kinematics.geometry, spun(contact, spin), arm)
+        box_to_last_joint(query.workcell, kinematics.geometry, spun(contact, spin), arm)
         for spin in spins
     ]
     q, which = finder.start_postures(T_box_joint)
     if not len(q):
         return found
-    hit = finder.colliding(task.start, q)
+    hit = finder.colliding(query.start, q)
     q, which = q[~hit], which[~hit]
     found.free = len(q)
     for spin, T in enumerate(T_box_joint):
@@ -143,7 +143,7 @@ def find_holds(
         if len(rows):
             finder.lead(float(spins[spin]), T, q[rows])
     found.holds.sort(key=lambda hold: -hold.score)
-    compared = kinematics.geometry.joints - spins_the_pad(task.workcell, arm, kinematics)
+    compared = kinematics.geometry.joints - spins_the_pad(query.workcell, arm, kinematics)
     found.holds = _diverse(found.holds, compared)[:MOST_HOLDS]
     return found
 
@@ -156,22 +156,22 @@ class _Finder:
     """
 
     def __init__(
-        self, task: Task, arm: int, kinematics: ArmKinematics, rng: np.random.Generator
+        self, query: HoldQuery, arm: int, kinematics: ArmKinematics, rng: np.random.Generator
     ) -> None:
-        self.task, self.arm, self.kinematics, self.rng = task, arm, kinematics, rng
+        self.query, self.arm, self.kinematics, self.rng = query, arm, kinematics, rng
         self.found = HoldSearch()
-        self._least = task.workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
+        self._least = query.workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
 
     def start_postures(self, T_box_joint: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
         """Distinct postures at the start and the index of each one's spin."""
-        kinematics, found, start = self.kinematics, self.found, self.task.start
-        T_world_box = box_placement(self.task.workcell.task.orientation, start)
-        which = np.arange(self.task.starts) % len(T_box_joint)
+        kinematics, found, start = self.kinematics, self.found, self.query.start
+        T_world_box = box_placement(self.query.workcell.task.orientation, start)
+        which = np.arange(self.query.starts) % len(T_box_joint)
         targets = np.array([T_world_box @ T for T in T_box_joint])[which]
         centre = (kinematics.lower + kinematics.upper) / 2.0
         half = (kinematics.upper - kinematics.lower) / 2.0
         half = np.where(kinematics.geometry.turning, np.minimum(half, np.pi), half)
-        q = centre + half * self.rng.uniform(-1.0, 1.0, (self.task.starts, len(half)))
+        q = centre + half * self.rng.uniform(-1.0, 1.0, (self.query.starts, len(half)))
         solved = kinematics.solve(q, targets, SEARCH_STEPS, SEARCH_DAMPING)
         good = solved.residual <= REACHED
         q, which, measure = solved.q[good], which[good], solved.manipulability[good]
@@ -195,7 +195,7 @@ class _Finder:
 
     def colliding(self, pose: Array, q: Array) -> NDArray[np.bool_]:
         """(n,) of postures (n, joints) that hold the box at a pose; counts what they meet."""
-        judge, arm = self.task.judge, self.arm
+        judge, arm = self.query.judge, self.arm
         if judge is None or not len(q):
             return np.zeros(len(q), dtype=bool)
         hit = judge.arm_colliding(arm, np.tile(pose, (len(q), 1)), q)
@@ -209,14 +209,14 @@ class _Finder:
 
     def lead(self, spin: float, T_box_joint: Array, q: Array) -> None:
         """Follow postures of one spin along guides to the goal; add those that arrive."""
-        start, goal = self.task.start, self.task.goal
+        start, goal = self.query.start, self.query.goal
         waiting = np.arange(len(q))
-        for bow in GUIDES[: self.task.guides]:
+        for bow in GUIDES[: self.query.guides]:
             if not len(waiting):
                 return
             poses = box_poses(start, goal, GUIDE_POSES)
             poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
-            targets = box_placement(self.task.workcell.task.orientation, poses) @ T_box_joint
+            targets = box_placement(self.query.workcell.task.orientation, poses) @ T_box_joint
             arrived, path, score = self._followed(targets, q[waiting])
             if self.kinematics.redundant and len(arrived) < len(waiting):
                 also, other, scores = self._resolved(targets, q[waiting])

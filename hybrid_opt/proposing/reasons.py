@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from hybrid_opt.evaluate.explanation import missing_reach
-from hybrid_opt.proposing.holding import HoldSearch, Task
+from hybrid_opt.proposing.holding import HoldQuery, HoldSearch
 from hybrid_opt.proposing.judge import PoseJudge
 from hybrid_opt.proposing.pairing import Pair
 from symbolic.array import Array
@@ -30,18 +30,18 @@ def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
     return "; ".join(found)
 
 
-def holds_missing(task: Task, searches: Sequence[HoldSearch]) -> str:
+def holds_missing(query: HoldQuery, searches: Sequence[HoldSearch]) -> str:
     """Why an arm has no way to hold the box, '' where both have one."""
     found = [
-        _arm_missing(task, arm, search) for arm, search in enumerate(searches) if not search.holds
+        _arm_missing(query, arm, search) for arm, search in enumerate(searches) if not search.holds
     ]
     return "; ".join(found)
 
 
-def _arm_missing(task: Task, arm: int, search: HoldSearch) -> str:
-    robot = task.workcell.robots[arm]
+def _arm_missing(query: HoldQuery, arm: int, search: HoldSearch) -> str:
+    robot = query.workcell.robots[arm]
     if not search.reached:
-        missing = min(_missing(task, arm, pose) for pose in (task.start,))
+        missing = min(_missing(query, arm, pose) for pose in (query.start,))
         return f"{robot.name} lacks {missing:.3f} m to its contact at the start"
     names = list(arm_model(robot).names)[1:]
     if not search.within:
@@ -58,7 +58,7 @@ def _arm_missing(task: Task, arm: int, search: HoldSearch) -> str:
             f"{robot.name} collides in every posture that leads from the start to the goal: "
             f"{_pairs(search.pairs)}"
         )
-    missing = _missing(task, arm, task.goal)
+    missing = _missing(query, arm, query.goal)
     if missing > 1e-3:
         return f"{robot.name} lacks {missing:.3f} m to its contact at the goal"
     return (
@@ -67,21 +67,21 @@ def _arm_missing(task: Task, arm: int, search: HoldSearch) -> str:
     )
 
 
-def _missing(task: Task, arm: int, pose: Array) -> float:
+def _missing(query: HoldQuery, arm: int, pose: Array) -> float:
     """Reach that an arm lacks to a pose, from several postures [m]."""
-    robot, contact = task.workcell.robots[arm], task.workcell.contacts[arm]
+    robot, contact = query.workcell.robots[arm], query.workcell.contacts[arm]
     rng = np.random.default_rng(0)
     low = np.maximum(robot.position_lower, -np.pi)
     high = np.minimum(robot.position_upper, np.pi)
     postures = rng.uniform(low, high, (8, len(low)))
-    T_world_box = box_placement(task.workcell.task.orientation, pose)
+    T_world_box = box_placement(query.workcell.task.orientation, pose)
     return min(missing_reach(robot, contact, T_world_box, q) for q in postures)
 
 
-def no_pair(task: Task, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
+def no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
     """Which bodies of the two arms meet where each alone is free."""
     met: Counter[tuple[str, str]] = Counter()
-    for end, pose in enumerate((task.start, task.goal)):
+    for end, pose in enumerate((query.start, query.goal)):
         for a in searches[0].holds[:8]:
             for b in searches[1].holds[:8]:
                 joints = [(hold.q_start, hold.q_goal)[end] for hold in (a, b)]

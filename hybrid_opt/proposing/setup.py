@@ -10,7 +10,7 @@ import numpy as np
 
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing.document import merged
-from hybrid_opt.proposing.holding import HoldSearch, Task, find_holds
+from hybrid_opt.proposing.holding import HoldQuery, HoldSearch, find_holds
 from hybrid_opt.proposing.judge import judge_of
 from hybrid_opt.proposing.kinematics import ArmKinematics
 from hybrid_opt.proposing.pairing import Pair, ranked_pairs
@@ -61,17 +61,17 @@ def prepare(
     blocked = box_blocked(judge, start, goal)
     if blocked:
         raise ProposalError(blocked)
-    task = Task(workcell, start, goal, spins, judge)
+    query = HoldQuery(workcell, start, goal, spins, judge)
     searches: list[HoldSearch] = []
     for arm in (0, 1):
         redundant = tuple(joint for joint, _ in workcell.task.redundant_of(arm))
-        searches.append(find_holds(task, arm, ArmKinematics.of(workcell, arm, redundant), rng))
-    missing = holds_missing(task, searches)
+        searches.append(find_holds(query, arm, ArmKinematics.of(workcell, arm, redundant), rng))
+    missing = holds_missing(query, searches)
     if missing:
         raise ProposalError(missing)
     pairs = ranked_pairs(workcell, judge, [found.holds for found in searches], (start, goal))
     if not pairs:
-        raise ProposalError(no_pair(task, judge, searches))
+        raise ProposalError(no_pair(query, judge, searches))
     return Setup(given, workcell, pairs)
 
 
