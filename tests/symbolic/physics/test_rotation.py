@@ -158,3 +158,20 @@ def test_rates_are_time_derivatives_of_the_rotation(
     np.testing.assert_allclose(
         (omega_after - omega_before) / (2 * h), alpha, atol=1e-7 * scale * (1 + np.abs(rate).max())
     )
+
+
+def test_between_half_turns_about_two_axes_rates_are_those_of_the_rotation() -> None:
+    """Straight between rotation vectors: rates are exact, but the way is no geodesic."""
+    first, last = np.array([np.pi, 0.0, 0.0]), np.array([0.0, np.pi, 0.0])
+    along, none, step = last - first, np.zeros(3), 1e-5
+    speeds = []
+    for u in np.linspace(0.0, 1.0, 41):
+        before, here, after = (first + (u + k * step) * along for k in (-1, 0, 1))
+        turn = Rotation.from_rotvec(after) * Rotation.from_rotvec(before).inv()
+        _, velocity, acceleration = rates(here, along, none, OF_PLAIN_VECTORS)
+        np.testing.assert_allclose(velocity, turn.as_rotvec() / (2.0 * step), atol=1e-8)
+        change = [rates(v, along, none, OF_PLAIN_VECTORS)[1] for v in (before, after)]
+        np.testing.assert_allclose(acceleration, (change[1] - change[0]) / (2.0 * step), atol=1e-7)
+        speeds.append(np.linalg.norm(velocity))
+    geodesic = (Rotation.from_rotvec(last) * Rotation.from_rotvec(first).inv()).magnitude()
+    assert np.trapezoid(speeds, dx=1.0 / 40) > 1.1 * geodesic
