@@ -47,7 +47,7 @@ def draw(
         for name, why in explained.items():
             if why.pair is not None:
                 at = carries[name].pose[why.sample], carries[name].q[why.sample]
-                figures[f"collision_{name}"] = settled(meeting(geometry, why.pair, *at))
+                figures[f"collision_{name}"] = settled(meeting(geometry, why.pair, *at, str(why)))
     return tuple(
         str(path) for name, figure in figures.items() for path in save(figure, output, name)
     )

@@ -14,7 +14,7 @@ from hybrid_opt.evaluate.evaluations import COLLISION, REASONS, Evaluations
 from hybrid_opt.evaluate.sampled import reached_samples
 from symbolic.array import Array
 from symbolic.physics.pose import box_placement, inverse
-from symbolic.robot.urdf import arm_model, link_frame
+from symbolic.robot.urdf import arm_model, link_frame, turning_joints
 from symbolic.workcell.records import Contact, Robot
 
 STEPS = 60
@@ -38,6 +38,7 @@ class Explanation:
         pair: names of the bodies that collide there, None for another reason.
         joint: 'robot/joint' that is beyond a limit there, likewise.
         excess: by how much [rad, or m of a joint that slides].
+        unit: of it.
         robot: name of the arm that does not reach, likewise.
         missing: how far its flange stays from where it has to be, at best [m].
     """
@@ -48,6 +49,7 @@ class Explanation:
     pair: tuple[str, str] | None = None
     joint: str | None = None
     excess: float = 0.0
+    unit: str = "rad"
     robot: str | None = None
     missing: float = 0.0
 
@@ -56,7 +58,7 @@ class Explanation:
         if self.pair is not None:
             return f"{self.pair[0]} meets {self.pair[1]} {where}"
         if self.joint is not None:
-            return f"{self.joint} is {self.excess:.3f} beyond its limit {where}"
+            return f"{self.joint} is {self.excess:.3f} {self.unit} beyond its limit {where}"
         if self.robot is not None:
             return f"{self.robot} lacks {self.missing:.3f} m to its contact {where}"
         return f"{self.reason.replace('_', ' ')} {where}"
@@ -111,8 +113,12 @@ def _explained(
         q = outputs[f"q_{arm}"][0, sample]
         beyond = np.maximum(robot.position_lower - q, q - robot.position_upper)
         joint = int(np.argmax(beyond))
-        name = f"{robot.name}/{list(arm_model(robot).names)[1 + joint]}"
-        return Explanation(reason, position, sample, joint=name, excess=float(beyond[joint]))
+        model = arm_model(robot)
+        name = f"{robot.name}/{list(model.names)[1 + joint]}"
+        unit = "rad" if turning_joints(model)[joint] else "m"
+        return Explanation(
+            reason, position, sample, joint=name, excess=float(beyond[joint]), unit=unit
+        )
     elif kind == "reach":
         index = int(arm) - 1
         robot, held = workcell.robots[index], workcell.contacts[index]

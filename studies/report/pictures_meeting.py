@@ -26,13 +26,16 @@ NEAR = 0.25
 """Half the width of what is shown near by [m]."""
 
 
-def meeting(geometry: CellGeometry, pair: tuple[str, str], pose: Array, q: Array) -> Figure:
+def meeting(
+    geometry: CellGeometry, pair: tuple[str, str], pose: Array, q: Array, title: str
+) -> Figure:
     """The cell with both bodies in red: all of it, and what is near them from two sides.
 
     Args:
         geometry: the cell.
         pair: names of the bodies.
         pose, q: (6,) of the box and (all joints,) where they meet [m, rad].
+        title: above it.
     """
     figure = new_figure(FULL_WIDTH, 0.36 * FULL_WIDTH)
     solids = cell_solids(geometry)
@@ -48,7 +51,7 @@ def meeting(geometry: CellGeometry, pair: tuple[str, str], pose: Array, q: Array
         draw_cell(axes, whole, view, pose, q)
         panel_label(axes, letter, text)
         frame_axes(axes, view, points, margin=0.0)
-    figure.suptitle(" meets ".join(pair), fontsize=8)
+    figure.suptitle(title, fontsize=8)
     return figure
 
 
