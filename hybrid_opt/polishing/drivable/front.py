@@ -130,8 +130,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._paths, self._others, self._largest = paths, paths[:0], self._range[0]
 
     def all(self, rng: np.random.Generator) -> None:
-        """A tournament, the front's points, ends and gaps, other starts, while attempts last; then
-        the best known paths all over the range of forces."""
+        """A tournament, the hand-made path, the front's points, ends and gaps, other starts, while
+        attempts last; then the best known paths all over the range of forces."""
         rows = self._archive.rows()
         count = min(len(rows), ceil(self._settings.attempts * self._settings.front.own_share))
         forces = [
@@ -140,6 +140,9 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._largest = max(*map(self._force, rows), self._range[0])
         self._others = self._leading(np.vstack([self._hand_made, self._paths]))
         self._tournament(self._range[0] + FAST * (self._largest - self._range[0]))
+        # Where carries are slow, the nearest basin may not be that of the paths driven best so far.
+        gentle = self._between(self._range[0], self._largest)
+        self._attempt("extreme", self._hand_made, gentle)
         for force in forces:
             self._at("point", force)
         self._at("extreme", self._range[1])
