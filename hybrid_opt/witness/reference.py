@@ -188,16 +188,22 @@ def with_tracking_error(
 
 
 def press_torque(workcell: Workcell, q: Array) -> Array:
-    """(n, all joints) torques of each arm's joints that press with 1 N, at joints (n, all)."""
-    return np.concatenate(
-        [
-            _press_torque(robot, contact, values)
-            for robot, contact, values in zip(
-                workcell.robots, workcell.contacts, _split(workcell, q), strict=True
-            )
-        ],
-        axis=1,
-    )
+    """(n, all joints) torques of each arm's joints that press with 1 N, at joints (n, all).
+
+    Both press along the normals where these are opposite, else along the line between the middles
+    of their pads, so that what they add cancels in the payload.
+    """
+    middles = [
+        np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
+        for contact in workcell.contacts
+    ]
+    found = []
+    for i, values in enumerate(_split(workcell, q)):
+        contact, line = workcell.contacts[i], middles[1 - i] - middles[i]
+        pushed = line if not workcell.has_opposite_pads else contact.T_box_pad[:3, 2]
+        force = contact.T_box_pad[:3, :3].T @ (pushed / (contact.T_box_pad[:3, 2] @ pushed))
+        found.append(_press_torque(workcell.robots[i], contact, force, values))
+    return np.concatenate(found, axis=1)
 
 
 def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
@@ -211,8 +217,8 @@ def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
     return np.concatenate(found, axis=1)
 
 
-def _press_torque(robot: Robot, contact: Contact, q: Array) -> Array:
-    """Several pads press alike."""
+def _press_torque(robot: Robot, contact: Contact, pushed: Array, q: Array) -> Array:
+    """Of a force (3,) along the first pad's axes; several pads press alike."""
     T_flange_box = robot.T_flange_pad @ inverse(contact.T_box_pad)
     pads = [T_flange_box @ pad.T_box_pad for pad in contact.further]
     places = np.mean([robot.T_flange_pad, *pads], axis=0)
@@ -221,7 +227,7 @@ def _press_torque(robot: Robot, contact: Contact, q: Array) -> Array:
     torque = np.empty_like(q)
     for k, row in enumerate(q):
         J = pin.computeFrameJacobian(arm.model, data, row, flange, pin.LOCAL)
-        force = places[:3, 2]
+        force = robot.T_flange_pad[:3, :3] @ pushed
         torque[k] = J[:3].T @ force + J[3:].T @ np.cross(places[:3, 3], force)
     return torque
 

@@ -1,0 +1,53 @@
+"""The shipped cell whose pads press on adjacent faces."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hybrid_opt.cell import Cell
+from hybrid_opt.timing import TimingLimits
+from hybrid_opt.timing.solve import time_path
+from symbolic.physics.payload_load import load_function
+from symbolic.workcell.file import load
+from tests.symbolic.cells import ROOT, call
+
+CORNER = ROOT / "studies" / "workcells" / "corner.toml"
+
+
+def test_at_rest_both_pads_hold_half_of_the_crate() -> None:
+    """Across the edge the forces lie in the line of both pads, at 45 degrees to both normals."""
+    workcell = load(CORNER)
+    first, second = workcell.contacts
+    assert abs(first.T_box_pad[:3, 2] @ second.T_box_pad[:3, 2]) < 1e-12
+    still = np.zeros(6)
+    found = call(load_function(workcell), still, still, still)
+    one, two = found["contact_force"].reshape(2, 3)
+    weight = 9.81 * workcell.payload.mass
+    np.testing.assert_allclose(one + two, [0.0, 0.0, weight], atol=1e-9 * weight)
+    np.testing.assert_allclose([one[2], two[2]], weight / 2.0, rtol=1e-4)
+    np.testing.assert_allclose(found["normal_force"][0], found["normal_force"][1], rtol=1e-4)
+    for contact, force in zip(workcell.contacts, (one, two), strict=True):
+        normal = contact.T_box_pad[:3, 2]
+        along = normal @ force
+        assert np.linalg.norm(force - along * normal) <= contact.friction * along
+
+
+@pytest.mark.slow
+def test_its_carry_is_feasible_certified_and_drivable_and_arms_carry_it() -> None:
+    cell = Cell.load(CORNER)
+    carry = cell.carry(cell.initial)
+    assert carry.judgement is not None
+    assert carry.judgement.feasible
+    assert np.abs(carry.moment_residual).max() < 1e-9
+    assert cell.certify(cell.initial).is_free
+    timing = time_path(cell.timing_model, cell.initial, TimingLimits(reference_speed=True))
+    assert timing.ok, timing.reason
+    assert timing.carry is not None
+    pytest.importorskip("mujoco")
+    from hybrid_opt.witness.arms import CellWitness
+    from hybrid_opt.witness.reference import carry_reference
+
+    witness, reference = CellWitness(cell.workcell), carry_reference(cell, timing.carry)
+    assert witness.simulate(reference, "leader", 1.15).arrives
+    assert not witness.simulate(reference, "leader", 0.95).holds
