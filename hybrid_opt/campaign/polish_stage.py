@@ -294,7 +294,8 @@ def polish_document(front: PolishedFront) -> PolishDocument:
     """A polished front as it is stored."""
     # Others were judged as they are, without a solver.
     solved = [o for o in front.outcomes if o.rounds or o.status == "failed"]
-    accepted = [outcome for outcome in solved if outcome.status == "accepted"]
+    # Probes are cut short on purpose.
+    accepted = [o for o in solved if o.status == "accepted" and o.aim != "probe"]
     points = zip(front.objectives, front.x, front.parent, front.polished, strict=True)
     return PolishDocument(
         front=tuple(

@@ -23,6 +23,7 @@ from hybrid_opt.polishing.kick import kicked
 from hybrid_opt.polishing.mirror import mirror_of
 from hybrid_opt.polishing.plan import Attempt, PlanState, aimed, points
 from hybrid_opt.polishing.point import PolishSolver, Solution, SolveStart
+from hybrid_opt.polishing.probing import Start, better_half, random_starts
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.run import Polisher, PolishRun
 from hybrid_opt.polishing.settings import PolishSettings
@@ -86,21 +87,46 @@ class ForceRun(PolishRun[Attempt]):
         self._tried: set[tuple[int | None, bytes]] = set()
         self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
         self._images: list[int] = []
+        self._ahead = 0
 
     def _solution(self, attempt: Attempt) -> Solution:
-        start = SolveStart(attempt.x, attempt.target, attempt.radius, attempt.wide, attempt.near)
-        return self._solver.solve(start)
+        how = attempt.wide, attempt.near, attempt.brief
+        return self._solver.solve(SolveStart(attempt.x, attempt.target, attempt.radius, *how))
 
     def all(self, rng: np.random.Generator) -> None:
-        """The front's points, then ends and middle in turns while attempts last; then what lies
-        between. Mirror images are taken in all the way, and certified together in the end."""
+        """The front's points, then probes far from it, then ends and middle in turns while attempts
+        last; then what lies between. Mirror images are taken in all the way, and certified together
+        in the end."""
         self._do(points(self._archive, self._settings))
+        self._ahead = self._left()
+        for objective in (0, 1, None) if self._mirror is None else (0, None):
+            self._probe(objective, rng)
         while self._left() > 0:
             self._turn((0, 1), rng)
             if self._stalls[None] < self._settings.front.middle_stalls:
                 self._turn((None,), rng)
         self._fill()
         self._certify_images()
+
+    def _probe(self, objective: int | None, rng: np.random.Generator) -> None:
+        """Short solves from random feasible candidates and from the front's best point, then again
+        from the better half of what they reached, until one is left. Never from more starts than
+        attempts are ahead."""
+        probe = self._settings.probe
+        count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
+        count = min(self._ahead, probe.middle_starts if objective is None else count)
+        k = self._archive.best(objective)[0]
+        pool = [Start(self._archive.x[k], self._archive.objectives[k])]
+        if count:
+            pool += random_starts(self._evaluator, self._settings, count - 1, rng)
+        while count and pool:
+            reached = []
+            for start in pool:
+                self._most += 1
+                self._do([start.probe(objective, self._settings)])
+                outcome = self.outcomes[-1]
+                reached.append(Start(outcome.x, outcome.objectives))
+            pool = better_half(reached, objective)
 
     def _fill(self) -> None:
         """Attempts between the ends, until the front is even or no side of a gap is left."""

@@ -28,7 +28,7 @@ class Attempt:
     Attributes:
         aim, parent, start: as in `hybrid_opt.polishing.records.PolishOutcome`.
         x: (n_var,) decision vector to start from.
-        target, radius, wide, near: see `hybrid_opt.polishing.point.SolveStart`.
+        target, radius, wide, near, brief: see `hybrid_opt.polishing.point.SolveStart`.
     """
 
     aim: Aim
@@ -39,6 +39,7 @@ class Attempt:
     radius: float
     wide: bool = False
     near: bool = False
+    brief: bool = False
 
 
 def points(archive: GrowingFront, settings: PolishSettings) -> list[Attempt]:

@@ -45,6 +45,7 @@ class SolveStart:
         radius: of the first box of trust, in halves of the decision variables' ranges.
         wide: whether to look farther than the nearest optimum, with `SolveSettings.wide_barrier`.
         near: whether the start is nearly an optimum of the target, as a neighbour on the front is.
+        brief: whether to end after `ProbeSettings.rounds`.
     """
 
     x: Array
@@ -52,6 +53,7 @@ class SolveStart:
     radius: float = TrustSettings().first
     wide: bool = False
     near: bool = False
+    brief: bool = False
 
 
 @dataclass
@@ -108,6 +110,7 @@ class PolishSolver:
         self._settings = settings
         wide = replace(settings.solve, barrier=settings.solve.wide_barrier)
         self._wide = replace(settings, solve=wide)
+        self._brief = replace(settings, rounds=settings.probe.rounds)
         near = settings.fill
         self._near = replace(
             settings,
@@ -168,6 +171,8 @@ class PolishSolver:
     def _settings_for(self, start: SolveStart) -> PolishSettings:
         if start.near:
             return self._near
+        if start.brief:
+            return self._brief
         return self._wide if start.wide else self._settings
 
     def _part(

@@ -13,7 +13,7 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.polishing.residuals import Residuals
 from symbolic.array import Array
 
-Aim = Literal["point", "extreme", "balance", "gap"]
+Aim = Literal["point", "extreme", "balance", "gap", "probe"]
 Status = Literal["accepted", "optimal", "rejected", "failed"]
 
 
@@ -23,7 +23,7 @@ class PolishOutcome:
 
     Attributes:
         aim: 'point' improves a point of the given front; 'extreme', 'balance' and 'gap' look for
-            new ones.
+            new ones; 'probe' is a short solve that tells where to look.
         parent: row of the given front that is to be replaced, -1 for a new point.
         status: accepted; optimal (not improved by more than the tolerance: the original stays);
             rejected by the re-evaluation; failed in the solver.

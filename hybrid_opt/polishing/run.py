@@ -144,6 +144,10 @@ class PolishRun(ABC, Generic[AnyAttempt]):
                 return "rejected", "an objective became worse", attempt.start
             if gain.max() <= self._settings.tolerance:
                 return self._not_improved(answer, attempt)
+        elif attempt.aim == "probe":
+            # Dominated or not: it tells what lies there, and may be continued.
+            if gain.max() <= self._settings.tolerance:
+                return self._not_improved(answer, attempt)
         elif self._archive.dominates(objectives):
             return "rejected", "dominated", attempt.start
         return "accepted", "", objectives

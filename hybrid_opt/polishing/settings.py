@@ -153,6 +153,23 @@ class KickSettings:
 
 
 @dataclass(frozen=True)
+class ProbeSettings:
+    """How basins far from the front are looked for, see `hybrid_opt.polishing.probing`.
+
+    Attributes:
+        starts: of an end of the front; both ends share them unless one is the other's mirror image.
+        middle_starts: of its balanced middle.
+        rounds: of each short solve.
+        candidates: random ones among which feasible starts are looked for.
+    """
+
+    starts: int = 8
+    middle_starts: int = 4
+    rounds: int = 3
+    candidates: int = 1000
+
+
+@dataclass(frozen=True)
 class FillSettings:
     """How a front is filled once its ends are known, see `hybrid_opt.polishing.filling`.
 
@@ -226,8 +243,8 @@ class PolishSettings:
     """What decides the results of a polish.
 
     Attributes:
-        attempts: that one front may take at its points, ends and middle; those that fill it
-            between them come on top.
+        attempts: that one front may take at its points, ends and middle; probes and
+            those that fill it between them come on top.
         method: how a point is improved: along the diagonal (Pascoletti and Serafini 1984), or by
             minimising one objective while the other is held (epsilon constraint).
         max_iterations: of the solver in one round; see `SolveSettings.patience`.
@@ -240,10 +257,10 @@ class PolishSettings:
         clearance: distance kept from obstacles [m]; lets the motion between samples be certified.
         stricter: least rise of a required value that counts as a new demand [m, rad, 1].
         tolerance: improvement of an objective below which a point counts as optimal already.
-        near, trust, solve, front, kick, fill, drivable: the parts' own.
+        near, trust, solve, front, kick, probe, fill, drivable: the parts' own.
     """
 
-    attempts: int = 12
+    attempts: int = 6
     method: Method = "pascoletti-serafini"
     max_iterations: int = 30
     rounds: int = 7
@@ -258,6 +275,7 @@ class PolishSettings:
     solve: SolveSettings = field(default_factory=SolveSettings)
     front: FrontSettings = field(default_factory=FrontSettings)
     kick: KickSettings = field(default_factory=KickSettings)
+    probe: ProbeSettings = field(default_factory=ProbeSettings)
     fill: FillSettings = field(default_factory=FillSettings)
     drivable: DrivableSettings = field(default_factory=DrivableSettings)
 

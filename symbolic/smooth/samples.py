@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.physics.contact_forces import normal_force_branches, split_force
+from symbolic.physics.contact_forces import allocate, normal_force_branches, split_force
 from symbolic.physics.path import PathBasis, sample_basis, waypoint_matrix
-from symbolic.physics.payload_load import LOAD_OUTPUTS, paper_load_function, resultant_force
+from symbolic.physics.payload_load import resultant_force
+from symbolic.physics.pressure import pressure_shift, required_moment
 from symbolic.physics.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.physics.time_law import timed_path
 from symbolic.smooth.keys import Block, Quantity, SampleKey
@@ -123,10 +124,16 @@ def _window_functions(
     identity = np.eye(WINDOW)
     window = ca.mtimes(waypoint_matrix(task, x), basis)
     own = PathBasis(np.linspace(0.0, 1.0, WINDOW), identity, identity, identity)
-    values = _values(workcell, sample, own, window, columns, rounding)
-    flat = ca.Function("values", [x, basis, rounding], [values]).expand()
+    wrenches = _at_samples(workcell, _wrench_function(workcell), own, window, columns, rounding)
+    flat = ca.Function("wrenches", [x, basis, rounding], [wrenches]).expand()
     inputs = [ca.SX.sym(name, *flat.size_in(k)) for k, name in enumerate(INPUTS)]
-    return _derivatives(flat(*inputs), inputs, quantity, block)
+    weight, wrenches = ca.SX.sym("weight", 2 * len(columns)), flat(*inputs)
+    values = _each(sample, wrenches)
+    if quantity == "force":
+        hessian, _ = ca.hessian(ca.dot(weight, values), inputs[0])
+    else:
+        hessian = _chained(sample, wrenches, inputs[0], weight)
+    return _functions(values, [*inputs, weight], hessian, quantity, block)
 
 
 def _whole_path(
@@ -135,68 +142,111 @@ def _whole_path(
     task = workcell.task
     x, unused = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", len(task.waypoints), task.samples)
     rounding = ca.MX.sym("rounding")
-    every = tuple(range(task.samples))
-    values = _values(workcell, sample, sample_basis(task), waypoint_matrix(task, x), every, None)
-    return _derivatives(values, [x, unused, rounding], quantity, "path")
+    every, wrench = tuple(range(task.samples)), _wrench_function(workcell)
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    whole = ca.Function("sample", motion, [sample(wrench(*motion))])
+    along = sample_basis(task), waypoint_matrix(task, x)
+    values = _at_samples(workcell, whole, *along, every, None)
+    weight = ca.MX.sym("weight", values.shape[0])
+    hessian, _ = ca.hessian(ca.dot(weight, values), x)
+    return _functions(values, [x, unused, rounding, weight], hessian, quantity, "path")
 
 
-def _values(
+def _at_samples(
     workcell: Workcell,
-    sample: ca.Function,
+    of_motion: ca.Function,
     basis: PathBasis,
     waypoints: ca.MX,
     columns: tuple[int, ...],
     rounding: ca.MX | None,
 ) -> ca.MX:
-    """A sample's two values (2 k,) at the chosen columns of the timed path."""
+    """What a function makes of the motion at the chosen columns of the timed path, one after the
+    other."""
     path = timed_path(workcell.task, basis, waypoints, rounding)
     at = list(columns)
-    each = sample.map(len(at))
+    each = of_motion.map(len(at))
     return ca.vec(each(path.pose[:, at], path.rate[:, at], path.second_rate[:, at]))
 
 
+def _wrench_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,) of a sample to the required force and moment (6,) about the
+    centre of mass, in the box's frame [N, N m]."""
+    pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
+    payload, turned = workcell.payload, workcell.task.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], rate[3:])
+    alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
+    offset = ca.mtimes(rotation, ca.DM(payload.centre_of_mass))
+    force = resultant_force(payload.mass, offset, omega, alpha, second[:3])
+    moment = required_moment(ca.SX(ca.DM(payload.inertia)), rotation, omega, alpha)
+    wrench = ca.vertcat(ca.mtimes(rotation.T, force), ca.mtimes(rotation.T, moment))
+    return ca.Function("sample_wrench", [pose, rate, second], [wrench])
+
+
 def _margin_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,) of a sample to 1 - (shift / patch radius)^2 (2,)."""
-    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    friction = ca.DM([contact.friction for contact in workcell.contacts])
-    # Where the patches suffice the joint allocation is the paper's, so that these rows keep to it.
-    load = paper_load_function(workcell)(*motion, friction, workcell.payload.centre_of_mass)
-    shift = load[LOAD_OUTPUTS.index("pressure_shift")]
-    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
-    return ca.Function("sample_margin", motion, [1.0 - (shift / radius) ** 2])
+    """Force and moment (6,) in the box's frame to 1 - (shift / patch radius)^2 (2,), by the paper's
+    allocation: where the patches suffice the joint one is the paper's."""
+    wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
+    first, second, normal = (ca.SX(ca.DM(contacts[0].T_box_pad[:3, k])) for k in range(3))
+    centre = workcell.payload.centre_of_mass
+    arms = [ca.SX(ca.DM(c.T_box_pad[:3, 3] - centre)) for c in contacts]
+    forces = allocate(wrench[:3], normal, (contacts[0].friction, contacts[1].friction))
+    shift = pressure_shift(
+        wrench[3:], (arms[0], arms[1]), (forces.force_1, forces.force_2), (first, second)
+    )
+    squares = ca.vertcat(ca.sumsqr(shift.shift_1), ca.sumsqr(shift.shift_2))
+    radius = ca.DM([contact.patch_radius for contact in contacts])
+    return ca.Function("sample_margin", [wrench], [1.0 - squares / radius**2])
 
 
 def _split_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,) of a sample to F_n, F_t (2,)."""
-    pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
-    turned = workcell.task.orientation
-    rotation = rotation_matrix(turned, pose[3:])
-    force = resultant_force(
-        workcell.payload.mass,
-        ca.mtimes(rotation, ca.DM(workcell.payload.centre_of_mass)),
-        angular_velocity(turned, pose[3:], rate[3:]),
-        angular_acceleration(turned, pose[3:], rate[3:], second[3:]),
-        second[:3],
-    )
-    normal = ca.mtimes(rotation, ca.DM(workcell.contacts[0].T_box_pad[:3, 2]))
-    f_n, f_t, _ = split_force(force, normal)
-    return ca.Function("sample_split", [pose, rate, second], [ca.vertcat(f_n, f_t)])
+    """Force and moment (6,) in the box's frame to F_n, F_t (2,)."""
+    wrench = ca.SX.sym("wrench", 6)
+    f_n, f_t, _ = split_force(wrench[:3], ca.SX(ca.DM(workcell.contacts[0].T_box_pad[:3, 2])))
+    return ca.Function("sample_split", [wrench], [ca.vertcat(f_n, f_t)])
 
 
-def _derivatives(
-    values: ca.SX | ca.MX, inputs: list[ca.SX | ca.MX], quantity: Quantity, block: Block
+def _chained(sample: ca.Function, wrenches: ca.SX, x: ca.SX, weight: ca.SX) -> ca.SX:
+    """The Hessian of weight . values by the chain rule over forces and moments w (6 k,):
+
+        (dw/dx)^T (weight . values)_ww dw/dx + sum_j (weight . values)_w,j w_j,xx.
+
+    Six numbers stand between a sample's motion and its allocation: derivatives of the pressure
+    through both at once take three times as many operations.
+    """
+    w, weights = ca.SX.sym("w", *wrenches.shape), ca.SX.sym("weight", *weight.shape)
+    bent, pull = ca.hessian(ca.dot(weights, _each(sample, w)), w)
+    outer = ca.Function("outer", [w, weights], [bent, pull])
+    nu = ca.SX.sym("nu", *wrenches.shape)
+    curvature, _ = ca.hessian(ca.dot(nu, wrenches), x)
+    inner = ca.Function("inner", [*ca.symvar(wrenches), nu], [curvature])
+    bent, pull = outer(wrenches, weight)
+    along = ca.jacobian(wrenches, x)
+    return ca.mtimes([along.T, bent, along]) + inner(*ca.symvar(wrenches), pull)
+
+
+def _each(sample: ca.Function, wrenches: ca.SX) -> ca.SX:
+    """(2 k,) both values of each sample from all forces and moments (6 k,)."""
+    return ca.vertcat(*[sample(wrenches[k : k + 6]) for k in range(0, wrenches.numel(), 6)])
+
+
+def _functions(
+    values: ca.SX | ca.MX,
+    inputs: list[ca.SX | ca.MX],
+    hessian: ca.SX | ca.MX,
+    quantity: Quantity,
+    block: Block,
 ) -> dict[SampleKey, ca.Function]:
-    x = inputs[0]
-    weight = type(x).sym("weight", values.shape[0])
-    hessian, _ = ca.hessian(ca.dot(weight, values), x)
+    """See `sample_functions`; the inputs' last is the weight."""
     first, second = (SampleKey(quantity, block, order) for order in ("first", "second"))
     names = list(INPUTS)
-    results = ca.cse([ca.densify(r) for r in (values, ca.jacobian(values, x).T)])
+    gradient = ca.jacobian(values, inputs[0]).T
+    results = ca.cse([ca.densify(result) for result in (values, gradient)])
     return {
-        first: ca.Function(first.name, inputs, results, names, ["values", "gradient"]),
+        first: ca.Function(first.name, inputs[:-1], results, names, ["values", "gradient"]),
         second: ca.Function(
             second.name,
-            [*inputs, weight],
+            inputs,
             ca.cse([ca.densify(hessian)]),
             [*names, "weight"],
             ["hessian"],

@@ -1,0 +1,48 @@
+"""Probes: feasible starts everywhere, the better half of which goes on."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybrid_opt.polishing.probing import Start, better_half, random_starts
+from hybrid_opt.polishing.settings import PolishSettings
+from tests.hybrid_opt.polishing.test_front import evaluator, polished
+
+
+def test_random_starts_are_feasible_and_the_same_for_the_same_seed() -> None:
+    settings = PolishSettings()
+    found = random_starts(evaluator(), settings, 5, np.random.default_rng(1))
+    again = random_starts(evaluator(), settings, 5, np.random.default_rng(1))
+    assert len(found) == 5
+    for start, other in zip(found, again, strict=True):
+        np.testing.assert_array_equal(start.x, other.x)
+        judged = evaluator().evaluate(start.x)
+        assert judged.feasible[0]
+        np.testing.assert_array_equal(judged.objectives[0], start.objectives)
+
+
+@given(
+    values=st.lists(st.tuples(st.floats(0.0, 2.0), st.floats(0.0, 2.0)), max_size=9),
+    objective=st.sampled_from([0, 1, None]),
+)
+def test_the_better_half_is_no_worse_than_the_rest(
+    values: list[tuple[float, float]], objective: int | None
+) -> None:
+    starts = [Start(np.empty(0), np.array(value)) for value in values]
+    half = better_half(starts, objective)
+    assert len(half) == len(starts) // 2
+    rest = [start for start in starts if all(start is not kept for kept in half)]
+    for kept in half:
+        assert all(kept.value(objective) <= other.value(objective) for other in rest)
+
+
+def test_a_polish_probes_and_takes_in_what_it_reaches_dominated_or_not() -> None:
+    probes = [o for o in polished().outcomes if o.aim == "probe"]
+    assert len(probes) > 4
+    accepted = [o for o in probes if o.status == "accepted"]
+    assert accepted
+    for outcome in accepted:
+        assert (outcome.start - outcome.objectives).max() > 0.0
+        assert np.any(np.all(polished().objectives <= outcome.objectives, axis=1))
