@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from dataclasses import replace
 from functools import cache
 
@@ -194,7 +192,7 @@ class Broken(PolishSolver):
         found = super().solve(start)
         mood = int(1e6 * start.x[0]) % 3
         if mood == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
+            raise FloatingPointError("broken")
         if mood == 1:
             return replace(found, x=evaluator().lower)  # claims success, far outside
         return replace(found, usable=False, message="Invalid_Number_Detected")
