@@ -111,10 +111,10 @@ class ForceRun(PolishRun[Attempt]):
     def _probe(self, objective: int | None, rng: np.random.Generator) -> None:
         """Short solves from random feasible candidates and from the front's best point, then again
         from the better half of what they reached, until one is left. Never from more starts than
-        attempts are ahead."""
+        twice the attempts that are ahead."""
         probe = self._settings.probe
         count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
-        count = min(self._ahead, probe.middle_starts if objective is None else count)
+        count = min(2 * self._ahead, probe.middle_starts if objective is None else count)
         k = self._archive.best(objective)[0]
         pool = [Start(self._archive.x[k], self._archive.objectives[k])]
         if count:

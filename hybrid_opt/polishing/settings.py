@@ -186,7 +186,7 @@ class FillSettings:
     """
 
     members: int = 50
-    attempts: int = 4
+    attempts: int = 6
     stride: float = 0.2
     far: float = 0.1
     far_radius: float = 1.0
