@@ -234,7 +234,8 @@ class _Search:
         return None
 
     def _failed(self, setups: list[_Lazy]) -> ProposalError:
-        begin = f"{self.problem.source}: no carry found in {self.spent:.0f} s: "
+        ended = ", when it was too late for another path" if self.too_late else ""
+        begin = f"{self.problem.source}: no carry found in {self.spent:.0f} s{ended}: "
         if not setups:
             return ProposalError(f"{begin}no bases from which both arms follow the box were found")
         tried = next((lazy for lazy in setups if lazy.setup is not None), setups[0])
