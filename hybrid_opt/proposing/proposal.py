@@ -283,8 +283,8 @@ class _Search:
             self.refusals.append(why)
             return None
         self.tell("bounds")
-        # The verdict on the file takes as long as this one did.
-        bounds = self._bounds(trial, self.settings.seconds - 1.2 * (self.spent - begun))
+        # The verdict on the file takes about as long as this one did.
+        bounds = self._bounds(trial, self.settings.seconds - 1.5 * (self.spent - begun))
         moved = replace(found, branches=trial.branches, bounds=bounds).around(bounds.centre)
         self.tell("the evaluator's verdict on the file")
         try:
