@@ -98,7 +98,7 @@ def test_cases_within_the_ranges_lie_below_the_vertices() -> None:
         one = replace(Uncertainty(), **{name: getattr(SET, name)})
         force = model().robust_force(motion(), one)
         assert model().check(motion(), force, 500, rng).holds, name
-        assert (force.commanded >= (1.0 - 1e-9) * force.nominal[:, 1]).all(), name
+        assert (force.commanded >= (1.0 - 1e-7) * force.nominal[:, 1]).all(), name
 
 
 def test_leading_arm_feels_no_more_than_told() -> None:
