@@ -14,7 +14,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from hybrid_opt.polishing.polisher import polisher_for
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import PolishSettings, usual_settings
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk
@@ -59,16 +59,18 @@ def polish(
     rng: np.random.Generator,
     settings: PolishSettings | None = None,
 ) -> Front:
-    """Improve a front of the paper's two objectives with an interior-point method.
+    """Improve a front: both peak forces with an interior-point method, or, under the time law
+    'optimal', path and speed profile together.
 
     Args:
         rng: spreads the starts of some attempts.
-        settings: see `hybrid_opt.polishing.settings`; None for the defaults.
+        settings: see `hybrid_opt.polishing.settings`; None for the usual ones of the time law.
 
     Raises:
-        SettingsError: the cell's objectives are not both peak forces.
+        SettingsError: the cell's objectives are not those of the polish.
     """
-    polisher = polisher_for(cell.evaluator, settings or PolishSettings(), cell.polish_functions)
+    settings = settings or usual_settings(cell.workcell.task.time_law)
+    polisher = polisher_for(cell.evaluator, settings, cell.polish_functions)
     done = polisher.polish(front.x, rng)
     title = f"{front.title}, polished"
     return Front(cell, title, done.x, done.objectives, front.evaluations, done)

@@ -14,7 +14,7 @@ from hybrid_opt.campaign.execution import ExecutorName
 from hybrid_opt.campaign.settings import FirstGeneration
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.metaheuristics.problem import ConstraintHandling
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import DRIVABLE_ATTEMPTS, PolishSettings
 from hybrid_opt.recommending.wish import Wish
 from symbolic.errors import SettingsError
 
@@ -22,9 +22,6 @@ _DEFAULT = CampaignSettings()
 
 QUICK_EVALUATIONS, QUICK_REPLICAS, QUICK_POLISH_ATTEMPTS = 300, 2, 2
 """Of a small but complete study."""
-
-DRIVABLE_POLISH_ATTEMPTS = 10
-"""At one drivable front: each takes several times as long as one of a paper's front."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -122,7 +119,7 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         type=int,
         metavar="N",
         help="attempts that the polish of one front may take before it is filled between its ends "
-        f"(default: {PolishSettings().attempts}, for a drivable one {DRIVABLE_POLISH_ATTEMPTS}, "
+        f"(default: {PolishSettings().attempts}, for a drivable one {DRIVABLE_ATTEMPTS}, "
         f"with --quick {QUICK_POLISH_ATTEMPTS})",
     )
     after.add_argument(

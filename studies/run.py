@@ -26,12 +26,11 @@ from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.campaign.simulated import read_simulations
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, FORCE_PAIRS, PAPER_OBJECTIVES
 from hybrid_opt.polishing.drivable.point import is_polishable
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import DRIVABLE_ATTEMPTS, PolishSettings
 from hybrid_opt.recommending.wish import Wish
 from hybrid_opt.witness.outcome import mujoco_module
 from hybrid_opt.work.processes import warm_up
 from studies.cli import (
-    DRIVABLE_POLISH_ATTEMPTS,
     campaign_parser,
     campaign_settings,
     execution_settings,
@@ -210,11 +209,9 @@ def main(
         if execution.executor == "processes":
             warm_up(*WORKERS_LOAD)
         study = StudySettings(
-            polish=polish_settings(
-                options, polishable, DRIVABLE_POLISH_ATTEMPTS if alone else None
-            ),
+            polish=polish_settings(options, polishable, DRIVABLE_ATTEMPTS if alone else None),
             drivable=options.drivable,
-            drivable_polish=polish_settings(options, True, DRIVABLE_POLISH_ATTEMPTS),
+            drivable_polish=polish_settings(options, True, DRIVABLE_ATTEMPTS),
             wish=wish(options),
             simulate=options.simulate,
             report=options.report,
