@@ -8,8 +8,8 @@ interrupted one repeats none.
 from __future__ import annotations
 
 import json
-import math
 import warnings
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,12 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.campaign.documents import FrontPoint, PolishDocument, PolishEffort
+from hybrid_opt.campaign.documents import PolishDocument, PolishEffort
 from hybrid_opt.campaign.execution import executor_for
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.identity import identity, replica_identity
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.layout import JOURNAL, POLISH, polished_folder
+from hybrid_opt.campaign.polish_document import polish_document
 from hybrid_opt.campaign.progress import Advance, Progress
 from hybrid_opt.campaign.results import Replica, read_campaign
 from hybrid_opt.campaign.settings import CampaignSettings
@@ -104,7 +105,7 @@ def polish_stage(
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        _Polish(folder, settings, known).run(progress)
+        PolishLedger(folder, settings, known).run(progress)
 
     def whole(folder: CampaignFolder) -> bool:
         # A front that cannot be read is the search's to compute anew.
@@ -205,7 +206,7 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedR
     return found
 
 
-class _Polish:
+class PolishLedger:
     """The fronts that are not polished, and the journals of those that are being worked on."""
 
     def __init__(
@@ -229,6 +230,7 @@ class _Polish:
         self._all = len(replicas)
         self._open = [replica for replica in replicas if not _is_polished(folder, replica)]
         self._journals: dict[int, Journal] = {}
+        self._losses = Counter[int]()
         self._paths = known(folder) if known is not None and self._open else None
 
     def run(self, progress: Progress) -> None:
@@ -241,8 +243,12 @@ class _Polish:
             with progress.stage("polish", self._all, "fronts", done) as self._advance:
                 executor_for(self._folder.execution).run(self._job, self)
         finally:
-            for journal in self._journals.values():
-                journal.close()
+            self.close()
+
+    def close(self) -> None:
+        """Close the journals; they stay where they are."""
+        for journal in self._journals.values():
+            journal.close()
 
     _advance: Advance
 
@@ -279,7 +285,8 @@ class _Polish:
     def lost(self, index: int, reason: str) -> None:
         """A solver that crashes or hangs costs the attempt at hand only."""
         journal = self._journal(index)
-        if len(journal.payloads) >= self._settings.attempts:
+        self._losses[index] += 1
+        if self._losses[index] >= self._settings.attempts:
             give_up(reason)
         journal.append(_block_of(Lost(reason)))
 
@@ -288,39 +295,3 @@ class _Polish:
         write_json(self._marker(self._open[index]), to_json(polish_document(answer)))
         self._journals.pop(index).discard()
         self._advance(1)
-
-
-def polish_document(front: PolishedFront) -> PolishDocument:
-    """A polished front as it is stored."""
-    # Others were judged as they are, without a solver.
-    solved = [o for o in front.outcomes if o.rounds or o.status == "failed"]
-    # Probes are cut short on purpose.
-    accepted = [o for o in solved if o.status == "accepted" and o.aim != "probe"]
-    points = zip(front.objectives, front.x, front.parent, front.polished, strict=True)
-    return PolishDocument(
-        front=tuple(
-            FrontPoint(objectives, x, int(parent), bool(polished))
-            for objectives, x, parent, polished in points
-        ),
-        figures=PolishEffort(
-            attempts=len(solved),
-            counts=front.counts,
-            success_share=front.success_share,
-            seconds=front.seconds,
-            median_attempt_seconds=_median([o.seconds for o in solved]),
-            equivalent_evaluations=front.equivalent_evaluations,
-            widest_gap=front.widest_gap,
-            worst_stationarity=_worst([o.residuals.stationarity for o in accepted]),
-            worst_feasibility=_worst([o.residuals.feasibility for o in accepted]),
-            median_stationarity=_median([o.residuals.stationarity for o in accepted]),
-        ),
-        attempts=tuple(outcome_to_json(outcome) for outcome in front.outcomes),
-    )
-
-
-def _median(values: list[float]) -> float:
-    return float(np.median(values)) if values else math.nan
-
-
-def _worst(values: list[float]) -> float:
-    return max(values, default=math.nan)

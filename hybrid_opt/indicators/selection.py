@@ -2,7 +2,8 @@
 
 The balanced carry has the least mean of both robots' peak normal forces. Where one robot can
 relieve the other at no cost, a polished front is flat: many points have the same mean to five
-digits. Of such points the most even one is selected, which leaves most room for payload.
+digits. Of such points the most even one is selected, which leaves most room for payload. Drivable
+fronts reach down to forces at which a carry hardly moves; of them the knee is selected.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.indicators.knee import knee
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from symbolic.array import Array
 
@@ -28,7 +30,7 @@ _CHUNK = 256
 
 @dataclass(frozen=True)
 class Selected:
-    """A front's balanced carry.
+    """The carry that stands for a front.
 
     Attributes:
         row: its row among the replica's evaluations, or in the polished front.
@@ -86,7 +88,7 @@ def balanced(peak_normal_force: Array) -> int:
 def select(
     evaluator: CandidateEvaluator, x: Array, rows: NDArray[np.intp] | None = None
 ) -> Selected | None:
-    """The balanced carry of a front, None where the front is empty.
+    """The carry that stands for a front, None where the front is empty.
 
     Args:
         x: (k, n_var) the front's decision vectors.
@@ -94,9 +96,22 @@ def select(
     """
     if len(x) == 0:
         return None
-    index = balanced(peak_normal_forces(evaluator, x))
+    index = selected_row(evaluator, x)
     row = index if rows is None else int(rows[index])
     return Selected(row, evaluator.carry(x[index]))
+
+
+def selected_row(evaluator: CandidateEvaluator, x: Array) -> int:
+    """Index of the carry that stands for a front (k, n_var), k > 0: the balanced one, under the
+    time law 'optimal' the knee of duration and larger peak force."""
+    peaks = peak_normal_forces(evaluator, x)
+    if evaluator.workcell.task.time_law != "optimal":
+        return balanced(peaks)
+    return knee(np.column_stack([_durations(evaluator, x), peaks.max(axis=1)]))
+
+
+def _durations(evaluator: CandidateEvaluator, x: Array) -> Array:
+    return np.array([evaluator.outputs(row[None])["time"][0, -1] for row in x])
 
 
 def peak_normal_forces(evaluator: CandidateEvaluator, x: Array) -> Array:

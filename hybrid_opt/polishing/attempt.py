@@ -33,8 +33,8 @@ def solve_safely(solve: Callable[[], Solution]) -> Solution | Lost:
 
 
 def use_one_thread() -> None:
-    """Keep the linear solver's BLAS from spinning on cores that other workers use: its matrices
-    are too small for threads."""
+    """Keep IPOPT's BLAS from spinning on cores that other workers use: its matrices are too small
+    for threads. It is loaded with the first solve, too late for `hybrid_opt.work.threads`."""
     for library in Path(casadi.__file__).parent.glob("*openblas*.so*"):
         with suppress(OSError, AttributeError):
             ctypes.CDLL(str(library)).openblas_set_num_threads(1)

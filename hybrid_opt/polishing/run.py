@@ -17,6 +17,7 @@ from hybrid_opt.polishing.attempt import Lost, solve_safely
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import Aim, PolishedFront, PolishOutcome, Status
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.work.threads import one_thread
 from symbolic.array import Array
 from symbolic.workcell.decision import initial_decision
 
@@ -207,7 +208,8 @@ class Polisher(ABC):
         known = np.empty((0, self.evaluator.workcell.task.n_path)) if paths is None else paths
         run = self._run(archive, list(recorded), emit, known)
         if len(feasible) and self.settings.attempts:
-            run.all(rng)
+            with one_thread():
+                run.all(rng)
         rows = archive.rows() if len(feasible) else []
         return PolishedFront(
             x=np.array([archive.x[k] for k in rows]).reshape(-1, self.evaluator.n_var),

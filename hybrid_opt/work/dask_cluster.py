@@ -287,7 +287,7 @@ def _work(pickled: bytes, request: Any, to: _Return) -> Any:
             _contexts.context = _contexts.made.make_context()
             _contexts.job = pickled
         send(address)
-        return _contexts.made.work(_contexts.context, request, send)
+        return _contexts.made.answer(_contexts.context, request, send)
 
     return attempt(answer)
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
 from hybrid_opt.errors import WorkerError
+from hybrid_opt.work.threads import one_thread
 from symbolic.errors import DualArmError
 
 Context = TypeVar("Context")
@@ -44,6 +45,11 @@ class Job(Generic[Context, Request, Answer]):
     make_context: Callable[[], Context]
     work: Callable[[Context, Request, Emit], Answer]
     patience: float | None = None
+
+    def answer(self, context: Context, request: Request, emit: Emit) -> Answer:
+        """The answer to a request."""
+        with one_thread():
+            return self.work(context, request, emit)
 
 
 class Ledger(Protocol[RequestOut, AnswerIn]):

@@ -238,7 +238,7 @@ def _serve(connection: Connection, job: Job[Any, Any, Any]) -> None:
     def answer(request: Any) -> Any:
         held = context()
         connection.send(None)
-        return job.work(held, request, connection.send)
+        return job.answer(held, request, connection.send)
 
     with suppress(EOFError, OSError):
         while True:

@@ -16,5 +16,5 @@ class SerialExecutor:
             return
         context = job.make_context()
         for index in range(len(ledger)):
-            answer = job.work(context, ledger.request(index), partial(ledger.heard, index))
+            answer = job.answer(context, ledger.request(index), partial(ledger.heard, index))
             ledger.answered(index, answer)

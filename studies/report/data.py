@@ -17,7 +17,7 @@ from hybrid_opt.campaign.simulated import read_simulations
 from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, ReplicaFigures
 from hybrid_opt.carry import Carry
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
-from hybrid_opt.indicators.selection import balanced, peak_normal_forces
+from hybrid_opt.indicators.selection import selected_row
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.timing import TimingLimits, timed_trajectory
 from hybrid_opt.timing.robustness import payload_sensitivity
@@ -148,9 +148,9 @@ class _CarryMaker:
     def carry(self, x: Array, label: str) -> DrawnCarry:
         return shown(label, self.evaluator.carry(x))
 
-    def balanced(self, front: Front, label: str) -> DrawnCarry:
-        """The trajectory of least mean peak force of a front."""
-        row = balanced(peak_normal_forces(self.evaluator, front.x))
+    def selected(self, front: Front, label: str) -> DrawnCarry:
+        """The trajectory that stands for a front."""
+        row = selected_row(self.evaluator, front.x)
         return self.carry(front.x[row], label)
 
 
@@ -213,10 +213,10 @@ def _algorithm(
         index=index,
         runs=runs,
         representative=representative,
-        selected=maker.balanced(front, title(name)) if len(front) else None,
+        selected=maker.selected(front, title(name)) if len(front) else None,
         hybrid_selected=None
         if hybrid is None or not len(hybrid)
-        else maker.balanced(hybrid, f"{title(name)}, polished"),
+        else maker.selected(hybrid, f"{title(name)}, polished"),
     )
 
 

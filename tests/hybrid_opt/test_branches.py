@@ -73,7 +73,7 @@ def test_a_robot_with_a_number_keeps_it() -> None:
 
 
 def test_starting_at_the_own_branches_gives_the_same_bits(cell: Cell) -> None:
-    x = cell.random(40, np.random.default_rng(5))
+    x = cell.random(400, np.random.default_rng(5))
     again = cell.evaluator.beginning_at(*cell.compiled.model.start).evaluate(x)
     np.testing.assert_array_equal(again.penalised, cell.evaluate(x).penalised)
     rows = front_rows(again.objectives, again.feasible)

@@ -58,11 +58,11 @@ def test_json_repeats_to_the_digit(capsys: pytest.CaptureFixture[str]) -> None:
     for _ in range(2):
         assert algorithms.main([*ARGUMENTS, "--json"]) == 0
         document = json.loads(capsys.readouterr().out)
-        for row in document["rows"]:
-            assert row.pop("overhead_us") > 0.0
+        for score in document["scores"]:
+            assert score.pop("overhead_us") > 0.0
         documents.append(document)
     assert documents[0] == documents[1]
-    assert [row["algorithm"] for row in documents[0]["rows"]] == ["mopso", "nsga2"] * 2
+    assert [score["algorithm"] for score in documents[0]["scores"]] == ["mopso", "nsga2"] * 2
 
 
 @pytest.mark.parametrize(

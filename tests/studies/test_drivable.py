@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.campaign.layout import POLISH, polished_folder
-from hybrid_opt.campaign.polish_stage import polish_document
+from hybrid_opt.campaign.polish_document import polish_document
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.files import write_json

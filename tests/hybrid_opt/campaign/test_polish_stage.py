@@ -22,15 +22,16 @@ from hybrid_opt.campaign import (
 )
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.layout import JOURNAL, POLISH, polished_folder
+from hybrid_opt.campaign.polish_document import polish_document
 from hybrid_opt.campaign.polish_stage import (
+    PolishLedger,
     PolishRequest,
-    polish_document,
     polish_replica,
     polish_stage,
     read_polished,
 )
 from hybrid_opt.campaign.results import read_campaign
-from hybrid_opt.errors import DamagedResultsWarning, ResultsError
+from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.front import FrontPolisher
@@ -41,13 +42,14 @@ from hybrid_opt.polishing.records import (
     outcome_to_json,
 )
 from hybrid_opt.polishing.residuals import Residuals
-from hybrid_opt.polishing.settings import FillSettings, PolishSettings
+from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from symbolic.array import Array
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
 SETTINGS = CampaignSettings(algorithms=("nsga2",), evaluations=200, replicas=1, seed=5)
-POLISHED = PolishSettings(attempts=4, fill=FillSettings(attempts=1))
+PROBE = ProbeSettings(starts=2, middle_starts=2)
+POLISHED = PolishSettings(attempts=4, fill=FillSettings(attempts=1), probe=PROBE)
 SILENT = Progress(shown=False)
 
 
@@ -76,11 +78,30 @@ def test_a_polished_front_is_feasible_certified_and_better(finished: Path) -> No
     before = metrics.hypervolume(replica.front, corner)
     assert metrics.hypervolume(polished.objectives, corner) > before
     assert polished.polished.any()
-    most = POLISHED.attempts * (1 + POLISHED.fill.attempts)
-    assert POLISHED.attempts < polished.figures.attempts <= most
+    # Probes of one end and of the middle, the better of two of which goes on.
+    probes = 2 * (2 + 1)
+    most = POLISHED.attempts * (1 + POLISHED.fill.attempts) + probes
+    assert POLISHED.attempts + probes < polished.figures.attempts <= most
     assert 0.0 < polished.figures.widest_gap < 1.0
     assert polished.figures.equivalent_evaluations > 0
     assert not (polished_folder(finished, "nsga2", 0) / JOURNAL).exists()
+
+
+def test_a_lost_solve_costs_one_attempt_however_many_were_made(
+    finished: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(finished, tmp_path / "again")
+    (polished_folder(tmp_path / "again", "nsga2", 0) / POLISH).unlink()
+    execution = ExecutionSettings(tmp_path / "again", jobs=1, resume=True)
+    with open_folder(SETTINGS, execution, load(RACK)) as folder:
+        ledger = PolishLedger(folder, POLISHED, None)
+        for _ in range(2 * POLISHED.attempts):
+            ledger.heard(0, b"an attempt")
+        for _ in range(POLISHED.attempts - 1):
+            ledger.lost(0, "crashed")
+        with pytest.raises(WorkerError, match="given up"):
+            ledger.lost(0, "crashed")
+        ledger.close()
 
 
 def test_a_polisher_is_given_the_paths_that_are_known_beside(

@@ -11,9 +11,17 @@ from hypothesis import strategies as st
 
 from hybrid_opt.campaign.replica import front_rows
 from hybrid_opt.campaign.results import Replica
+from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.static_hold import payload_limit, static_hold
-from hybrid_opt.indicators.selection import balanced, peak_normal_forces, select
+from hybrid_opt.indicators.knee import knee
+from hybrid_opt.indicators.selection import (
+    balanced,
+    peak_normal_forces,
+    select,
+    selected_row,
+)
+from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
 from tests.hybrid_opt.campaign.fake import RACK
@@ -66,6 +74,16 @@ def test_peaks_do_not_depend_on_how_many_are_asked_for(evaluator: CandidateEvalu
     together = peak_normal_forces(evaluator, x)
     assert together.shape == (300, 2)
     np.testing.assert_array_equal(peak_normal_forces(evaluator, x[280:]), together[280:])
+
+
+def test_the_knee_stands_for_drivable_carries() -> None:
+    cell = Cell.load(RACK).drivable()
+    path = initial_decision(cell.workcell.task)[: cell.workcell.task.n_path]
+    x = np.array([np.append(path, force) for force in (49.2, 50.0, 52.0, 55.0, 70.0)])
+    row = selected_row(cell.evaluator, x)
+    assert row == knee(cell.evaluate(x).objectives)
+    # The gentlest one has the least mean of both forces, and hardly moves.
+    assert balanced(peak_normal_forces(cell.evaluator, x)) == 0 != row
 
 
 def test_an_empty_front_selects_nothing(evaluator: CandidateEvaluator) -> None:

@@ -15,7 +15,7 @@ def test_an_image_is_as_good_with_exchanged_objectives() -> None:
     mirror = mirror_of(evaluator().workcell)
     assert mirror is not None
     rng = np.random.default_rng(7)
-    x = rng.uniform(evaluator().lower, evaluator().upper, (300, evaluator().n_var))
+    x = rng.uniform(evaluator().lower, evaluator().upper, (600, evaluator().n_var))
     found = [mirror.image(row) for row in x]
     images = np.array([image for image in found if image is not None])
     assert len(images) == len(x)

@@ -87,7 +87,7 @@ def program_of(judge: CandidateEvaluator) -> tuple[SmoothProgram, Array]:
     program = SmoothProgram(cell, dict.fromkeys(rows, 0.01), TARGET, carry, x, 1.0)
     z = program.start.copy()
     z[program.layout.decision] += np.random.default_rng(0).uniform(-0.05, 0.05, task.n_var)
-    return program, z
+    return program, np.clip(z, program.low, program.high)
 
 
 @CELLS
