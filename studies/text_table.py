@@ -9,4 +9,4 @@ from hybrid_opt.display.table import text_table as text_table
 
 def number(value: float | None, digits: int, scale: float = 1.0) -> str:
     """A figure in print; '-' where there is none."""
-    return "-" if value is None or not math.isfinite(value) else f"{value * scale:.{digits}f}"
+    return "-" if value is None or not math.isfinite(value) else f"{value * scale:z.{digits}f}"

@@ -143,7 +143,7 @@ def _facts(data: ReportData) -> str:
         peak = float(algorithm.best.timed.normal_force.max(axis=0).mean())
         rest = sum(still.normal_force) / 2.0
         facts.append(
-            (f"{100.0 * (peak / rest - 1.0):.2f} %", f"above the force at rest, {algorithm.title}")
+            (f"{100.0 * (peak / rest - 1.0):z.2f} %", f"above the force at rest, {algorithm.title}")
         )
         limit = algorithm.best.sensitivity.payload_limit
         facts.append((f"{limit:.2f} kg", f"payload at the limit, {algorithm.title}"))

@@ -82,7 +82,7 @@ def number(value: float | None, digits: int = 2) -> str:
     """A figure in print."""
     if value is None or not math.isfinite(value):
         return NOTHING
-    return f"{value:.{digits}f}"
+    return f"{value:z.{digits}f}"
 
 
 def _html_cell(cell: str) -> str:
