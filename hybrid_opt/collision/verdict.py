@@ -55,9 +55,9 @@ class Verdict:
 
 
 def sample_durations(time: Array) -> Array:
-    """Time (n,) [s] that each sample stands for: half of both neighbouring steps."""
-    steps = np.diff(time)
-    durations = np.zeros(len(time))
-    durations[:-1] += steps / 2.0
-    durations[1:] += steps / 2.0
+    """Time (..., n) [s] that each sample stands for: half of both neighbouring steps."""
+    halves = np.diff(time) / 2.0
+    durations = np.zeros(time.shape)
+    durations[..., :-1] += halves
+    durations[..., 1:] += halves
     return durations

@@ -113,12 +113,11 @@ class Kernel:
             found = [run(0, n)]
         else:
             found = list(thread_pool().map(run, bounds[:-1], bounds[1:]))
-        left = np.concatenate(
-            [np.empty(0, self._open_pair), *(part for parts in found for part in parts)]
-        )
-        colliding = extra["colliding"].astype(np.bool_)
-        hit = self._judged(left)
-        colliding[left["candidate"][hit], left["sample"][hit]] = True
+        colliding = extra["colliding"].view(np.bool_)
+        # One part at a time: NumPy takes long to join records.
+        for left in (part for parts in found for part in parts if len(part)):
+            hit = self._judged(left)
+            colliding[left["candidate"][hit], left["sample"][hit]] = True
         # A scalar per sample has no axis of its own.
         outputs |= {
             name: values[:, :, 0] if self._sizes[name] == 1 else values
@@ -157,9 +156,7 @@ class Kernel:
         return found
 
     def _judged(self, left: NDArray[np.void]) -> NDArray[np.bool_]:
-        """FCL's word on open pairs."""
-        if not len(left):
-            return np.zeros(0, dtype=bool)
+        """FCL's word on open pairs, at least one."""
         # Pairs of one sample lie side by side: placed once.
         place = left["candidate"] * self._samples + left["sample"]
         new = np.concatenate([[True], place[1:] != place[:-1]])

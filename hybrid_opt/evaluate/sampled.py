@@ -64,6 +64,7 @@ def reached_samples(outputs: Mapping[str, Array], row: int) -> int:
 def collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
     """Share (n,) of the duration that the colliding samples (n, samples) stand for."""
     shares = np.zeros(len(time))
+    durations = sample_durations(time)
     for row in np.flatnonzero(colliding.any(axis=1)).tolist():
-        shares[row] = sample_durations(time[row])[colliding[row]].sum() / time[row, -1]
+        shares[row] = durations[row, colliding[row]].sum() / time[row, -1]
     return shares
