@@ -18,7 +18,13 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations, concatenated
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, PAPER_OBJECTIVES, Objective
+from hybrid_opt.evaluate.objectives import (
+    DRIVABLE_OBJECTIVES,
+    PAPER_OBJECTIVES,
+    Objective,
+    limits_robust_forces,
+    select_objectives,
+)
 from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
@@ -124,7 +130,7 @@ class Cell:
         """What times carries."""
         from hybrid_opt.timing.model import TimingModel
 
-        return TimingModel(self.compiled)
+        return TimingModel(self.compiled, robust=self.limits_robust_forces)
 
     @cached_property
     def path_timer(self) -> PathTimer:
@@ -149,6 +155,12 @@ class Cell:
     def geometry(self) -> CellGeometry:
         """The collision bodies and the pairs of them that are checked."""
         return self.evaluator.checker.geometry
+
+    @property
+    def limits_robust_forces(self) -> bool:
+        """Whether force limits of drivable carries hold in every case of the uncertainty: where
+        robust forces are minimised."""
+        return limits_robust_forces(select_objectives(self._objectives))
 
     @property
     def objective_names(self) -> tuple[str, ...]:

@@ -140,7 +140,7 @@ def _force_table(
     def durations(paths: Array) -> Array:
         if len(paths) == 0:
             return np.full(len(forces), np.inf)
-        driven = DrivenPaths(cell.path_timer, paths, task.force_limit[1])
+        driven = DrivenPaths.of(cell, paths)
         return front_durations(driven, forces)
 
     paths = {HAND_MADE: cell.initial[: task.n_path]} | dict(others)

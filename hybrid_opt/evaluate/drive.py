@@ -6,17 +6,20 @@ force and all limits of robots, payload and contacts (`hybrid_opt.timing.path_ti
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from codegen.function import NumericFunction
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.drive_constraints import (
     DRIVE_CONSTRAINTS,
     FORCE_LIMIT,
     JOINT_TORQUE,
     NO_TIMING,
 )
+from hybrid_opt.evaluate.objectives import Objective, limits_robust_forces
 from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from symbolic.array import Array
@@ -32,6 +35,8 @@ class Drive:
         time, speed, acceleration: (n, m) [s], u' [1/s], u'' [1/s^2]. A path without a timing
             stands still, its samples one second apart in all.
         peak_force: (n, 2) largest normal forces [N].
+        robust_force: (n, 2) the same in every case of the workcell's uncertainty, None where the
+            limit is one of the planned forces.
         violation: (n, len(DRIVE_CONSTRAINTS)).
         position: (n,) path parameter of the violation, NaN without one.
     """
@@ -40,23 +45,34 @@ class Drive:
     speed: Array
     acceleration: Array
     peak_force: Array
+    robust_force: Array | None
     violation: Array
     position: Array
 
 
 class Driver:
-    """Drives candidates of one workcell."""
+    """Drives candidates of one workcell.
 
-    def __init__(self, timer: PathTimer, threads: int = 1) -> None:
+    Attributes:
+        timer: what times their paths.
+        robust: whether their force limits hold in every case of the workcell's uncertainty.
+    """
+
+    def __init__(self, timer: PathTimer, threads: int = 1, robust: bool = False) -> None:
         """Drive with a timer.
 
         Args:
             timer: of a workcell whose time law is 'optimal'.
             threads: threads that share a batch of candidates.
+            robust: whether force limits hold in every case of the workcell's uncertainty.
         """
         self._task = timer.workcell.task
         self._threads = threads
-        self.timer = timer
+        self.timer, self.robust = timer, robust
+
+    def limits(self, force: float) -> TimingLimits:
+        """Those of a candidate whose force limit this is [N]."""
+        return TimingLimits(force=max(force, 1e-9), robust=self.robust)
 
     def outputs(self, candidate: NumericFunction, x: Array) -> dict[str, Array]:
         """Every per-sample output of decision vectors (n, n_var), driven.
@@ -66,22 +82,25 @@ class Driver:
             x: decision vectors.
 
         Returns:
-            Its outputs, and `peak_force`, `drive_violation`, `drive_position` as in `Drive`.
+            Its outputs, and `peak_force`, `drive_violation`, `drive_position` as in `Drive`; with
+            robust limits `robust_force` as well.
         """
         found = self.drive(x)
         motion = (found.time, found.speed, found.acceleration)
         outputs = candidate.batch(x, *motion, threads=self._threads)
         # Where the path itself fails no timing tells the forces: those of its samples at rest.
         sampled = outputs["normal_force"].max(axis=1)
-        return outputs | {
-            "peak_force": np.where(np.isfinite(found.peak_force), found.peak_force, sampled),
-            "drive_violation": found.violation,
-            "drive_position": found.position,
-        }
+        forces = {"peak_force": found.peak_force}
+        if found.robust_force is not None:
+            forces["robust_force"] = found.robust_force
+        told = {name: np.where(np.isfinite(f), f, sampled) for name, f in forces.items()}
+        return (
+            outputs | told | {"drive_violation": found.violation, "drive_position": found.position}
+        )
 
     def timings(self, x: Array) -> list[PathTiming]:
         """The timing of every decision vector (n, n_var)."""
-        limits = [TimingLimits(force=max(float(force), 1e-9)) for force in x[:, -1]]
+        limits = [self.limits(float(force)) for force in x[:, -1]]
         return self.timer.time_all(x[:, : self._task.n_path], limits)
 
     def drive(self, x: Array) -> Drive:
@@ -101,10 +120,21 @@ class Driver:
             violation[row, DRIVE_CONSTRAINTS.index(name)] = excess
             position[row] = timing.place.parameter
         force = np.array([timing.peak_force for timing in timings]).reshape(-1, 2)
+        robust = None
+        if self.robust:
+            unknown = np.full(2, np.nan)
+            known = [t.robust_force for t in timings]
+            robust = np.array([unknown if f is None else f for f in known]).reshape(-1, 2)
         # An axis of three that no candidates leave empty, too.
         parts = np.array(driven).reshape(len(x), 3, len(u))
         time, speed, acceleration = np.swapaxes(parts, 0, 1)
-        return Drive(time, speed, acceleration, force, violation, position)
+        return Drive(time, speed, acceleration, force, robust, violation, position)
+
+
+def driver_of(compiled: CompiledCell, threads: int, objectives: Sequence[Objective]) -> Driver:
+    """What drives candidates of a cell under the time law 'optimal', see `Driver`; limits are those
+    of robust forces where these are minimised."""
+    return Driver(PathTimer(compiled, threads=threads), threads, limits_robust_forces(objectives))
 
 
 def _at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:

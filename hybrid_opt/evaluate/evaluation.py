@@ -88,7 +88,7 @@ class CandidateEvaluator:
         self.functions = self.compiled.evaluators if functions is None else functions
         self._candidate = self.functions["candidate"]
         self.checker = CollisionChecker(build_geometry(workcell), self.functions)
-        self.driver = _driver(self.compiled, threads) if driver is None else driver
+        self.driver = self._driver(threads) if driver is None else driver
         self.n_var = workcell.task.n_var
         self.lower = workcell.task.lower
         self.upper = workcell.task.upper
@@ -97,6 +97,14 @@ class CandidateEvaluator:
         self._begin: Array | None = None
         if functions is None and self.driver is None:
             self._kernel = load_kernel(self.compiled, self.checker, self.outputs)
+
+    def _driver(self, threads: int) -> Driver | None:
+        if self.workcell.task.time_law != "optimal":
+            return None
+        # Not imported at the top: other time laws need no timing, and hence no CasADi.
+        from hybrid_opt.evaluate.drive import driver_of
+
+        return driver_of(self.compiled, threads, self.objectives)
 
     def beginning_at(self, q_1: Array, q_2: Array) -> CandidateEvaluator:
         """The same evaluator with other start postures: joints (n,) of each arm that hold the box
@@ -116,8 +124,8 @@ class CandidateEvaluator:
 
     def outputs(self, x: Array) -> dict[str, Array]:
         """Every per-sample output for decision vectors (n, n_var), see
-        `symbolic.functions.candidate`; under the time law 'optimal' also `peak_force` (n, 2),
-        `drive_violation` and `drive_position` as in `hybrid_opt.evaluate.drive.Drive`."""
+        `symbolic.functions.candidate`; under the time law 'optimal' also what
+        `hybrid_opt.evaluate.drive.Driver.outputs` adds."""
         x = self._checked(x)
         if self.driver is not None:
             return self.driver.outputs(self._candidate, x)
@@ -300,17 +308,6 @@ class CandidateEvaluator:
             violation,
             violation_time,
         )
-
-
-def _driver(compiled: CompiledCell, threads: int) -> Driver | None:
-    """What drives candidates under the time law 'optimal'."""
-    if compiled.workcell.task.time_law != "optimal":
-        return None
-    # Not imported at the top: other time laws need no timing, and hence no CasADi.
-    from hybrid_opt.evaluate.drive import Driver
-    from hybrid_opt.timing.path_timer import PathTimer
-
-    return Driver(PathTimer(compiled, threads=threads), threads)
 
 
 def _failure(certificate: Certificate) -> float | None:

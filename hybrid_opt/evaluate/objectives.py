@@ -50,6 +50,12 @@ FORCE_PAIRS = (PAPER_OBJECTIVES, ROBUST_OBJECTIVES)
 DRIVABLE_OBJECTIVES = ("duration", "peak_force")
 """How long a carry takes and how hard it presses: the pair of the time law 'optimal'."""
 
+ROBUST_DRIVABLE_OBJECTIVES = ("duration", "robust_force")
+"""The same where every case of the workcell's uncertainty is to hold."""
+
+DRIVABLE_PAIRS = (DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES)
+"""What the drivable experiment may be about."""
+
 
 def _peak_force(robot: int) -> Callable[[Outputs, Workcell], Array]:
     def evaluate(outputs: Outputs, workcell: Workcell) -> Array:
@@ -128,8 +134,11 @@ def _robust_force_of(robot: int) -> Callable[[Outputs, Workcell], Array]:
 def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
     """(n, 2) peaks over the reference force of what the workcell's uncertainty asks of each arm.
 
-    Arm 1 leads, the force of arm 2 is commanded (`hybrid_opt.robust`).
+    Arm 1 leads, the force of arm 2 is commanded (`hybrid_opt.robust`). A timing that limits them
+    tells those of the whole path.
     """
+    if "robust_force" in outputs:
+        return np.asarray(outputs["robust_force"] / workcell.task.reference_force)
     # Only who asks for it pays for its compilation.
     from hybrid_opt.robust.force import BoxMotion, robust_model
 
@@ -198,6 +207,13 @@ OBJECTIVES: dict[str, Objective] = {
     )
 }
 """All objectives by name."""
+
+_ROBUST = tuple(OBJECTIVES[name].evaluate for name in ("robust_force", *ROBUST_OBJECTIVES))
+
+
+def limits_robust_forces(objectives: Sequence[Objective]) -> bool:
+    """Whether the force limit of the time law 'optimal' is one of robust forces."""
+    return any(objective.evaluate in _ROBUST for objective in objectives)
 
 
 def select_objectives(wanted: Sequence[str | Objective]) -> tuple[Objective, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hybrid_opt.cell import Cell
 from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
@@ -21,18 +22,27 @@ class DrivenPaths:
         highest_force: the largest force limit that is tried [N].
     """
 
-    def __init__(self, timer: PathTimer, x: Array, highest_force: float) -> None:
+    def __init__(
+        self, timer: PathTimer, x: Array, highest_force: float, robust: bool = False
+    ) -> None:
         """Compute the geometry of the paths.
 
         Args:
             timer: of the cell.
             x: (k, n_path) free waypoints.
             highest_force: the largest force limit that is tried [N].
+            robust: whether limits hold in every case of the cell's uncertainty.
         """
         self.x = np.atleast_2d(np.asarray(x, dtype=float))
         self.highest_force = highest_force
-        self._timer = timer
+        self._timer, self._robust = timer, robust
         self._known = timer.path_limits(self.x)
+
+    @classmethod
+    def of(cls, cell: Cell, x: Array) -> DrivenPaths:
+        """Paths of a cell within the limits of its drivable carries."""
+        highest = cell.workcell.task.force_limit[1]
+        return cls(cell.path_timer, x, highest, cell.limits_robust_forces)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -41,7 +51,9 @@ class DrivenPaths:
         """The fastest timing of every path within force limits (k,) or one for all [N]."""
         limits = np.broadcast_to(np.asarray(force, dtype=float), (len(self),))
         return self._timer.time_known(
-            self.x, self._known, [TimingLimits(force=float(limit)) for limit in limits]
+            self.x,
+            self._known,
+            [TimingLimits(force=float(limit), robust=self._robust) for limit in limits],
         )
 
     def durations(self, force: Array | float) -> Array:

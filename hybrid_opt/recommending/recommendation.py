@@ -18,7 +18,7 @@ from hybrid_opt.recommending.unsure import Unsure, unsure_forces
 from hybrid_opt.recommending.wish import Wish
 from hybrid_opt.robust.squeeze import FACTOR, SqueezeSettings
 from hybrid_opt.timing.jerk import drive_with_jerk
-from hybrid_opt.timing.records import JerkTiming, Timing, TimingLimits
+from hybrid_opt.timing.records import JerkTiming, Timing
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
@@ -123,7 +123,7 @@ def recommend(
             "evaluations or the task wider bounds"
         )
     wish = wish or Wish()
-    paths = DrivenPaths(cell.path_timer, x[:, :-1], task.force_limit[1])
+    paths = DrivenPaths.of(cell, x[:, :-1])
     members = paths.timings(x[:, -1])
     points = np.array([[member.duration, member.peak_force.max()] for member in members])
     choice, timing = _driven(cell, x, choices(cell.workcell, paths, points, wish))
@@ -155,10 +155,10 @@ def recommend(
 
 def _driven(cell: Cell, x: Array, wanted: Iterable[Choice]) -> tuple[Choice, Timing]:
     """The first choice that the independent timing confirms."""
-    reason = ""
+    reason, model = "", cell.timing_model
     for choice in islice(wanted, TRIED):
         decision = np.append(x[choice.index, :-1], choice.force)
-        timing = time_path(cell.timing_model, decision, TimingLimits(force=choice.force))
+        timing = time_path(model, decision, model.drive_limits(choice.force))
         if timing.ok:
             return choice, timing
         reason = timing.reason

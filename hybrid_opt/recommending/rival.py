@@ -9,7 +9,6 @@ import numpy as np
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.recommending.driven_paths import DrivenPaths
-from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 
@@ -62,16 +61,16 @@ def rivals(cell: Cell, paths: Mapping[str, Array], beside: Reference) -> tuple[R
     own is; forces and the front's durations are compared by the compiled timing, which also gives
     the duration that the rival has to keep to.
     """
-    highest = beside.front.highest_force
     best = np.array([beside.front.durations(float(limit)).min() for limit in beside.forces])
     in_time = float(beside.front.durations(beside.force)[beside.member])
     found = []
     for label, path in paths.items():
-        driven = DrivenPaths(cell.path_timer, path, highest)
+        driven = DrivenPaths.of(cell, path)
         own = np.array([driven.durations(float(limit))[0] for limit in beside.forces])
         ahead = beside.forces[own < best * (1.0 - BETTER)]
         decision = np.append(path, beside.force)
-        timing = time_path(cell.timing_model, decision, TimingLimits(force=beside.force))
+        limits = cell.timing_model.drive_limits(beside.force)
+        timing = time_path(cell.timing_model, decision, limits)
         found.append(
             Rival(
                 label,

@@ -6,58 +6,185 @@ In every case the least squeeze is convex in the required force and moment, and 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
+from numpy.typing import NDArray
 
 from codegen.build import compile_function
 from codegen.cache import Cache
 from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import check_pads, check_set
-from hybrid_opt.robust.ruling import ruling_cases
+from hybrid_opt.robust.ruling import RulingCases, felt_share, ruling_cases
 from symbolic.array import Array
-from symbolic.physics.case_squeeze import case_slopes_function
+from symbolic.physics.case_squeeze import (
+    case_difference_function,
+    case_slack_function,
+    case_slopes_function,
+    case_squeeze_function,
+)
 from symbolic.workcell.records import Workcell
+
+BY_TIMING = slice(18, 20)
+"""Where a slope's entries by u'' and u'^2 are."""
+
+HELD = -np.inf
+"""Normal force that stands for a case that less than the limit holds."""
+
+
+@dataclass(frozen=True)
+class PathPoints:
+    """n driven points of paths.
+
+    Attributes:
+        pose, first, second: (n, 6) box poses and their derivatives by u.
+        a, w: (n,) u'' and u'^2.
+    """
+
+    pose: Array
+    first: Array
+    second: Array
+    a: Array
+    w: Array
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+    def at(self, rows: NDArray[np.intp]) -> PathPoints:
+        """Some of them."""
+        return PathPoints(*[values[rows] for values in self.driven])
+
+    @property
+    def driven(self) -> tuple[Array, ...]:
+        """As `case_slopes_function` takes them."""
+        return self.pose, self.first, self.second, self.a, self.w
+
+    @property
+    def motion(self) -> tuple[Array, Array, Array]:
+        """Poses and their time derivatives."""
+        rate = self.first * np.sqrt(np.maximum(self.w, 0.0))[:, None]
+        return self.pose, rate, self.first * self.a[:, None] + self.second * self.w[:, None]
 
 
 class RobustPath:
-    """The compiled function behind robust forces along paths of one workcell."""
+    """The compiled functions behind robust forces along paths of one workcell.
 
-    def __init__(self, workcell: Workcell, cache: Cache | None = None) -> None:
-        """Load or build the compiled function.
+    Attributes:
+        leader: index of the arm that keeps its place.
+    """
+
+    def __init__(self, workcell: Workcell, cache: Cache | None = None, leader: int = 0) -> None:
+        """Load or build the compiled functions.
+
+        Args:
+            leader: index of the arm that keeps its place.
 
         Raises:
             SettingsError: the pads do not face one another, or the workcell's set leaves no
                 friction or patch.
-            DualArmError: the function cannot be built.
+            DualArmError: a function cannot be built.
         """
         check_pads(workcell)
         check_set(workcell, workcell.uncertainty)
+        self.leader = leader
         self._cases = worst_cases(workcell, workcell.uncertainty)
         self._set = workcell.uncertainty
-        self._function = compile_function(case_slopes_function(workcell), cache, lanes=0)
+        self._squeeze, self._slopes, self._slack, self._difference = (
+            compile_function(function(workcell), cache, lanes=0)
+            for function in (
+                case_squeeze_function,
+                case_slopes_function,
+                case_slack_function,
+                case_difference_function,
+            )
+        )
 
-    def at(
-        self, path: tuple[Array, Array, Array], a: Array, w: Array, leader: int = 0
-    ) -> tuple[Array, Array]:
+    def at(self, points: PathPoints) -> tuple[Array, Array]:
         """Least normal forces that hold in every case of the workcell's set.
 
-        Args:
-            path: box poses and their derivatives by u at n points, (n, 6) each.
-            a, w: (n,) u'' and u'^2.
-            leader: index of the arm that keeps its place.
+        Returns:
+            (n, 2) forces of both robots [N], and (n, 2, 20) their derivatives by pose, its
+            derivatives by u, u'' and u'^2.
+        """
+        every = np.ones((len(self._cases), len(points)), dtype=bool)
+        return self._ruled(points, self._least(points, every))
+
+    def beyond(self, points: PathPoints, level: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """The points where a force of either robot is above a level (n,) [N], their forces and
+        slopes as of `at`.
+
+        Most cases are seen to need less by a pressure that shares everything evenly.
+        """
+        n, k, follower = len(points), len(self._cases), 1 - self.leader
+        difference = self._differences(points)
+        sign = 1.0 if self.leader == 0 else -1.0
+        felt = (felt_share(sign * difference, self._set) * sign * difference).max(axis=0)
+        room = level - np.maximum(felt, 0.0)
+        repeated = [np.tile(values, (k, 1)) for values in points.motion]
+        slack = self._slack.batch(
+            *repeated, np.repeat(self._cases, n, axis=0), np.tile(room, k), float(follower)
+        )["slack"]
+        least = self._least(points, ~(slack.reshape(k, n) > 0.0))
+        rows = np.flatnonzero(least[:, :, follower].max(axis=0) > room)
+        # A case that leaves the force below the level can yet be the one that the leader feels.
+        known = least[:, rows]
+        missing = known[:, :, follower] == HELD
+        known[:, :, self.leader] = np.where(
+            missing, HELD, known[:, :, follower] + sign * difference[:, rows]
+        )
+        return (rows, *self._ruled(points.at(rows), known, sign * difference[:, rows]))
+
+    def most_demanding(self, points: PathPoints, count: int) -> tuple[Array, Array]:
+        """Forces of the cases that ask for most: where they rule in turn, each has its own slope.
 
         Returns:
-            (n, 2) forces of both robots [N], and (n, 2, 2) their derivatives by u'' and by u'^2.
+            (n, 2, count) forces of both robots [N], the largest first, and their slopes
+            (n, 2, count, 20).
         """
-        n, k = len(a), len(self._cases)
-        rows = [np.tile(values, (k, 1)) for values in path]
-        rows += [np.tile(a, k), np.tile(w, k), np.repeat(self._cases, n, axis=0)]
-        out = self._function.batch(*rows)
-        force = out["normal_force"].reshape(k, n, 2)
-        slope = out["slope"].reshape(k, n, 2, 2)
-        every, ruling = np.arange(n), ruling_cases(force, self._set, leader)
-        slopes = ruling.slopes(slope[ruling.commanded, every], slope[ruling.felt, every])
-        return ruling.force, slopes
+        n, leader, follower = len(points), self.leader, 1 - self.leader
+        least = self._least(points, np.ones((len(self._cases), n), dtype=bool))
+        ruling = ruling_cases(least, self._set, leader)
+        first = np.argsort(-least[:, :, follower], axis=0)[:count]
+        beyond = ruling.force[:, leader] - ruling.force[:, follower]
+        force, slope = np.empty((n, 2, count)), np.empty((n, 2, count, BY_TIMING.stop))
+        for j, case in enumerate(first):
+            one = replace(ruling, commanded=case)
+            force[:, follower, j] = least[case, np.arange(n), follower]
+            force[:, leader, j] = force[:, follower, j] + beyond
+            slope[:, :, j] = self.slopes(points, one)
+        return force, slope
+
+    def _differences(self, points: PathPoints) -> Array:
+        """(k, n) N_1 - N_2 of every case."""
+        n, k = len(points), len(self._cases)
+        repeated = [np.tile(values, (k, 1)) for values in points.motion]
+        cases = np.repeat(self._cases, n, axis=0)
+        return self._difference.batch(*repeated, cases)["difference"].reshape(k, n)
+
+    def _least(self, points: PathPoints, wanted: NDArray[np.bool_]) -> Array:
+        """(k, n, 2) least normal forces of the wanted (k, n) cases, `HELD` for the others."""
+        case, row = np.nonzero(wanted)
+        found = np.full((*wanted.shape, 2), HELD)
+        if len(row):
+            motion = [values[row] for values in points.motion]
+            found[case, row] = self._squeeze.batch(*motion, self._cases[case])["normal_force"]
+        return found
+
+    def _ruled(
+        self, points: PathPoints, least: Array, difference: Array | None = None
+    ) -> tuple[Array, Array]:
+        ruling = ruling_cases(least, self._set, self.leader, difference)
+        return ruling.force, self.slopes(points, ruling)
+
+    def slopes(self, points: PathPoints, ruling: RulingCases) -> Array:
+        """(n, 2, 20) of the forces that these cases decide."""
+        if not len(points):
+            return np.zeros((0, 2, BY_TIMING.stop))
+        cases = np.concatenate([self._cases[ruling.commanded], self._cases[ruling.felt]])
+        twice = [np.concatenate([values, values]) for values in points.driven]
+        slopes = self._slopes.batch(*twice, cases)["slope"]
+        return ruling.slopes(slopes[: len(points)], slopes[len(points) :])
 
 
 robust_path = kept_per_workcell(RobustPath)

@@ -41,17 +41,28 @@ class RulingCases:
         return found
 
 
-def ruling_cases(worst: Array, uncertainty: Uncertainty, leader: int) -> RulingCases:
+def felt_share(difference: Array, uncertainty: Uncertainty) -> Array:
+    """Of differences of leading and commanded force under the largest mass what the leading arm
+    feels at most: all of it, or where it is relieved by it, what the least mass leaves."""
+    lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
+    return np.where(difference > 0.0, 1.0, lightest)
+
+
+def ruling_cases(
+    worst: Array, uncertainty: Uncertainty, leader: int, difference: Array | None = None
+) -> RulingCases:
     """The cases that decide among the least normal forces (k, n, 2) [N] of the worst ones.
 
     The difference of both forces is the motion's, whatever the squeeze, and proportional to the
-    mass: the leading arm feels all of it under the largest mass, or where it is relieved by it,
-    what the least mass leaves.
+    mass.
+
+    Args:
+        difference: (k, n) leading less commanded force [N], where `worst` does not tell all.
     """
     follower, every = 1 - leader, np.arange(worst.shape[1])
-    difference = worst[:, :, leader] - worst[:, :, follower]
-    lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
-    share = np.where(difference > 0.0, 1.0, lightest)
+    if difference is None:
+        difference = worst[:, :, leader] - worst[:, :, follower]
+    share = felt_share(difference, uncertainty)
     commanded = worst[:, :, follower].argmax(axis=0)
     felt = (share * difference).argmax(axis=0)
     force = np.empty(worst.shape[1:])

@@ -13,6 +13,7 @@ from hybrid_opt.carry import ArmMotion, Carry, joints_of
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.time_law import carry_under_time_law
 from hybrid_opt.timing.path_motion import SAMPLED, PathMotion
+from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
@@ -59,12 +60,15 @@ class TimingModel:
         self,
         cell: Workcell | CompiledCell,
         intervals: int = INTERVALS,
+        robust: bool = False,
     ) -> None:
         """Load or build the compiled functions.
 
         Args:
             cell: the cell; compiled, where others share its functions.
             intervals: pieces of constant path acceleration.
+            robust: whether the force limits of drivable carries hold in every case of the
+                workcell's uncertainty.
 
         Raises:
             SettingsError: the number of intervals is out of range.
@@ -74,7 +78,7 @@ class TimingModel:
             raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000")
         self._compiled = CompiledCell.of(cell)
         self.workcell = workcell = self._compiled.workcell
-        self.intervals = intervals
+        self.intervals, self._robust = intervals, robust
         self.joint_names = (joint_names(workcell.robots[0]), joint_names(workcell.robots[1]))
         samples = REFINEMENT * intervals + 1
         self._latest: PathMotion | None = None
@@ -186,6 +190,10 @@ class TimingModel:
             judgement=None,
         )
 
+    def drive_limits(self, force: float) -> TimingLimits:
+        """The limits of drivable carries whose force limit this is [N]."""
+        return TimingLimits(force=force, robust=self._robust)
+
     def search_carry(self, x: Array) -> Carry:
         """The carry under the task's own time law, see `hybrid_opt.evaluate.time_law`."""
         x = self._checked(x)
@@ -202,7 +210,7 @@ class TimingModel:
         from hybrid_opt.evaluate.drive import Driver
         from hybrid_opt.timing.path_timer import PathTimer
 
-        return Driver(PathTimer(self._compiled))
+        return Driver(PathTimer(self._compiled), robust=self._robust)
 
     @cached_property
     def _search_functions(self) -> Mapping[str, NumericFunction]:

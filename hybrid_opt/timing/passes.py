@@ -37,14 +37,18 @@ OUTCOMES = (
 """What its statuses mean."""
 
 
-def passes_function(compiled: CompiledCell, intervals: int) -> NumericFunction | None:
+def passes_function(
+    compiled: CompiledCell, intervals: int, cuts: int = 0
+) -> NumericFunction | None:
     """The timing of one path from its limits; None without a C compiler, or where the contact
     forces are allocated jointly.
 
     Inputs: samples (2 intervals + 1, `LimitLayout.size`), both ends and the middle of
     every interval; options (4,): largest normal force [N],
     infinite for none, then whether torques, pressure shifts and the reference speeds are limited
-    (0 or 1). Outputs: status, index into `OUTCOMES`; interval of a failure; duration [s], infinite
+    (0 or 1); with cuts, cuts (2 intervals + 1, cuts, 3): at every sample lines
+    alpha u'' + beta u'^2 <= bound that hold as well, positive bounds, infinite ones from the last
+    line on. Outputs: status, index into `OUTCOMES`; interval of a failure; duration [s], infinite
     without a timing; peak (2,) normal forces [N]; use (len(KINDS), 3): largest share of each limit,
     path parameter and joint or contact there; squared (intervals + 1,) u'^2 at the grid points;
     sweeps, how often both passes ran; slowed, the factor on the speed. Without a timing peak and
@@ -53,21 +57,22 @@ def passes_function(compiled: CompiledCell, intervals: int) -> NumericFunction |
     Args:
         compiled: the cell.
         intervals: pieces of constant path acceleration.
+        cuts: lines at every sample that the caller gives.
     """
     workcell, cache = compiled.workcell, compiled.cache
     if workcell.task.allocation != "paper":
         return None  # the passes know the paper's normal forces in closed form, and no others
     if compiled.is_identified:
         own = source_digest("hybrid_opt")
-        key = compiled.key("path timing", str(intervals), own)
-        return load_or_compile(key, lambda: _source(workcell, intervals), cache)
+        key = compiled.key("path timing", str(intervals), str(cuts), own)
+        return load_or_compile(key, lambda: _source(workcell, intervals, cuts), cache)
     if find_compiler() is None:
         return None
-    signature, text = _source(workcell, intervals)
+    signature, text = _source(workcell, intervals, cuts)
     return load_or_compile(digest("path timing", text), lambda: (signature, text), cache)
 
 
-def _source(workcell: Workcell, intervals: int) -> tuple[Signature, str]:
+def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, str]:
     # Not imported at the top: a warm start needs no CasADi.
     from codegen.source import handwritten_source
     from symbolic.physics.path_limits import limit_layout, ratio_functions
@@ -80,6 +85,7 @@ def _source(workcell: Workcell, intervals: int) -> tuple[Signature, str]:
         "SIZE": layout.size,
         "RATIOS": layout.joints + 2,
         "FORCE_BRANCHES": len(branches),
+        "CUTS": cuts,
         **{f"AT_{name.upper()}": place for name, place in layout.offsets.items()},
     }
     rows = ", ".join(f"{{{n!r}, {t!r}}}" for n, t in branches)
@@ -92,9 +98,12 @@ def _source(workcell: Workcell, intervals: int) -> tuple[Signature, str]:
     )
     signature = Signature(
         "path_timing",
-        ("samples", "options"),
+        ("samples", "options", *(("cuts",) if cuts else ())),
         ("status", "interval", "duration", "peak", "use", "squared", "sweeps", "slowed"),
-        ((2 * intervals + 1, layout.size), (4,)),
+        (
+            *((2 * intervals + 1, layout.size), (4,)),
+            *(((2 * intervals + 1, cuts, 3),) if cuts else ()),
+        ),
         ((), (), (), (2,), (len(KINDS), 3), (intervals + 1,), (), ()),
     )
     return signature, handwritten_source(signature, text, ratio_functions(workcell))

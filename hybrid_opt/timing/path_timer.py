@@ -6,18 +6,21 @@ docs/timing.md. A carry is not built: `drive_path` recomputes one for a timing f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.robust.path_force import robust_path
 from hybrid_opt.timing.model import TimingModel, joint_names
 from hybrid_opt.timing.passes import KINDS, OUTCOMES, passes_function
 from hybrid_opt.timing.path_check import LEAST_LENGTH, arm_checks
 from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.robust_timer import CUTS, RestForce, RobustPasses
 from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.use import limited_force
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Workcell
@@ -46,6 +49,8 @@ class PathTiming:
         grid_speed: (intervals + 1,) path speed u' at the grid points [1/s], zero without a timing.
         sweeps: how often both passes ran.
         slowed: uniform factor on the path speed that made the limits hold, 1 normally.
+        robust_force: (2,) as peak_force, in every case of the workcell's uncertainty; None where
+            no limit asks for them.
     """
 
     status: TimingStatus
@@ -56,6 +61,7 @@ class PathTiming:
     grid_speed: Array
     sweeps: int = 0
     slowed: float = 1.0
+    robust_force: Array | None = None
 
     @property
     def ok(self) -> bool:
@@ -65,8 +71,7 @@ class PathTiming:
 
 class PathTimer:
     """Times paths of one workcell. Where it has no compiled passes it asks `time_path`, which is
-    slow: without a C compiler, with the joint allocation of the contact forces, and where robust
-    forces are limited.
+    slow: without a C compiler, and with the joint allocation of the contact forces.
 
     Attributes:
         workcell: the cell.
@@ -162,18 +167,55 @@ class PathTimer:
         """As `time_all`, with the answers of `path_limits` known already."""
         found = [self._path_failure(paths, row) for row in range(len(limits))]
         rows = [row for row, failure in enumerate(found) if failure is None]
-        if rows and (self._passes is None or any(limit.robust for limit in limits)):
-            timings = [from_time_path(time_path(self._model, x[r], limits[r])) for r in rows]
-        elif rows and self._passes is not None:
-            options = np.array([_options(limits[row]) for row in rows])
-            samples = paths["limits"] if len(rows) == len(limits) else paths["limits"][rows]
-            out = self._passes.batch(samples, options, threads=self._threads)
-            timings = [self._timing(out, k) for k in range(len(rows))]
-        else:
-            timings = []
-        for row, timing in zip(rows, timings, strict=True):
-            found[row] = timing
+        if rows and self._passes is None:
+            timings = [
+                from_time_path(self._model, time_path(self._model, x[r], limits[r]), limits[r])
+                for r in rows
+            ]
+            for row, timing in zip(rows, timings, strict=True):
+                found[row] = timing
+            return [timing for timing in found if timing is not None]
+        for robust in (False, True):
+            some = [row for row in rows if limits[row].robust is robust]
+            if not some:
+                continue
+            options = np.array([_options(limits[row]) for row in some])
+            drive = self._robustly_driven if robust else self._driven
+            for row, timing in zip(some, drive(_rows_of(paths, some), options), strict=True):
+                found[row] = timing
         return [timing for timing in found if timing is not None]
+
+    def _driven(self, paths: dict[str, Array], options: Array) -> list[PathTiming]:
+        assert self._passes is not None, "asked for where the passes are compiled"
+        out = self._passes.batch(paths["limits"], options, threads=self._threads)
+        return [self._timing(out, k) for k in range(len(options))]
+
+    def _robustly_driven(self, paths: dict[str, Array], options: Array) -> list[PathTiming]:
+        out, peak, still = self._robust.time(paths, options, self._threads)
+        found = [self._timing(out, k) for k in range(len(options))]
+        for k, rest in enumerate(still):
+            if rest is not None:
+                found[k] = self._held_too_weakly(rest, float(options[k, 0]))
+            elif found[k].ok:
+                share = float(peak[k].max() / options[k, 0])
+                use = found[k].use | {"normal force": share}
+                found[k] = replace(found[k], robust_force=peak[k], use=use)
+        return found
+
+    def _held_too_weakly(self, rest: RestForce, limit: float) -> PathTiming:
+        """Standing still needs more than the limit in some case."""
+        arm, u = int(rest.force.argmax()), rest.sample / (2 * self.intervals)
+        name = self.workcell.robots[arm].name
+        place = Place("normal force", name, "", round(u * self.intervals), u)
+        failed = self._failed(TimingStatus.INFEASIBLE_AT_REST, place)
+        use = {"normal force": float(rest.force.max()) / limit}
+        return replace(failed, peak_force=rest.force, robust_force=rest.force, use=use)
+
+    @cached_property
+    def _robust(self) -> RobustPasses:
+        passes = passes_function(self._compiled, self.intervals, CUTS)
+        assert passes is not None, "asked for where the passes are compiled"
+        return RobustPasses(passes, robust_path(self.workcell), self.intervals)
 
     @cached_property
     def _model(self) -> TimingModel:
@@ -234,9 +276,20 @@ class PathTimer:
         return Place(name, "", "", sample, parameter)
 
 
-def from_time_path(timing: Timing) -> PathTiming:
+def _rows_of(paths: dict[str, Array], rows: list[int]) -> dict[str, Array]:
+    """Some paths; all of them without a copy."""
+    if len(rows) == len(paths["limits"]):
+        return paths
+    return {name: values[rows] for name, values in paths.items()}
+
+
+def from_time_path(model: TimingModel, timing: Timing, limits: TimingLimits) -> PathTiming:
     """What `time_path` found, as a `PathTiming`."""
-    force = np.full(2, np.nan) if timing.carry is None else timing.carry.peak_normal_force
+    force, robust = np.full(2, np.nan), None
+    if timing.carry is not None:
+        force = timing.carry.peak_normal_force
+        if limits.robust:
+            robust = limited_force(timing.carry, model.workcell, limits).max(axis=0)
     speed = np.zeros(0) if timing.grid_speed is None else timing.grid_speed
     return PathTiming(
         status=timing.status,
@@ -247,6 +300,7 @@ def from_time_path(timing: Timing) -> PathTiming:
         grid_speed=speed,
         sweeps=timing.iterations,
         slowed=timing.slowed,
+        robust_force=robust,
     )
 
 

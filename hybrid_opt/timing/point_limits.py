@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.robust.path_force import robust_path
+from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
 from hybrid_opt.timing import rows as rows_of
 from hybrid_opt.timing.model import REFINEMENT, TimingModel, contact_torque
 from hybrid_opt.timing.path_motion import PathMotion
@@ -94,7 +94,8 @@ class PointLimits:
     def _robust(self, a: Array, w: Array) -> tuple[Array, Array]:
         p = self.points
         path = (p.pose[:, :6], p.pose_first[:, :6], p.pose_second[:, :6])
-        return robust_path(self._model.workcell).at(path, a, w)
+        force, slope = robust_path(self._model.workcell).at(PathPoints(*path, a, w))
+        return force, slope[:, :, BY_TIMING]
 
     def cut(self, a: Array, w: Array) -> tuple[list[PointRows], float]:
         """Supporting lines of the convex limits that a timing exceeds, and the largest excess."""

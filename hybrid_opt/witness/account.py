@@ -9,7 +9,6 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, chosen_squeeze, extra_force
 from hybrid_opt.timing.analysis import closest_to_reference_timing
-from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.arms import ArmOutcome, CellWitness
 from hybrid_opt.witness.controller import Control
@@ -93,7 +92,7 @@ def driven_carry(cell: Cell, x: Array) -> Carry:
         WitnessError: there is none.
     """
     if cell.workcell.task.time_law == "optimal":
-        timing = time_path(cell.timing_model, x, TimingLimits(force=float(x[-1])))
+        timing = time_path(cell.timing_model, x, cell.timing_model.drive_limits(float(x[-1])))
     else:
         timing = closest_to_reference_timing(cell.timing_model, x)
     if not timing.ok or timing.carry is None:

@@ -63,8 +63,8 @@ def case_gradient_function(workcell: Workcell) -> ca.Function:
 
 def case_slopes_function(workcell: Workcell) -> ca.Function:
     """Box pose and its derivatives by u (6,), u'', u'^2 and a case (15,), see `CASE_SIZES`, to
-    normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 2)), of each
-    force by u'' and by u'^2."""
+    normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 20)), of each
+    force by pose, both derivatives, u'' and u'^2."""
     path = [ca.MX.sym(name, 6) for name in ("pose", "first", "second")]
     a, w, case = ca.MX.sym("a"), ca.MX.sym("w"), ca.MX.sym("case", CASE_SIZE)
     pose, first, second = path
@@ -73,10 +73,20 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     friction, radius, *_ = _parts(case)
     balance = _balance_function(workcell)(*motion, case)
     held = least_squeeze(balance, friction, radius, differentiable=True)
-    slope = ca.densify(ca.jacobian(held.normal, ca.vertcat(a, w)).T)
+    slope = ca.densify(ca.jacobian(held.normal, ca.vertcat(*path, a, w)).T)
     names = ["pose", "first", "second", "a", "w", "case"]
     outputs = ["normal_force", "slope"]
     return ca.Function("case_slopes", [*path, a, w, case], [held.normal, slope], names, outputs)
+
+
+def case_difference_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to difference N_1 - N_2 [N],
+    which no squeeze changes."""
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.SX.sym("case", CASE_SIZE)
+    difference = ca.cse([_balance_function(workcell)(*motion, case)[0]])
+    names = ["pose", "rate", "second_rate", "case"]
+    return ca.Function("case_difference", [*motion, case], difference, names, ["difference"])
 
 
 def case_slack_function(workcell: Workcell) -> ca.Function:

@@ -6,7 +6,6 @@ import numpy as np
 
 from hybrid_opt.evaluate.drive import Driver
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.refined import drive_path
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
@@ -24,7 +23,7 @@ def second_opinion(driver: Driver, model: TimingModel, x: Array) -> str:
     (timing,) = driver.timings(np.asarray(x)[None])
     if not timing.ok:
         return f"no timing: {timing.status}"
-    motion, limits = model.path_motion(x), TimingLimits(force=float(x[-1]))
+    motion, limits = model.path_motion(x), driver.limits(float(x[-1]))
     driven = drive_path(model, x, timing.grid_speed, limits, motion)
     if not driven.ok:
         return f"on the tenfold grid: {driven.reason}"

@@ -17,13 +17,13 @@ from math import ceil
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.drivable.certified import second_opinion
 from hybrid_opt.polishing.drivable.point import DrivableSolver, DriveStart
 from hybrid_opt.polishing.drivable.tilts import turned
-from hybrid_opt.polishing.drivable.timed import Goal
+from hybrid_opt.polishing.drivable.timed import STILL, Goal
 from hybrid_opt.polishing.drivable.tournament import best_of
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.point import Solution
@@ -34,9 +34,6 @@ from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.decision import initial_decision
-
-STILL = 1e-3
-"""The least force limit is this share above the force that holds the box at rest."""
 
 FAST = 0.75
 """Where between the least and the front's largest force limit the tournament is: basins differ most
@@ -79,13 +76,13 @@ class DrivablePolisher(Polisher):
 
         Raises:
             SettingsError: the time law is not 'optimal', the objectives are others than duration
-                and peak force, or forces are allocated jointly.
+                and peak or robust force, or forces are allocated jointly.
             DualArmError: the functions cannot be built.
         """
-        if sorted(evaluator.objective_names) != sorted(DRIVABLE_OBJECTIVES):
+        if not any(sorted(evaluator.objective_names) == sorted(pair) for pair in DRIVABLE_PAIRS):
             raise SettingsError(
                 f"under the time law 'optimal' the polish minimises "
-                f"{' and '.join(DRIVABLE_OBJECTIVES)}; the objectives are "
+                f"{' or '.join(' and '.join(pair) for pair in DRIVABLE_PAIRS)}; the objectives are "
                 f"{', '.join(evaluator.objective_names)}: switch the polish off for them"
             )
         super().__init__(evaluator, settings)
@@ -122,9 +119,9 @@ class DriveRun(PolishRun[DriveAttempt]):
         super().__init__(polisher.evaluator, polisher.settings, archive, recorded, emit)
         self._solver, self._doubt = polisher.drivable, polisher.doubt
         task = polisher.evaluator.workcell.task
-        self._n_path, self._range = task.n_path, task.force_limit
+        self._n_path, self._range = task.n_path, self._solver.judge.force_limit
         self._reference = float(task.reference_force.min())
-        self._by_force = polisher.evaluator.objective_names.index("peak_force")
+        self._by_force = 1 - polisher.evaluator.objective_names.index("duration")
         self._tried: set[float] = set()
         self._hand_made = initial_decision(task)[: self._n_path]
         self._paths, self._others, self._largest = paths, paths[:0], self._range[0]

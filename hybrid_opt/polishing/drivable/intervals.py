@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from hybrid_opt.polishing.drivable.functions import DrivenFunctions
+from hybrid_opt.polishing.drivable.robust_rows import ROBUST_ROWS, RobustForces, planned_branches
 from symbolic.array import Array
-from symbolic.physics.contact_forces import normal_force_branches
 from symbolic.physics.path import path_basis
 from symbolic.smooth.driven import driven_layout
 from symbolic.smooth.keys import ClosureKey
@@ -39,16 +40,15 @@ class RowKinds:
     weight: Array
 
     @classmethod
-    def of(cls, workcell: Workcell) -> RowKinds:
-        """Those of a workcell: both signs where a quantity has one, all branches of the forces."""
+    def of(cls, workcell: Workcell, robust: int = 0) -> RowKinds:
+        """Those of a workcell: both signs where a quantity has one, all branches of the forces.
+
+        Args:
+            robust: further forces beside the quantities, each with a row of its own.
+        """
         layout = driven_layout(workcell)
         eye = np.eye(layout.size)
-        forces = np.zeros((2, 5, layout.size))
-        friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
-        for column, split in ((0, (1.0, 0.0)), (1, (0.0, 1.0))):
-            branches = np.array(normal_force_branches(*split, friction)).reshape(-1)
-            forces[:, :, layout.block("force").start + column] = branches
-        forces[0, :, layout.block("force").start] += 1.0  # N_1 = N_2 + F_n
+        forces = planned_branches(workcell)
         blocks = [
             eye[layout.block("speed")],
             eye[layout.block("acceleration")],
@@ -59,8 +59,9 @@ class RowKinds:
             eye[layout.block("pressure")],
             forces.reshape(-1, layout.size),
         ]
-        mix = np.concatenate(blocks)
-        is_force = np.arange(len(mix)) >= len(mix) - forces.shape[0] * forces.shape[1]
+        planned = np.concatenate(blocks)
+        mix = block_diag(planned, np.eye(robust))
+        is_force = np.arange(len(mix)) >= len(planned) - forces.shape[0] * forces.shape[1]
         terms = int(np.count_nonzero(mix, axis=1).max())
         where = np.argsort(mix == 0.0, axis=1, kind="stable")[:, :terms]
         return cls(mix, is_force, where, np.take_along_axis(mix, where, axis=1))
@@ -85,9 +86,10 @@ class IntervalGrid:
         moving: entries of the extended pose and its two derivatives, 3 (6 + m).
         carry_over: (points, moving, n_path) from the path's variables to them.
         kinds: the inequalities of a point.
+        robust: robust forces, None where planned ones are limited.
     """
 
-    def __init__(self, workcell: Workcell, intervals: int) -> None:
+    def __init__(self, workcell: Workcell, intervals: int, robust: bool = False) -> None:
         self.workcell, self.intervals = workcell, intervals
         task = workcell.task
         basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, intervals + 1))
@@ -99,7 +101,8 @@ class IntervalGrid:
         for k, basis_of in enumerate(self._bases):
             at = (k * self.pose + columns, np.arange(task.n_path))
             self.carry_over[:, at[0], at[1]] = basis_of[self.sample][:, rows]
-        self.kinds = RowKinds.of(workcell)
+        self.robust = RobustForces(workcell, self.pose) if robust else None
+        self.kinds = RowKinds.of(workcell, 0 if self.robust is None else ROBUST_ROWS)
         self.layout = driven_layout(workcell)
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
@@ -131,7 +134,7 @@ class IntervalValues:
 
     Attributes:
         grid: what the path shares with others.
-        value: (points, quantities).
+        value: (points, quantities), robust forces behind them.
         slope: (points, quantities, moving + 2) by the extended pose and its derivatives, u'' and
             u'^2, the joints following.
     """
@@ -170,11 +173,15 @@ class IntervalValues:
         out = functions.first.batch(*inputs)
         full = out["slope"]
         follow = tuple(found["follow"][s] for found in held)
-        slope = _followed(grid, full, follow)
+        slope, value = _followed(grid, full, follow), out["value"]
+        if grid.robust is not None:
+            force, by_motion = grid.robust.at(inputs[:3], a, squared[s])
+            value = np.hstack([value, force])
+            slope = np.concatenate([slope, by_motion], axis=1)
         pull = tuple(found["pull"][s] for found in held)
         return cls(
             grid,
-            out["value"],
+            value,
             slope,
             inputs,
             full,
@@ -202,11 +209,13 @@ class IntervalValues:
         """Second derivatives of weight . value.
 
         Args:
-            weight: (points, quantities).
+            weight: (points, quantities and robust forces); the latter bend as planned forces do.
 
         Returns:
             The points (m,) with any weight, and (m, moving + 2, moving + 2) of each.
         """
+        if self.grid.robust is not None:
+            weight = self.grid.robust.as_planned(weight, self.value)
         at = np.flatnonzero(np.abs(weight).max(axis=1) > 0.0)
         n, variables = len(at), self.grid.layout.variables
         pose, moving = self.grid.pose, self.grid.moving

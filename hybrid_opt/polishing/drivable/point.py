@@ -19,7 +19,7 @@ from hybrid_opt.polishing.constraints.active import ActiveSet
 from hybrid_opt.polishing.constraints.kind import Surroundings
 from hybrid_opt.polishing.constraints.learned import Learned
 from hybrid_opt.polishing.drivable.proposal import Proposal, Proposer, Reached
-from hybrid_opt.polishing.drivable.timed import Goal, PathJudge, TimedPath
+from hybrid_opt.polishing.drivable.timed import Goal, PathJudge, TimedPath, force_range
 from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.layout import PlaceRow
@@ -81,10 +81,12 @@ class DrivableSolver:
         self.evaluator, self.task, self.settings = evaluator, task, settings
         self.active = ActiveSet(Surroundings(evaluator, cell, settings))
         self.reader = CarryReader(evaluator, grid, functions.rows)
-        self.proposer = Proposer(cell, functions.driven, driver.timer.intervals, settings.drivable)
+        self.proposer = Proposer(
+            cell, functions.driven, driver.timer.intervals, settings.drivable, driver.robust
+        )
         self.driver = driver
         self.half = cell.unit.half[: task.n_path]
-        self.judge = PathJudge(driver.timer, task.force_limit)
+        self.judge = PathJudge(driver, force_range(driver))
 
     def solve(self, start: DriveStart) -> Solution:
         """Improve towards the goal, in as many rounds as the settings allow."""

@@ -88,11 +88,12 @@ class Proposer:
         functions: DrivenFunctions,
         intervals: int,
         settings: DrivableSettings,
+        robust: bool = False,
     ) -> None:
-        """intervals: pieces of constant u''."""
+        """intervals: pieces of constant u''. robust: whether robust forces are limited."""
         self._cell, self._functions = cell, functions
         self._task, self._driven = cell.task, settings
-        self._intervals = IntervalGrid(cell.workcell, intervals)
+        self._intervals = IntervalGrid(cell.workcell, intervals, robust)
         self._half = cell.unit.half[: cell.task.n_path]
 
     def step(self, best: Reached, goal: Goal, radius: float, lenient: bool) -> Proposal | None:

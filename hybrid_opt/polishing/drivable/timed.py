@@ -7,12 +7,16 @@ from typing import Literal
 
 import numpy as np
 
-from hybrid_opt.timing.path_timer import PathTimer
-from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.evaluate.drive import Driver
+from hybrid_opt.robust.path_force import PathPoints, robust_path
 from symbolic.array import Array
+from symbolic.workcell.decision import waypoints_of
 
 DriveAim = Literal["duration", "force"]
 """Least duration within a force limit, or least force limit within a duration."""
+
+STILL = 1e-3
+"""The least force limit is this share above the force that holds the box at rest."""
 
 FORCE_STEPS = 14
 """Timings that the least force of a path may take."""
@@ -58,11 +62,15 @@ class TimedPath:
 
 
 class PathJudge:
-    """Times paths by the compiled passes."""
+    """Times paths by the compiled passes.
 
-    def __init__(self, timer: PathTimer, force_limit: tuple[float, float]) -> None:
+    Attributes:
+        force_limit: least and largest [N].
+    """
+
+    def __init__(self, driver: Driver, force_limit: tuple[float, float]) -> None:
         """force_limit: least and largest [N]."""
-        self._timer, self._range = timer, force_limit
+        self._timer, self._limits, self.force_limit = driver.timer, driver.limits, force_limit
 
     def timed(self, path: Array, goal: Goal) -> TimedPath:
         """The best timing of free waypoints (n_path,) for a goal."""
@@ -73,22 +81,22 @@ class PathJudge:
 
     def durations(self, paths: Array, force: float) -> Array:
         """(n,) [s] of paths (n, n_path) within a force, infinite where there is none."""
-        limits = [TimingLimits(force=force)] * len(paths)
+        limits = [self._limits(force)] * len(paths)
         found = self._timer.time_all(np.ascontiguousarray(paths), limits)
         return np.array([t.duration if t.ok else np.inf for t in found])
 
     def _at(self, path: Array, known: dict[str, Array], force: float) -> TimedPath:
-        (found,) = self._timer.time_known(path[None], known, [TimingLimits(force=force)])
+        (found,) = self._timer.time_known(path[None], known, [self._limits(force)])
         duration = found.duration if found.ok else float("inf")
         joints = [np.ascontiguousarray(known[f"q_{arm}"][0][::2]) for arm in (1, 2)]
         return TimedPath(duration, force, found.grid_speed**2, (joints[0], joints[1]))
 
     def _least_force(self, path: Array, known: dict[str, Array], duration: float) -> TimedPath:
         """By regula falsi (Illinois) in the logarithm of force and duration."""
-        low, high = (self._at(path, known, force) for force in self._range)
+        low, high = (self._at(path, known, force) for force in self.force_limit)
         if not high.duration <= duration:
             return (
-                self._at(path, known, self._range[0])
+                self._at(path, known, self.force_limit[0])
                 if low.duration <= duration
                 else (TimedPath(float("inf"), high.force, high.squared, high.joints))
             )
@@ -109,3 +117,16 @@ class PathJudge:
             if above - below <= FORCE_TOLERANCE or -FORCE_TOLERANCE < miss <= 0.0:
                 break
         return high
+
+
+def force_range(driver: Driver) -> tuple[float, float]:
+    """The task's least and largest force limit [N]; of robust forces the least is at least what
+    holds the box at both ends of every path."""
+    workcell = driver.timer.workcell
+    least, most = workcell.task.force_limit
+    if driver.robust:
+        ends = waypoints_of(workcell.task, workcell.task.lower)[[0, -1]]
+        (first, second), (a, w) = np.zeros((2, 2, 6)), np.zeros((2, 2))
+        held, _ = robust_path(workcell).at(PathPoints(ends, first, second, a, w))
+        least = max(least, (1.0 + STILL) * float(held.max()))
+    return least, most

@@ -2,7 +2,8 @@
 
    docs/timing.md explains the method; `symbolic.physics.path_limits.LimitLayout` the numbers at a
    sample. The text before this file defines INTERVALS, JOINTS, the SIZE of a sample's row, the
-   offset of every block (AT_...), RATIOS, FORCE_BRANCHES and limit_ratios, limit_slopes of CasADi.
+   offset of every block (AT_...), RATIOS, FORCE_BRANCHES, CUTS, the lines that a caller gives at every
+   sample, and limit_ratios, limit_slopes of CasADi.
 
    x and y are the squared speeds u'^2 at the beginning and the end of an interval. There is rest at
    both ends of the path, and standing still is allowed everywhere, so that (0, 0) satisfies every
@@ -50,6 +51,8 @@ typedef struct {
   double (*tight)[GROUPS];         /* (INTERVALS, GROUPS) divisor of what is left for motion */
   double* top;                     /* (INTERVALS + 1,) largest u'^2 that can be brought to rest */
   double* squared;                 /* (INTERVALS + 1,) u'^2 */
+  const double* cuts;              /* (SAMPLES, CUTS, 3) alpha u'' + beta u'^2 <= bound, infinite
+                                      from the last one on */
 } problem;
 
 static double larger(double a, double b) { return a > b ? a : b; }
@@ -92,15 +95,36 @@ static int normal_forces(const double* f, double a, double w, double* n, double*
 
 /* ---- rows of an interval ---- */
 
-/* alpha u'' + beta u'^2 <= bound at the beginning (end = 0) or the end of an interval. */
-static line interval_row(double alpha, double beta, double bound, int end) {
-  line row = {-HALF * alpha, HALF * alpha, bound, 0};
-  if (end) row.y += beta; else row.x += beta;
+/* alpha u'' + beta u'^2 <= bound at a share of an interval. */
+static line inner_row(double alpha, double beta, double bound, double share) {
+  const line row = {(1.0 - share) * beta - HALF * alpha, share * beta + HALF * alpha, bound, 0};
   return row;
+}
+
+/* The same at the beginning (end = 0) or the end of an interval. */
+static line interval_row(double alpha, double beta, double bound, int end) {
+  return inner_row(alpha, beta, bound, end);
 }
 
 static int append(line* rows, int count, line row) {
   if (count < MAX_ROWS) rows[count++] = row;
+  return count;
+}
+
+/* Of the lines given at both ends and in the middle of an interval those that (x, y) uses furthest,
+   where that is beyond `threshold`. */
+static int given_rows(const problem* p, int interval, double x, double y, double threshold,
+                      line* rows, int count) {
+  for (int k = 0; k < 3; ++k) {
+    const double share = 0.5 * k, a = HALF * (y - x), w = x + share * (y - x);
+    const double *cut = p->cuts + 3 * CUTS * (2 * interval + k), *worst = 0;
+    double largest = threshold;
+    for (int j = 0; j < CUTS && isfinite(cut[2]); ++j, cut += 3) {
+      const double use = (cut[0] * a + cut[1] * w) / cut[2];
+      if (use > largest) { largest = use; worst = cut; }
+    }
+    if (worst) count = append(rows, count, inner_row(worst[0], worst[1], worst[2], share));
+  }
   return count;
 }
 
@@ -161,7 +185,7 @@ static int convex_rows(const problem* p, int interval, double x, double y, doubl
       count = append(rows, count, row);
     }
   }
-  return count;
+  return given_rows(p, interval, x, y, threshold, rows, count);
 }
 
 static int limited(const problem* p, int ratio) {
@@ -555,7 +579,7 @@ static int solve(problem* p, largest_use* use, double* peak, double* interval, d
 }
 
 /* Inputs: samples (SAMPLES, SIZE); options (4,): largest normal force, whether torques, pressure
-   and the reference speeds are limited. Outputs: status; interval of a failure; duration; peak (2,)
+   and the reference speeds are limited; with CUTS, cuts (SAMPLES, CUTS, 3). Outputs: status; interval of a failure; duration; peak (2,)
    normal forces; use (KINDS, 3): ratio, parameter, column; squared (INTERVALS + 1,) u'^2; sweeps;
    slowed. */
 int path_timing(const double** arg, double** res, long long* iw, double* w, int mem) {
@@ -566,7 +590,7 @@ int path_timing(const double** arg, double** res, long long* iw, double* w, int 
   problem p = {
     arg[0], options[0], options[1] > 0.5, options[2] > 0.5, options[3] > 0.5, w,
     w + (INTERVALS + 1) * RATIOS, (double(*)[GROUPS])(w + (INTERVALS + 1) * (RATIOS + 1)),
-    w + (INTERVALS + 1) * (RATIOS + 1 + GROUPS), squared,
+    w + (INTERVALS + 1) * (RATIOS + 1 + GROUPS), squared, CUTS ? arg[2] : 0,
   };
   (void)iw; (void)mem;
   *interval = *sweeps = *duration = 0.0;
@@ -588,7 +612,7 @@ int path_timing(const double** arg, double** res, long long* iw, double* w, int 
 }
 
 int path_timing_work(long long* arg, long long* res, long long* iw, long long* w) {
-  *arg = 2; *res = 8; *iw = 0; *w = (INTERVALS + 1) * (RATIOS + 2 + GROUPS);
+  *arg = CUTS ? 3 : 2; *res = 8; *iw = 0; *w = (INTERVALS + 1) * (RATIOS + 2 + GROUPS);
   return 0;
 }
 void path_timing_incref(void) {}

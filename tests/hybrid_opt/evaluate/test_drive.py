@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -14,29 +15,35 @@ from hybrid_opt.evaluate.drive import Driver
 from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.problem import CarryProblem
+from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing import PathTimer, TimingLimits, time_path
 from symbolic.array import Array
 from symbolic.functions.candidate import candidate_function
 from symbolic.geometry.clearance import screening_functions
 from symbolic.robot.arm import posture_function
 from symbolic.workcell.decision import initial_decision, waypoints_of
-from symbolic.workcell.records import Workcell
-from tests.hybrid_opt.timing.cells import hand_timing, near_initial
+from symbolic.workcell.records import Uncertainty, Workcell
+from tests.hybrid_opt.timing.cells import hand_timing, near_initial, timing_of
 from tests.symbolic.cells import hand_cell, hand_model, with_task
 
 STATIC = 98.1 / 2.0
 
 
 def drivable_cell() -> Workcell:
-    return with_task(hand_cell(), time_law="optimal", force_limit=(1.01 * STATIC, 60.0))
+    cell = with_task(hand_cell(), time_law="optimal", force_limit=(1.01 * STATIC, 60.0))
+    return replace(cell, uncertainty=Uncertainty(friction=0.1))
+
+
+def evaluator() -> CandidateEvaluator:
+    """The drivable hand cell, its functions compiled as a file's would be."""
+    return evaluator_of(DRIVABLE_OBJECTIVES)
 
 
 @cache
-def evaluator() -> CandidateEvaluator:
-    """The drivable hand cell, its functions compiled as a file's would be."""
+def evaluator_of(objectives: tuple[str, ...]) -> CandidateEvaluator:
     cell = drivable_cell()
     model = hand_model(cell)
     placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
@@ -48,8 +55,12 @@ def evaluator() -> CandidateEvaluator:
         f"inverse_dynamics_{i + 1}": robot.inverse_dynamics for i, robot in enumerate(model.robots)
     }
     functions = build(made).functions
-    driver = Driver(PathTimer(CompiledCell(cell, model=model), lanes=1))
-    return CandidateEvaluator(cell, DRIVABLE_OBJECTIVES, functions=functions, driver=driver)
+    timer, robust = (
+        PathTimer(CompiledCell(cell, model=model), lanes=1),
+        "robust_force" in objectives,
+    )
+    driver = Driver(timer, robust=robust)
+    return CandidateEvaluator(cell, objectives, functions=functions, driver=driver)
 
 
 def candidates(count: int) -> Array:
@@ -84,6 +95,28 @@ def test_objectives_are_those_of_time_path_at_the_candidates_force() -> None:
         time = np.interp(u, timing.carry.parameter, timing.carry.time)
         np.testing.assert_allclose(outputs["time"][k], time, atol=0.01 * timing.duration)
         assert outputs["normal_force"][k].max() <= row[-1] * 1.005
+
+
+def test_force_limits_hold_in_every_case_where_robust_forces_are_minimised() -> None:
+    """Friction a tenth less at most: nearly a tenth more force."""
+    x, robust = candidates(2), evaluator_of(ROBUST_DRIVABLE_OBJECTIVES)
+    unsure = replace(hand_cell(), uncertainty=drivable_cell().uncertainty)
+    x[:, -1] = 59.0
+    found, planned = robust.evaluate(x), evaluator().evaluate(x)
+    for k, row in enumerate(x):
+        assert found.feasible[k] == planned.feasible[k]
+        limits = TimingLimits(force=59.0, robust=True)
+        timing = time_path(timing_of(unsure, 100), row[:-1], limits)
+        assert timing.ok, timing.reason
+        assert timing.carry is not None
+        peak = robust_model(unsure).robust_force(timing.carry).peak.max()
+        assert found.objectives[k, 1] == pytest.approx(peak / 117.68, rel=2e-3)
+        outputs = robust.outputs(row)
+        assert outputs["time"][0, -1] == pytest.approx(timing.duration, rel=2e-3)
+        assert outputs["peak_force"].max() < 0.95 * peak
+    x[:, -1] = 52.0
+    names = [REASONS[code] for code in robust.evaluate(x).reason]
+    assert names == ["force_limit"] * 2
 
 
 def test_the_motion_is_the_derivative_of_the_path() -> None:

@@ -20,15 +20,21 @@ from hybrid_opt.timing.path_motion import PathMotion
 from symbolic.array import Array
 
 Terms = dict[int, float]
+Affine = Callable[[float, float], Terms]
 
 
-class _Program:
+class Program:
     """Rows A z + s = b with s in cones, gathered one cone at a time."""
 
     def __init__(self, n: int) -> None:
         self.n = n
         self.rows: list[tuple[Terms, float]] = []
         self.cones: list[object] = []
+
+    def fresh(self, count: int) -> int:
+        """The first of some more variables."""
+        self.n += count
+        return self.n - count
 
     def at_most(self, terms: Terms, bound: float) -> None:
         """terms . z <= bound, which is positive."""
@@ -45,7 +51,20 @@ class _Program:
             self.rows.append(({k: -v for k, v in terms.items()}, constant))
         self.cones.append(clarabel.SecondOrderConeT(len(parts)))
 
+    def zero(self, parts: list[tuple[Terms, float]]) -> None:
+        """Every part is zero."""
+        self.rows += [({k: -v for k, v in terms.items()}, constant) for terms, constant in parts]
+        self.cones.append(clarabel.ZeroConeT(len(parts)))
+
+    def semidefinite(self, triangle: list[Terms], order: int) -> None:
+        """The scaled upper triangle is that of a positive semidefinite matrix."""
+        self.rows += [({k: -v for k, v in terms.items()}, 0.0) for terms in triangle]
+        self.cones.append(clarabel.PSDTriangleConeT(order))
+
     def solve(self, cost: Array) -> Array:
+        """The optimum; that of semidefinite cones to what the solver reaches."""
+        semidefinite = any(isinstance(cone, clarabel.PSDTriangleConeT) for cone in self.cones)
+        tolerated = ("AlmostSolved",) if semidefinite else ()
         entries = [(i, k, v) for i, (terms, _) in enumerate(self.rows) for k, v in terms.items()]
         i, k, v = (np.array(column) for column in zip(*entries, strict=True))
         matrix = sparse.csc_matrix((v, (i, k)), shape=(len(self.rows), self.n))
@@ -60,17 +79,23 @@ class _Program:
             self.cones,
             settings,
         ).solve()
-        assert str(solution.status) == "Solved", solution.status
+        assert str(solution.status) in ("Solved", *tolerated), solution.status
         return np.array(solution.x)
 
 
-def shortest_duration(model: TimingModel, x: Array, limits: TimingLimits) -> float:
-    """Shortest duration [s] from rest to rest; torque and pressure limits are left out."""
+def shortest_duration(
+    model: TimingModel, x: Array, limits: TimingLimits, limit_force: LimitForce | None = None
+) -> float:
+    """Shortest duration [s] from rest to rest; torque and pressure limits are left out.
+
+    Args:
+        limit_force: what limits forces at a point of an interval; by default the planned ones.
+    """
     n, cell = model.intervals, model.workcell
     motion = model.path_motion(x).at(np.arange(0, REFINEMENT * model.intervals + 1, REFINEMENT))
     scale = 5.0  # around the duration [s], so that variables are around one
     delta = scale / n
-    program = _Program(3 * n + 2)
+    program = Program(3 * n + 2)
     root, inverse = n + 1, 2 * n + 2  # z = (u'^2 at n + 1, its root at n + 1, 1 / sums at n)
     program.equals(0, 0.0)
     program.equals(n, 0.0)
@@ -113,12 +138,15 @@ def shortest_duration(model: TimingModel, x: Array, limits: TimingLimits) -> flo
                 ]
                 program.norm([({}, 1.0), *rows])
             if limits.force is not None:
-                _limit_force(program, model, motion, point, limits.force, affine)
+                (limit_force or _limit_force)(program, model, motion, point, limits.force, affine)
     cost = np.zeros(program.n)
-    cost[inverse:] = 2.0 * delta
+    cost[inverse : inverse + n] = 2.0 * delta
     z = program.solve(cost)
     path_speed = np.sqrt(np.maximum(z[: n + 1], 0.0))
     return float(np.sum(2.0 * delta / (path_speed[:-1] + path_speed[1:])))
+
+
+LimitForce = Callable[[Program, TimingModel, PathMotion, int, float, Affine], None]
 
 
 def _speeds(
@@ -142,12 +170,12 @@ def _joints(model: TimingModel, motion: PathMotion, i: int) -> Iterator[tuple[fl
 
 
 def _limit_force(
-    program: _Program,
+    program: Program,
     model: TimingModel,
     motion: PathMotion,
     i: int,
     force: float,
-    affine: Callable[[float, float], Terms],
+    affine: Affine,
 ) -> None:
     """Both normal forces at most `force`, with contact forces as free variables eliminated.
 

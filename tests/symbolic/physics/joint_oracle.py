@@ -52,7 +52,7 @@ def _solve(case: Case, size: float, squeeze: bool) -> Array:
     balance = np.block([[eye, none, eye, none], [turn[0], eye, turn[1], eye]])
     rows = np.hstack([balance, np.zeros((6, 2))])
     right = np.concatenate([case.force, case.moment / unit]) / size
-    cones = [np.column_stack([_matrix(case, i, one) for one in np.eye(14)]) for i in (0, 1)]
+    cones = [np.column_stack([cone_matrix(case, i, one) for one in np.eye(14)]) for i in (0, 1)]
     forces = np.array([1.0, 1, 1, 0, 0, 0] * 2 + [0, 0])
     normals = np.array([0.0, 0, 1, 0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0])
     options = clarabel.DefaultSettings()
@@ -74,7 +74,7 @@ def _solve(case: Case, size: float, squeeze: bool) -> Array:
     return wrenches
 
 
-def _matrix(case: Case, i: int, x: Array) -> Array:
+def cone_matrix(case: Case, i: int, x: Array) -> Array:
     """Scaled upper triangle (21,) of contact i's real (6, 6) matrix; linear in x (14,), whose
     moments are in units of the larger radius."""
     sign = 1.0 if i == 0 else -1.0
