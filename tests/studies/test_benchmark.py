@@ -11,7 +11,7 @@ import pytest
 
 from studies import benchmark, benchmark_collisions, benchmark_study
 from studies.benchmark_text import report
-from studies.benchmark_turns import Evaluate, interleaved, summary
+from studies.benchmark_turns import SLICE, Evaluate, interleaved, summary
 from symbolic.array import Array
 from tests.symbolic.cells import RACK, hand_cell
 
@@ -47,7 +47,7 @@ def test_every_way_sees_every_candidate_in_every_round() -> None:
     def recorder(name: str) -> Evaluate:
         def evaluate(x: Array) -> None:
             seen[name].append(float(x[0]))
-            busy(6.0)(x)  # longer than a slice: once per round
+            busy(1.1e3 * SLICE)(x)  # longer than a slice: once per round
 
         return evaluate
 
@@ -57,6 +57,18 @@ def test_every_way_sees_every_candidate_in_every_round() -> None:
         # Two evaluations come before the rounds: a first one, and one to choose the repetitions.
         assert values[2:] == [0.0, 1.0, 2.0, 3.0] * 2
         assert times[name].shape == (8,)
+
+
+def test_fast_ways_go_on_with_the_next_candidates_within_a_round() -> None:
+    seen: list[float] = []
+
+    def fast(x: Array) -> None:
+        seen.append(float(x[0]))
+        busy(1e3 * SLICE / 2.5)(x)
+
+    interleaved({"fast": fast}, {"fast": np.arange(4.0)[:, None]}, 1)
+    # Three calls fill a slice; two evaluations come before the rounds.
+    assert seen[2:] == [0.0, 1.0, 2.0, 1.0, 2.0, 3.0, 2.0, 3.0, 0.0, 3.0, 0.0, 1.0]
 
 
 @pytest.mark.parametrize("count", range(1, 9))
