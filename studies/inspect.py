@@ -102,14 +102,17 @@ def _optimum_lines(optimum: Optimum) -> list[str]:
 
 
 def _branch_text(branch: Branch) -> str:
-    joints = " ".join(f"{angle:7.1f}" for angle in branch.joints_deg)
+    joints = " ".join(
+        f"{value:7.1f}" if unit == "deg" else f"{value:7.1f} {unit}"
+        for value, unit in zip(branch.joints, branch.joint_units, strict=True)
+    )
+    limits = ", ".join(f"{margin:.0f} {unit}" for unit, margin in branch.limit_margins.items())
     near = "unlimited" if branch.clearance_mm is None else f"{branch.clearance_mm:.1f} mm"
     if branch.clearance_mm == 0.0:
         near = "none (collides)"
     return (
-        f"[{joints}] deg: keeps {branch.kept_samples} samples, clearance {near}, limits "
-        f"{branch.limit_margin_deg:.0f} deg, manipulability {branch.manipulability:.4f} m^3 "
-        f"(at least {branch.least_manipulability:g})"
+        f"[{joints}] deg: keeps {branch.kept_samples} samples, clearance {near}, limits {limits}, "
+        f"manipulability {branch.manipulability:.4f} m^3 (at least {branch.least_manipulability:g})"
     )
 
 

@@ -33,12 +33,14 @@ becomes."""
 class Branch:
     """A posture of one arm at the start and the least margins of the hand-made trajectory from
     there; see `symbolic.robot.branches.StartBranch`. The clearance is measured by FCL, 0 where
-    bodies intersect and None where nothing can collide."""
+    bodies intersect and None where nothing can collide. Joints that slide are in mm, others in deg;
+    `limit_margins` holds the least distance to a limit of either kind by its unit."""
 
-    joints_deg: tuple[float, ...]
+    joints: tuple[float, ...]
+    joint_units: tuple[str, ...]
     kept_samples: int
     clearance_mm: float | None
-    limit_margin_deg: float
+    limit_margins: dict[str, float]
     manipulability: float
     least_manipulability: float
     chosen: bool
@@ -201,11 +203,16 @@ def _branches(cell: Cell, model: CellModel, arm: int) -> tuple[Branch, ...]:
 
 
 def _branch(cell: Cell, model: CellModel, arm: int, branch: StartBranch) -> Branch:
+    robot, units = cell.workcell.robots[arm], np.where(model.robots[arm].turning, "deg", "mm")
+    factor = np.where(units == "deg", np.degrees(1.0), 1e3)
+    path = branch.path[: max(branch.kept, 1)]
+    room = np.minimum(path - robot.position_lower, robot.position_upper - path).min(axis=0) * factor
     return Branch(
-        joints_deg=tuple(np.degrees(branch.q).round(2).tolist()),
+        joints=tuple((branch.q * factor).round(2).tolist()),
+        joint_units=tuple(units.tolist()),
         kept_samples=branch.kept,
         clearance_mm=_clearance_mm(cell, arm, branch),
-        limit_margin_deg=float(np.degrees(branch.limit_margin)),
+        limit_margins={str(unit): float(room[units == unit].min()) for unit in np.unique(units)},
         manipulability=branch.manipulability,
         least_manipulability=cell.workcell.robots[arm].min_manipulability,
         chosen=bool(np.allclose(branch.q, model.start[arm])),

@@ -38,7 +38,7 @@ def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
         _apply(document, changes)
     found: str = tomlkit.dumps(document)
     try:
-        same = outside.toml_tables(found.encode()) == wanted
+        same = _alike(outside.toml_tables(found.encode()), wanted)
     except OutsideError:
         same = False
     if not same:
@@ -47,6 +47,15 @@ def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
             "its own ([task], [[contacts]]) and keep what belongs to one together"
         )
     return found
+
+
+def _alike(found: Any, wanted: Any) -> bool:
+    """Whether values are equal; what is no number is like itself, and told by the reader."""
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        return found.keys() == wanted.keys() and all(_alike(found[k], wanted[k]) for k in found)
+    if isinstance(found, list) and isinstance(wanted, list):
+        return len(found) == len(wanted) and all(map(_alike, found, wanted))
+    return bool(found == wanted) or (found != found and wanted != wanted)
 
 
 def merged(data: Any, changes: Any) -> Any:

@@ -215,6 +215,8 @@ def _problems(data: dict[str, Any]) -> list[str]:
         pose = task.get(key)
         if not isinstance(pose, list) or len(pose) != 6 or not all(map(_is_number, pose)):
             found.append(f"task.{key}: allowed are 6 numbers: x, y, z, roll, pitch, yaw")
+    if task.get("start") == task.get("goal"):
+        found.append("task.goal: found the start again; allowed is another pose")
     reference = task.get("rotation_reference", [0.0, 0.0, 0.0])
     if (
         not isinstance(reference, list)

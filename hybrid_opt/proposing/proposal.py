@@ -234,14 +234,17 @@ class _Search:
         return None
 
     def _failed(self, setups: list[_Lazy]) -> ProposalError:
-        ended = ", when it was too late for another path" if self.too_late else ""
-        begin = f"{self.problem.source}: no carry found in {self.spent:.0f} s{ended}: "
+        begin = f"{self.problem.source}: no carry found in {self.spent:.0f} s"
         if not setups:
-            return ProposalError(f"{begin}no bases from which both arms follow the box were found")
+            return ProposalError(
+                f"{begin}: no bases from which both arms follow the box were found"
+            )
         tried = next((lazy for lazy in setups if lazy.setup is not None), setups[0])
-        if tried.setup is None:
-            return ProposalError(begin + tried.problem)
-        return ProposalError(begin + no_path(tried.setup.pairs, self.refusals))
+        if tried.setup is None and tried.problem:
+            return ProposalError(f"{begin}: {tried.problem}")
+        ended = ", when it was too late for another path" if self.too_late else ""
+        met = "" if tried.setup is None else no_path(tried.setup.pairs, self.refusals)
+        return ProposalError(f"{begin}{ended}: {met or 'no path was tried yet, give it more time'}")
 
     def _via_points(self, setup: Setup, pair: Pair, stray: Stray, effort: int) -> Array | None:
         """The fewest via-points of a path in one way of holding, None where none are found."""

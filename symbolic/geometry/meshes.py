@@ -95,8 +95,8 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
         ) from error
     if open_components:
         warnings.warn_explicit(
-            f"{open_components} part(s) of the mesh are not watertight; the convex hull of each "
-            "is used as its collision shape. Close the holes to get a tighter shape",
+            f"{open_components} part(s) of the mesh {path.name} are not watertight; the convex "
+            "hull of each is used as its collision shape. Close the holes to get a tighter shape",
             CollisionModelWarning,
             filename=path.name,  # the mesh is to be corrected, not a line of this source
             lineno=0,

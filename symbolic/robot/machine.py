@@ -93,6 +93,11 @@ def machine_problem(robots: Arms) -> str:
         moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
         chains.append(moving)
         held.append(dict(held_joints(urdf, moving, robot.locked_joints)))
+    if set(chains[0]) <= set(chains[1]) or set(chains[1]) <= set(chains[0]):
+        return (
+            "names the same arm as robots[0], at the same base; allowed is another arm of the "
+            "machine, or another base"
+        )
     for k, robot in enumerate(robots):
         urdf = robot_urdf(robot)
         for name in chains[1 - k]:

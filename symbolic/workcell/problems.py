@@ -69,9 +69,12 @@ def suggestion(word: str, candidates: Iterable[str]) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value as a short single line for a message, control characters escaped."""
+    """A value as a short single line for a message, control characters escaped.
+
+    Of a long one both ends: a path is known by its last part.
+    """
     text = _short.repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return text if len(text) <= 60 else f"{text[:28]}...{text[-29:]}"
 
 
 class _Short(reprlib.Repr):
