@@ -166,3 +166,26 @@ def test_a_mesh_of_the_payload_is_found_from_another_folder(tmp_path: Path) -> N
     (tmp_path / "other").mkdir()
     moved = tomllib.loads(problem.completed({}, tmp_path / "other"))
     assert moved["payload"]["path"] == "../meshes/box.stl"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("goal = [0.45,", "goal = [-0.45,", r"task\.goal: found the start again"),
+        ("mass = 6.0", "mass = nan", r"payload\.mass: found nan"),
+        (
+            "[0.0, -0.9, 0.0], rpy = [0.0, 0.0, 1",
+            "[0.0, 0.9, 0.0], rpy = [0.0, 0.0, -1",
+            "same arm",
+        ),
+    ],
+)
+def test_what_no_carry_can_come_of_is_told(
+    old: str, new: str, message: str, tmp_path: Path
+) -> None:
+    text = POST.read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / "cell.toml"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(WorkcellError, match=message):
+        read_problem(path).workcell()

@@ -160,6 +160,7 @@ def test_arms_of_one_machine_agree(tmp_path: Path) -> None:
     assert machine_problem((both, other)) == ""
     assert common_joints((both, other)) == ("lift",)
     assert "'lift' moves robot 'right' too" in machine_problem((both, right))
+    assert "names the same arm as robots[0]" in machine_problem((left, left))
     # The gripper of one arm is no business of the other.
     gripping = replace(left, locked_joints=(("left_grip", 0.3),))
     assert machine_problem((gripping, right)) == ""

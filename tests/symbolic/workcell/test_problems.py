@@ -209,6 +209,14 @@ URDF_CASES: list[tuple[str, UrdfChange, str, str]] = [
         "robots[0].urdf",
         "collision mesh 'package://a/b.stl' that it names does not exist",
     ),
+    (
+        "mesh missing far away",
+        lambda text: text.replace(
+            '<box size="0.161 0.093 0.707"/>', f'<mesh filename="package://{"a/" * 50}link.stl"/>'
+        ),
+        "robots[0].urdf",
+        "a/a/a/link.stl' that it names does not exist",
+    ),
 ]
 
 
