@@ -122,7 +122,7 @@ def recommend_from(root: Path, wish: ho.Wish, path: Path) -> StoredRecommendatio
 
 def _price(carry: ho.Carry, seed: int) -> StoredPrice | None:
     """What robustness costs the recommended carry; None where no set leaves friction and patches,
-    and where the pads do not face one another."""
+    and where the pads cannot hold whatever happens."""
     try:
         model = robust_model(carry.workcell)
         return stored_price(robust_price(model, carry, np.random.default_rng(seed), LEADER))

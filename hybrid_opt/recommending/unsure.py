@@ -46,8 +46,8 @@ def usual_doubts(workcell: Workcell) -> dict[str, Uncertainty]:
 def unsure_forces(carry: Carry, model: RobustModel | None = None) -> tuple[Unsure, ...]:
     """The forces that hold a carry under each of the usual doubts.
 
-    A doubt that leaves no friction or no patch is left out; so are all where the pads do not face
-    one another, for which there are no robust forces.
+    A doubt that leaves no friction or no patch is left out; so are all where the pads cannot hold
+    whatever happens.
     """
     workcell = carry.workcell
     try:

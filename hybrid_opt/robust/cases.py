@@ -9,7 +9,7 @@ Which are worst follows from the least squeeze that a case asks for:
   largest at vertices of both ranges;
 - a disc of radius r - e about the nominal pad lies within every disc of radius r displaced by at
   most e, so that a patch smaller by e stands for all displaced ones. This one is sufficient, not
-  exact.
+  exact. A rectangle shrinks in proportion, so that its shorter side shrinks by e.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from itertools import product
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.physics.case_grasp import least_reaches
 from symbolic.workcell.records import Uncertainty, Workcell
 
 
@@ -40,7 +41,7 @@ def worst_cases(workcell: Workcell, uncertainty: Uncertainty) -> Array:
     """(k, 15) cases that ask for as much squeeze as any within the ranges, or a little more."""
     case = nominal_case(workcell)
     case[0:2] *= 1.0 - uncertainty.friction
-    case[2:4] -= uncertainty.pad_position
+    case[2:4] *= 1.0 - uncertainty.pad_position / np.array(least_reaches(workcell))
     case[4] *= 1.0 + uncertainty.mass
     ranges = np.concatenate([uncertainty.centre_of_mass, uncertainty.disturbance])
     corners = product(*[(-width, width) if width > 0.0 else (0.0,) for width in ranges])

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from codegen.build import compile_function
 from codegen.cache import Cache
 from hybrid_opt.carry import Carry
 from hybrid_opt.per_workcell import kept_per_workcell
+from hybrid_opt.robust.case_forces import CaseForces
 from hybrid_opt.robust.cases import nominal_case, random_cases, worst_cases
 from hybrid_opt.robust.ruling import ruling_cases
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.case_squeeze import case_slack_function, case_squeeze_function
+from symbolic.physics.case_grasp import least_reaches
 from symbolic.workcell.checks import PATCH_OVERLAP, pads_beside
 from symbolic.workcell.records import Uncertainty, Workcell
 
@@ -107,29 +107,28 @@ class RobustModel:
         """Load or build the compiled function.
 
         Raises:
-            SettingsError: the pads do not face one another, so that some cases cannot be held.
+            SettingsError: some cases cannot be held, however hard the pads press.
             DualArmError: the function cannot be built.
         """
-        check_pads(workcell)
         self.workcell = workcell
-        self._function = compile_function(case_squeeze_function(workcell), cache, lanes=0)
-        self._slack = compile_function(case_slack_function(workcell), cache, lanes=0)
+        self._cases = CaseForces(workcell, cache)
 
     @property
     def allowed_factor(self) -> float:
         """Bound of the multiples of the workcell's set that leave friction and patches."""
         return allowed_factor(self.workcell, self.workcell.uncertainty)
 
-    def least_squeeze(self, motion: HeldMotion, cases: Array) -> Array:
-        """(k, n, 2) least normal forces [N] that hold each of k cases (k, 15) at n samples."""
+    def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
+        """(k, n, 2) least normal forces [N] that hold each of k cases (k, 15) at n samples; of pads
+        that do not face one another the least commanded one, and what `leader` presses with."""
         n = len(motion.pose)
         found = np.empty((len(cases), n, 2))
         step = max(1, BATCH // n)
         arrays = (motion.pose, motion.rate, motion.second_rate)
         for start in range(0, len(cases), step):
             some = cases[start : start + step]
-            repeated = [np.tile(values, (len(some), 1)) for values in arrays]
-            forces = self._function.batch(*repeated, np.repeat(some, n, axis=0))["normal_force"]
+            repeated = tuple(np.tile(values, (len(some), 1)) for values in arrays)
+            forces = self._cases.least(repeated, np.repeat(some, n, axis=0), leader)
             found[start : start + step] = forces.reshape(len(some), n, 2)
         return found
 
@@ -147,9 +146,9 @@ class RobustModel:
         if leader not in (0, 1):
             raise SettingsError(f"leader {leader}: give 0 or 1, the index of an arm")
         check_set(self.workcell, uncertainty)
-        worst = self.least_squeeze(motion, worst_cases(self.workcell, uncertainty))
-        follower = 1 - leader
-        force = ruling_cases(worst, uncertainty, leader).force
+        worst = self.least_squeeze(motion, worst_cases(self.workcell, uncertainty), leader)
+        follower, share = 1 - leader, self._cases.leading_share(leader)
+        force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
         return force[:, follower], force[:, leader]
 
     def robust_force(
@@ -166,7 +165,7 @@ class RobustModel:
         """
         chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
         commanded, leading = self.hold(motion, chosen, leader)
-        nominal = self.least_squeeze(motion, nominal_case(self.workcell)[None])[0]
+        nominal = self.least_squeeze(motion, nominal_case(self.workcell)[None], leader)[0]
         return RobustForce(leader, chosen, nominal, commanded, leading)
 
     def check(
@@ -186,14 +185,15 @@ class RobustModel:
     def _shares(self, motion: HeldMotion, force: RobustForce, cases: Array) -> Array:
         """(k,) largest share of the commanded force that each case needs; `SCREENED` for less."""
         n, k = len(motion.pose), len(cases)
-        rows = [np.tile(v, (k, 1)) for v in (motion.pose, motion.rate, motion.second_rate)]
-        rows.append(np.repeat(cases, n, axis=0))
+        parts = (motion.pose, motion.rate, motion.second_rate)
+        rows = tuple(np.tile(values, (k, 1)) for values in parts)
+        repeated = np.repeat(cases, n, axis=0)
         commanded, follower = np.tile(force.commanded, k), 1 - force.leader
-        arm = np.full(n * k, float(follower))
-        left = ~(self._slack.batch(*rows, SCREENED * commanded, arm)["slack"].ravel() > 0.0)
+        left = ~self._cases.surely_held(rows, repeated, SCREENED * commanded, force.leader)
         share = np.full(n * k, SCREENED)
         if left.any():
-            needed = self._function.batch(*[values[left] for values in rows])["normal_force"]
+            some = tuple(values[left] for values in rows)
+            needed = self._cases.least(some, repeated[left], force.leader)
             share[left] = np.maximum(SCREENED, needed[:, follower] / commanded[left])
         return np.asarray(share.reshape(k, n).max(axis=1))
 
@@ -239,23 +239,6 @@ class RobustModel:
         return low
 
 
-def check_pads(workcell: Workcell) -> None:
-    """Refuse pads that do not face one another.
-
-    Raises:
-        SettingsError: some cases cannot be held, however hard both press, or there are others than
-            two round pads with opposite normals.
-    """
-    if not workcell.has_facing_pads:
-        raise SettingsError("robust forces need two round pads that face one another")
-    room = PATCH_OVERLAP * sum(contact.patch_radius for contact in workcell.contacts)
-    if pads_beside(workcell) >= room:
-        raise SettingsError(
-            f"the contacts lie {pads_beside(workcell):g} m beside one another; robust forces "
-            f"need less than {room:g} m, so that pressing harder holds whatever happens"
-        )
-
-
 def check_set(workcell: Workcell, uncertainty: Uncertainty) -> None:
     """Refuse sets that nothing can hold.
 
@@ -270,12 +253,14 @@ def check_set(workcell: Workcell, uncertainty: Uncertainty) -> None:
 
 
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
-    """Largest multiple of a set that leaves some friction and patches that face one another."""
-    radii = [contact.patch_radius for contact in workcell.contacts]
+    """Largest multiple of a set that leaves some friction and patches."""
+    radii = least_reaches(workcell)
     limits = [float("inf")]
     limits += [1.0 / share for share in (uncertainty.friction, uncertainty.mass) if share > 0.0]
     if uncertainty.pad_position > 0.0:
-        room = min(min(radii), (sum(radii) - pads_beside(workcell) / PATCH_OVERLAP) / 2.0)
+        room = min(radii)
+        if workcell.has_facing_pads:
+            room = min(room, (sum(radii) - pads_beside(workcell) / PATCH_OVERLAP) / 2.0)
         limits.append(room / uncertainty.pad_position)
     return min(limits)
 

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from codegen.build import compile_function
 from codegen.cache import Cache
 from hybrid_opt.per_workcell import kept_per_workcell
+from hybrid_opt.robust.case_forces import check_pads
 from hybrid_opt.robust.cases import worst_cases
-from hybrid_opt.robust.force import check_pads, check_set
+from hybrid_opt.robust.force import check_set
 from hybrid_opt.robust.ruling import RulingCases, felt_share, ruling_cases
 from symbolic.array import Array
+from symbolic.errors import SettingsError
 from symbolic.physics.case_squeeze import (
     case_difference_function,
     case_slack_function,
@@ -85,6 +87,10 @@ class RobustPath:
                 friction or patch.
             DualArmError: a function cannot be built.
         """
+        if not workcell.has_facing_pads:
+            raise SettingsError(
+                "limits and slopes of robust forces need two round pads that face one another"
+            )
         check_pads(workcell)
         check_set(workcell, workcell.uncertainty)
         self.leader = leader

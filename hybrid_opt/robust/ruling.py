@@ -49,7 +49,11 @@ def felt_share(difference: Array, uncertainty: Uncertainty) -> Array:
 
 
 def ruling_cases(
-    worst: Array, uncertainty: Uncertainty, leader: int, difference: Array | None = None
+    worst: Array,
+    uncertainty: Uncertainty,
+    leader: int,
+    difference: Array | None = None,
+    leading_share: float = 1.0,
 ) -> RulingCases:
     """The cases that decide among the least normal forces (k, n, 2) [N] of the worst ones.
 
@@ -58,14 +62,15 @@ def ruling_cases(
 
     Args:
         difference: (k, n) leading less commanded force [N], where `worst` does not tell all.
+        leading_share: what the leading arm presses more for each newton more that is commanded.
     """
     follower, every = 1 - leader, np.arange(worst.shape[1])
     if difference is None:
-        difference = worst[:, :, leader] - worst[:, :, follower]
+        difference = worst[:, :, leader] - leading_share * worst[:, :, follower]
     share = felt_share(difference, uncertainty)
     commanded = worst[:, :, follower].argmax(axis=0)
     felt = (share * difference).argmax(axis=0)
     force = np.empty(worst.shape[1:])
     force[:, follower] = worst[commanded, every, follower]
-    force[:, leader] = force[:, follower] + (share * difference)[felt, every]
+    force[:, leader] = leading_share * force[:, follower] + (share * difference)[felt, every]
     return RulingCases(leader, force, commanded, felt, share[felt, every])

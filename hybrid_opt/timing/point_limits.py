@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
 from hybrid_opt.timing import rows as rows_of
 from hybrid_opt.timing.model import REFINEMENT, TimingModel, contact_torque
@@ -142,8 +143,19 @@ class PointLimits:
             radius = np.array([contact.patch_radius for contact in workcell.contacts])
             columns.append(load["pressure_shift"] / radius)
         if force:
-            columns.append(load["normal_force"] / force)
+            needed = load["normal_force"]
+            if self._limits.robust:
+                needed = np.maximum(needed, self._robust_anywhere(a, w))
+            columns.append(needed / force)
         return np.concatenate(columns, axis=1)
+
+    def _robust_anywhere(self, a: Array, w: Array) -> Array:
+        """(n, 2) robust forces, also of pads that do not face one another."""
+        p, workcell = self.points, self._model.workcell
+        path = (p.pose[:, :6], p.pose_first[:, :6], p.pose_second[:, :6])
+        motion = BoxMotion(*PathPoints(*path, a, w).motion)
+        commanded, leading = robust_model(workcell).hold(motion, workcell.uncertainty)
+        return np.stack([leading, commanded], axis=1)
 
     def linearise(self, ratios: Array, near: NDArray[np.bool_], a: Array, w: Array) -> PointRows:
         """Rows of the ratios near their limits, by forward differences in (u'', u'^2)."""

@@ -26,7 +26,7 @@ CASE_SIZES = {
 }
 """Parts of a case, in order: coefficients; radii of the patches [m]; mass [kg]; centre of mass in
 the box frame [m]; acceleration beside the motion's, world frame [m/s^2]; displacements of both
-pads along the tangents of contact 1 [m]."""
+pads along the tangents of contact 1 [m], of pads anywhere along their own."""
 
 SQUARED_SPEED_FLOOR = 1e-12
 """Of u'^2 [1/s^2]; what it adds to a force is far below rounding."""
@@ -41,7 +41,7 @@ def case_squeeze_function(workcell: Workcell) -> ca.Function:
     """
     motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = ca.MX.sym("case", CASE_SIZE)
-    friction, radius, *_ = _parts(case)
+    friction, radius, *_ = case_parts(case)
     held = least_squeeze(_balance_function(workcell)(*motion, case), friction, radius)
     names = ["pose", "rate", "second_rate", "case"]
     return ca.Function("case_squeeze", [*motion, case], [held.normal], names, ["normal_force"])
@@ -52,7 +52,7 @@ def case_gradient_function(workcell: Workcell) -> ca.Function:
     second_rate."""
     motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = ca.MX.sym("case", CASE_SIZE)
-    friction, radius, *_ = _parts(case)
+    friction, radius, *_ = case_parts(case)
     balance = _balance_function(workcell)(*motion, case)
     force = least_squeeze(balance, friction, radius, differentiable=True).normal
     slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in motion]).T)
@@ -70,7 +70,7 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     pose, first, second = path
     # A root has no slope at rest, what follows from its square has.
     motion = (pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w)
-    friction, radius, *_ = _parts(case)
+    friction, radius, *_ = case_parts(case)
     balance = _balance_function(workcell)(*motion, case)
     held = least_squeeze(balance, friction, radius, differentiable=True)
     slope = ca.densify(ca.jacobian(held.normal, ca.vertcat(*path, a, w)).T)
@@ -98,7 +98,7 @@ def case_slack_function(workcell: Workcell) -> ca.Function:
     """
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case, force, arm = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force"), ca.SX.sym("arm")
-    friction, radius, *_ = _parts(case)
+    friction, radius, *_ = case_parts(case)
     balance = _balance_function(workcell)(*motion, case)
     n_1 = force + arm * balance[0]
     names = ["pose", "rate", "second_rate", "case", "force", "arm"]
@@ -106,7 +106,8 @@ def case_slack_function(workcell: Workcell) -> ca.Function:
     return ca.Function("case_slack", [*motion, case, force, arm], slack, names, ["slack"])
 
 
-def _parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
+def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
+    """The parts of a case (15,), see `CASE_SIZES`."""
     ends = [0]
     for size in CASE_SIZES.values():
         ends.append(ends[-1] + size)
@@ -115,10 +116,30 @@ def _parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
 
 def _balance_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate and a case to what the contacts have to balance (9,)."""
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.SX.sym("case", CASE_SIZE)
+    *_, displacement = case_parts(case)
+    in_box = case_load_function(workcell)(*motion, case)
+    nominal = ca.DM(workcell.payload.centre_of_mass)
+    axes = ca.DM(workcell.contacts[0].T_box_pad[:3, :3])
+    arms = [
+        ca.mtimes(axes.T, ca.DM(contact.T_box_pad[:3, 3]) - nominal)
+        + ca.vertcat(displacement[2 * i : 2 * i + 2], 0.0)
+        for i, contact in enumerate(workcell.contacts)
+    ]
+    force, moment = (ca.mtimes(axes.T, part) for part in in_box)
+    return ca.Function(
+        "case_balance", [*motion, case], [balance_of(force, moment, (arms[0], arms[1]))]
+    )
+
+
+def case_load_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate and a case to the force and the moment about the nominal centre of
+    mass that the case asks for, (3,) each, box axes."""
     pose, rate, second = motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = ca.SX.sym("case", CASE_SIZE)
-    _, _, mass, centre, disturbance, displacement = _parts(case)
-    payload, contacts = workcell.payload, workcell.contacts
+    _, _, mass, centre, disturbance, _ = case_parts(case)
+    payload = workcell.payload
     turned = workcell.task.orientation
     rotation = rotation_matrix(turned, pose[3:])
     omega = angular_velocity(turned, pose[3:], rate[3:])
@@ -133,16 +154,5 @@ def _balance_function(workcell: Workcell) -> ca.Function:
     # About the nominal centre of mass; the true one's distance turns the force on a mass there.
     turning = required_moment(ca.SX(ca.DM(payload.inertia)), rotation, omega, alpha)
     moment = turning + ca.cross(ca.mtimes(rotation, centre - nominal), resultant(nominal))
-    axes = ca.DM(contacts[0].T_box_pad[:3, :3])
-    to_pad = ca.mtimes(rotation, axes).T
-    arms = [
-        ca.mtimes(axes.T, ca.DM(contact.T_box_pad[:3, 3]) - nominal)
-        + ca.vertcat(displacement[2 * i : 2 * i + 2], 0.0)
-        for i, contact in enumerate(contacts)
-    ]
-    balance = balance_of(
-        share * ca.mtimes(to_pad, resultant(centre)),
-        share * ca.mtimes(to_pad, moment),
-        (arms[0], arms[1]),
-    )
-    return ca.Function("case_balance", [*motion, case], [balance])
+    parts = [share * ca.mtimes(rotation.T, part) for part in (resultant(centre), moment)]
+    return ca.Function("case_load", [*motion, case], parts)

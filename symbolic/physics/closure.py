@@ -164,6 +164,12 @@ def tangential(state_size: int) -> list[int]:
     return [k for k in (1, 2, 5, 7, 8, 9, 10, 11) if k < state_size]
 
 
+def size_powers(state_size: int) -> tuple[int, ...]:
+    """With which power of a patch's size over another's a state's entries shrink, if the forces at
+    its corners are shared among those of the other: once for each axis along which they vary."""
+    return (0, 0, 0, 1, 1, 1, 2, 1, 2, 1, 2, 1)[:state_size]
+
+
 def _with_friction(states: Array, share: float) -> Array:
     lessened = states.copy()
     lessened[:, tangential(states.shape[1])] *= share

@@ -15,7 +15,13 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.physics.central_path import differentiable_least_effort, least_effort
-from symbolic.physics.closure import WRENCH_SIZE, closing_squeeze, state_to_box, tangential
+from symbolic.physics.closure import (
+    WRENCH_SIZE,
+    closing_squeeze,
+    size_powers,
+    state_to_box,
+    tangential,
+)
 from symbolic.physics.patches import Patch, least
 from symbolic.physics.rectangular_patch import RectangularPatch
 from symbolic.physics.round_patch import RoundPatch
@@ -38,6 +44,10 @@ BEYOND = 1e12
 
 MOMENT_ARM = 0.1
 """Of moments in the load's scale [m]: about half a payload, so that they count like forces."""
+
+
+WHOLE = ca.SX.ones(2)
+"""Patches of their own size."""
 
 
 class Grasp:
@@ -63,7 +73,7 @@ class Grasp:
             )
         self.robots = workcell.pad_robots
         self.patches = tuple(_patch(pad) for pad in pads)
-        self.cell_sizes = (("load", LOAD_SIZE), ("friction", 2))
+        self.cell_sizes: tuple[tuple[str, int], ...] = (("load", LOAD_SIZE), ("friction", 2))
         self._pads = pads
         self._squeeze = squeeze.states
         # The least states that balance a load, whether they lie within the cones or not.
@@ -80,11 +90,11 @@ class Grasp:
 
     def left(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """See `symbolic.physics.central_path.Program`."""
-        load, friction = cell
+        load, *sizes = cell
         rest = ca.mtimes(self._load_to_last, load)
         for i, (wrench, to_last) in enumerate(zip(wrenches, self._pads_to_last, strict=True)):
-            rest -= ca.mtimes(to_last, self.units(i, friction) * wrench)
-        return rest / self.units(len(self.patches) - 1, friction)
+            rest -= ca.mtimes(to_last, self.units(i, *sizes) * wrench)
+        return rest / self.units(len(self.patches) - 1, *sizes)
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """Half the sum of all squared forces."""
@@ -96,32 +106,48 @@ class Grasp:
     def start(self, cell: list[ca.SX]) -> list[ca.SX]:
         """The least states that balance the load, and as much of the squeeze as takes them into
         the cones."""
-        load, friction = cell
-        asked = [ca.mtimes(ca.DM(spread), load) for spread in self._spread]
-        asked = self._at(friction, asked)
-        given = self.squeezed(friction)
+        asked, given = self.asked(*cell), self.squeezed(*cell[1:])
         shares = [p.lowest(s, a) for p, s, a in zip(self.patches, given, asked, strict=True)]
         pressed = ca.fmax(-least(shares), 0.0) / START_SHARE + START_FLOOR
         return [a + pressed * s for a, s in zip(asked, given, strict=True)]
 
-    def squeezed(self, friction: ca.SX) -> list[ca.SX]:
-        """The squeeze to start from, as states at friction coefficients (2,) of the robots; it may
-        lie beyond the cones where they are far below the nominal ones."""
-        return self._at(friction, [ca.SX(ca.DM(state)) for state in self._squeeze])
+    def asked(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
+        """The least states that balance a load (6,), whether they lie within the cones or not."""
+        states = [ca.mtimes(ca.DM(spread), load) for spread in self._spread]
+        return self._at(states, friction, reach)
 
-    def units(self, i: int, friction: ca.SX) -> ca.SX:
+    def squeezed(self, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
+        """The squeeze to start from, as states at friction coefficients (2,) of the robots; it may
+        lie beyond the cones where they are far below the nominal ones.
+
+        Args:
+            reach: (2,) sizes of the robots' patches over their own.
+        """
+        return self._at([ca.SX(ca.DM(state)) for state in self._squeeze], friction, reach)
+
+    def squeeze_normals(self) -> Array:
+        """(2,) what each robot's pads press with in the squeeze."""
+        normals = np.array([state[0] for state in self._squeeze])
+        return np.bincount(np.array(self.robots), normals, 2).astype(float)
+
+    def units(self, i: int, friction: ca.SX, reach: ca.SX = WHOLE) -> ca.SX:
         """(6,) what the entries of pad i's scaled wrench are multiples of."""
-        mu, r = friction[self.robots[i]], self._pads[i].patch_radius
+        robot = self.robots[i]
+        mu, r = friction[robot], reach[robot] * self._pads[i].patch_radius
         return ca.vertcat(1.0, mu, mu, r, r, mu * r)
 
-    def _at(self, friction: ca.SX, states: list[ca.SX]) -> list[ca.SX]:
-        """States at the nominal friction with what they carry, at another."""
+    def _at(self, states: list[ca.SX], friction: ca.SX, reach: ca.SX) -> list[ca.SX]:
+        """States at the nominal friction and size with what they carry, at others: each corner's
+        force is shared among those of the other size."""
         moved = []
         for pad, robot, state in zip(self._pads, self.robots, states, strict=True):
-            factor = np.zeros(state.shape[0])
-            factor[tangential(state.shape[0])] = 1.0
-            by_friction = pad.friction / friction[robot]
-            moved.append(state * (ca.DM(factor) * by_friction + ca.DM(1.0 - factor)))
+            by_friction, by_reach = pad.friction / friction[robot], 1.0 / reach[robot]
+            size = state.shape[0]
+            held, by_size = tangential(size), size_powers(size)
+            factors = [
+                (by_friction if k in held else 1.0) * by_reach ** by_size[k] for k in range(size)
+            ]
+            moved.append(state * ca.vertcat(*factors))
         return moved
 
 

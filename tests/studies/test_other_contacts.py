@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,13 +11,15 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.front import FrontPolisher
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.robust.force import RobustModel
-from hybrid_opt.timing import TimingLimits
+from hybrid_opt.robust.force import BoxMotion, RobustModel
+from hybrid_opt.robust.path_force import RobustPath
+from hybrid_opt.timing import TimingLimits, TimingModel
 from hybrid_opt.timing.solve import time_path
 from studies.plain.collisions import PlainCollisionChecker
 from symbolic.errors import SettingsError
 from symbolic.physics.payload_load import load_function
 from symbolic.workcell.file import load
+from symbolic.workcell.records import Uncertainty
 from tests.symbolic.cells import ROOT, call
 
 WORKCELLS = ROOT / "studies" / "workcells"
@@ -62,11 +66,29 @@ def test_its_carry_is_feasible_certified_and_drivable_and_arms_carry_it(cell: Ce
 
 
 @pytest.mark.slow
+def test_robust_forces_keep_to_a_limit_and_hold_random_cases(cell: Cell) -> None:
+    unsure = replace(cell.workcell, uncertainty=Uncertainty(0.08, 0.05, np.full(3, 0.004), 0.002))
+    model, forces = TimingModel(unsure, 40), RobustModel(unsure)
+    still = BoxMotion(
+        *[np.tile(part, (1, 1)) for part in (unsure.task.waypoints[0].lower, *np.zeros((2, 6)))]
+    )
+    limit = 1.15 * float(forces.robust_force(still).peak.max())
+    timing = time_path(model, cell.initial, TimingLimits(force=limit, robust=True))
+    assert timing.ok, timing.reason
+    assert timing.carry is not None
+    force = forces.robust_force(timing.carry)
+    assert 0.98 * limit <= force.peak.max() <= 1.005 * limit
+    assert forces.check(timing.carry, force, 300, np.random.default_rng(1)).holds
+    planned = time_path(model, cell.initial, TimingLimits(force=limit))
+    assert planned.duration < timing.duration
+
+
+@pytest.mark.slow
 def test_what_knows_closed_forms_only_refuses_it(cell: Cell) -> None:
     with pytest.raises(SettingsError, match="face one another"):
         FrontPolisher(CandidateEvaluator(cell.workcell), PolishSettings())
     with pytest.raises(SettingsError, match="face one another"):
-        RobustModel(cell.workcell)
+        RobustPath(cell.workcell)
 
 
 @pytest.mark.parametrize("name", list(HOLDS))

@@ -19,25 +19,31 @@ TOLERANCES = (1e-11, 1e-10, 1e-9)
 SOLVED = ("Solved", "AlmostSolved")
 
 
-def least_wrenches(pads: tuple[Contact, ...], load: Array) -> Array:
+def least_wrenches(
+    pads: tuple[Contact, ...], load: Array, normal_weights: Array | None = None
+) -> Array:
     """(k, 6) forces and moments about the pads' centres, in their own axes, of least effort.
 
     Args:
         load: (6,) force and moment about the box frame's origin, box axes.
+        normal_weights: (k,) for the least sum of so weighted normal forces in place of the effort.
 
     Raises:
         AssertionError: what the solver says does not hold.
     """
     size = float(np.linalg.norm(load[:3]) + 10.0 * np.linalg.norm(load[3:]))
     # Forces may be a thousand times the load, where pads hardly close their grasp.
-    tries = (_solve(pads, load, size * factor) for factor in (1.0, 10.0, 100.0, 1000.0))
+    weights = normal_weights
+    tries = (_solve(pads, load, size * f, weights) for f in (1.0, 10.0, 100.0, 1000.0))
     rough = next(found for found in tries if found is not None)
-    found = _solve(pads, load, float(np.abs(rough[:, :3]).max()))
+    found = _solve(pads, load, float(np.abs(rough[:, :3]).max()), weights)
     assert found is not None
     return found
 
 
-def _solve(pads: tuple[Contact, ...], load: Array, size: float) -> Array | None:
+def _solve(
+    pads: tuple[Contact, ...], load: Array, size: float, normal_weights: Array | None
+) -> Array | None:
     """The same from a program whose unknowns are about one if forces are about `size`; None where
     the solver gives up."""
     blocks: list[Array] = []
@@ -71,6 +77,10 @@ def _solve(pads: tuple[Contact, ...], load: Array, size: float) -> Array | None:
         at += n
     arm = max(pad.patch_radius for pad in pads)
     total[3:] /= arm
+    cost = np.zeros(count)
+    if normal_weights is not None:
+        squares[:] = 0.0
+        cost = normal_weights @ np.array([block[2] for block in blocks])
     right = [load / size / np.repeat([1.0, arm], 3), *(np.zeros(len(row)) for row in rows)]
     options = clarabel.DefaultSettings()
     options.verbose = False
@@ -78,7 +88,7 @@ def _solve(pads: tuple[Contact, ...], load: Array, size: float) -> Array | None:
         options.tol_gap_abs = options.tol_gap_rel = options.tol_feas = tolerance
         solution = clarabel.DefaultSolver(
             sparse.csc_matrix(np.triu(squares)),
-            np.zeros(count),
+            cost,
             sparse.csc_matrix(np.vstack([total, *rows])),
             np.concatenate(right),
             [clarabel.ZeroConeT(6), *cones],

@@ -1,0 +1,104 @@
+"""What single cases ask for, compiled: of two round pads that face one another, and of pads
+anywhere."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.build import compile_function
+from codegen.cache import Cache
+from codegen.function import NumericFunction
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.physics.case_grasp import case_grasp_function, case_grasp_slack_function
+from symbolic.physics.case_squeeze import case_slack_function, case_squeeze_function
+from symbolic.physics.grasp_squeeze import GraspSqueeze
+from symbolic.workcell.checks import PATCH_OVERLAP, pads_beside
+from symbolic.workcell.records import Workcell
+
+
+class CaseForces:
+    """Least forces that hold single cases.
+
+    Attributes:
+        workcell: the cell.
+    """
+
+    def __init__(self, workcell: Workcell, cache: Cache | None = None) -> None:
+        """Load or build the functions of facing pads; those of others when first asked.
+
+        Raises:
+            SettingsError: some cases cannot be held, however hard the pads press.
+            DualArmError: a function cannot be built.
+        """
+        check_pads(workcell)
+        self.workcell, self._cache = workcell, cache
+        self._general: dict[int, tuple[NumericFunction, NumericFunction]] = {}
+        if workcell.has_facing_pads:
+            self._facing = [
+                compile_function(function(workcell), cache, lanes=0)
+                for function in (case_squeeze_function, case_slack_function)
+            ]
+
+    def least(self, motion: tuple[Array, ...], cases: Array, leader: int) -> Array:
+        """(m, 2) least normal forces [N]: what is to be commanded of one robot, and what the
+        leading one then presses with.
+
+        Args:
+            motion: poses and their time derivatives (m, 6) each.
+            cases: (m, 15).
+            leader: index of the robot whose force is not commanded.
+        """
+        function = self._functions(1 - leader)[0]
+        return function.batch(*motion, cases)["normal_force"]
+
+    def surely_held(
+        self, motion: tuple[Array, ...], cases: Array, force: Array, leader: int
+    ) -> NDArray[np.bool_]:
+        """(m,) whether a pressure that is known beforehand holds under commanded forces (m,) [N];
+        where not, another one still may."""
+        slack = self._functions(1 - leader)[1]
+        arm = (float(1 - leader),) if self.workcell.has_facing_pads else ()
+        found = slack.batch(*motion, cases, force, *arm)["slack"].ravel() > 0.0
+        return np.asarray(found, dtype=np.bool_)
+
+    def leading_share(self, leader: int) -> float:
+        """What the leading robot presses more for each newton more that is commanded."""
+        if self.workcell.has_facing_pads:
+            return 1.0
+        normals = self._squeeze_normals
+        return float(normals[leader] / normals[1 - leader])
+
+    @cached_property
+    def _squeeze_normals(self) -> Array:
+        return GraspSqueeze(self.workcell, 1).squeeze_normals()
+
+    def _functions(self, commanded: int) -> tuple[NumericFunction, NumericFunction]:
+        if self.workcell.has_facing_pads:
+            return self._facing[0], self._facing[1]
+        if commanded not in self._general:
+            first, second = (
+                compile_function(function(self.workcell, commanded), self._cache, lanes=0)
+                for function in (case_grasp_function, case_grasp_slack_function)
+            )
+            self._general[commanded] = first, second
+        return self._general[commanded]
+
+
+def check_pads(workcell: Workcell) -> None:
+    """Refuse pads that cannot hold whatever happens.
+
+    Raises:
+        SettingsError: some cases cannot be held, however hard both press.
+    """
+    if not workcell.has_facing_pads:
+        return  # a grasp that is not closed is refused where its squeeze is looked for
+    room = PATCH_OVERLAP * sum(contact.patch_radius for contact in workcell.contacts)
+    if pads_beside(workcell) >= room:
+        raise SettingsError(
+            f"the contacts lie {pads_beside(workcell):g} m beside one another; robust forces "
+            f"need less than {room:g} m, so that pressing harder holds whatever happens"
+        )

@@ -1,0 +1,64 @@
+"""Robust forces of pads that are not two round ones facing one another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hybrid_opt.robust.force import BoxMotion, RobustModel
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Uncertainty
+from tests.hybrid_opt.robust.test_force import at_rest
+from tests.symbolic.cells import ROOT
+
+SET = Uncertainty(0.08, 0.05, np.full(3, 0.004), 0.003, np.array([0.2, 0.0, 0.3]))
+NAMES = ("drum", "fork", "corner")
+
+
+@cache
+def model(name: str) -> RobustModel:
+    cell = load(ROOT / "studies" / "workcells" / f"{name}.toml")
+    return RobustModel(replace(cell, uncertainty=SET))
+
+
+def motion(name: str) -> BoxMotion:
+    """Around the cell's start pose, gently."""
+    task = model(name).workcell.task
+    rng, n = np.random.default_rng(2), 6
+    pose = np.tile(task.waypoints[0].lower, (n, 1)) + 0.05 * rng.normal(size=(n, 6))
+    return BoxMotion(pose, 0.2 * rng.normal(size=(n, 6)), 0.5 * rng.normal(size=(n, 6)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_random_case_needs_more_and_some_need_nearly_as_much(name: str) -> None:
+    moved = motion(name)
+    force = model(name).robust_force(moved)
+    assert (force.commanded > force.nominal[:, 1]).all()
+    check = model(name).check(moved, force, 400, np.random.default_rng(1))
+    assert check.holds
+    weaker = replace(force, commanded=0.85 * force.commanded)
+    assert not model(name).check(moved, weaker, 400, np.random.default_rng(1)).holds
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_price_grows_from_about_the_planned_force(name: str) -> None:
+    moved = at_rest()
+    price = model(name).price(moved, np.array([0.0, 0.5, 1.0]))
+    assert (np.diff(price, axis=0) > 0.0).all()
+    limit = 1.1 * price[2]
+    factor = model(name).largest_factor(moved, limit)
+    peak = model(name).price(moved, np.array([factor]))[0]
+    assert factor > 1.0
+    assert (peak / limit).max() == pytest.approx(1.0, rel=1e-3)
+
+
+def test_a_fork_and_a_pad_press_alike() -> None:
+    """Opposite normals: what the motion asks along them is the difference, all else is squeeze."""
+    force = model("fork").robust_force(at_rest(), Uncertainty(friction=0.1))
+    cell = model("fork").workcell
+    least = 9.81 * cell.payload.mass / (2.0 * 0.9 * cell.contacts[0].friction)
+    assert force.leading == pytest.approx(force.commanded, rel=2e-3)
+    assert force.commanded[0] >= least * (1.0 - 1e-6)
