@@ -106,18 +106,21 @@ def build(
     Raises:
         CodegenError: see `compile_function`.
     """
+    from codegen.source import operations
+
     compiler = find_compiler()
     if compiler is None:
         return _interpreted(functions)
     cache = cache or Cache()
     with ThreadPoolExecutor(jobs or available_cores()) as pool:
-        futures = []
-        for name, function in functions.items():
-            source = Source.of(function, lanes)
+        futures = {}
+        # The longest first: none is left to run alone in the end.
+        for name in sorted(functions, key=lambda name: -operations(functions[name])):
+            source = Source.of(functions[name], lanes)
             level = (levels or {}).get(name)
             level = default_level(source.own_bytes) if level is None else level
-            futures.append(pool.submit(compile_source, source, compiler, cache, level, rebuild))
-        built = [future.result() for future in futures]
+            futures[name] = pool.submit(compile_source, source, compiler, cache, level, rebuild)
+        built = [futures[name].result() for name in functions]
     reports = tuple(
         FunctionReport(
             name=name,

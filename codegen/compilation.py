@@ -30,13 +30,14 @@ class Source:
     @classmethod
     def of(cls, function: ca.Function, lanes: int) -> Source:
         """The C of a function, with so many evaluations of a batch side by side."""
-        from codegen.source import c_source, dense, operations
+        from codegen.source import c_source, dense, generated_c, operations
 
         densified = dense(function)
-        text = c_source(densified)
-        signature, count, own = Signature.of(densified), operations(function), len(text)
-        wide = c_source(densified, lanes)
-        return cls(signature, count, wide, own, None if wide == text else text)
+        generated = generated_c([densified])
+        text = c_source(densified, 1, generated)
+        wide = text if lanes == 1 else c_source(densified, lanes, generated)
+        signature, count = Signature.of(densified), operations(function)
+        return cls(signature, count, wide, len(generated), None if wide == text else text)
 
 
 def compile_source(

@@ -10,6 +10,7 @@ import casadi as ca
 
 from codegen.errors import CodegenError
 from codegen.lanes import lane_text
+from codegen.pieces import in_pieces
 from codegen.runtime import runtime
 from codegen.signature import Signature
 
@@ -37,11 +38,12 @@ def dense(function: ca.Function) -> ca.Function:
     )
 
 
-def c_source(function: ca.Function, lanes: int = 1) -> str:
+def c_source(function: ca.Function, lanes: int = 1, generated: str = "") -> str:
     """C text of a dense CasADi function: what CasADi generates, then the batch drivers.
 
     Args:
         function: any that CasADi can write as C.
+        generated: its `generated_c`, if that is there already.
         lanes: 1 for one evaluation at a time; otherwise batches are also evaluated in lanes, as
             many as given, or for 0 as many as suit the machine that compiles.
 
@@ -49,15 +51,16 @@ def c_source(function: ca.Function, lanes: int = 1) -> str:
         CodegenError: CasADi cannot write this function as C (a callback, an external solver).
     """
     include = "#include <math.h>\n"
-    generated, signature = generated_c([function]), Signature.of(function)
+    generated, signature = generated or generated_c([function]), Signature.of(function)
     in_lanes = None if lanes == 1 else lane_text(generated, "lanes")
+    generated = in_pieces(generated)
     before, after = [include, runtime("arithmetic.h")], [_filled(runtime("driver.c"), signature)]
     if in_lanes is not None:
         width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
         before += [runtime("one_lane.h"), width, runtime("lanes.h")]
         lane_driver = _filled(runtime("lane_driver.c"), signature)
         after += [
-            "\n#if DUAL_ARM_LANES > 1\n" + in_lanes.text + "#endif\n\n",
+            "\n#if DUAL_ARM_LANES > 1\n" + in_pieces(in_lanes.text) + "#endif\n\n",
             lane_driver.replace("@LANE_FUNCTION@", in_lanes.entry),
         ]
     # Our arithmetic comes after the library's declarations, which it shadows.

@@ -23,7 +23,7 @@ from hybrid_opt.polishing.kick import kicked
 from hybrid_opt.polishing.mirror import mirror_of
 from hybrid_opt.polishing.plan import Attempt, PlanState, aimed, points
 from hybrid_opt.polishing.point import PolishSolver, Solution, SolveStart
-from hybrid_opt.polishing.probing import Start, better_half, random_starts
+from hybrid_opt.polishing.probing import Start, halve, random_starts
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.run import Polisher, PolishRun
 from hybrid_opt.polishing.settings import PolishSettings
@@ -115,18 +115,19 @@ class ForceRun(PolishRun[Attempt]):
         probe = self._settings.probe
         count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
         count = min(2 * self._ahead, probe.middle_starts if objective is None else count)
+        if not count:
+            return
         k = self._archive.best(objective)[0]
         pool = [Start(self._archive.x[k], self._archive.objectives[k])]
-        if count:
-            pool += random_starts(self._evaluator, self._settings, count - 1, rng)
-        while count and pool:
-            reached = []
-            for start in pool:
-                self._most += 1
-                self._do([start.probe(objective, self._settings)])
-                outcome = self.outcomes[-1]
-                reached.append(Start(outcome.x, outcome.objectives))
-            pool = better_half(reached, objective)
+        pool += random_starts(self._evaluator, self._settings, count - 1, rng)
+
+        def solve(start: Start) -> Start:
+            self._most += 1
+            self._do([start.probe(objective, self._settings)])
+            outcome = self.outcomes[-1]
+            return Start(outcome.x, outcome.objectives, spent=outcome.status != "accepted")
+
+        halve(pool, objective, solve)
 
     def _fill(self) -> None:
         """Attempts between the ends, until the front is even or no side of a gap is left."""

@@ -7,6 +7,7 @@ halving, Jamieson and Talwalkar 2016). Everything that is reached enters the arc
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +22,12 @@ from symbolic.array import Array
 
 @dataclass(frozen=True)
 class Start:
-    """A feasible decision vector (n_var,) and its objectives (2,)."""
+    """A feasible decision vector (n_var,) and its objectives (2,); spent where a solve from it came
+    no further, as would every other."""
 
     x: Array
     objectives: Array
+    spent: bool = False
 
     def value(self, objective: int | None) -> float:
         """The objective that is aimed at, or the sum of both."""
@@ -50,6 +53,13 @@ def random_starts(
     found = evaluator.evaluate(candidates)
     chosen = np.flatnonzero(found.feasible)[:count]
     return [Start(candidates[k], found.objectives[k]) for k in chosen]
+
+
+def halve(pool: list[Start], objective: int | None, solve: Callable[[Start], Start]) -> None:
+    """Solve from all starts, then from the better half of what was reached, until one is left."""
+    while pool:
+        reached = [start if start.spent else solve(start) for start in pool]
+        pool = better_half(reached, objective)
 
 
 def better_half(reached: list[Start], objective: int | None) -> list[Start]:

@@ -16,6 +16,10 @@ from symbolic.smooth.keys import ClosureKey, Order
 
 ORDERS: tuple[Order, ...] = ("first", "second")
 
+CLOSURE_LEVELS = {ClosureKey(arm, order).name: 1 for arm in (0, 1) for order in ORDERS}
+"""Optimisation levels of the compiler: as for the rows at places of the same cell, whose libraries
+then serve both."""
+
 
 @dataclass(frozen=True)
 class DrivenFunctions:
@@ -44,7 +48,7 @@ def driven_functions_of(compiled: CompiledCell) -> DrivenFunctions:
             functions |= {key.name: f for key, f in closure_functions(model, arm).items()}
         return functions
 
-    built = compiled.functions("driven", make, lanes=0)
+    built = compiled.functions("driven", make, str(CLOSURE_LEVELS), levels=CLOSURE_LEVELS, lanes=0)
     keys = [ClosureKey(arm, order) for arm in (0, 1) for order in ORDERS]
     return DrivenFunctions(
         built[DRIVEN_FIRST], built[DRIVEN_SECOND], {key: built[key.name] for key in keys}

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.polishing.probing import Start, better_half, random_starts
+from hybrid_opt.polishing.probing import Start, better_half, halve, random_starts
 from hybrid_opt.polishing.settings import PolishSettings
 from tests.hybrid_opt.polishing.test_front import evaluator, polished
 
@@ -36,6 +36,20 @@ def test_the_better_half_is_no_worse_than_the_rest(
     rest = [start for start in starts if all(start is not kept for kept in half)]
     for kept in half:
         assert all(kept.value(objective) <= other.value(objective) for other in rest)
+
+
+def test_starts_that_came_no_further_are_not_solved_again_and_stay_in_the_running() -> None:
+    solved: list[float] = []
+
+    def solve(start: Start) -> Start:
+        value = start.value(0)
+        solved.append(value)
+        gain = 0.0 if value == 1.0 else 0.5
+        return Start(start.x, start.objectives - gain, spent=gain == 0.0)
+
+    pool = [Start(np.empty(0), np.array([value, 0.0])) for value in (1.0, 4.0, 2.0, 3.0)]
+    halve(pool, 0, solve)
+    assert solved == [1.0, 4.0, 2.0, 3.0, 1.5]
 
 
 def test_a_polish_probes_and_takes_in_what_it_reaches_dominated_or_not() -> None:
