@@ -10,10 +10,14 @@ import numpy as np
 from hybrid_opt.evaluate.explanation import missing_reach
 from hybrid_opt.proposing.holding import HoldQuery, HoldSearch
 from hybrid_opt.proposing.judge import PoseJudge
+from hybrid_opt.proposing.kinematics import possible_spins, spun
 from hybrid_opt.proposing.pairing import Pair
 from symbolic.array import Array
 from symbolic.physics.pose import box_placement
 from symbolic.robot.urdf import arm_model
+
+POSTURES = 6
+"""From which the reach that is missing is looked for with each spin."""
 
 TOLD = 3
 """So many pairs or joints are named."""
@@ -41,7 +45,7 @@ def holds_missing(query: HoldQuery, searches: Sequence[HoldSearch]) -> str:
 def _arm_missing(query: HoldQuery, arm: int, search: HoldSearch) -> str:
     robot = query.workcell.robots[arm]
     if not search.reached:
-        missing = min(_missing(query, arm, pose) for pose in (query.start,))
+        missing = _missing(query, arm, query.start)
         return f"{robot.name} lacks {missing:.3f} m to its contact at the start"
     names = list(arm_model(robot).names)[1:]
     if not search.within:
@@ -68,14 +72,19 @@ def _arm_missing(query: HoldQuery, arm: int, search: HoldSearch) -> str:
 
 
 def _missing(query: HoldQuery, arm: int, pose: Array) -> float:
-    """Reach that an arm lacks to a pose, from several postures [m]."""
+    """Reach that an arm lacks to a pose with any spin, from several postures each [m]."""
     robot, contact = query.workcell.robots[arm], query.workcell.contacts[arm]
     rng = np.random.default_rng(0)
     low = np.maximum(robot.position_lower, -np.pi)
     high = np.minimum(robot.position_upper, np.pi)
-    postures = rng.uniform(low, high, (8, len(low)))
+    contacts = [spun(contact, spin) for spin in possible_spins(contact, query.spins)]
+    postures = rng.uniform(low, high, (len(contacts), POSTURES, len(low)))
     T_world_box = box_placement(query.workcell.task.orientation, pose)
-    return min(missing_reach(robot, contact, T_world_box, q) for q in postures)
+    return min(
+        missing_reach(robot, spun_contact, T_world_box, q)
+        for spun_contact, some in zip(contacts, postures, strict=True)
+        for q in some
+    )
 
 
 def no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
