@@ -64,7 +64,7 @@ class ArmSettings:
     time_step: float = 5e-4
     control_period: float = 1e-3
     contact_time: float = 0.01
-    rim_points: int = 8
+    rim_points: int = 32
     noslip_iterations: int = 30
     slip: float = 1e-3
     arrival: float = 5e-3

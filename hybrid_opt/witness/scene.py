@@ -59,7 +59,7 @@ class SimulationSettings:
 
     time_step: float = 2e-4
     contact_time: float = 0.01
-    rim_points: int = 8
+    rim_points: int = 32
     noslip_iterations: int = 30
     tilt_stiffness: float | None = None
     settle: float = 0.15
