@@ -168,6 +168,9 @@ def tangent_rows(value: Array, gradient: Array, z: Array) -> PointRows:
 def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> PointRows:
     """Linearisation of value <= 1 about z, kept satisfiable at rest.
 
+    Where it would forbid rest, which is truly allowed, it follows the value by u'' and the chord to
+    rest by u'^2: a row whose bound is raised instead cuts off nothing, not even z.
+
     Args:
         value: (n, k) at z.
         gradient: (n, k, 2) by (u'', u'^2).
@@ -175,8 +178,15 @@ def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> 
         z: (n, 2) the point of linearisation.
     """
     lines = tangent_rows(value, gradient, z)
-    # Rest is truly allowed; a linearisation from far away must not forbid it.
-    return PointRows(lines.alpha, lines.beta, np.maximum(lines.bound, (1.0 - at_rest) / 2.0))
+    least = (1.0 - at_rest) / 2.0
+    a, w = z[:, :1], z[:, 1:]
+    chord = (value - at_rest - lines.alpha * a) / np.maximum(w, 1e-300)
+    forbids = (lines.bound < least) & (w > 0.0)
+    return PointRows(
+        lines.alpha,
+        np.where(forbids, chord, lines.beta),
+        np.where(forbids, 1.0 - at_rest, np.maximum(lines.bound, least)),
+    )
 
 
 def _unit(vectors: Array) -> Array:
