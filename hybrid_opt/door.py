@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,7 @@ def polish(
     *,
     rng: np.random.Generator,
     settings: PolishSettings | None = None,
+    paths: Sequence[Carry | Array] = (),
 ) -> Front:
     """Improve a front: both peak forces with an interior-point method, or, under the time law
     'optimal', path and speed profile together.
@@ -65,13 +66,30 @@ def polish(
     Args:
         rng: spreads the starts of some attempts.
         settings: see `hybrid_opt.polishing.settings`; None for the usual ones of the time law.
+        paths: carries of the cell whose paths are known to be good, or their decision vectors,
+            with or without a force limit; under the time law 'optimal' only. The front is nowhere
+            behind them. The hand-made path always takes part.
 
     Raises:
-        SettingsError: the cell's objectives are not those of the polish.
+        SettingsError: the cell's objectives are not those of the polish, or a path does not fit.
     """
-    settings = settings or usual_settings(cell.workcell.task.time_law)
+    task = cell.workcell.task
+    settings = settings or usual_settings(task.time_law)
     polisher = polisher_for(cell.evaluator, settings, cell.polish_functions)
-    done = polisher.polish(front.x, rng)
+    known = [np.asarray(_decision(path), dtype=float) for path in paths]
+    if known and task.time_law != "optimal":
+        raise SettingsError(
+            f"known paths take part in polishes of drivable carries only; the time law is "
+            f"'{task.time_law}': polish the front of Cell.drivable()"
+        )
+    for path in known:
+        if path.shape not in ((task.n_path,), (task.n_var,)) or not np.isfinite(path).all():
+            raise SettingsError(
+                f"a known path of shape {path.shape}; needs {task.n_path} finite numbers, or "
+                f"{task.n_var} with a force limit"
+            )
+    beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
+    done = polisher.polish(front.x, rng, paths=beside)
     title = f"{front.title}, polished"
     return Front(cell, title, done.x, done.objectives, front.evaluations, done)
 

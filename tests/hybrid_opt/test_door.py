@@ -43,6 +43,11 @@ def polished() -> ho.Front:
     return ho.polish(cell(), front(), rng=rng, settings=ho.PolishSettings(attempts=2))
 
 
+def test_known_paths_are_refused_where_they_take_no_part() -> None:
+    with pytest.raises(SettingsError, match=r"Cell\.drivable\(\)"):
+        ho.polish(cell(), front(), rng=np.random.default_rng(1), paths=[cell().initial])
+
+
 def test_everything_that_is_promised_is_there() -> None:
     assert set(ho.__all__) <= set(dir(ho))
     for name in ho.__all__:
