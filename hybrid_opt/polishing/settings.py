@@ -202,7 +202,10 @@ class DrivableSettings:
 
     Attributes:
         first_radius: of the box of trust, in halves of the ranges of the waypoints.
-        rounds: steps of one point at most.
+        rounds: steps of one point, unless it ends before.
+        worth: gain of the later half of them, as a share of what is minimised, with which a point
+            goes on for two turns more, and again.
+        most_rounds: with such gains.
         least_radius: of the box of trust, below which a point is left.
         stationary: residual of stationarity and of complementarity at which a point counts as
             optimal.
@@ -222,8 +225,10 @@ class DrivableSettings:
     """
 
     first_radius: float = 0.3
-    rounds: int = 16
-    least_radius: float = 1e-5
+    rounds: int = 24
+    worth: float = 5e-4
+    most_rounds: int = 48
+    least_radius: float = 1e-4
     stationary: float = 1e-4
     feasible: float = 5e-3
     noise: float = 5e-4
@@ -234,7 +239,7 @@ class DrivableSettings:
     steadiness: float = 1.0
     corrections: int = 3
     bend: float = 0.01
-    turn: int = 4
+    turn: int = 3
     members: int = 24
 
 

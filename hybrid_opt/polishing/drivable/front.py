@@ -1,11 +1,12 @@
 """The polish of a whole front of drivable carries: duration against force.
 
 Every attempt is at one force limit. It starts from the path that is driven best there of all that
-are known, the hand-made one among them, so that what one attempt finds serves the others. The first
-is a tournament of starts in several basins, because a search's front often lies in one. Then come
-points of the given front, evenly spread; both ends and the widest gaps, and where these are narrow,
-points again from other paths. In the end the best known path becomes a point at force limits all
-over their range.
+are known, so that what one attempt finds serves the others, from others in basins of their own and
+from the hand-made one; a few rounds tell which of them goes on. The first attempt is a tournament
+of more starts, because a search's front often lies in one basin. Then come a gentle force, points
+of the given front, evenly spread; both ends and the widest gaps, and where these are narrow, points
+again from other paths. In the end the best known path becomes a point at force limits all over
+their range.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS
-from hybrid_opt.polishing.archive import GrowingFront
+from hybrid_opt.polishing.archive import LEAST_SPAN, GrowingFront
 from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.drivable.certified import second_opinion
 from hybrid_opt.polishing.drivable.point import DrivableSolver, DriveStart
 from hybrid_opt.polishing.drivable.tilts import turned
 from hybrid_opt.polishing.drivable.timed import STILL, Goal
-from hybrid_opt.polishing.drivable.tournament import best_of
+from hybrid_opt.polishing.drivable.tournament import SAME, best_of, distance
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
@@ -38,6 +39,12 @@ from symbolic.workcell.decision import initial_decision
 FAST = 0.75
 """Where between the least and the front's largest force limit the tournament is: basins differ most
 where carries are fast."""
+
+LATER = 1.15
+"""Paths that are driven slower than this times the fastest are no rivals of it."""
+
+RIVALS = 3
+"""Basins at most that an attempt starts in."""
 
 COMPARED = 8
 """Force limits at which paths from beside the front are compared."""
@@ -127,7 +134,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._paths, self._others, self._largest = paths, paths[:0], self._range[0]
 
     def all(self, rng: np.random.Generator) -> None:
-        """A tournament, the hand-made path, the front's points, ends and gaps, other starts, while
+        """A tournament, a gentle force, the front's points, ends and gaps, other starts, while
         attempts last; then the best known paths all over the range of forces."""
         rows = self._archive.rows()
         count = min(len(rows), ceil(self._settings.attempts * self._settings.front.own_share))
@@ -137,9 +144,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._largest = max(*map(self._force, rows), self._range[0])
         self._others = self._leading(np.vstack([self._hand_made, self._paths]))
         self._tournament(self._range[0] + FAST * (self._largest - self._range[0]))
-        # Where carries are slow, the nearest basin may not be that of the paths driven best so far.
-        gentle = self._between(self._range[0], self._largest)
-        self._attempt("extreme", self._hand_made, gentle)
+        self._at("extreme", self._between(self._range[0], self._largest))
         for force in forces:
             self._at("point", force)
         self._at("extreme", self._range[1])
@@ -163,9 +168,28 @@ class DriveRun(PolishRun[DriveAttempt]):
         return still + float(np.sqrt((first - still) * (second - still)))
 
     def _at(self, aim: Aim, force: float) -> None:
-        """An attempt at a force limit from the path that is driven best there."""
+        """An attempt at a force limit from the path that is driven best there, and from others in
+        basins of their own, the hand-made one among them: which is the best is seen only after some
+        rounds, and where carries are slow, it is seldom the one of those driven best so far."""
+        rivals = self._rivals(force)
+        starts = tuple(np.append(path, force) for path in rivals)
+        self._attempt(aim, rivals[0], force, starts if len(starts) > 1 else ())
+
+    def _rivals(self, force: float) -> list[Array]:
+        """Known paths (n_path,) far from one another by how fast they are driven, after the best
+        one the hand-made."""
         paths, durations = self._driven(force)
-        self._attempt(aim, paths[int(np.argmin(durations))], force)
+        half, best = self._solver.half, paths[int(np.argmin(durations))]
+        chosen = [best]
+        if distance(best, self._hand_made, half) > SAME:
+            chosen.append(self._hand_made)
+        for k in np.argsort(durations, kind="stable"):
+            away = min(distance(paths[k], path, half) for path in chosen)
+            if len(chosen) == RIVALS or not durations[k] <= LATER * durations.min():
+                break
+            if away > SAME:
+                chosen.append(paths[k])
+        return chosen
 
     def _elsewhere(self, rng: np.random.Generator) -> None:
         """An attempt at the force limit of a member of the front, from another known path."""
@@ -237,8 +261,9 @@ class DriveRun(PolishRun[DriveAttempt]):
         rows = [k for k in self._archive.rows() if self._archive.polished[k]]
         if len(rows) < 2:
             rows = self._archive.rows()
-        span = self._archive.span()
-        values = np.array([self._archive.objectives[k] for k in rows]) / span
+        # By shares: a second matters less to a slow carry than to a fast one.
+        values = np.log([self._archive.objectives[k] for k in rows])
+        values /= np.maximum(np.ptp(values, axis=0), LEAST_SPAN)
         areas = np.abs(np.prod(np.diff(values, axis=0), axis=1))
         for gap in np.argsort(-areas, kind="stable").tolist():
             if areas[gap] <= self._settings.front.least_gap**2:

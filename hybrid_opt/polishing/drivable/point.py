@@ -17,7 +17,7 @@ import numpy as np
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.constraints.active import ActiveSet
 from hybrid_opt.polishing.constraints.kind import Surroundings
-from hybrid_opt.polishing.constraints.learned import Learned
+from hybrid_opt.polishing.drivable.memory import Memory
 from hybrid_opt.polishing.drivable.proposal import Proposal, Proposer, Reached
 from hybrid_opt.polishing.drivable.timed import Goal, PathJudge, TimedPath, force_range
 from hybrid_opt.polishing.functions import PolishFunctions
@@ -91,7 +91,7 @@ class DrivableSolver:
     def solve(self, start: DriveStart) -> Solution:
         """Improve towards the goal, in as many rounds as the settings allow."""
         climb = Climb(self, start.x, start.goal, start.radius)
-        climb.go_on(self.settings.drivable.rounds)
+        climb.finish()
         return climb.solution
 
 
@@ -113,11 +113,14 @@ class Climb:
         x = np.clip(x, self._task.lower, self._task.upper)
         timed = solver.judge.timed(x[: self._task.n_path], self._goal)
         x = self._with_force(x, timed)
-        learned = Learned(solver.active, solver.settings.stricter)
+        memory = Memory(solver.active, solver.settings.stricter, solver.half)
         carry, level = solver.reader.read(x), timed.level(self._goal)
-        self._best = Reached(timed, timed.squared, x, carry, level, learned)
+        self._best = Reached(timed, timed.squared, x, carry, level, memory)
         self.solution = Solution(x, usable=bool(np.isfinite(timed.duration)))
         self.last_gain = 0.0
+        # A start, and what a step came to, may be nearer to obstacles than is wanted. To get away
+        # from them must not cost what no step can bring.
+        self._lenient = True
 
     @property
     def x(self) -> Array:
@@ -153,15 +156,25 @@ class Climb:
         else:
             solution.message = "the box of trust is spent" if self.ended else "out of rounds"
 
+    def finish(self) -> None:
+        """The rounds of a point, and more of them while these bring much."""
+        driven = self._driven
+        self.go_on(driven.rounds)
+        most = self.solution.rounds - driven.rounds + driven.most_rounds
+        while not self.ended and self.last_gain > driven.worth * self.level:
+            if self.solution.rounds >= most:
+                break
+            self.go_on(2 * driven.turn)
+
     def _round(self) -> None:
         solution, best = self.solution, self._best
-        lenient = solution.rounds == 1
-        found = self._solver.proposer.step(best, self._goal, self._radius, lenient)
+        found = self._solver.proposer.step(best, self._goal, self._radius, self._lenient)
         if found is None:
             self._radius *= 0.25
             return
         solution.iterations += 1
         solution.residuals = found.residuals
+        self._best.memory.press(found.pressing)
         solution.rows = sum(isinstance(row, PlaceRow) for row in found.required)
         if self._is_optimal(solution.residuals):
             solution.converged = True
@@ -187,19 +200,21 @@ class Climb:
         # What the timing rounds off may hide a small gain, but must not add up.
         tiny = found.gain <= driven.noise
         kept = after <= best.lowest * (1.0 + driven.noise)
-        if gain < 0.1 * found.gain and not (tiny and kept):
+        self._lenient = gain < 0.1 * found.gain and not (tiny and kept)
+        if self._lenient:
             return 0.5 * min(radius, step) if np.isfinite(after) else 0.25 * min(radius, step)
         x = self._with_force(self._moved(start, found.d), timed)
         carry = self._solver.reader.read(x)
         violated = self._solver.active.violated(carry, best.carry, found.required)
         if violated or not carry.is_followed:
-            learned = best.learned.refuse(carry, best.carry, violated, found.required)
+            path = x[: self._task.n_path]
+            learned = best.memory.refuse(carry, best.carry, path, violated, found.required)
             return radius if learned and carry.is_followed else 0.5 * min(radius, step)
         squared = found.squared if step <= driven.newton else timed.squared
         self._take(x, timed, carry, squared)
         if gain > found.gain and not tiny:
             self._lengthen(start, found)
-        best.learned.move()
+        best.memory.move(step <= driven.newton)
         if gain > 0.7 * found.gain and step > 0.9 * radius:
             return min(2.0 * radius, self._solver.settings.trust.largest)
         return radius if gain > 0.3 * found.gain or tiny else 0.5 * radius

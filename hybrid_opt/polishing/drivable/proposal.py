@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.polishing.constraints.learned import Learned
 from hybrid_opt.polishing.drivable import quadratic
 from hybrid_opt.polishing.drivable.bordered import BorderedMatrix
 from hybrid_opt.polishing.drivable.functions import DrivenFunctions
 from hybrid_opt.polishing.drivable.interior import QuadraticProgram
 from hybrid_opt.polishing.drivable.intervals import IntervalGrid, IntervalValues
+from hybrid_opt.polishing.drivable.memory import Memory
 from hybrid_opt.polishing.drivable.program import Iterate, JointProgram, Linear, Multipliers
 from hybrid_opt.polishing.drivable.timed import Goal, TimedPath
 from hybrid_opt.polishing.layout import PlaceRow, Row
@@ -25,11 +25,7 @@ from hybrid_opt.polishing.placed_carry import PlacedCarry
 from hybrid_opt.polishing.program import SmoothCell, place_values
 from hybrid_opt.polishing.residuals import Residuals
 from hybrid_opt.polishing.settings import DrivableSettings
-from hybrid_opt.polishing.targets import pascoletti_serafini
 from symbolic.array import Array
-
-ANY_TARGET = pascoletti_serafini(np.zeros(2), np.ones(2))
-"""Geometric constraints do not look at what is aimed at."""
 
 LEAST_SQUARED, LARGEST_SQUARED = 0.9, 3.0
 """How far a squared speed may fall and rise in a step, as shares of it."""
@@ -44,7 +40,7 @@ class Reached:
     x: Array
     carry: PlacedCarry
     lowest: float
-    learned: Learned
+    memory: Memory
 
 
 @dataclass(frozen=True)
@@ -57,6 +53,12 @@ class _Found:
     def active(self, negligible: float) -> NDArray[np.bool_]:
         """(rows but the duration's,) which ones have a multiplier."""
         return np.asarray(self.step.rows[: len(self.linear.b)] > negligible)
+
+    def pressing(self, program: JointProgram, negligible: float) -> list[PlaceRow]:
+        """Geometric rows with a multiplier."""
+        first = len(self.linear.point)
+        has = self.active(negligible)[first : first + len(program.place_rows)]
+        return [row for row, own in zip(program.place_rows, has, strict=True) if own]
 
     def multipliers(self, program: JointProgram, negligible: float) -> Multipliers:
         """Of the unscaled rows; negligible ones of the timing are none."""
@@ -76,6 +78,7 @@ class Proposal:
     squared: Array
     gain: float
     required: dict[Row, float]
+    pressing: list[PlaceRow]
     residuals: Residuals
 
 
@@ -98,7 +101,7 @@ class Proposer:
 
     def step(self, best: Reached, goal: Goal, radius: float, lenient: bool) -> Proposal | None:
         """A step within the box; None where there is none."""
-        program, required = self._program(best, goal, lenient)
+        program, required = self._program(best, goal, radius, lenient)
         box = self._box(best, goal, radius)
         chosen = program.near()
         steady = np.zeros(program.n)
@@ -130,9 +133,9 @@ class Proposer:
         d = second.step.d
         squared = best.squared.copy()
         squared[1:-1] *= 1.0 + d[program.speeds]
-        return Proposal(
-            d[: program.n_path], squared, max(program.gain(d), 0.0), required, residuals
-        )
+        gain = max(program.gain(d), 0.0)
+        pressing = second.pressing(program, self._driven.negligible)
+        return Proposal(d[: program.n_path], squared, gain, required, pressing, residuals)
 
     def _step(
         self,
@@ -165,9 +168,10 @@ class Proposer:
         return _Found(step, linear)
 
     def _program(
-        self, best: Reached, goal: Goal, lenient: bool
+        self, best: Reached, goal: Goal, radius: float, lenient: bool
     ) -> tuple[JointProgram, dict[Row, float]]:
-        required = best.learned.required(best.carry, ANY_TARGET, lenient)
+        path = best.x[: self._task.n_path]
+        required = best.memory.required(best.carry, path, radius, lenient)
         listed = sorted(
             (row for row in required if isinstance(row, PlaceRow)),
             key=lambda row: (repr(row.constraint), row.place),

@@ -50,7 +50,7 @@ def functions() -> PolishFunctions:
 def polisher(rounds: int = 40) -> DrivablePolisher:
     """Of the drivable rack."""
     settings = PolishSettings(
-        attempts=3, drivable=DrivableSettings(rounds=rounds, turn=2, members=8)
+        attempts=3, drivable=DrivableSettings(rounds=rounds, most_rounds=rounds, turn=2, members=8)
     )
     return DrivablePolisher(evaluator(), settings, functions())
 

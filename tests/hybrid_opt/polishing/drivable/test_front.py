@@ -7,8 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+import hybrid_opt as ho
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.objectives import duration_unit
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, duration_unit
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.drivable.front import DrivablePolisher
 from hybrid_opt.polishing.drivable.point import Climb
@@ -88,7 +89,7 @@ def test_known_paths_take_part() -> None:
     assert evaluator().evaluate(climb.x).feasible[0]
     sunk = known.copy()
     sunk[0, [2, 8, 14]] -= 0.2
-    settings = DrivableSettings(rounds=1, turn=1, members=4)
+    settings = DrivableSettings(rounds=1, most_rounds=1, turn=1, members=4)
     owner = DrivablePolisher(
         evaluator(), PolishSettings(attempts=1, drivable=settings), functions()
     )
@@ -98,6 +99,24 @@ def test_known_paths_take_part() -> None:
     assert (fastest(front.x[:, :-1], forces) <= fastest(known, forces) * (1.0 + 1e-9)).all()
     alone = owner.polish(starts(), rng(0), paths=known)
     np.testing.assert_array_equal(alone.x, front.x)
+
+
+def test_they_do_so_at_the_front_door() -> None:
+    """Given as decision vectors, with a force limit or without."""
+    settings = PolishSettings(
+        attempts=1, drivable=DrivableSettings(rounds=1, most_rounds=1, turn=1, members=2)
+    )
+    known, rng = tilted(55.0), np.random.default_rng
+    owner = DrivablePolisher(evaluator(), settings, functions())
+    wanted = owner.polish(starts(), rng(0), paths=known[None, :-1])
+    cell = ho.Cell(drivable_rack(), DRIVABLE_OBJECTIVES)
+    found = evaluator().evaluate(starts())
+    front = ho.Front(cell, "two", starts(), found.objectives, found)
+    for path in (known, known[:-1]):
+        polished = ho.polish(cell, front, rng=rng(0), settings=settings, paths=[path])
+        np.testing.assert_array_equal(polished.x, wanted.x)
+    with pytest.raises(SettingsError, match=r"shape \(5,\); needs 18 finite numbers"):
+        ho.polish(cell, front, rng=rng(0), paths=[known[:5]])
 
 
 def test_an_empty_front_stays_empty() -> None:

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from hybrid_opt.polishing.drivable.certified import second_opinion
-from hybrid_opt.polishing.drivable.point import DriveStart
+from hybrid_opt.polishing.drivable.point import Climb, DrivableSolver, DriveStart
 from hybrid_opt.polishing.drivable.timed import DriveAim, Goal
 from hybrid_opt.polishing.point import Solution
+from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.timing import TimingLimits, TimingModel, time_path
-from tests.hybrid_opt.polishing.drivable.cells import evaluator, polisher, start
+from tests.hybrid_opt.polishing.drivable.cells import evaluator, functions, polisher, start
 
 RADIUS = 0.3
 
@@ -50,6 +51,26 @@ def test_an_answer_is_nearly_stationary() -> None:
     solution = solved("duration", 52.0)
     assert solution.residuals.stationarity < 5e-3
     assert solution.residuals.feasibility < 2e-2
+
+
+def test_most_points_end_stationary() -> None:
+    """In what is recomputed from the program, whichever way they came there."""
+    forces = (50.0, 51.0, 53.0)
+    residuals = [
+        polisher().drivable.solve(DriveStart(start(f), Goal("duration", f), RADIUS)).residuals
+        for f in forces
+    ]
+    worst = sorted(max(r.stationarity, r.complementarity) for r in residuals)
+    assert worst[1] <= 1e-4
+
+
+@pytest.mark.parametrize(("worth", "goes_on"), [(1.0, False), (1e-6, True)])
+def test_a_point_goes_on_while_that_brings_much(worth: float, goes_on: bool) -> None:
+    driven = DrivableSettings(rounds=2, worth=worth, turn=1, most_rounds=5)
+    solver = DrivableSolver(evaluator(), functions(), PolishSettings(drivable=driven))
+    climb = Climb(solver, start(52.0), Goal("duration", 52.0), RADIUS)
+    climb.finish()
+    assert 3 <= climb.solution.rounds <= 6 if goes_on else climb.solution.rounds == 2
 
 
 def test_least_force_and_least_duration_are_two_sides_of_one_front() -> None:
