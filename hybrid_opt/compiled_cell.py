@@ -15,7 +15,7 @@ from symbolic.workcell.records import Workcell
 if TYPE_CHECKING:
     import casadi as ca
 
-    from symbolic.cell_model import CellModel
+    from symbolic.cell_model import CellBodies, CellModel
 
 
 class CompiledCell:
@@ -58,6 +58,20 @@ class CompiledCell:
         from symbolic.cell_model import build_cell_model
 
         return build_cell_model(self.workcell) if self._given is None else self._given
+
+    @cached_property
+    def bodies(self) -> CellBodies:
+        """Arms and bodies: the model where it is known, else without start postures.
+
+        Raises:
+            DualArmError: they cannot be read.
+        """
+        known = vars(self).get("model", self._given)
+        if known is not None:
+            return known
+        from symbolic.cell_model import build_cell_bodies
+
+        return build_cell_bodies(self.workcell)
 
     @property
     def is_identified(self) -> bool:

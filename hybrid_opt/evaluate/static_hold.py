@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hybrid_opt.per_workcell import kept_per_workcell
 from symbolic.array import Array
 from symbolic.physics.payload_load import load_function
 from symbolic.workcell.records import Workcell
@@ -17,8 +18,8 @@ class StaticHold:
     """A level box at rest.
 
     Attributes:
-        normal_force: (2,) normal force of each robot [N].
-        contact_force: (2,) magnitude of each robot's whole force [N].
+        normal_force: (2,) normal force of each robot [N], read-only.
+        contact_force: (2,) magnitude of each robot's whole force [N], read-only.
         payload_limit: payload at which a robot's whole force reaches its reference force [kg].
     """
 
@@ -28,16 +29,25 @@ class StaticHold:
 
 
 def static_hold(workcell: Workcell) -> StaticHold:
-    """Forces of the payload held level and still.
+    """Forces of the payload held level and still; the same record for the same workcell.
 
     With equal friction coefficients mu the normal forces are m g / (2 mu) each, and the whole
     forces (m g / 2) sqrt(1 + 1 / mu^2).
     """
+    return _kept(workcell)
+
+
+def _static_hold(workcell: Workcell) -> StaticHold:
     function = load_function(workcell)
     outputs = function(pose=np.zeros(6), rate=np.zeros(6), second_rate=np.zeros(6))
     normal = np.array(outputs["normal_force"], dtype=float).reshape(2)
     whole = np.linalg.norm(np.array(outputs["contact_force"], dtype=float).reshape(2, 3), axis=1)
+    for force in (normal, whole):
+        force.setflags(write=False)
     return StaticHold(normal, whole, payload_limit(workcell, whole))
+
+
+_kept = kept_per_workcell(_static_hold)
 
 
 def mass_at_reference(workcell: Workcell, force: Array) -> Array:

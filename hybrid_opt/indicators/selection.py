@@ -104,21 +104,22 @@ def select(
 def selected_row(evaluator: CandidateEvaluator, x: Array) -> int:
     """Index of the carry that stands for a front (k, n_var), k > 0: the balanced one, under the
     time law 'optimal' the knee of duration and larger peak force."""
-    peaks = peak_normal_forces(evaluator, x)
+    peaks, durations = _peaks_and_durations(evaluator, x)
     if evaluator.workcell.task.time_law != "optimal":
         return balanced(peaks)
-    return knee(np.column_stack([_durations(evaluator, x), peaks.max(axis=1)]))
-
-
-def _durations(evaluator: CandidateEvaluator, x: Array) -> Array:
-    return np.array([evaluator.outputs(row[None])["time"][0, -1] for row in x])
+    return knee(np.column_stack([durations, peaks.max(axis=1)]))
 
 
 def peak_normal_forces(evaluator: CandidateEvaluator, x: Array) -> Array:
     """(n, 2) peak normal force of each robot [N] for decision vectors (n, n_var)."""
-    return np.concatenate(
-        [
-            evaluator.outputs(x[begin : begin + _CHUNK])["normal_force"].max(axis=1)
-            for begin in range(0, len(x), _CHUNK)
-        ]
-    )
+    return _peaks_and_durations(evaluator, x)[0]
+
+
+def _peaks_and_durations(evaluator: CandidateEvaluator, x: Array) -> tuple[Array, Array]:
+    """(n, 2) peak normal forces [N] and (n,) durations [s] of decision vectors (n, n_var)."""
+    peaks, durations = [], []
+    for begin in range(0, len(x), _CHUNK):
+        outputs = evaluator.outputs(x[begin : begin + _CHUNK])
+        peaks.append(outputs["normal_force"].max(axis=1))
+        durations.append(outputs["time"][:, -1])
+    return np.concatenate(peaks), np.concatenate(durations)

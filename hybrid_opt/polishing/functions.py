@@ -14,7 +14,7 @@ from codegen.interpreted import InterpretedFunction
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.polishing.drivable.functions import DrivenFunctions, driven_functions_of
 from symbolic.array import Array
-from symbolic.cell_model import CellModel
+from symbolic.cell_model import CellBodies, CellModel
 from symbolic.smooth.closure import closure_functions
 from symbolic.smooth.joint_limit import JointLimit
 from symbolic.smooth.keys import Block, ClosureKey, Order, Quantity, RowKey, SampleKey
@@ -68,7 +68,7 @@ class RowFunctions:
 
     def __init__(
         self,
-        model: CellModel,
+        model: CellBodies,
         compiled: Mapping[RowKey, NumericFunction],
         gaps: NumericFunction,
     ) -> None:
@@ -155,7 +155,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     return PolishFunctions(
         samples={key: built[key.name] for key in sample_keys if key.name in built},
         closures={key: built[key.name] for key in closure_keys},
-        rows=RowFunctions(compiled.model, {key: built[key.name] for key in row_keys}, built[GAPS]),
+        rows=RowFunctions(compiled.bodies, {key: built[key.name] for key in row_keys}, built[GAPS]),
         driven=driven_functions_of(compiled) if driven else None,
     )
 

@@ -6,6 +6,7 @@ Behind `symbolic.geometry.clearance`, which states the principle.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -44,7 +45,6 @@ class Scene:
     ) -> None:
         """See `symbolic.geometry.clearance.clearance_expressions`."""
         self.geometry, self.soft = geometry, softness
-        self._close = close_pairs(geometry)
         self._between = between_bases(geometry)
         self._placed: dict[Frame, tuple[ca.SX, ca.SX]] = {
             Frame("world"): (ca.SX.eye(3), ca.SX.zeros(3)),
@@ -58,6 +58,11 @@ class Scene:
         self._intervals: dict[tuple[int, str], list[Interval]] = {}
         self._covers: dict[int, tuple[Piece, ...]] = {}
         self._chains: dict[int, tuple[SphereChain, list[ca.SX]]] = {}
+
+    @cached_property
+    def _close(self) -> frozenset[tuple[int, int]]:
+        # Random postures are looked at: only where pairs within an arm are asked for.
+        return close_pairs(self.geometry)
 
     def bound(self, i: int, j: int) -> ca.SX:
         """Lower bound of the distance between bodies i and j (i < j)."""

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from symbolic.cell_model import CellModel
+from symbolic.cell_model import CellBodies
 from symbolic.smooth.place import Place, PlaceConstraint
 
 
@@ -29,7 +29,7 @@ class Clearance(PlaceConstraint):
         bodies = place.model.geometry.active[self.pair]
         return place.scene.bound(bodies.first, bodies.second)
 
-    def arms(self, model: CellModel) -> tuple[int, ...]:
+    def arms(self, model: CellBodies) -> tuple[int, ...]:
         """Those whose links are in the pair."""
         geometry = model.geometry
         bodies = geometry.active[self.pair]

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.cell_model import CellModel
+from symbolic.cell_model import CellBodies
 from symbolic.smooth.place import Place, PlaceConstraint
 
 Side = Literal["lower", "upper"]
@@ -46,6 +46,6 @@ class JointLimit(PlaceConstraint):
         limit = robot.position_lower if self.side == "lower" else robot.position_upper
         return np.concatenate([[-slope[self.joint] * limit[self.joint]], slope])
 
-    def arms(self, model: CellModel) -> tuple[int, ...]:
+    def arms(self, model: CellBodies) -> tuple[int, ...]:
         """The joint's own."""
         return (self.arm,)

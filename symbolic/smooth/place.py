@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.cell_model import CellModel
+from symbolic.cell_model import CellBodies
 from symbolic.geometry.bodies import PAYLOAD
 from symbolic.geometry.scene import Scene
 from symbolic.geometry.softness import Softness
@@ -36,16 +36,16 @@ class Place:
     """The symbols of one place and what is built from them once.
 
     Attributes:
-        model: the cell's.
+        model: of the cell's arms and bodies.
         pose: (6,) of the box [m, rad].
         rate: (6,) change of the pose with the path parameter.
         q: both arms' joints, (n,) each [rad].
     """
 
-    def __init__(self, model: CellModel) -> None:
+    def __init__(self, model: CellBodies) -> None:
         self.model = model
         self.pose, self.rate = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6)
-        first, second = (len(start) for start in model.start)
+        first, second = (arm.joints for arm in model.geometry.arms)
         self.q = ca.SX.sym("q_1", first), ca.SX.sym("q_2", second)
 
     @cached_property
@@ -108,7 +108,7 @@ class PlaceConstraint(ABC):
         """(count,) what tells this one from others of its family."""
         return np.zeros(0)
 
-    def arms(self, model: CellModel) -> tuple[int, ...]:
+    def arms(self, model: CellBodies) -> tuple[int, ...]:
         """The arms whose joints the value depends on."""
         return ()
 

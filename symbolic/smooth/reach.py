@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from symbolic.cell_model import CellModel
+from symbolic.cell_model import CellBodies
 from symbolic.robot.newton import following_columns, manipulability
 from symbolic.smooth.place import Place, PlaceConstraint
 
@@ -36,6 +36,6 @@ class Reach(PlaceConstraint):
         jacobian = following_columns(model, model.jacobian(place.q[self.arm]))
         return (manipulability(jacobian) / least) ** 2 - 1.0
 
-    def arms(self, model: CellModel) -> tuple[int, ...]:
+    def arms(self, model: CellBodies) -> tuple[int, ...]:
         """The one."""
         return (self.arm,)

@@ -75,3 +75,22 @@ def test_a_given_model_is_not_what_the_files_say() -> None:
     given = CompiledCell(rack_cell(), model=model)
     assert not given.is_identified
     assert given.model is model
+    assert given.bodies is model
+
+
+def test_bodies_are_known_without_start_postures(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unwanted(*_: Any) -> None:
+        raise AssertionError("start postures are not asked for")
+
+    compiled = CompiledCell(rack_cell())
+    with monkeypatch.context() as patched:
+        patched.setattr(symbolic.cell_model, "start_branches", unwanted)
+        bodies = compiled.bodies
+        with pytest.raises(AssertionError):
+            _ = compiled.model
+    names = [body.name for body in compiled.model.geometry.bodies]
+    assert [body.name for body in bodies.geometry.bodies] == names
+    joints = [len(start) for start in compiled.model.start]
+    assert [arm.joints for arm in bodies.geometry.arms] == joints
+    known = CompiledCell(rack_cell())
+    assert known.model is known.bodies

@@ -99,6 +99,7 @@ def with_friction(cell: Workcell, friction: float, mass: float) -> Workcell:
 def test_static_hold_in_closed_form(friction: float, mass: float) -> None:
     cell = with_friction(load(RACK), friction, mass)
     hold = static_hold(cell)
+    assert static_hold(cell) is hold, "worked out once"
     weight = 9.81 * mass
     np.testing.assert_allclose(hold.normal_force, weight / (2.0 * friction), rtol=1e-9)
     whole = 0.5 * weight * np.sqrt(1.0 + 1.0 / friction**2)
