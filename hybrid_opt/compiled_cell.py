@@ -66,7 +66,7 @@ class CompiledCell:
         Raises:
             DualArmError: they cannot be read.
         """
-        known = vars(self).get("model", self._given)
+        known: CellBodies | None = vars(self).get("model", self._given)
         if known is not None:
             return known
         from symbolic.cell_model import build_cell_bodies

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import hybrid_opt as ho
+from codegen.function import available_cores
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage
 from hybrid_opt.campaign.layout import RECOMMENDATION, RECOMMENDED, STAGES
 from hybrid_opt.campaign.recommended import (
@@ -53,7 +54,8 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
         with progress.stage("recommendation", 1, "carry") as advance:
-            found = recommend_from(folder.root, wish, folder.root / RECOMMENDED)
+            threads = folder.execution.jobs  # those of the workers, which wait meanwhile
+            found = recommend_from(folder.root, wish, folder.root / RECOMMENDED, threads)
             if found is None:  # also after an earlier attempt that was interrupted
                 (folder.root / RECOMMENDATION).unlink(missing_ok=True)
             else:
@@ -76,13 +78,16 @@ def read_recommendation(root: Path) -> StoredRecommendation | None:
     return read_record(StoredRecommendation, path, remedy)
 
 
-def recommend_from(root: Path, wish: ho.Wish, path: Path) -> StoredRecommendation | None:
+def recommend_from(
+    root: Path, wish: ho.Wish, path: Path, threads: int = 0
+) -> StoredRecommendation | None:
     """Recommend a carry of a study's drivable fronts, and store it.
 
     Args:
         root: the results folder, its drivable experiment done.
         wish: what is asked for.
         path: the trajectory file to write.
+        threads: in which carries are timed, 0 for one per core; has no influence on what is found.
 
     Returns:
         What is said of it; None where no drivable carry was found.
@@ -95,7 +100,8 @@ def recommend_from(root: Path, wish: ho.Wish, path: Path) -> StoredRecommendatio
     drivable = drivable_fronts(drivable_root(root, campaign.workcell, campaign.objectives))
     if len(drivable.x) == 0:
         return None
-    cell = ho.Cell(drivable.results.workcell, DRIVABLE_OBJECTIVES)
+    threads = threads or available_cores()
+    cell = ho.Cell(drivable.results.workcell, DRIVABLE_OBJECTIVES, threads)
     alone = is_drivable(campaign.workcell, campaign.objectives)
     others = {} if alone else least_force(campaign)
     found = ho.recommend(cell, drivable.x, wish, others)

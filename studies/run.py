@@ -1,175 +1,17 @@
-"""Run a whole study of a workcell: search, then everything that is made from its results."""
+"""Run a whole study of a workcell, see `studies.study`."""
 
 from __future__ import annotations
 
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hybrid_opt.campaign import (
-    CampaignFolder,
-    CampaignSettings,
-    ExecutionSettings,
-    Progress,
-    Stage,
-    open_folder,
-    run_stages,
-    search_stage,
-)
-from hybrid_opt.campaign.branch_choice import decided_cell, store_branches
-from hybrid_opt.campaign.experiment_stage import drivable_stage
-from hybrid_opt.campaign.layout import DRIVABLE, SUMMARY
-from hybrid_opt.campaign.polish_stage import polish_stage
-from hybrid_opt.campaign.results import read_summary
-from hybrid_opt.campaign.simulated import read_simulations
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, FORCE_PAIRS, PAPER_OBJECTIVES
-from hybrid_opt.polishing.drivable.point import is_polishable
-from hybrid_opt.polishing.settings import DRIVABLE_ATTEMPTS, PolishSettings
-from hybrid_opt.recommending.wish import Wish
-from hybrid_opt.witness.outcome import mujoco_module
-from hybrid_opt.work.processes import warm_up
-from studies.cli import (
-    campaign_parser,
-    campaign_settings,
-    execution_settings,
-    polish_settings,
-    wish,
-)
-from studies.drivable import is_drivable, known_paths
-from studies.jerk_costs import jerk_costs, jerk_text
 from studies.program import add_verbose, carry_out, run_program
-from studies.recommendation_stage import recommendation_stage
-from studies.recommendation_text import recommendation_text
-from studies.report.stage import add_report_options, follow_report_options, report_stage
-from studies.simulation_stage import simulation_stage
-from studies.simulation_text import simulation_text
-from studies.summary_stage import summary_stage
-from studies.terminal_summary import terminal_summary
-from studies.timing_stage import timing_stage
-from symbolic.array import Array
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from studies.workers import start_workers
 
 PAGE = "report.html"
 """The report in a results folder."""
-
-WORKERS_LOAD = (
-    "hybrid_opt.campaign.polish_stage",
-    "studies.timing_stage",
-    "studies.report.generate",
-)
-"""Modules that the work of a study needs."""
-
-
-@dataclass(frozen=True)
-class StudySettings:
-    """What is made of a search's results.
-
-    Attributes:
-        polish: how fronts are polished, None for not at all.
-        drivable: whether carries are also searched for as robots drive them.
-        drivable_polish: how their fronts are polished, None for not at all.
-        wish: what is asked of the recommended one of them.
-        simulate: whether the selected carries are driven in the simulated cell.
-        report: whether figures, tables and the page are written.
-        with_paper: whether the figures stand beside those that the paper states.
-        pdf: whether pictures are also written as PDF.
-    """
-
-    polish: PolishSettings | None = None
-    drivable: bool = True
-    drivable_polish: PolishSettings | None = None
-    wish: Wish = field(default_factory=Wish)
-    simulate: bool = False
-    report: bool = True
-    with_paper: bool = False
-    pdf: bool = True
-
-
-def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
-    """The stages of a study, in order.
-
-    Args:
-        alone: whether its first experiment is the drivable one already, so that it has no other.
-    """
-    every = [search_stage()]
-    if study.polish is not None:
-        every.append(polish_stage(study.polish))
-    if study.drivable and not alone:
-        inner = []
-        if study.drivable_polish is not None:
-            beside = _paths_beside if study.polish is not None else None
-            inner.append(polish_stage(study.drivable_polish, beside))
-        driven = [search_stage(), *inner, summary_stage(), timing_stage(last=True)]
-        every.append(drivable_stage(driven))
-    if study.drivable:
-        every.append(recommendation_stage(study.wish))
-    every += [summary_stage(), timing_stage(study.wish.force, last=alone)]
-    if study.simulate:
-        every.append(simulation_stage())
-    if study.report:
-        every.append(report_stage(study.with_paper, study.pdf))
-    return tuple(every)
-
-
-def _paths_beside(folder: CampaignFolder) -> Array:
-    """What a study's first experiment ended with, in whose folder the drivable one lies."""
-    return known_paths(folder.root.parent)
-
-
-def run_study(
-    workcell: Workcell,
-    settings: CampaignSettings,
-    execution: ExecutionSettings,
-    progress: Progress,
-    study: StudySettings,
-) -> str:
-    """Carry out all stages that are not done, and return the figures as text.
-
-    Args:
-        workcell: the cell, read from its file.
-        settings: what to compute.
-        execution: how.
-        progress: where to show it.
-        study: what is made of the results.
-
-    Raises:
-        DualArmError: the workcell, a setting or the results folder is wrong, or work failed.
-    """
-    cell, competition = decided_cell(workcell, settings, execution)
-    alone = is_drivable(cell, settings.objectives)
-    if not cell.has_facing_pads:
-        progress.note("the polish knows two round pads that face one another: search alone")
-        study = replace(study, polish=None, drivable_polish=None)
-    polish = study.polish if alone else study.drivable_polish
-    if polish is not None and not is_polishable(cell.task):
-        progress.note("the drivable carries of this cell cannot be polished: search alone")
-        study = replace(study, drivable_polish=None, polish=None if alone else study.polish)
-    with open_folder(settings, execution, cell) as folder:
-        told = store_branches(folder.root, competition)
-        run_stages(folder, stages(study, alone), progress)
-        return told + study_text(folder.root, study.with_paper)
-
-
-def study_text(root: Path, with_paper: bool) -> str:
-    """The figures of a finished study for a terminal, the carry to run first.
-
-    Raises:
-        ResultsError: the folder is not complete or damaged.
-    """
-    summary = read_summary(root)
-    found = summary.recommendation
-    words = (
-        "" if found is None else recommendation_text(found, summary.robots, str(root)).terminal()
-    )
-    beside = (root / DRIVABLE / SUMMARY).exists()
-    drivable = read_summary(root / DRIVABLE) if beside else None
-    costs = jerk_text(jerk_costs(root / DRIVABLE if beside else root))
-    told = terminal_summary(summary, with_paper, words, drivable, costs)
-    simulations = read_simulations(root)
-    return f"{told}\n\n{simulation_text(simulations)}" if simulations else told
 
 
 def main(
@@ -185,6 +27,24 @@ def main(
         program: its name in messages.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    start_workers(arguments)
+    # Imported only now: meanwhile the server of the workers loads much of the same.
+    from hybrid_opt.campaign import Progress
+    from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, FORCE_PAIRS, PAPER_OBJECTIVES
+    from hybrid_opt.polishing.settings import DRIVABLE_ATTEMPTS
+    from hybrid_opt.witness.outcome import mujoco_module
+    from studies.cli import (
+        campaign_parser,
+        campaign_settings,
+        execution_settings,
+        polish_settings,
+        wish,
+    )
+    from studies.drivable import is_drivable
+    from studies.report.stage import add_report_options, follow_report_options
+    from studies.study import StudySettings, run_study
+    from symbolic.workcell.file import load
+
     description = "Search for the least-force carries of a dual-arm workcell."
     output = f"results/{'WORKCELL' if workcell is None else workcell.stem}"
     parser = campaign_parser(program, description, output)
@@ -206,8 +66,6 @@ def main(
         alone = is_drivable(cell, settings.objectives)
         polishable = alone or (not driven and settings.objectives in FORCE_PAIRS)
         execution = execution_settings(options, Path("results") / path.stem)
-        if execution.executor == "processes":
-            warm_up(*WORKERS_LOAD)
         study = StudySettings(
             polish=polish_settings(options, polishable, DRIVABLE_ATTEMPTS if alone else None),
             drivable=options.drivable,

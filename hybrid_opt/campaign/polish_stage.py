@@ -12,6 +12,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -40,8 +41,8 @@ from hybrid_opt.polishing.records import (
 )
 from hybrid_opt.polishing.run import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.store.files import write_json
-from hybrid_opt.store.json_records import read_record, to_json
+from hybrid_opt.store.files import read_bytes, write_json
+from hybrid_opt.store.json_records import record_of, to_json
 from hybrid_opt.work.job import Job, give_up
 from symbolic import outside
 from symbolic.array import Array
@@ -50,6 +51,10 @@ from symbolic.workcell.records import Workcell
 
 JUDGING_SECONDS = 30.0
 """What judging an attempt, and the front before the first one, may take besides solving."""
+
+KEPT_FRONTS = 64
+"""Documents that are remembered by their content: a study's stages read its fronts again and
+again."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +188,7 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedR
     if not path.exists():
         return None
     remedy = "--resume polishes it anew"
-    document = read_record(PolishDocument, path, remedy)
+    document = _document(read_bytes(path), path, remedy)
     task, front = workcell.task, document.front
     if bool(front) != bool(len(replica.front)):
         raise ResultsError(f"{path}: damaged at front: found {len(front)} points; {remedy}")
@@ -204,6 +209,11 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedR
     for array in (found.x, found.objectives, found.polished):
         array.setflags(write=False)
     return found
+
+
+@lru_cache(maxsize=KEPT_FRONTS)
+def _document(content: bytes, path: Path, remedy: str) -> PolishDocument:
+    return record_of(PolishDocument, content, path, remedy)
 
 
 class PolishLedger:

@@ -7,6 +7,7 @@ written. docs/results.md describes the folder.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,10 @@ from hybrid_opt.store.json_records import from_json, read_record
 from symbolic.array import Array
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Workcell
+
+KEPT_TABLES = 64
+"""Tables of candidates that are remembered by their content: a study's stages read its replicas
+again and again."""
 
 
 @dataclass(frozen=True)
@@ -178,10 +183,15 @@ def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str,
         raise ResultsError(
             f"{folder / EVALUATIONS}: damaged, its checksum differs; --resume computes it anew"
         )
-    table = decode(content, folder / EVALUATIONS)
+    table = _decoded(content, folder / EVALUATIONS)
     if table.objective_names != objectives:
         raise ResultsError(f"{folder / EVALUATIONS}: holds other objectives than the campaign")
     return _replica(algorithm, number, table, marker.seconds)
+
+
+@lru_cache(maxsize=KEPT_TABLES)
+def _decoded(content: bytes, path: Path) -> EvaluationTable:
+    return decode(content, path)
 
 
 def _replica(algorithm: str, number: int, table: EvaluationTable, seconds: float) -> Replica:

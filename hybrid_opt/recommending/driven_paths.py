@@ -37,6 +37,7 @@ class DrivenPaths:
         self.highest_force = highest_force
         self._timer, self._robust = timer, robust
         self._known = timer.path_limits(self.x)
+        self._failures = timer.failures(self._known)
 
     @classmethod
     def of(cls, cell: Cell, x: Array) -> DrivenPaths:
@@ -54,6 +55,7 @@ class DrivenPaths:
             self.x,
             self._known,
             [TimingLimits(force=float(limit), robust=self._robust) for limit in limits],
+            self._failures,
         )
 
     def durations(self, force: Array | float) -> Array:

@@ -77,8 +77,13 @@ def read_json(path: Path, remedy: str = "") -> Any:
     Raises:
         ResultsError: the file cannot be read or is not JSON.
     """
+    return json_of(read_bytes(path), path, remedy)
+
+
+def json_of(content: bytes, path: Path, remedy: str = "") -> Any:
+    """The JSON values of a file's content; see `read_json`."""
     try:
-        return outside.json_value(read_bytes(path))
+        return outside.json_value(content)
     except OutsideError as error:
         told = f"; {remedy}" if remedy else ""
         raise ResultsError(f"{path}: damaged ({error}){told}") from error

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import numpy as np
 
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.files import read_json
+from hybrid_opt.store.files import json_of, read_bytes
 from symbolic.array import Array
 
 Record = TypeVar("Record")
@@ -105,7 +105,12 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
     Raises:
         ResultsError: it cannot be read or is damaged.
     """
-    return from_json(kind, read_json(path, remedy), path, remedy)
+    return record_of(kind, read_bytes(path), path, remedy)
+
+
+def record_of(kind: type[Record], content: bytes, path: Path, remedy: str) -> Record:
+    """The record in a file's content; see `read_record`."""
+    return from_json(kind, json_of(content, path, remedy), path, remedy)
 
 
 def _read(kind: Any, value: Any, where: str) -> Any:

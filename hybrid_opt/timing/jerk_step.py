@@ -30,7 +30,7 @@ def convex_step(
     _force_rows(model, at, limits, rows)
     _ratio_rows(model, at, c, limits, rows)
     _jerk_rows(at, c, jerk, rows)
-    rows.below(-np.eye(len(c)), -LEAST_SHARE * c)
+    rows.below(-np.ones((len(c), 1)), -LEAST_SHARE * c, np.arange(len(c)))
     gradient, H = at.objective(c)
     answer = rows.assembled().minimised(H, gradient - H @ c, c)
     if answer is None:
@@ -46,24 +46,24 @@ def convex_step(
 def _motion_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows) -> None:
     """Speeds and accelerations of joints and box."""
     workcell, m, keep = model.workcell, at.motion, at.keep
+    first_basis = at.first_basis
+    squared_by, acceleration_by = at.local(at.squared_by), at.local(at.acceleration_by)
     ceiling = np.minimum(squared_speed_limit(m, workcell, limits), 1e6)
-    rows.below(at.squared_by / ceiling[:, None], keep)
+    rows.below(squared_by / ceiling[:, None], keep, first_basis)
     limit = np.concatenate([robot.acceleration_max for robot in workcell.robots])
-    by = (m.q_first / limit)[:, :, None] * at.acceleration_by[:, None, :]
-    by = by + (m.q_second / limit)[:, :, None] * at.squared_by[:, None, :]
-    flat = by.reshape(-1, by.shape[2])
+    by = (m.q_first / limit)[:, :, None] * acceleration_by[:, None, :]
+    by = by + (m.q_second / limit)[:, :, None] * squared_by[:, None, :]
+    flat, bound = by.reshape(-1, by.shape[2]), np.repeat(keep, len(limit))
     for sign in (1.0, -1.0):
-        rows.below(sign * flat, np.repeat(keep, len(limit)))
+        rows.below(sign * flat, bound, np.repeat(first_basis, len(limit)))
     payload = workcell.payload
     for first, second, most in (
         (m.pose_first[:, :3], m.pose_second[:, :3], payload.acceleration_max),
         (m.angular_first, m.angular_second, payload.angular_acceleration_max),
     ):
-        A = first[:, :, None] * at.acceleration_by[:, None] + (
-            second[:, :, None] * at.squared_by[:, None]
-        )
-        n, k = len(at.s), at.value.shape[1]
-        rows.within(A / most, np.zeros((n, 3)), np.zeros((n, k)), keep)
+        A = first[:, :, None] * acceleration_by[:, None] + second[:, :, None] * squared_by[:, None]
+        none = np.zeros_like(squared_by)
+        rows.within(A / most, np.zeros((len(at.s), 3)), none, keep, first_basis)
 
 
 def _force_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows) -> None:
@@ -81,8 +81,8 @@ def _force_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows)
         for n in (1, 0)
     )
     weight = workcell.payload.mass * np.array(GRAVITY)
-    A = m.force_by_acceleration[:, :, None] * at.acceleration_by[:, None] + (
-        m.force_by_speed[:, :, None] * at.squared_by[:, None]
+    A = m.force_by_acceleration[:, :, None] * at.local(at.acceleration_by)[:, None] + (
+        m.force_by_speed[:, :, None] * at.local(at.squared_by)[:, None]
     )
     along = np.einsum("nd,ndk->nk", m.normal, A)
     still = -(m.normal @ weight)
@@ -97,9 +97,10 @@ def _force_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows)
                     share_t * rest / force,
                     share_n * along / force,
                     room / force,
+                    at.first_basis,
                 )
             elif share_n:
-                rows.below(share_n * along / force, room / force)
+                rows.below(share_n * along / force, room / force, at.first_basis)
 
 
 def _ratio_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, rows: Rows) -> None:
@@ -117,7 +118,9 @@ def _ratio_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, r
     for sign in (1.0, -1.0):
         # What is exceeded between rounds, because it is not convex, may stay as it is for one.
         bound = np.maximum(at.keep[:, None], sign * chosen) - sign * chosen + sign * (by @ c)
-        rows.below(sign * by.reshape(-1, by.shape[2]), bound.reshape(-1))
+        A = sign * at.local(by)
+        first = np.repeat(at.first_basis, by.shape[1])
+        rows.below(A.reshape(-1, A.shape[2]), bound.reshape(-1), first)
 
 
 def _ratios(
@@ -143,15 +146,17 @@ def _jerk_rows(at: Point, c: Array, jerk: JerkLimits, rows: Rows) -> None:
     level, slope = 1.5 / np.sqrt(v), 0.5 * v**-1.5
     # Multiplied by sqrt(v) of the last round, so that rows are of order one.
     root = np.sqrt(v)
-    head = (at.keep * slope * root)[:, None] * at.value
+    head = (at.keep * slope * root)[:, None] * at.local(at.value)
     level = at.keep * level * root
     limited = np.isfinite(jerk.joints)
-    by = at.joint_jerk_by[:, limited] / jerk.joints[limited, None] * root[:, None, None]
+    joint_jerk_by = at.local(at.joint_jerk_by)[:, limited]
+    by = joint_jerk_by / jerk.joints[limited, None] * root[:, None, None]
     joints = by.shape[1]
     bound = np.repeat(level, joints)
     below = np.repeat(head, joints, axis=0)
+    first = np.repeat(at.first_basis, joints)
     for sign in (1.0, -1.0):
-        rows.below(sign * by.reshape(-1, by.shape[2]) + below, bound)
+        rows.below(sign * by.reshape(-1, by.shape[2]) + below, bound, first)
     if np.isfinite(jerk.payload):
-        box = at.box_jerk_by / jerk.payload * root[:, None, None]
-        rows.within(box, np.zeros((len(v), 3)), head, level)
+        box = at.local(at.box_jerk_by) / jerk.payload * root[:, None, None]
+        rows.within(box, np.zeros((len(v), 3)), head, level, at.first_basis)

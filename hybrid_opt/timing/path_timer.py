@@ -6,6 +6,7 @@ docs/timing.md. A carry is not built: `drive_path` recomputes one for a timing f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -161,11 +162,21 @@ class PathTimer:
             )
         return self.time_known(x, self.path_limits(x), limits)
 
+    def failures(self, paths: dict[str, Array]) -> list[PathTiming | None]:
+        """Why paths cannot be timed at all, by the answers of `path_limits`; None where they can
+        be."""
+        return [self._path_failure(paths, row) for row in range(len(paths["pose"]))]
+
     def time_known(
-        self, x: Array, paths: dict[str, Array], limits: list[TimingLimits]
+        self,
+        x: Array,
+        paths: dict[str, Array],
+        limits: list[TimingLimits],
+        failures: Sequence[PathTiming | None] | None = None,
     ) -> list[PathTiming]:
-        """As `time_all`, with the answers of `path_limits` known already."""
-        found = [self._path_failure(paths, row) for row in range(len(limits))]
+        """As `time_all`, with the answers of `path_limits` known already, and of `failures` where
+        they are given."""
+        found = list(self.failures(paths) if failures is None else failures)
         rows = [row for row, failure in enumerate(found) if failure is None]
         if rows and self._passes is None:
             timings = [

@@ -17,7 +17,7 @@ from hybrid_opt.campaign.summary import PolishedFigures
 from hybrid_opt.indicators.metrics import non_dominated
 from studies.report.data import gather
 from studies.report.records import Front, ReportData
-from studies.run import StudySettings, run_study
+from studies.study import StudySettings, run_study
 from studies.summary import front_indicators
 from symbolic.workcell.file import load
 from tests.symbolic.cells import ROOT

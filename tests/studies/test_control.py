@@ -16,7 +16,7 @@ from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.settings import PolishSettings
 from studies import control
 from studies.reference_front import ReferenceFront
-from studies.run import StudySettings, run_study
+from studies.study import StudySettings, run_study
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
