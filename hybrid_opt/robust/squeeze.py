@@ -20,6 +20,10 @@ from symbolic.workcell.records import Uncertainty, Workcell
 FACTOR = 1.3
 """Commanded over planned force where nothing says how uncertain the cell is."""
 
+RESERVE = 0.02
+"""Share by which robust forces are exceeded: they hold a box whose wrenches follow the plan, and
+simulated arms, which track it, need up to 1.5 % more (docs/witness.md)."""
+
 LARGEST_FACTOR = 10.0
 SMOOTHING = 0.1
 """Half the width of the time window over which commanded forces are smoothed [s]."""
@@ -75,7 +79,7 @@ class Squeeze:
 
     def __str__(self) -> str:
         if self.factor is None:
-            return "robust forces of the cell's [uncertainty]"
+            return f"robust forces of the cell's [uncertainty], {RESERVE:.0%} more"
         return f"{self.factor:g} times the planned squeeze"
 
 
@@ -94,8 +98,8 @@ def extra_force(
 ) -> Array:
     """(n,) what both robots press with beyond the planned normal forces [N].
 
-    Smooth where the planned forces are; with it neither robot ever presses less than the plan or
-    the robust force asks for.
+    Smooth where the planned forces are; with it neither robot ever presses less than the plan, or
+    than the robust force and its reserve, ask for.
 
     Args:
         time: (n,) of the samples, not decreasing [s].
@@ -108,7 +112,7 @@ def extra_force(
     follower = least[:, 1 - squeeze.leader]
     if squeeze.uncertainty is not None:
         commanded, _ = robust_model(workcell).hold(motion, squeeze.uncertainty, squeeze.leader)
-        needed = np.maximum(commanded, follower)
+        needed = np.maximum((1.0 + RESERVE) * commanded, follower)
     else:
         assert squeeze.factor is not None, "a squeeze has a factor or a set"
         needed = follower + (squeeze.factor - 1.0) * least.mean(axis=1)
