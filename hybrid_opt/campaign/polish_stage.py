@@ -49,8 +49,9 @@ from symbolic.array import Array
 from symbolic.errors import OutsideError
 from symbolic.workcell.records import Workcell
 
-JUDGING_SECONDS = 30.0
-"""What judging an attempt, and the front before the first one, may take besides solving."""
+JUDGING_SECONDS = 540.0
+"""What an attempt may take besides one solve, or the front before the first one: on an idle core ten
+seconds. The clock is the wall's, and machines with twenty times more work than cores were seen."""
 
 KEPT_FRONTS = 64
 """Documents that are remembered by their content: a study's stages read its fronts again and
