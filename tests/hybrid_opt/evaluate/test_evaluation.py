@@ -142,23 +142,21 @@ def test_the_plain_check_knows_the_allowed_contacts() -> None:
 
 
 WARM_START = """
-import sys, time
+import sys
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from symbolic.workcell.file import load
 workcell = load(sys.argv[1])
 CandidateEvaluator(workcell).evaluate(workcell.task.initial.reshape(-1))
-print(time.process_time(), *sys.modules)
+print(*sys.modules)
 """
 
 
-def test_a_warm_start_takes_less_than_a_second() -> None:
-    """To the first evaluation, in processor time; slow libraries wait until they are needed."""
+def test_a_warm_start_loads_no_slow_library() -> None:
+    """To the first evaluation; what takes long to import waits until it is needed."""
     evaluator(RACK)
     command = [sys.executable, "-c", WARM_START, str(RACK)]
     run = subprocess.run(command, capture_output=True, text=True, check=True)
-    seconds, *modules = run.stdout.split()
-    assert float(seconds) < 1.0
-    assert not {"scipy", "trimesh", "pymoo", "matplotlib"} & set(modules)
+    assert not {"scipy", "trimesh", "pymoo", "matplotlib"} & set(run.stdout.split())
 
 
 def test_screening_changes_no_sample_of_random_candidates() -> None:
