@@ -14,7 +14,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.recommending.squeeze import commanded
 from hybrid_opt.robust.force import RobustModel
-from hybrid_opt.robust.squeeze import FACTOR
+from hybrid_opt.robust.squeeze import FACTOR, RESERVE
 from hybrid_opt.witness.account import Account, driven_carry, pressed_reference
 from hybrid_opt.witness.arms import CellWitness
 from symbolic.array import Array
@@ -63,7 +63,7 @@ def test_an_uncertain_cell_is_pressed_with_its_robust_forces() -> None:
     other = Cell(unsure)
     other.compiled = cell.compiled  # which knows nothing of what is uncertain
     pressed = pressed_reference(other, carry)
-    needed = RobustModel(unsure).robust_force(carry).commanded
+    needed = (1.0 + RESERVE) * RobustModel(unsure).robust_force(carry).commanded
     assert pressed.squeeze.factor is None
     told = pressed.reference.normal_force[2:, 1]
     assert (told >= needed - 1e-6).all()
