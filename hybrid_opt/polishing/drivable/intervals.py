@@ -198,7 +198,7 @@ class IntervalValues:
         out = self._functions.first.batch(*begins[:-2], still, still)
         follow = tuple(along[::2] for along in self._follow)
         block = self.grid.layout.block("pressure")
-        slope = _followed(self.grid, out["slope"], follow)[:, block, : self.grid.moving]
+        slope = _followed(self.grid, out["slope"][:, block], follow)[:, :, : self.grid.moving]
         return out["value"][:, block].reshape(-1), slope.reshape(-1, self.grid.moving)
 
     def rows(self) -> Array:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hybrid_opt.polishing.drivable import quadratic
 from hybrid_opt.polishing.drivable.bordered import BorderedMatrix
+from hybrid_opt.polishing.drivable.compiled_interior import interior_method
 from hybrid_opt.polishing.drivable.functions import DrivenFunctions
 from hybrid_opt.polishing.drivable.interior import QuadraticProgram
 from hybrid_opt.polishing.drivable.intervals import IntervalGrid, IntervalValues
@@ -98,6 +99,7 @@ class Proposer:
         self._task, self._driven = cell.task, settings
         self._intervals = IntervalGrid(cell.workcell, intervals, robust)
         self._half = cell.unit.half[: cell.task.n_path]
+        self._method = interior_method()
 
     def step(self, best: Reached, goal: Goal, radius: float, lenient: bool) -> Proposal | None:
         """A step within the box; None where there is none."""
@@ -152,11 +154,12 @@ class Proposer:
             asked = QuadraticProgram(
                 model[0], g, linear.A, linear.b, *box, linear.whole, linear.most
             )
-            step = quadratic.solve(asked)
+            step = quadratic.solve(asked, self._method)
             if not step.solved:
                 # What the box has no room for is asked for as far as it is kept now.
                 most = max(linear.most, 0.0)
-                step = quadratic.solve(replace(asked, b=np.maximum(linear.b, 0.0), most=most))
+                relaxed = replace(asked, b=np.maximum(linear.b, 0.0), most=most)
+                step = quadratic.solve(relaxed, self._method)
             if not step.solved:
                 return None
             fresh = (program.predicted(step.d) > self._driven.row_tolerance) & ~chosen

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.linalg import eigvalsh_tridiagonal
 
 from hybrid_opt.polishing.drivable.bordered import BorderedMatrix, BorderedRows, Factors
+from hybrid_opt.polishing.drivable.compiled_interior import Method
 from hybrid_opt.polishing.drivable.interior import Answer, QuadraticProgram
 from hybrid_opt.polishing.drivable.interior import solve as solve_inside
 from symbolic.array import Array
@@ -47,9 +48,10 @@ class Step:
     solved: bool
 
 
-def solve(program: QuadraticProgram) -> Step:
-    """The least value of a program, or that there is none."""
-    found = solve_inside(program, TOLERANCE)
+def solve(program: QuadraticProgram, method: Method = solve_inside) -> Step:
+    """The least value of a program, or that there is none; by a method, and Clarabel's where its
+    answer does not hold."""
+    found = method(program, TOLERANCE)
     if found.ending != "infeasible" and not holds(program, found):
         found = solve_by_clarabel(program)
     return Step(found.d, found.rows, found.bounds, holds(program, found))

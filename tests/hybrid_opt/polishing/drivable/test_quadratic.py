@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hybrid_opt.polishing.drivable import quadratic
+from codegen import library
+from hybrid_opt.polishing.drivable import compiled_interior, quadratic
 from hybrid_opt.polishing.drivable.bordered import BorderedMatrix, BorderedRows
+from hybrid_opt.polishing.drivable.compiled_interior import Method, interior_method
 from hybrid_opt.polishing.drivable.interior import Answer, QuadraticProgram
 from hybrid_opt.polishing.drivable.interior import solve as solve_inside
 from hybrid_opt.polishing.drivable.point import DriveStart
@@ -93,6 +96,7 @@ def test_what_is_impossible_is_proven_so(seed: int) -> None:
     short = float(rng.uniform(1e-4, 0.3)) * np.abs(entries).sum()
     of = replace(of, A=against, b=np.append(of.b, -of.b[row] - short))
     assert quadratic.solve_by_clarabel(of).ending == "failed"
+    assert interior_method()(of, TOLERANCE).ending == "infeasible"
     found = solve_inside(of, TOLERANCE)
     assert found.ending == "infeasible"
     pull = of.pulled(found.rows)
@@ -105,9 +109,9 @@ def test_programs_of_a_polish_agree_with_clarabel(monkeypatch: pytest.MonkeyPatc
     asked: list[QuadraticProgram] = []
     own = quadratic.solve
 
-    def recorded(of: QuadraticProgram) -> quadratic.Step:
+    def recorded(of: QuadraticProgram, method: Method) -> quadratic.Step:
         asked.append(of)
-        return own(of)
+        return own(of, method)
 
     monkeypatch.setattr(quadratic, "solve", recorded)
     solver = polisher(4).drivable
@@ -115,21 +119,41 @@ def test_programs_of_a_polish_agree_with_clarabel(monkeypatch: pytest.MonkeyPatc
     solver.solve(DriveStart(start(52.0), Goal("force", 3.0), 0.3))
     assert len(asked) > 15
     assert any(of.whole is not None for of in asked)
+    compiled = interior_method()
     for of in asked:
-        found = solve_inside(of, TOLERANCE)
         other = quadratic.solve_by_clarabel(of)
-        assert (found.ending == "solved") == (other.ending == "solved")
-        if found.ending == "solved":
-            assert quadratic.holds(of, found)
-            assert value(of, found.d) == pytest.approx(value(of, other.d), abs=1e-6, rel=1e-6)
+        for found in (solve_inside(of, TOLERANCE), compiled(of, TOLERANCE)):
+            assert (found.ending == "solved") == (other.ending == "solved")
+            if found.ending == "solved":
+                assert quadratic.holds(of, found)
+                assert value(of, found.d) == pytest.approx(value(of, other.d), abs=1e-6, rel=1e-6)
 
 
-def test_clarabel_answers_where_the_own_method_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiled_and_interpreted_answers_agree() -> None:
+    """But where a whole row's speeds have no curvature of their own: rounding decides there."""
+    compiled = interior_method()
+    assert compiled is not solve_inside
+    for seed in (seed for seed in range(90) if seed % 15):
+        of = program(seed)
+        inner, outer = solve_inside(of, TOLERANCE), compiled(of, TOLERANCE)
+        assert outer.ending == inner.ending
+        np.testing.assert_allclose(outer.d, inner.d, atol=1e-6)
+        assert value(of, outer.d) == pytest.approx(value(of, inner.d), abs=1e-8, rel=1e-8)
+
+
+def test_without_a_compiler_the_method_is_interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library, "find_compiler", lambda: None)
+    monkeypatch.setattr(compiled_interior, "default_folder", lambda: "of no compiler")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert interior_method() is solve_inside
+
+
+def test_clarabel_answers_where_the_own_method_does_not() -> None:
     of = program(1)
     whole = solve_inside(of, TOLERANCE)
     cut_off = replace(whole, d=whole.d + 1e-3, ending="failed")
-    monkeypatch.setattr(quadratic, "solve_inside", lambda *_: cut_off)
-    found = quadratic.solve(of)
+    found = quadratic.solve(of, lambda *_: cut_off)
     assert found.solved
     np.testing.assert_allclose(found.d, whole.d, atol=1e-4)
 

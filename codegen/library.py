@@ -1,0 +1,53 @@
+"""C of our own as a library, for methods that call no CasADi function."""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+from typing import Any
+
+from codegen.cache import FORMAT, Cache, digest
+from codegen.compiler import FLAGS, find_compiler
+from codegen.errors import CodegenError
+from codegen.interpreted import warn_interpreted
+
+LEVEL = 3
+"""Optimisation level: what is written by hand is short."""
+
+
+def load_or_build_library(name: str, text: str, cache: Cache | None = None) -> ctypes.CDLL | None:
+    """The library, from the cache where it was built before.
+
+    Args:
+        name: for messages.
+        text: self-contained C; what it offers is visible by attribute.
+        cache: where libraries are kept; by default the user's.
+
+    Returns:
+        The library; None without a C compiler, with one warning per process.
+
+    Raises:
+        CodegenError: it cannot be compiled, cached or loaded.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        warn_interpreted()
+        return None
+    cache = cache or Cache()
+    key = digest("library", str(FORMAT), name, str(LEVEL), compiler.identity, *FLAGS, text)
+
+    def make(library: Path) -> dict[str, Any]:
+        source = library.parent / f"{name}.c"
+        source.write_text(text)
+        compiler.compile(source, library, LEVEL)
+        return {}
+
+    with cache.lock(key):
+        entry = cache.find(key) or cache.store(key, make)
+    try:
+        return ctypes.CDLL(str(entry.library))
+    except OSError as error:
+        raise CodegenError(
+            f"{name}: the compiled library cannot be loaded: {error}; if its folder does not "
+            "allow programs, name another one in the environment variable DUAL_ARM_CACHE"
+        ) from error
