@@ -19,11 +19,10 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations, concatenated
 from hybrid_opt.evaluate.objectives import (
-    DRIVABLE_OBJECTIVES,
     PAPER_OBJECTIVES,
+    ForceKind,
     Objective,
-    limits_robust_forces,
-    select_objectives,
+    force_kind,
 )
 from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
 from symbolic.array import Array
@@ -100,16 +99,18 @@ class Cell:
 
     def drivable(self) -> Cell:
         """The same cell with carries as robots drive them: under the time law 'optimal', searched
-        for duration and peak force (docs/timing.md).
+        for duration and peak force, the robust one where robust forces are minimised
+        (docs/timing.md).
 
         Its workcell file lies in a temporary folder that lasts as long as the cell.
 
         Raises:
             BundleError: the workcell file cannot be changed, or was since it was read.
+            SettingsError: an objective is unknown.
         """
         folder = TemporaryDirectory()
         workcell = unpack_cell(drivable_files(collect_cell(self.workcell)), Path(folder.name))
-        cell = Cell(workcell, DRIVABLE_OBJECTIVES, self.threads)
+        cell = Cell(workcell, self.force_kind.drivable, self.threads)
         cell._folder = folder
         return cell
 
@@ -130,7 +131,7 @@ class Cell:
         """What times carries."""
         from hybrid_opt.timing.model import TimingModel
 
-        return TimingModel(self.compiled, robust=self.limits_robust_forces)
+        return TimingModel(self.compiled, robust=self.force_kind.robust)
 
     @cached_property
     def path_timer(self) -> PathTimer:
@@ -157,10 +158,14 @@ class Cell:
         return self.evaluator.checker.geometry
 
     @property
-    def limits_robust_forces(self) -> bool:
-        """Whether force limits of drivable carries hold in every case of the uncertainty: where
-        robust forces are minimised."""
-        return limits_robust_forces(select_objectives(self._objectives))
+    def force_kind(self) -> ForceKind:
+        """The forces that limits of drivable carries are about: robust ones where these are
+        minimised.
+
+        Raises:
+            SettingsError: an objective is unknown.
+        """
+        return force_kind(self._objectives)
 
     @property
     def objective_names(self) -> tuple[str, ...]:

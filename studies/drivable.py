@@ -12,7 +12,7 @@ from hybrid_opt.campaign.layout import DRIVABLE
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.selection import select
 from studies.terminal_summary import title
@@ -112,7 +112,7 @@ def least_force(campaign: CampaignResults) -> dict[str, Array]:
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
     """Whether an experiment already is the search for carries as robots drive them."""
-    return workcell.task.time_law == "optimal" and tuple(objectives) == DRIVABLE_OBJECTIVES
+    return workcell.task.time_law == "optimal" and tuple(objectives) in DRIVABLE_PAIRS
 
 
 def drivable_root(root: Path, workcell: Workcell, objectives: Sequence[str]) -> Path:

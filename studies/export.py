@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.job.compliance import (
     SKEWS,
     STIFFNESSES,
@@ -63,7 +62,11 @@ def _parser() -> argparse.ArgumentParser:
         "below --force-limit (default: force where that is given, else closest)",
     )
     parser.add_argument(
-        "--force-limit", type=float, metavar="N", help="largest planned normal force [N]"
+        "--force-limit",
+        type=float,
+        metavar="N",
+        help="largest planned normal force [N], the largest robust one of a trajectory that was "
+        "searched for robust forces",
     )
     parser.add_argument(
         "--squeeze",
@@ -126,10 +129,9 @@ def _run(options: argparse.Namespace) -> int:
 def _planned(
     stored: StoredTrajectory, folder: Path, options: argparse.Namespace, squeeze: SqueezeSettings
 ) -> Job:
-    compiled = CompiledCell(stored.unpack(folder))
-    model = TimingModel(compiled)
-    timing = _timing(model, stored, options.use, options.force_limit)
-    return JobModel(compiled, model).plan(timing, squeeze, options.smoothing)
+    cell = stored.open_cell(folder)
+    timing = _timing(cell.timing_model, stored, options.use, options.force_limit)
+    return JobModel(cell.compiled, cell.timing_model).plan(timing, squeeze, options.smoothing)
 
 
 def _timing(

@@ -21,7 +21,6 @@ from hybrid_opt.campaign.recommended import (
     stored_recommendation,
 )
 from hybrid_opt.campaign.results import read_campaign
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.recommending.driven_paths import DrivenPaths
 from hybrid_opt.recommending.force_table import (
     front_durations,
@@ -101,7 +100,7 @@ def recommend_from(
     if len(drivable.x) == 0:
         return None
     threads = threads or available_cores()
-    cell = ho.Cell(drivable.results.workcell, DRIVABLE_OBJECTIVES, threads)
+    cell = ho.Cell(drivable.results.workcell, drivable.results.objectives, threads)
     alone = is_drivable(campaign.workcell, campaign.objectives)
     others = {} if alone else least_force(campaign)
     found = ho.recommend(cell, drivable.x, wish, others)
@@ -141,7 +140,7 @@ def _force_table(
 ) -> ForceTable:
     """Every front's durations at the same forces, that of the recommended carry among them."""
     task = cell.workcell.task
-    forces = np.unique(np.append(table_forces(cell.workcell), found.force))
+    forces = np.unique(np.append(table_forces(cell.workcell, cell.force_kind), found.force))
 
     def durations(paths: Array) -> Array:
         if len(paths) == 0:

@@ -48,14 +48,15 @@ def recommendation_text(
         folder: of the results, in front of the files' names; '' where the reader is in it.
     """
     headline = (
-        f"Run this carry: {found.duration:.2f} s, pressing with at most "
-        f"{max(found.peak_force):.2f} N ({_of_robots(found.peak_force, robots)})"
+        f"Run this carry: {found.duration:.2f} s, {found.force_kind.pressing} "
+        f"{max(found.limited_force):.2f} N ({_of_robots(found.limited_force, robots)})"
     )
     facts = [
         ("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}"),
         ("file", str(Path(folder) / found.file)),
         ("export", export_command(Path(folder) / found.file, found.force_limit)),
         *([] if found.jerk is None else [("within jerk limits", _jerk(found.jerk))]),
+        *_planned(found, robots),
         ("press with", f"{_of_robots(found.squeeze, robots)}, {found.squeeze_reason}"),
         ("payload", f"up to {found.payload_limit:.2f} kg on the same motion"),
         *[(rival.label, _rival(rival, found)) for rival in found.rivals],
@@ -77,6 +78,13 @@ def recommendation_text(
             )
         )
     return RecommendationText(headline, tuple(facts), found.warnings)
+
+
+def _planned(found: StoredRecommendation, robots: Sequence[str]) -> list[tuple[str, str]]:
+    """The planned forces, where limits are about others."""
+    if found.robust_force is None:
+        return []
+    return [("planned", f"{_of_robots(found.peak_force, robots)}, if nothing is uncertain")]
 
 
 def export_command(path: Path, force: float) -> str:

@@ -53,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace) -> int:
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
-        cell = Cell(stored.unpack(Path(folder)))
+        cell = stored.open_cell(Path(folder))
         carry = cell.carry(stored.x)
         limit = options.force_limit
         timed = [] if limit is None else _timed(cell, stored.x, limit)

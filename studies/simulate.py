@@ -105,7 +105,7 @@ def _run(options: argparse.Namespace) -> int:
     pads = SimulationSettings(options.time_step, options.contact_time)
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
-        cell = Cell(stored.unpack(Path(folder)))
+        cell = stored.open_cell(Path(folder))
         carry = _timed(cell, stored.x, options)
         peak = carry.peak_normal_force
         print(
@@ -134,7 +134,7 @@ def _run(options: argparse.Namespace) -> int:
 def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
     model = cell.timing_model
     if options.force_limit is not None:
-        timing = time_path(model, x, TimingLimits(force=options.force_limit))
+        timing = time_path(model, x, model.drive_limits(options.force_limit))
     elif options.timing == "fastest":
         timing = time_path(model, x, TimingLimits())
     elif options.timing == "search":

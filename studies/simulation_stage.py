@@ -24,7 +24,6 @@ from hybrid_opt.campaign.simulated import (
     not_simulated,
     stored_simulation,
 )
-from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError, WitnessError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
@@ -131,7 +130,7 @@ def _nothing() -> None:
 def _simulated(_: None, one: Simulated, emit: Emit) -> StoredSimulation:
     whose = Whose(one.label, one.digest, CONTROL)
     with TemporaryDirectory() as folder:
-        cell = Cell(one.trajectory.unpack(Path(folder)))
+        cell = one.trajectory.open_cell(Path(folder))
         try:
             carry = driven_carry(cell, one.trajectory.x)
             found = account_of(cell, carry, CellWitness(cell.workcell), CONTROL)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from hybrid_opt.campaign.recommended import ForceTable
+from hybrid_opt.campaign.recommended import StoredRecommendation
 from hybrid_opt.campaign.summary import AlgorithmFigures, Bounds, CampaignSummary, StoredTest
 from studies.text_table import number, text_table
 
@@ -85,7 +85,7 @@ def terminal_summary(
         bounds_sentence(summary.bounds),
     ]
     if summary.recommendation is not None:
-        parts.append(_durations(summary.recommendation.durations))
+        parts.append(_durations(summary.recommendation))
     if drivable is not None:
         parts += [
             f"The drivable experiment\n{_drivable(drivable)}",
@@ -111,8 +111,9 @@ def bounds_sentence(bounds: Bounds) -> str:
     return f"{head}; these bind, wider ones may allow better carries\n{listed}"
 
 
-def _durations(table: ForceTable) -> str:
+def _durations(found: StoredRecommendation) -> str:
     """How long all fronts take at the same forces."""
+    table = found.durations
     rows = [["duration [s] at", *(f"{force:.2f} N" for force in table.forces)]]
     for row in table.rows:
         cells = [
@@ -120,7 +121,7 @@ def _durations(table: ForceTable) -> str:
         ]
         rows.append([row.label, *cells])
     note = "Every path timed anew at the force; of fronts the fastest member, median [least, most]."
-    return f"Time against force\n{text_table(rows)}\n{note}"
+    return f"Time against {found.force_kind.name}\n{text_table(rows)}\n{note}"
 
 
 def _spread_of(median: float, least: float, largest: float) -> str:

@@ -142,7 +142,7 @@ def _cases(files: Sequence[str], folder: Path, rng: np.random.Generator) -> Iter
             yield from _timed(cell, (name, "hand-made"), x, (friction,) * len(TIMINGS))
     for k, file in enumerate(files):
         stored = read_trajectory(file)
-        cell = Cell(stored.unpack(folder / str(k)))
+        cell = stored.open_cell(folder / str(k))
         yield from _timed(cell, ("file", Path(file).parent.name[-11:]), stored.x, _turned(k))
     for k in count():
         for name, cell in cells.items():

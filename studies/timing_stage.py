@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.layout import POLISHED_SUFFIX, SELECTED
+from hybrid_opt.cell import Cell
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
@@ -44,7 +46,7 @@ def _run(folder: CampaignFolder, progress: Progress, force_limit: float | None, 
             path for path in files if f"{path.parent}{POLISHED_SUFFIX}/{path.name}" not in known
         ]
     found = {file: read_trajectory(selected / file).x for file in files}
-    job = Job(TimingModelSource(PackedCell.of(folder.files)), _document)
+    job = Job(TimingModelSource(PackedCell.of(folder.files), folder.settings.objectives), _document)
     requests = [(x, force_limit) for x in found.values()]
     with progress.stage(TIMING, len(requests), "trajectories") as advance:
         executor = executor_for(folder.execution)
@@ -59,17 +61,19 @@ class TimingModelSource:
 
     Attributes:
         cell: the workcell.
+        objectives: what is minimised, which says what force limits are about.
     """
 
     cell: PackedCell
+    objectives: tuple[str, ...]
 
     def __call__(self) -> TimingModel:
         """Load the compiled functions, or build them where they are missing."""
-        return self.cell.make(_ready_model)
+        return self.cell.make(partial(_ready_model, self.objectives))
 
 
-def _ready_model(workcell: Workcell) -> TimingModel:
-    model = TimingModel(workcell)
+def _ready_model(objectives: tuple[str, ...], workcell: Workcell) -> TimingModel:
+    model = Cell(workcell, objectives).timing_model
     # The cell's files are there only now: what is loaded when it is first needed is needed now.
     model.search_carry(initial_decision(workcell.task))
     return model

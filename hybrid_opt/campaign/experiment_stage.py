@@ -12,14 +12,15 @@ from hybrid_opt.campaign.layout import CONFIGURATION, DRIVABLE
 from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Stage, run_stages
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.evaluate.objectives import force_kind
 from symbolic.workcell.cell_files import unpack_cell
 from symbolic.workcell.drivable import drivable_files
 
 
 def drivable_settings(settings: CampaignSettings) -> CampaignSettings:
-    """Of the drivable experiment beside another one: the same but for what is minimised."""
-    return replace(settings, objectives=DRIVABLE_OBJECTIVES)
+    """Of the drivable experiment beside another one: the same but for what is minimised, durations
+    and forces of the kind that the other one minimises."""
+    return replace(settings, objectives=force_kind(settings.objectives).drivable)
 
 
 def drivable_stage(stages: Sequence[Stage]) -> Stage:

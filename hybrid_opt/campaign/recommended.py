@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hybrid_opt.campaign.documents import Count, Pair, Vector
+from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ROBUST_FORCE, ForceKind
 from hybrid_opt.recommending.recommendation import Recommendation
 from hybrid_opt.robust.price import RobustPrice
 from hybrid_opt.store.json_records import Figure
@@ -78,7 +79,7 @@ class ForceTable:
     """Durations at the same forces.
 
     Attributes:
-        forces: limits on both normal forces [N].
+        forces: limits on both forces [N].
         rows: hand-made path, optimum of the other experiment, then every algorithm's fronts.
     """
 
@@ -165,7 +166,9 @@ class StoredRecommendation:
         export: the command that makes of it what robots need, run in the folder.
         duration: [s].
         force_limit: [N].
-        peak_force: largest normal force of each robot [N].
+        peak_force: largest planned normal force of each robot [N].
+        robust_force: likewise in every case of the workcell's uncertainty, where force limits are
+            about these; else null.
         squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
         payload_limit: payload that the robots bear on the same motion [kg].
         rivals: other paths at the same force and in the same time, the hand-made one first.
@@ -197,6 +200,17 @@ class StoredRecommendation:
     durations: ForceTable
     price: StoredPrice | None = None
     jerk: StoredJerk | None = None
+    robust_force: Pair | None = None
+
+    @property
+    def force_kind(self) -> ForceKind:
+        """The forces that limits, of the table and of rivals too, are about."""
+        return PLANNED_FORCE if self.robust_force is None else ROBUST_FORCE
+
+    @property
+    def limited_force(self) -> Array:
+        """(2,) largest of them of each robot [N]."""
+        return self.peak_force if self.robust_force is None else self.robust_force
 
 
 @dataclass(frozen=True)
@@ -231,4 +245,5 @@ def stored_recommendation(found: Recommendation, told: Told) -> StoredRecommenda
         unsure=tuple(StoredUnsure(**vars(doubt)) for doubt in found.unsure),
         warnings=found.warnings,
         jerk=None if found.jerk is None else StoredJerk.of(found.jerk),
+        robust_force=found.limited_force if found.force_kind.robust else None,
     )

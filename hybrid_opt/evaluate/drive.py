@@ -19,7 +19,7 @@ from hybrid_opt.evaluate.drive_constraints import (
     JOINT_TORQUE,
     NO_TIMING,
 )
-from hybrid_opt.evaluate.objectives import Objective, limits_robust_forces
+from hybrid_opt.evaluate.objectives import Objective, force_kind
 from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from symbolic.array import Array
@@ -134,7 +134,7 @@ class Driver:
 def driver_of(compiled: CompiledCell, threads: int, objectives: Sequence[Objective]) -> Driver:
     """What drives candidates of a cell under the time law 'optimal', see `Driver`; limits are those
     of robust forces where these are minimised."""
-    return Driver(PathTimer(compiled, threads=threads), threads, limits_robust_forces(objectives))
+    return Driver(PathTimer(compiled, threads=threads), threads, force_kind(objectives).robust)
 
 
 def _at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:

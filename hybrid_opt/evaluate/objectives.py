@@ -47,12 +47,44 @@ ROBUST_OBJECTIVES = ("robust_force_1", "robust_force_2")
 FORCE_PAIRS = (PAPER_OBJECTIVES, ROBUST_OBJECTIVES)
 """Both robots' peak forces: what the polish of forces minimises."""
 
-DRIVABLE_OBJECTIVES = ("duration", "peak_force")
-"""How long a carry takes and how hard it presses: the pair of the time law 'optimal'."""
 
-ROBUST_DRIVABLE_OBJECTIVES = ("duration", "robust_force")
-"""The same where every case of the workcell's uncertainty is to hold."""
+@dataclass(frozen=True)
+class ForceKind:
+    """The normal forces that are limited and minimised in carries as robots drive them.
 
+    Attributes:
+        robust: whether they hold in every case of the workcell's uncertainty.
+        drivable: the pair of objectives of the time law 'optimal': how long a carry takes and how
+            hard it presses.
+        name: of them, in sentences.
+        title: the largest of them, for axes.
+        pressing: before the largest of them, where a carry is told.
+    """
+
+    robust: bool
+    drivable: tuple[str, str]
+    name: str
+    title: str
+    pressing: str
+
+
+PLANNED_FORCE = ForceKind(
+    robust=False,
+    drivable=("duration", "peak_force"),
+    name="force",
+    title="largest normal force",
+    pressing="pressing with at most",
+)
+ROBUST_FORCE = ForceKind(
+    robust=True,
+    drivable=("duration", "robust_force"),
+    name="robust force",
+    title="largest robust force",
+    pressing="held in every case by at most",
+)
+
+DRIVABLE_OBJECTIVES = PLANNED_FORCE.drivable
+ROBUST_DRIVABLE_OBJECTIVES = ROBUST_FORCE.drivable
 DRIVABLE_PAIRS = (DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES)
 """What the drivable experiment may be about."""
 
@@ -211,9 +243,16 @@ OBJECTIVES: dict[str, Objective] = {
 _ROBUST = tuple(OBJECTIVES[name].evaluate for name in ("robust_force", *ROBUST_OBJECTIVES))
 
 
-def limits_robust_forces(objectives: Sequence[Objective]) -> bool:
-    """Whether the force limit of the time law 'optimal' is one of robust forces."""
-    return any(objective.evaluate in _ROBUST for objective in objectives)
+def force_kind(objectives: Sequence[str | Objective]) -> ForceKind:
+    """The forces that the limits of the time law 'optimal' are about: robust ones where these are
+    minimised.
+
+    Raises:
+        SettingsError: as of `select_objectives`.
+    """
+    chosen = select_objectives(objectives)
+    robust = any(objective.evaluate in _ROBUST for objective in chosen)
+    return ROBUST_FORCE if robust else PLANNED_FORCE
 
 
 def select_objectives(wanted: Sequence[str | Objective]) -> tuple[Objective, ...]:

@@ -25,7 +25,7 @@ from hybrid_opt.job.forces import held, pressing, without_force
 from hybrid_opt.job.limits import EXCESS, phase_use
 from hybrid_opt.job.profile import rise
 from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
-from hybrid_opt.job.smooth import WIDEST, WIDTH, limits_of, rests_at_ends, smoothed
+from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, smoothed
 from hybrid_opt.job.straight import (
     SAMPLES,
     Straight,
@@ -189,8 +189,7 @@ class JobModel:
         if jerk is None:
             return smoothed(self.timing, timing, width)
         assert timing.carry is not None, "a timing that is to be driven has a carry"
-        x, limits = timing.carry.x, limits_of(timing)
-        found = time_with_jerk(self.timing, x, limits, jerk).timing
+        found = time_with_jerk(self.timing, timing.carry.x, timing.limits, jerk).timing
         if found.carry is None:
             raise JobError(f"no timing within the limits on jerk: {found.reason}")
         return found

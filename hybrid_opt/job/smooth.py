@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import JobError
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.records import Timing, TimingLimits
+from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.use import limit_use, worst
 from symbolic.array import Array
 
@@ -71,7 +71,7 @@ def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing
     assert speed is not None, "a timing that was found has its speeds"
     u, rate, second = _averaged(speed, width)
     motion = model.path_motion(carry.x).between(u)
-    limits = limits_of(timing)
+    limits = timing.limits
 
     def driven(factor: float) -> Carry:
         time = np.asarray(EVERY * STEP / factor * np.arange(len(u)))
@@ -126,15 +126,3 @@ def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
     second = np.convolve(speed, slope / total, mode="valid")
     keep = np.arange(0, len(u) + EVERY - 1, EVERY).clip(max=len(u) - 1)
     return np.clip(u[keep], 0.0, 1.0), np.maximum(rate[keep], 0.0), second[keep]
-
-
-def limits_of(timing: Timing) -> TimingLimits:
-    """The limits that a timing was found for, as its use of them tells."""
-    assert timing.carry is not None, "a timing that is to be driven has a carry"
-    force = timing.use.get("normal force")
-    return TimingLimits(
-        force=None if force is None else float(timing.carry.normal_force.max()) / force.ratio,
-        torque="joint torque" in timing.use,
-        pressure="pressure shift" in timing.use,
-        reference_speed="path speed" in timing.use,
-    )

@@ -46,7 +46,7 @@ def choices(workcell: Workcell, paths: DrivenPaths, points: Array, wish: Wish) -
     Args:
         workcell: the cell.
         paths: of the front's members.
-        points: (k, 2) duration [s] and largest normal force [N] of the members themselves.
+        points: (k, 2) duration [s] and largest limited force [N] of the members themselves.
         wish: what is asked for.
 
     Raises:
@@ -84,7 +84,7 @@ def _by_force(workcell: Workcell, paths: DrivenPaths, wish: Wish) -> Iterator[Ch
     force = min(force, paths.highest_force)
     durations = paths.durations(force)
     if not np.isfinite(durations).any():
-        still = min(timing.peak_force.max() for timing in paths.timings(1e-6))
+        still = min(timing.limited_force for timing in paths.timings(1e-6))
         raise SettingsError(
             f"{asked}: no carry of the front moves with so little; holding still takes {still:.2f} "
             "N already"

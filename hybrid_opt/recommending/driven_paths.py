@@ -43,7 +43,7 @@ class DrivenPaths:
     def of(cls, cell: Cell, x: Array) -> DrivenPaths:
         """Paths of a cell within the limits of its drivable carries."""
         highest = cell.workcell.task.force_limit[1]
-        return cls(cell.path_timer, x, highest, cell.limits_robust_forces)
+        return cls(cell.path_timer, x, highest, cell.force_kind.robust)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -67,7 +67,7 @@ class DrivenPaths:
 
         Durations fall as the limit rises, so bisection finds it.
         """
-        still = np.array([timing.peak_force.max() for timing in self.timings(1e-6)])
+        still = np.array([timing.limited_force for timing in self.timings(1e-6)])
         low = np.where(np.isfinite(still), still, 1.0) * (1.0 + LEAST_ABOVE_STILL)
         high = np.full(len(self), max(self.highest_force, float(low.max())))
         possible = self.durations(high) <= duration

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ForceKind
 from hybrid_opt.evaluate.static_hold import static_hold
 from hybrid_opt.recommending.driven_paths import DrivenPaths
+from hybrid_opt.robust.force import BoxMotion, robust_model
 from symbolic.array import Array
 from symbolic.workcell.records import Workcell
 
@@ -18,9 +20,22 @@ MEMBERS = 24
 """Of a front that are timed, evenly spread over it."""
 
 
-def table_forces(workcell: Workcell) -> Array:
+def level_force(workcell: Workcell, kind: ForceKind) -> float:
+    """Largest force of a robot that holds the payload level and still [N].
+
+    Raises:
+        SettingsError: the uncertainty leaves no friction or patch.
+    """
+    if not kind.robust:
+        return float(static_hold(workcell).normal_force.max())
+    still = np.zeros((1, 6))
+    model = robust_model(workcell)
+    return float(np.max(model.hold(BoxMotion(still, still, still), workcell.uncertainty)))
+
+
+def table_forces(workcell: Workcell, kind: ForceKind = PLANNED_FORCE) -> Array:
     """(n,) force limits of the table [N], those within the force limit's bounds."""
-    forces = float(static_hold(workcell).normal_force.max()) * np.array(ABOVE_STILL)
+    forces = level_force(workcell, kind) * np.array(ABOVE_STILL)
     low, high = workcell.task.force_limit
     return np.asarray(forces[(forces >= low) & (forces <= high)])
 

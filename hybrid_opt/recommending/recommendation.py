@@ -10,6 +10,7 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.objectives import ForceKind
 from hybrid_opt.recommending.choice import Choice, choices
 from hybrid_opt.recommending.driven_paths import DrivenPaths
 from hybrid_opt.recommending.rival import BETTER, Reference, Rival, comparison_forces, rivals
@@ -21,6 +22,7 @@ from hybrid_opt.timing.jerk import drive_with_jerk
 from hybrid_opt.timing.records import JerkTiming, Timing
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.use import limited_force
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
@@ -45,6 +47,8 @@ class Recommendation:
         timing: as the independent timing drives it, every limit recomputed; its `carry` is what
             robots drive where the cell limits no jerk.
         jerk: the same path and force within the cell's limits on jerk as well, None without any.
+        force_kind: which forces its limit is about, and the front's.
+        limited_force: (2,) largest of them of each robot along the carry [N].
         squeeze: how hard to press.
         margins: how wrong the cell's description may be.
         rivals: the hand-made path, and others, at the same force and in the same time.
@@ -57,6 +61,8 @@ class Recommendation:
     x: Array
     timing: Timing
     jerk: JerkTiming | None
+    force_kind: ForceKind
+    limited_force: Array
     squeeze: Commanded
     margins: tuple[Margin, ...]
     rivals: tuple[Rival, ...]
@@ -71,14 +77,15 @@ class Recommendation:
 
     @property
     def force(self) -> float:
-        """Limit on both normal forces [N]."""
+        """Limit on the forces of both robots [N]."""
         return float(self.x[-1])
 
     def __repr__(self) -> str:
-        first, second = self.carry.peak_normal_force
+        first, second = self.limited_force
+        held = f"{self.force_kind.pressing} {first:.2f} and {second:.2f} N"
         lines = [
-            f"Recommended: {self.timing.duration:.3f} s, peak normal forces {first:.2f} and "
-            f"{second:.2f} N; press with {self.squeeze.peak.max():.1f} N ({self.squeeze.reason})",
+            f"Recommended: {self.timing.duration:.3f} s, {held}; press with "
+            f"{self.squeeze.peak.max():.1f} N ({self.squeeze.reason})",
             f"  {self.wish}",
         ]
         if self.jerk is not None:
@@ -125,13 +132,14 @@ def recommend(
     wish = wish or Wish()
     paths = DrivenPaths.of(cell, x[:, :-1])
     members = paths.timings(x[:, -1])
-    points = np.array([[member.duration, member.peak_force.max()] for member in members])
+    points = np.array([[member.duration, member.limited_force] for member in members])
     choice, timing = _driven(cell, x, choices(cell.workcell, paths, points, wish))
     assert timing.carry is not None, "the timing respects every limit"
     named = {HAND_MADE: cell.initial[:-1]} | dict(others or {})
     reference = Reference(paths, choice.index, choice.force, comparison_forces(points))
     beside = rivals(cell, named, reference)
     jerk = drive_with_jerk(cell.timing_model, timing.carry.x)
+    forces = limited_force(timing.carry, cell.workcell, timing.limits)
     margins = robustness_margins(cell.timing_model, timing.carry)
     squeeze, doubt = _commanded(timing.carry)
     return Recommendation(
@@ -140,6 +148,8 @@ def recommend(
         x=timing.carry.x,
         timing=timing,
         jerk=jerk,
+        force_kind=cell.force_kind,
+        limited_force=forces.max(axis=0),
         squeeze=squeeze,
         margins=margins,
         rivals=beside,

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.store.trajectory_figures import same_figure, trajectory_figures
 from hybrid_opt.store.trajectory_file import StoredTrajectory
 
@@ -58,11 +57,7 @@ def replay(stored: StoredTrajectory, folder: Path) -> Replay:
     Raises:
         DualArmError: the stored workcell is not valid, or its model cannot be built.
     """
-    workcell = stored.unpack(folder)
-    prefix = "objective_"
-    named = [name.removeprefix(prefix) for name in stored.figures if name.startswith(prefix)]
-    objectives = tuple(name for name in named if name in OBJECTIVES)
-    cell = Cell(workcell, objectives or PAPER_OBJECTIVES)
+    cell = stored.open_cell(folder)
     carry = cell.carry(stored.x)
     recomputed = trajectory_figures(carry)
     differences = [

@@ -8,6 +8,9 @@ ABSOLUTE_TOLERANCE = 1e-9
 RELATIVE_TOLERANCE = 1e-6
 """Two evaluations of one trajectory may differ by this much: other compiler, other machine."""
 
+OBJECTIVE = "objective_"
+"""Before the name of an objective."""
+
 
 def trajectory_figures(carry: Carry) -> dict[str, float]:
     """Figures of a judged carry, SI units.
@@ -21,7 +24,7 @@ def trajectory_figures(carry: Carry) -> dict[str, float]:
         "duration": carry.duration,
         "payload_limit": carry.payload_limit,
     }
-    figures |= {f"objective_{name}": value for name, value in judgement.objectives.items()}
+    figures |= {f"{OBJECTIVE}{name}": value for name, value in judgement.objectives.items()}
     per_robot = {
         "peak_normal_force": carry.peak_normal_force,
         "mean_normal_force": carry.mean_normal_force,

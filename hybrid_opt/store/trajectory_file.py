@@ -16,9 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.store.files import AGAIN, storing
+from hybrid_opt.store.trajectory_figures import OBJECTIVE
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import BundleError, OutsideError
@@ -63,6 +66,22 @@ class StoredTrajectory:
     figures: Mapping[str, float]
     provenance: Mapping[str, Any]
     cell: CellFiles
+
+    @property
+    def objectives(self) -> tuple[str, ...]:
+        """The library's objectives that it was stored with, those of the paper where there are
+        none."""
+        named = {f"{OBJECTIVE}{name}": name for name in OBJECTIVES}
+        found = tuple(named[figure] for figure in self.figures if figure in named)
+        return found or PAPER_OBJECTIVES
+
+    def open_cell(self, folder: Path) -> Cell:
+        """Its cell, which minimises these objectives; its files are written below a folder.
+
+        Raises:
+            ResultsError: as of `unpack`.
+        """
+        return Cell(self.unpack(folder), self.objectives)
 
     def unpack(self, folder: Path) -> Workcell:
         """Write the workcell's files below a folder and read it.

@@ -11,7 +11,14 @@ from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_check import path_failure
 from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, joint_at, joint_use, limit_use, worst
+from hybrid_opt.timing.use import (
+    RECOMPUTED_TOLERANCE,
+    joint_at,
+    joint_use,
+    limit_use,
+    limited_force,
+    worst,
+)
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
@@ -43,14 +50,15 @@ class JudgedTiming:
 
 @dataclass(frozen=True)
 class ForceCurve:
-    """Duration of the fastest timing against the limit on the normal forces.
+    """Duration of the fastest timing against the limit on the normal forces, on robust ones where
+    the model limits these.
 
     Attributes:
         force: (n,) limits [N].
         duration: (n,) [s], infinite where there is no timing.
         status: outcome per limit.
-        static_force: largest normal force standing still anywhere on the path [N].
-        unlimited_force: largest normal force of the fastest timing without force limit [N].
+        static_force: largest limited force standing still anywhere on the path [N].
+        unlimited_force: largest limited force of the fastest timing without force limit [N].
     """
 
     force: Array
@@ -119,7 +127,8 @@ def closest_to_reference_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def force_limited_timing(model: TimingModel, x: Array, force: float) -> Timing:
-    """The fastest timing whose normal forces stay below a limit while friction holds.
+    """The fastest timing whose normal forces, robust ones where the model limits these, stay below
+    a limit while friction holds.
 
     Args:
         force: largest normal force of each robot [N].
@@ -127,7 +136,7 @@ def force_limited_timing(model: TimingModel, x: Array, force: float) -> Timing:
     Raises:
         SettingsError: the limit is not a positive force.
     """
-    return time_path(model, x, TimingLimits(force=force))
+    return time_path(model, x, model.drive_limits(force))
 
 
 def duration_against_force_limit(model: TimingModel, x: Array, points: int = 12) -> ForceCurve:
@@ -142,14 +151,14 @@ def duration_against_force_limit(model: TimingModel, x: Array, points: int = 12)
         raise SettingsError(f"{points} points of the force curve; give at least 2")
     motion = model.path_motion(x)
     still = np.zeros(len(motion.parameter))
-    static = float(model.drive(motion, still, still)["normal_force"].max())
+    static = _peak_force(model, model.carry(motion, still, still, still))
     free = time_path(model, x, TimingLimits(), motion)
     if free.carry is None:
         return ForceCurve(np.zeros(0), np.zeros(0), (free.status,), static, float("nan"))
-    top = float(free.carry.normal_force.max())
+    top = _peak_force(model, free.carry)
     first = (NEAREST_FORCE - 1.0) * static
     force = static + np.geomspace(first, max(top - static, 2.0 * first), points)
-    timings = [time_path(model, x, TimingLimits(force=float(limit)), motion) for limit in force]
+    timings = [time_path(model, x, model.drive_limits(float(limit)), motion) for limit in force]
     return ForceCurve(
         force,
         np.array([timing.duration for timing in timings]),
@@ -157,3 +166,8 @@ def duration_against_force_limit(model: TimingModel, x: Array, points: int = 12)
         static,
         top,
     )
+
+
+def _peak_force(model: TimingModel, carry: Carry) -> float:
+    """The largest of the forces that the model limits [N]."""
+    return float(limited_force(carry, model.workcell, model.drive_limits(1.0)).max())

@@ -73,11 +73,9 @@ def time_with_jerk(
         x: (n_var,) decision vector.
 
     Raises:
-        SettingsError: x does not fit the workcell, robust forces are limited, or the force is
-            limited of pads that are not two round ones facing one another.
+        SettingsError: x does not fit the workcell, or the force is limited of pads that are not
+            two round ones facing one another.
     """
-    if limits.robust:
-        raise SettingsError("jerk limits beside a limit of robust forces are not available")
     if limits.force is not None and not model.workcell.has_facing_pads:
         raise SettingsError(
             "jerk limits beside a force limit need two round pads that face one another: leave "
@@ -93,13 +91,11 @@ def time_with_jerk(
 
 def drive_with_jerk(model: TimingModel, x: Array) -> JerkTiming | None:
     """A drivable carry x (n_var,) within its own force limit and the cell's limits on jerk; None
-    where the cell limits no jerk, where its pads are not two round ones facing one another, and
-    where its force limit is one of robust forces."""
+    where the cell limits no jerk, and where its pads are not two round ones facing one another."""
     limits = JerkLimits.of(model.workcell)
-    force = model.drive_limits(float(x[-1]))
-    if limits is None or not model.workcell.has_facing_pads or force.robust:
+    if limits is None or not model.workcell.has_facing_pads:
         return None
-    return time_with_jerk(model, x, force, limits)
+    return time_with_jerk(model, x, model.drive_limits(float(x[-1])), limits)
 
 
 class _Problem:
@@ -194,7 +190,7 @@ class _Problem:
         joint, box = (float(jerk.max()) for jerk in self._jerks(at, c))
         excess = worst(use)
         reason = f"{carry.duration:.3f} s; most used: {excess.place}"
-        timing = Timing(TimingStatus.OK, reason, excess.place, carry, use)
+        timing = Timing(TimingStatus.OK, reason, excess.place, carry, use, limits=self._limits)
         return timing, excess.ratio, joint, box
 
     def _factor(self, c: Array) -> float:

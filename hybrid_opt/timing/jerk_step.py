@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
 from hybrid_opt.timing.jerk_program import Point, Rows
 from hybrid_opt.timing.model import TimingModel, contact_torque
 from hybrid_opt.timing.path_motion import PathMotion
@@ -28,6 +29,7 @@ def convex_step(
     rows = Rows(len(c))
     _motion_rows(model, at, limits, rows)
     _force_rows(model, at, limits, rows)
+    _robust_rows(model, at, c, limits, rows)
     _ratio_rows(model, at, c, limits, rows)
     _jerk_rows(at, c, jerk, rows)
     rows.below(-np.ones((len(c), 1)), -LEAST_SHARE * c, np.arange(len(c)))
@@ -103,6 +105,31 @@ def _force_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows)
                 rows.below(share_n * along / force, room / force, at.first_basis)
 
 
+def _robust_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, rows: Rows) -> None:
+    """Robust forces below the limit, linearised at c: they are convex in (u'', u'^2)."""
+    if limits.force is None or not limits.robust:
+        return
+    a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
+    m = at.motion
+    path = (m.pose[:, :6], m.pose_first[:, :6], m.pose_second[:, :6])
+    force, slope = robust_path(model.workcell).at(PathPoints(*path, a, w))
+    by = (slope[:, :, BY_TIMING] / limits.force)[..., None] * np.stack(
+        [at.acceleration_by, at.squared_by], axis=1
+    )[:, None]
+    _linearised(at, c, force / limits.force, by.sum(axis=2), rows)
+
+
+def _linearised(at: Point, c: Array, value: Array, by: Array, rows: Rows) -> None:
+    """Values (n, m) at c over their limits, with derivatives (n, m, k), below one.
+
+    What is exceeded between rounds, by what the last one left out, may stay as it is for one.
+    """
+    bound = np.maximum(at.keep[:, None], value) - value + by @ c
+    A = at.local(by)
+    first = np.repeat(at.first_basis, by.shape[1])
+    rows.below(A.reshape(-1, A.shape[2]), bound.reshape(-1), first)
+
+
 def _ratio_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, rows: Rows) -> None:
     """Joint torques and shifts of the pressure, linearised at c."""
     a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
@@ -116,11 +143,7 @@ def _ratio_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, r
     by = by_a[:, :, None] * at.acceleration_by[:, None] + by_w[:, :, None] * at.squared_by[:, None]
     chosen = value[:, near]
     for sign in (1.0, -1.0):
-        # What is exceeded between rounds, because it is not convex, may stay as it is for one.
-        bound = np.maximum(at.keep[:, None], sign * chosen) - sign * chosen + sign * (by @ c)
-        A = sign * at.local(by)
-        first = np.repeat(at.first_basis, by.shape[1])
-        rows.below(A.reshape(-1, A.shape[2]), bound.reshape(-1), first)
+        _linearised(at, c, sign * chosen, sign * by, rows)
 
 
 def _ratios(

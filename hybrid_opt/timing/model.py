@@ -67,8 +67,7 @@ class TimingModel:
         Args:
             cell: the cell; compiled, where others share its functions.
             intervals: pieces of constant path acceleration.
-            robust: whether the force limits of drivable carries hold in every case of the
-                workcell's uncertainty.
+            robust: whether force limits hold in every case of the workcell's uncertainty.
 
         Raises:
             SettingsError: the number of intervals is out of range.
@@ -191,7 +190,8 @@ class TimingModel:
         )
 
     def drive_limits(self, force: float) -> TimingLimits:
-        """The limits of drivable carries whose force limit this is [N]."""
+        """The limits of drivable carries whose force limit this is [N], one of robust forces where
+        the model limits these."""
         return TimingLimits(force=force, robust=self._robust)
 
     def search_carry(self, x: Array) -> Carry:

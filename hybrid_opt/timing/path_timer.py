@@ -69,6 +69,12 @@ class PathTiming:
         """Whether there is a timing that respects every limit."""
         return self.status is TimingStatus.OK
 
+    @property
+    def limited_force(self) -> float:
+        """Largest of the normal forces that its limits are about [N], see `peak_force`."""
+        known = self.peak_force if self.robust_force is None else self.robust_force
+        return float(known.max())
+
 
 class PathTimer:
     """Times paths of one workcell. Where it has no compiled passes it asks `time_path`, which is

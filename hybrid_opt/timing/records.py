@@ -147,6 +147,7 @@ class Timing:
         iterations: linear problems solved.
         slowed: uniform factor on the path speed that made recomputed limits hold, 1 normally.
         seconds: computing time.
+        limits: that it was found for, beyond the workcell's own.
     """
 
     status: TimingStatus
@@ -158,6 +159,7 @@ class Timing:
     iterations: int = 0
     slowed: float = 1.0
     seconds: float = 0.0
+    limits: TimingLimits = field(default_factory=TimingLimits)
 
     @property
     def ok(self) -> bool:
@@ -178,6 +180,16 @@ class Timing:
     def duration(self) -> float:
         """Duration [s], infinite without a timing."""
         return self.carry.duration if self.carry is not None else float("inf")
+
+    @property
+    def peak_force(self) -> float:
+        """Largest of the normal forces that its limits are about [N], robust ones where these are
+        limited; NaN without a timing."""
+        if self.carry is None:
+            return float("nan")
+        if self.limits.force is None:
+            return float(self.carry.normal_force.max())
+        return self.use["normal force"].ratio * self.limits.force
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -75,4 +75,4 @@ def drive_path(
     if excess.ratio > 1.0 + RECOMPUTED_TOLERANCE:
         status = TimingStatus.EXCEEDED
         reason = f"uses {100.0 * excess.ratio:.1f} % of the limit: {excess.place}"
-    return Timing(status, reason, excess.place, carry, use, grid_speed)
+    return Timing(status, reason, excess.place, carry, use, grid_speed, limits=limits)

@@ -9,7 +9,7 @@ they are linearised about the last timing and solved again until recomputed valu
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,7 @@ def time_path(
     if timing is None:
         timing = _Problem(model, motion, limits).solve()
     seconds = time.perf_counter() - begin
-    return Timing(**{**vars(timing), "seconds": seconds})
+    return replace(timing, seconds=seconds, limits=limits)
 
 
 def _failure_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing | None:

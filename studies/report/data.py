@@ -16,9 +16,11 @@ from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign,
 from hybrid_opt.campaign.simulated import read_simulations
 from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, ReplicaFigures
 from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.selection import selected_row
 from hybrid_opt.job.plan import JobModel
+from hybrid_opt.recommending.force_table import level_force
 from hybrid_opt.timing import TimingLimits, timed_trajectory
 from hybrid_opt.timing.robustness import payload_sensitivity
 from hybrid_opt.work.job import Emit, Executor, Job, answer_all
@@ -47,7 +49,6 @@ from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.workcell.cell_files import collect_cell
 from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.records import Workcell
 
 INITIAL_LABEL = "hand-made"
 CURVE_POINTS = 12
@@ -77,9 +78,10 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     drivable = gather_drivable(results, summary)
     slow: list[Callable[[JobModel], Any]] = [partial(_reach, geometry)]
     slow += [partial(_timing, carry.label, carry.x) for carry in carries]
-    slow += [partial(_job, request) for request in _job_requests(carries, drivable, workcell)]
+    requests = _job_requests(carries, drivable, results.cell)
+    slow += [partial(_job, request) for request in requests]
     files = collect_cell(workcell)
-    job = Job(JobModelSource(PackedCell.of(files)), _called)
+    job = Job(JobModelSource(PackedCell.of(files), results.objectives), _called)
     reach, *found = answer_all(executor or SerialExecutor(), job, slow)
     timings, jobs = found[: len(carries)], found[len(carries) :]
     return ReportData(
@@ -97,6 +99,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         reach=reach,
         branches=read_branches(results.root),
         simulations=read_simulations(results.root),
+        level_force=level_force(workcell, results.cell.force_kind),
         drivable=drivable,
         jobs=tuple(jobs),
     )
@@ -169,13 +172,14 @@ def _timing(label: str, x: Array, model: JobModel) -> TimedSelection:
 
 
 def _job_requests(
-    carries: Sequence[DrawnCarry], drivable: DrivableReport | None, workcell: Workcell
+    carries: Sequence[DrawnCarry], drivable: DrivableReport | None, cell: Cell
 ) -> list[JobRequest]:
     """The recommended carry's job, then those of hand-made and selected ones."""
     found = []
     if drivable is not None and drivable.recommended is not None:
-        x, force = drivable.recommended[: workcell.task.n_var], float(drivable.recommended[-1])
-        found.append(JobRequest(RECOMMENDED_LABEL, x, TimingLimits(force=force), True))
+        n_var, force = cell.workcell.task.n_var, float(drivable.recommended[-1])
+        within = TimingLimits(force=force, robust=cell.force_kind.robust)
+        found.append(JobRequest(RECOMMENDED_LABEL, drivable.recommended[:n_var], within, True))
     limits = TimingLimits(reference_speed=True)
     return found + [JobRequest(carry.label, carry.x, limits, True) for carry in carries]
 

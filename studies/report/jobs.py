@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.cell import Cell
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase, contact_effort
 from hybrid_opt.store.export.manifest import phase_documents
-from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, TimingModel, time_path
+from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, time_path
 from hybrid_opt.work.job import Emit
 from symbolic.array import Array
 from symbolic.errors import DualArmError
@@ -83,21 +84,23 @@ class JobModelSource:
 
     Attributes:
         cell: the workcell.
+        objectives: what is minimised, which says what force limits are about.
     """
 
     cell: PackedCell
+    objectives: tuple[str, ...]
 
     def __call__(self) -> JobModel:
         """Load the compiled functions, or build them where they are missing."""
-        return self.cell.make(_ready_model)
+        return self.cell.make(partial(_ready_model, self.objectives))
 
 
-def _ready_model(workcell: Workcell) -> JobModel:
-    compiled = CompiledCell(workcell)
-    timing = TimingModel(compiled)
+def _ready_model(objectives: tuple[str, ...], workcell: Workcell) -> JobModel:
+    cell = Cell(workcell, objectives)
+    timing = cell.timing_model
     # The cell's files are there only now: what is loaded when it is first needed is needed now.
     timing.search_carry(initial_decision(workcell.task))
-    return JobModel(compiled, timing)
+    return JobModel(cell.compiled, timing)
 
 
 def drawn_job(model: JobModel, request: JobRequest, emit: Emit | None = None) -> DrawnJob:

@@ -147,7 +147,7 @@ class PageCarries:
         law = cell.workcell.task.time_law
         judged = cell.carry(shown.x)
         assert judged.judgement is not None, "carries of a cell are judged"
-        request = JobRequest(shown.label, shown.x[: self._n_var], _limits(law, shown.x))
+        request = JobRequest(shown.label, shown.x[: self._n_var], _limits(cell, shown.x))
         timing = time_path(self._jobs.timing, request.x, request.limits)
         driven = timing.carry
         motions = [] if driven is None else [self._motion(DRIVEN, driven)]
@@ -162,9 +162,10 @@ class PageCarries:
             name = f"{name} (infeasible)"
         figures = trajectory_figures(judged).items()
         found = {
-            "label": f"{name}: {_values(cell, judged, driven)}",
+            "label": f"{name}: {_values(cell, judged, timing)}",
             "objectives": [float(value) for value in values.values()],
             "problem": "" if timing.ok else f"robots cannot drive it: {timing.reason}",
+            "force": timing.peak_force if driven is not None else max(motions[0]["peaks"]),
             "motions": motions,
             "cell": shown.cell,
             "decision": shown.x.tolist(),
@@ -201,22 +202,22 @@ class PageCarries:
 
 
 def driven_point(trajectory: Mapping[str, Any]) -> tuple[float, float]:
-    """Largest normal force [N] and duration [s] of a trajectory as its robots drive it."""
-    motion = trajectory["motions"][0]
-    return max(motion["peaks"]), motion["duration"]
+    """Largest limited force [N] and duration [s] of a trajectory as its robots drive it."""
+    return trajectory["force"], trajectory["motions"][0]["duration"]
 
 
-def _limits(law: str, x: Array) -> ho.TimingLimits:
-    if law == "optimal":
-        return ho.TimingLimits(force=float(x[-1]))
+def _limits(cell: ho.Cell, x: Array) -> ho.TimingLimits:
+    if cell.workcell.task.time_law == "optimal":
+        return cell.timing_model.drive_limits(float(x[-1]))
     return ho.TimingLimits(reference_speed=True)
 
 
-def _values(cell: ho.Cell, judged: ho.Carry, driven: ho.Carry | None) -> str:
+def _values(cell: ho.Cell, judged: ho.Carry, timing: ho.Timing) -> str:
     """What a trajectory is named by: what is minimised, forces and times with their units."""
     if cell.workcell.task.time_law == "optimal":
-        carry = driven or judged
-        return f"{carry.duration:.2f} s, {carry.peak_normal_force.max():.2f} N"
+        if timing.carry is not None:
+            return f"{timing.duration:.2f} s, {timing.peak_force:.2f} N"
+        return f"{judged.duration:.2f} s, {judged.peak_normal_force.max():.2f} N"
     assert judged.judgement is not None, "carries of a cell are judged"
     found = judged.judgement.objectives
     if tuple(found) != PAPER_OBJECTIVES:

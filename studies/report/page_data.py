@@ -10,7 +10,6 @@ import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.display.scene import packed, scene_data
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.work.job import Executor, Job, answer_all
 from hybrid_opt.work.serial import SerialExecutor
 from studies.drivable import is_drivable
@@ -55,7 +54,7 @@ class PageData:
         alone = is_drivable(data.workcell, data.objectives)
         self._cells = [] if alone else [(data.files, data.objectives)]
         if data.drivable is not None:
-            self._cells.append((data.drivable.files, DRIVABLE_OBJECTIVES))
+            self._cells.append((data.drivable.files, data.drivable.summary.objectives))
 
     def document(self, executor: Executor | None = None) -> dict[str, Any]:
         """The page's data as JSON values.
@@ -121,8 +120,9 @@ class PageData:
 
     def _drive_view(self, drivable: DrivableReport, groups: Sequence[Numbered]) -> dict[str, Any]:
         """Time against force of hand-made path, the other experiment's optimum and the fronts."""
+        kind = self._data.force_kind
         view = FrontView(
-            "Time against force", "largest normal force [N]", "duration [s]", clouds=[]
+            f"Time against {kind.name}", f"{kind.title} [N]", "duration [s]", clouds=[]
         )
         self._add(view, groups)
         for _, label, look, force, duration in curves(self._data):

@@ -150,7 +150,7 @@ def _carry_pictures(data: ReportData) -> Iterator[ReportPicture]:
     if data.timings:
         yield ReportPicture(
             "duration_against_force",
-            "Drivable durations against the limit on the normal forces: single paths timed anew "
+            f"Drivable durations against the {data.force_kind.title}: single paths timed anew "
             "at every limit, and the members of the drivable fronts. All other limits hold "
             "throughout.",
             lambda: pictures_drive.duration_against_force(data),

@@ -23,7 +23,7 @@ from symbolic.array import Array
 
 
 def duration_against_force(data: ReportData) -> Figure:
-    """Durations for each limit on the normal forces: of single paths, and of the drivable fronts
+    """Durations for each limit on the forces: of single paths, and of the drivable fronts
     where there are any: members at their peak forces, and the fastest of a replica's paths at
     every force (median and range of the replicas)."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
@@ -46,7 +46,7 @@ def duration_against_force(data: ReportData) -> Figure:
         curves += _draw_replicas(axes, data.drivable, data.summary.recommendation)
     chosen = _draw_still(axes, data)
     _look_at(axes, np.concatenate(curves), chosen)
-    axes.set_xlabel("largest normal force [N]")
+    axes.set_xlabel(f"{data.force_kind.title} [N]")
     axes.set_ylabel("duration [s]")
     axes.legend(loc="upper right")
     return figure
@@ -124,8 +124,13 @@ def _draw_still(axes: Axes, data: ReportData) -> Array:
             markersize=11.0,
             label="recommended",
         )
-    still = max(data.summary.static_hold.normal_force)
-    axes.axvline(still, color=STATIC_COLOUR, linewidth=0.8, linestyle=(0, (2, 2)), label="at rest")
+    axes.axvline(
+        data.level_force,
+        color=STATIC_COLOUR,
+        linewidth=0.8,
+        linestyle=(0, (2, 2)),
+        label="at rest",
+    )
     return np.array([] if choice is None else [choice.force_limit, choice.duration]).reshape(-1, 2)
 
 

@@ -13,6 +13,7 @@ from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.simulated import StoredSimulation
 from hybrid_opt.campaign.summary import CampaignSummary, PolishedFigures, ReplicaFigures
 from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.evaluate.objectives import ForceKind, force_kind
 from hybrid_opt.timing import ForceCurve, TimingReport
 from hybrid_opt.timing.robustness import Margin, PayloadSensitivity
 from studies.drivable import ReplicaFront
@@ -134,7 +135,7 @@ class DrivableFront:
     Attributes:
         index: of the algorithm, which decides its look.
         front: of the replica with the largest hypervolume, as searched or as polished.
-        force, duration: (k,) peak normal forces [N] and durations [s] of its members.
+        force, duration: (k,) largest limited forces [N] and durations [s] of its members.
         cloud: (n, 2) force [N] and duration [s] of feasible candidates, empty for a polished one.
     """
 
@@ -184,6 +185,7 @@ class ReportData:
         initial: the hand-made trajectory.
         timings: of the hand-made and the selected trajectories, in the order of `carries`.
         reach: where the arms reach.
+        level_force: largest of the forces of `force_kind` that hold the level payload at rest [N].
         drivable: the drivable experiment, None without one.
         branches: how the start branches were decided, None where the workcell decides them.
         simulations: of the carries that were driven in the simulated cell, empty without.
@@ -202,10 +204,16 @@ class ReportData:
     initial: DrawnCarry
     timings: tuple[TimedSelection, ...]
     reach: ReachMap
+    level_force: float
     drivable: DrivableReport | None = None
     branches: BranchCompetition | None = None
     simulations: tuple[StoredSimulation, ...] = ()
     jobs: tuple[DrawnJob, ...] = ()
+
+    @property
+    def force_kind(self) -> ForceKind:
+        """Which forces limits, and so the drivable fronts, are about."""
+        return force_kind(self.objectives)
 
     @property
     def solved(self) -> tuple[AlgorithmRuns, ...]:

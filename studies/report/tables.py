@@ -31,7 +31,7 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
     """
     tables = [quality(data, with_paper), selected(data, with_paper)]
     if data.summary.recommendation is not None:
-        tables.append(time_against_force(data.summary.recommendation.durations))
+        tables.append(time_against_force(data.summary.recommendation))
         if data.summary.recommendation.price is not None:
             tables.append(robust_price(data, data.summary.recommendation.price))
     if data.drivable is not None and data.drivable.jerk:

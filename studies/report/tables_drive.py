@@ -7,15 +7,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hybrid_opt.campaign.recommended import ForceTable, StoredPrice
+from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation
 from studies.jerk_costs import HEAD, NOTE, JerkCosts
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
 
 
-def time_against_force(table: ForceTable) -> Table:
+def time_against_force(found: StoredRecommendation) -> Table:
     """How long paths and fronts take at the same forces."""
-    rows = []
+    table, rows = found.durations, []
     for row in table.rows:
         cells = [
             number(median, 3)
@@ -26,7 +26,7 @@ def time_against_force(table: ForceTable) -> Table:
         rows.append((row.label, *cells))
     return Table(
         "time_against_force",
-        "Time against force: shortest drivable durations [s].",
+        f"Time against {found.force_kind.name}: shortest drivable durations [s].",
         ("path or front", *(f"{force:.2f} N" for force in table.forces)),
         tuple(rows),
         "Every path timed anew at the force. Of fronts the fastest member: median over the "

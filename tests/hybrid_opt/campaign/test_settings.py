@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
+from hybrid_opt.campaign.experiment_stage import drivable_settings
 from symbolic.errors import SettingsError
 
 
@@ -47,6 +48,21 @@ def test_wrong_settings_are_told(change: dict[str, Any], message: str) -> None:
 def test_wrong_execution_is_told(change: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         ExecutionSettings(Path("results"), **change)
+
+
+@pytest.mark.parametrize(
+    ("objectives", "drivable"),
+    [
+        (("peak_force_1", "peak_force_2"), ("duration", "peak_force")),
+        (("mean_force",), ("duration", "peak_force")),
+        (("robust_force_1", "robust_force_2"), ("duration", "robust_force")),
+    ],
+)
+def test_the_drivable_experiment_is_about_the_same_forces(
+    objectives: tuple[str, ...], drivable: tuple[str, ...]
+) -> None:
+    settings = CampaignSettings(objectives=objectives, seed=5)
+    assert drivable_settings(settings) == replace(settings, objectives=drivable)
 
 
 def test_random_search_stays_random() -> None:

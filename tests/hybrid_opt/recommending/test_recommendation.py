@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
+from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.indicators.knee import knee
 from hybrid_opt.recommending.choice import force_for_payload
 from hybrid_opt.recommending.driven_paths import DrivenPaths
@@ -167,3 +168,5 @@ def test_a_drivable_cell_is_the_same_cell(drivable: ho.Cell) -> None:
     assert drivable.objective_names == ("duration", "peak_force")
     np.testing.assert_array_equal(drivable.initial[:-1], cell.initial)
     assert drivable.workcell.source.is_file()
+    assert not drivable.force_kind.robust
+    assert ho.Cell.load(RACK, ROBUST_OBJECTIVES).drivable().force_kind.robust

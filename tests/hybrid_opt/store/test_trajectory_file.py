@@ -52,6 +52,17 @@ def test_round_trip(tmp_path: Path) -> None:
     assert stored.unpack(tmp_path / "cell").digest == rack_cell().digest
 
 
+def test_what_it_was_searched_for_is_read_from_its_figures(tmp_path: Path) -> None:
+    figures = {"objective_duration": 0.5, "objective_robust_force": 0.6, "objective_own": 0.1}
+    for stored, objectives, robust in (
+        (figures, ("duration", "robust_force"), True),
+        ({"objective_own": 0.1, "duration": 2.0}, ("peak_force_1", "peak_force_2"), False),
+    ):
+        found = read_trajectory(changed(tmp_path, figures=stored))
+        assert found.objectives == objectives
+        assert found.open_cell(tmp_path / f"cell{robust}").force_kind.robust is robust
+
+
 def test_the_start_posture_holds_the_box(tmp_path: Path) -> None:
     import pinocchio as pin
 

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing import (
     JerkLimits,
     JerkTiming,
@@ -17,6 +18,7 @@ from hybrid_opt.timing import (
     time_with_jerk,
 )
 from symbolic.errors import SettingsError
+from symbolic.workcell.records import Uncertainty
 from tests.hybrid_opt.timing import jerk_oracle
 from tests.hybrid_opt.timing.cells import (
     hand_timing,
@@ -66,6 +68,26 @@ def test_positions_speeds_and_accelerations_belong_together() -> None:
     second = carry.side_by_side("q_second")
     middle = (second[1:] + second[:-1]) / 2.0
     np.testing.assert_allclose(np.diff(rate, axis=0) / steps, middle, atol=2e-2)
+
+
+def test_a_limit_of_robust_forces_is_kept() -> None:
+    """At what the planned timing needs in every case, so that both are allowed much the same."""
+    cell = replace(hand_cell(), uncertainty=Uncertainty(friction=0.1, mass=0.05))
+    model, forces = timing_of(cell), robust_model(cell)
+    plain = timed(40.0).timing.carry
+    assert plain is not None
+    needed = float(forces.robust_force(plain).peak.max())
+    limits = TimingLimits(force=needed, robust=True)
+    found = time_with_jerk(model, initial(), limits, jerk_limits(40.0))
+    assert found.timing.ok
+    assert found.timing.limits == limits
+    assert found.timing.carry is not None
+    peak = float(forces.robust_force(found.timing.carry).peak.max())
+    assert 0.99 * needed < peak <= needed * 1.005
+    assert found.timing.peak_force == pytest.approx(peak)
+    # The plan's own timing keeps this limit, so that this is no slower, but for what rounds
+    # settle at.
+    assert found.without < found.timing.duration <= plain.duration * 1.005
 
 
 def test_both_ends_rest_without_acceleration() -> None:
