@@ -165,7 +165,7 @@ class PageCarries:
             "label": f"{name}: {_values(cell, judged, timing)}",
             "objectives": [float(value) for value in values.values()],
             "problem": "" if timing.ok else f"robots cannot drive it: {timing.reason}",
-            "force": timing.peak_force if driven is not None else max(motions[0]["peaks"]),
+            "force": max(motions[0]["peaks"]) if driven is None else round(timing.peak_force, 4),
             "motions": motions,
             "cell": shown.cell,
             "decision": shown.x.tolist(),
