@@ -17,6 +17,8 @@ from symbolic.robot.chain import held_joints
 from symbolic.robot.urdf import link_frame, moving_joints, reduced_model
 from symbolic.robot.urdf_file import read_urdf
 from symbolic.workcell.contacts import face_normal, pad_rotation
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
 
 SIZE = (0.30, 0.40, 0.25)
 
@@ -179,6 +181,13 @@ MACHINES = {
     ),
 }
 """Machines with both arms in one file, their lift and torso held."""
+
+
+def cell_of(name: str, folder: Path) -> Workcell:
+    """The cell of an arm of `SINGLE` or of a machine of `MACHINES`."""
+    if name in SINGLE:
+        return load(single_cell(SINGLE[name], folder))
+    return load(machine_cell(MACHINES[name], folder))
 
 
 def machine_cell(machine: Machine, folder: Path) -> Path:

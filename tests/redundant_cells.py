@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +27,33 @@ def free_pandas(folder: Path, entry: str = "") -> Workcell:
         text = path.read_text()
         given = f'"redundant" = [{{joint = "{PANDA_JOINT}", {entry}}}], "samples" ='
         path.write_text(text.replace('"samples" =', given))
+    return load(path)
+
+
+def seven_joints(name: str, folder: Path) -> Workcell:
+    """A cell of an arm of `SINGLE` or a machine of `MACHINES`, the joint that is locked there
+    redundant."""
+    if name in SINGLE:
+        arms = [SINGLE[name]]
+        path = single_cell(SINGLE[name], folder, {})
+    else:
+        machine = MACHINES[name]
+        arms = [machine.left, machine.right]
+        left, right = (replace(arm, locked={}) for arm in arms)
+        path = machine_cell(replace(machine, left=left, right=right), folder)
+    text = path.read_text()
+    for arm in arms:  # a joint of both robots' arms is named twice, as it has to be
+        text = re.sub(
+            rf'(?<="chain" = \["{arm.chain[0]}", "{arm.chain[1]}"\], )',
+            f'"redundant_joints" = {json.dumps(list(arm.locked))}, ',
+            text,
+        )
+    given = ", ".join(
+        f'{{joint = "{joint}", initial = {angle}}}'
+        for arm in arms
+        for joint, angle in arm.locked.items()
+    )
+    path.write_text(text.replace('"samples" =', f'"redundant" = [{given}], "samples" ='))
     return load(path)
 
 

@@ -19,20 +19,13 @@ from symbolic.robot.machine import arm_links, one_machine
 from symbolic.robot.model import build_robot_model
 from symbolic.robot.urdf import moving_joints, robot_urdf
 from symbolic.workcell.body_names import body_names
-from symbolic.workcell.file import load
 from symbolic.workcell.records import Robot, Workcell
-from tests.machines import MACHINES, SINGLE, machine_cell, single_cell
+from tests.machines import MACHINES, SINGLE, cell_of
 from tests.symbolic.geometry.collision_cells import placed_pieces
 
 pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
 
 NAMES = (*SINGLE, *MACHINES)
-
-
-def cell_of(name: str, folder: Path) -> Workcell:
-    if name in SINGLE:
-        return load(single_cell(SINGLE[name], folder))
-    return load(machine_cell(MACHINES[name], folder))
 
 
 def full_model(robot: Robot) -> tuple[pin.Model, list[int], Array]:

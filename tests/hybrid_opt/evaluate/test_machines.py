@@ -1,0 +1,99 @@
+"""Robots as their makers describe them: compiled against interpreted, both against the plain
+reference."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from codegen.build import build
+from codegen.interpreted import InterpretedFunction
+from codegen.source import dense
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from studies.plain.verdict import PlainJudge
+from symbolic.array import Array
+from symbolic.cell_model import build_cell_model
+from symbolic.functions.cell import cell_functions
+from symbolic.workcell.decision import initial_decision
+from symbolic.workcell.records import Workcell
+from tests.hybrid_opt.evaluate.test_evaluation import assert_agrees
+from tests.machines import MACHINES, SINGLE, cell_of
+from tests.redundant_cells import machine_on_lift, seven_joints
+
+pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+
+AGREEMENT = 1e-11
+"""Largest difference of compiled and interpreted values, absolute or relative."""
+
+SEVEN = [name for name, arm in SINGLE.items() if arm.locked] + list(MACHINES)
+"""Those whose arms have seven joints, of which one is else held."""
+
+ASIDE = 0.2
+"""How far redundant joints are from where they hold the box, within their limits [rad or m]."""
+
+
+def around(workcell: Workcell, n: int, seed: int, widening: float) -> Array:
+    """Candidates (n, n_var) around the one in the middle, in bounds widened by a factor."""
+    task = workcell.task
+    middle, half = initial_decision(task), (task.upper - task.lower) / 2.0
+    room = np.minimum(middle - task.lower, task.upper - middle)
+    half[task.n_box :] = np.minimum(ASIDE, room[task.n_box :])
+    half *= widening
+    return np.random.default_rng(seed).uniform(middle - half, middle + half, (n, len(half)))
+
+
+def agree(workcell: Workcell, fully: bool = True) -> None:
+    """Hold verdicts and values of candidates, compiled, interpreted and plain, to one another.
+
+    Args:
+        fully: as searches evaluate, in lanes and optimised; else without both, which is compiled
+            much faster.
+    """
+    model = build_cell_model(workcell)
+    made = cell_functions(model)
+    plainly = None if fully else build(made, levels=dict.fromkeys(made, 0)).functions
+    compiled = CandidateEvaluator(workcell, functions=plainly)
+    functions = {name: InterpretedFunction(dense(function)) for name, function in made.items()}
+    interpreted = CandidateEvaluator(workcell, functions=functions)
+    x = np.vstack([around(workcell, 6, 7, 1.0), around(workcell, 6, 8, 10.0)])
+    found, expected = compiled.evaluate(x), interpreted.evaluate(x)
+    assert 0.0 < expected.feasible.mean() < 1.0
+    outputs = compiled.outputs(x)
+    pairs = {name: (getattr(found, name), values) for name, values in vars(expected).items()}
+    pairs |= {name: (outputs[name], values) for name, values in interpreted.outputs(x).items()}
+    for name, (here, there) in pairs.items():
+        if there.dtype == float:
+            np.testing.assert_allclose(here, there, rtol=AGREEMENT, atol=AGREEMENT, err_msg=name)
+        else:
+            np.testing.assert_array_equal(here, there, err_msg=name)
+    plain = PlainJudge(workcell, model.start)
+    for k, values in enumerate(x):
+        assert_agrees(found, k, plain(values))
+
+
+@pytest.mark.parametrize("name", ["ur5", "pr2"])
+def test_six_joints_and_both_arms_in_one_file(name: str, tmp_path: Path) -> None:
+    agree(cell_of(name, tmp_path), fully=False)
+
+
+def test_seven_joints(tmp_path: Path) -> None:
+    agree(seven_joints("panda", tmp_path), fully=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*SINGLE, *MACHINES])
+def test_every_machine_with_six_joints(name: str, tmp_path: Path) -> None:
+    agree(cell_of(name, tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEVEN)
+def test_every_machine_with_seven_joints(name: str, tmp_path: Path) -> None:
+    agree(seven_joints(name, tmp_path))
+
+
+@pytest.mark.slow
+def test_both_arms_on_one_lift(tmp_path: Path) -> None:
+    agree(machine_on_lift(tmp_path, 0.1, free=True))
