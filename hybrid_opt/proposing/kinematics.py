@@ -148,6 +148,7 @@ class ArmKinematics:
         """Postures (n, joints) that follow placements (m, 4, 4) of the last joint.
 
         Args:
+            targets: one path for all, or one for each, (m, n, 4, 4).
             ends: (n, redundant) where the redundant joints are at the end; None: they stay.
             resolved: whether they go where the joints keep to the middle of their ranges.
 

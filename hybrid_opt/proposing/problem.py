@@ -109,8 +109,8 @@ class Problem:
 
     def sides(self) -> list[Problem]:
         """The same problem with each pair of upright faces that the pads may press where its
-        robots have no bases yet; itself alone where the file names the points, or a carry that
-        goes level past two robots leaves no choice."""
+        robots have no bases yet, a machine's arms either way round; itself alone where the file
+        names the points, or a carry that goes level past two robots leaves no choice."""
         entries = self.data["contacts"]
         start, goal = self.poses
         level = float(np.linalg.norm((goal - start)[:2]))
@@ -121,10 +121,11 @@ class Problem:
         for axis in np.flatnonzero(np.abs(R[2]) <= UPRIGHT):
             point = np.zeros(3)
             point[axis] = float(self.data["payload"]["size"][axis]) / 2.0
-            data = copy.deepcopy(self.data)
-            for entry, xyz in zip(data["contacts"], (point, -point), strict=True):
-                entry["xyz"] = xyz.tolist()
-            found.append(replace(self, data=data))
+            for side in (1.0, -1.0) if self.is_machine else (1.0,):
+                data = copy.deepcopy(self.data)
+                for entry, xyz in zip(data["contacts"], (point, -point), strict=True):
+                    entry["xyz"] = (side * xyz).tolist()
+                found.append(replace(self, data=data))
         return found
 
     def workcell(self, changes: dict[str, Any] | None = None) -> Workcell:

@@ -54,7 +54,7 @@ def prepare(
         ProposalError: an arm cannot hold the box at start and goal; the text says why.
         WorkcellError: the problem is wrong.
     """
-    given = merged(given, _redundancy(problem, problem.workcell(given)))
+    given = merged(given, redundancy(problem, problem.workcell(given)))
     workcell = problem.workcell(given)
     start, goal = problem.poses
     judge = judge_of(build_geometry(workcell))
@@ -75,7 +75,7 @@ def prepare(
     return Setup(given, workcell, pairs)
 
 
-def _redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
+def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
     """The joints beyond six where the file does not name them, at the middle of their ranges."""
     robots: list[dict[str, Any]] = [{}, {}]
     entries: dict[str, dict[str, Any]] = {}

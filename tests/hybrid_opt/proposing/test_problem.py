@@ -139,12 +139,15 @@ def test_two_arms_of_one_type_are_no_machine() -> None:
     assert not read_problem(POST).is_machine
 
 
-def test_without_bases_a_machine_may_press_either_pair_of_upright_faces(tmp_path: Path) -> None:
+def test_without_bases_a_machine_may_press_either_pair_of_faces_either_way_round(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "baxter.toml"
     path.write_text(re.sub(r"\nbase = .*", "", BAXTER), encoding="utf-8")
     sides = read_problem(path).sides()
     found = [[contact["xyz"] for contact in side.contacts] for side in sides]
-    assert found == [[[0.1, 0, 0], [-0.1, 0, 0]], [[0, 0.15, 0], [0, -0.15, 0]]]
+    pairs = [[[0.1, 0, 0], [-0.1, 0, 0]], [[0, 0.15, 0], [0, -0.15, 0]]]
+    assert found == [pair[::way] for pair in pairs for way in (1, -1)]
     post = read_problem(POST)
     assert post.sides() == [post]
 
