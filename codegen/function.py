@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -124,7 +124,9 @@ class NumericFunction(ABC):
             self._evaluate_batch(arrays, batched, outputs, n, threads or available_cores())
         return dict(zip(self.output_names, outputs, strict=True))
 
-    def prepared(self, n: int, shared: Collection[str] = ()) -> PreparedBatch:
+    def prepared(
+        self, n: int, shared: Collection[str] = (), given: Mapping[str, Array] | None = None
+    ) -> PreparedBatch:
         """A batch of up to n evaluations on arrays that stay where they are.
 
         For calls whose work is small beside `batch`'s own checks and allocations.
@@ -132,15 +134,25 @@ class NumericFunction(ABC):
         Args:
             n: at least 1.
             shared: names of inputs that have one value for all evaluations.
+            given: the caller's own arrays for some inputs and outputs, (n, *shape), C-contiguous.
+
+        Raises:
+            CodegenError: an array that does not fit.
         """
-        inputs = {
-            name: np.zeros(shape if name in shared else (n, *shape))
-            for name, shape in zip(self.input_names, self.input_shapes, strict=True)
-        }
-        outputs = {
-            name: np.zeros((n, *shape))
-            for name, shape in zip(self.output_names, self.output_shapes, strict=True)
-        }
+        given = given or {}
+        names = (*self.input_names, *self.output_names)
+        shapes = [
+            shape if name in shared else (n, *shape)
+            for name, shape in zip(names, (*self.input_shapes, *self.output_shapes), strict=True)
+        ]
+        own = [
+            given[name] if name in given else np.zeros(shape)
+            for name, shape in zip(names, shapes, strict=True)
+        ]
+        self._require_exact(own, names, shapes, write=True)
+        split = len(self.input_names)
+        inputs = dict(zip(names[:split], own[:split], strict=True))
+        outputs = dict(zip(names[split:], own[split:], strict=True))
         batched = [name not in shared for name in self.input_names]
         arrays = list(inputs.values()), list(outputs.values())
         return PreparedBatch(inputs, outputs, n, self._prepared(arrays[0], batched, arrays[1]))

@@ -146,9 +146,34 @@ LANES_INLINE lanes_real lanes_sqrt(lanes_real x) {
     for (int l = 0; l < DUAL_ARM_LANES; ++l) z[l] = __builtin_##f(x[l], y[l]); \
     return z;                                                                 \
   }
-LANES_EACH(ceil) LANES_EACH(floor) LANES_EACH(exp) LANES_EACH(log) LANES_EACH(tan)
-LANES_EACH(asin) LANES_EACH(acos) LANES_EACH(atan) LANES_EACH(sinh) LANES_EACH(cosh)
-LANES_EACH(tanh) LANES_EACH_2(pow) LANES_EACH_2(atan2) LANES_EACH_2(hypot) LANES_EACH_2(fmod)
+LANES_EACH(exp) LANES_EACH(log) LANES_EACH(tan) LANES_EACH(asin) LANES_EACH(acos) LANES_EACH(atan)
+LANES_EACH(sinh) LANES_EACH(cosh) LANES_EACH(tanh) LANES_EACH_2(pow) LANES_EACH_2(atan2)
+LANES_EACH_2(hypot) LANES_EACH_2(fmod)
+
+/* Angles are unwrapped with these: one lane after the other they take longer than all the rest. */
+#if DUAL_ARM_LANES == 8 && defined(__AVX512F__)
+#define LANES_ROUND(f, direction)                                                \
+  LANES_INLINE lanes_real lanes_##f(lanes_real x) {                              \
+    return (lanes_real)_mm512_roundscale_pd((__m512d)x, direction | _MM_FROUND_NO_EXC); \
+  }
+LANES_ROUND(ceil, _MM_FROUND_TO_POS_INF)
+LANES_ROUND(floor, _MM_FROUND_TO_NEG_INF)
+#elif DUAL_ARM_LANES == 4 && defined(__AVX__)
+#define LANES_ROUND(f) \
+  LANES_INLINE lanes_real lanes_##f(lanes_real x) { return (lanes_real)_mm256_##f##_pd((__m256d)x); }
+LANES_ROUND(ceil)
+LANES_ROUND(floor)
+#elif DUAL_ARM_LANES == 2 && defined(__SSE4_1__)
+#define LANES_ROUND(f) \
+  LANES_INLINE lanes_real lanes_##f(lanes_real x) { return (lanes_real)_mm_##f##_pd((__m128d)x); }
+LANES_ROUND(ceil)
+LANES_ROUND(floor)
+#elif DUAL_ARM_LANES == 2 && defined(__aarch64__)
+LANES_INLINE lanes_real lanes_ceil(lanes_real x) { return (lanes_real)vrndpq_f64((float64x2_t)x); }
+LANES_INLINE lanes_real lanes_floor(lanes_real x) { return (lanes_real)vrndmq_f64((float64x2_t)x); }
+#else
+LANES_EACH(ceil) LANES_EACH(floor)
+#endif
 
 #define REAL lanes_real
 #define INTEGER lanes_mask

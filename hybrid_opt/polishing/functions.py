@@ -39,19 +39,10 @@ QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 BLOCKS: tuple[Block, ...] = get_args(Block)
 ORDERS: tuple[Order, ...] = get_args(Order)
 
-_LEVELS = {
-    "pressure_inner_second": 1,
-    "pressure_first_second": 0,
-    "pressure_last_second": 0,
-    "force_first_second": 0,
-    "force_last_second": 0,
-}
-"""Optimisation levels of the compiler where size alone would choose too high a one: these are
-straight-line code of half a megabyte and more, called once per iteration or seldom."""
-
 _LANE_LEVELS = dict.fromkeys(
     [
-        *(SampleKey("force", "inner", order).name for order in ORDERS),
+        *(SampleKey(quantity, "inner", "first").name for quantity in QUANTITIES),
+        *(SampleKey(quantity, block, "second").name for quantity in QUANTITIES for block in BLOCKS),
         *(ClosureKey(arm, order).name for arm in ARMS for order in ORDERS),
         *(RowKey(constraint.family, order).name for constraint in COMPILED for order in ORDERS),
         GAPS,
@@ -146,7 +137,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
 
     details, levels = str(_LANE_LEVELS), _LANE_LEVELS
     built = compiled.functions("polish in lanes", in_lanes, details, levels=levels, lanes=0)
-    built |= compiled.functions("polish", one_by_one, str(_LEVELS), details, levels=_LEVELS)
+    built |= compiled.functions("polish", one_by_one, details)
     sample_keys = [
         SampleKey(q, block, order) for q in QUANTITIES for block in BLOCKS for order in ORDERS
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybrid_opt.polishing.program import Program
+from hybrid_opt.polishing.solvers import Program
 from symbolic.array import Array
 
 
@@ -13,23 +13,29 @@ class Inequalities:
 
     def __init__(self, program: Program) -> None:
         self._program = program
-        upper = np.flatnonzero(np.isfinite(program.above))
-        lower = np.flatnonzero(np.isfinite(program.below))
-        self._rows = np.concatenate([upper, lower])
-        self._sign = np.concatenate([-np.ones(len(upper)), np.ones(len(lower))])
-        self._shift = np.concatenate([program.above[upper], -program.below[lower]])
+        self._upper = np.flatnonzero(np.isfinite(program.above))
+        self._lower = np.flatnonzero(np.isfinite(program.below))
+        self._rows = np.concatenate([self._upper, self._lower])
+        self._sign = np.concatenate([-np.ones(len(self._upper)), np.ones(len(self._lower))])
+        self._shift = np.concatenate([program.above[self._upper], -program.below[self._lower]])
 
-    def at(self, z: Array) -> tuple[Array, Array]:
-        """Values (m,) and gradients (m, n_variables)."""
-        values, jacobian = self._program.constraints(z)
-        return (
-            self._sign * values[self._rows] + self._shift,
-            self._sign[:, None] * jacobian[self._rows],
-        )
+    def values(self, z: Array) -> Array:
+        """(m,) at z."""
+        values = self._program.values(z).take(self._rows)
+        values *= self._sign
+        values += self._shift
+        return values
+
+    def slopes(self, z: Array) -> Array:
+        """(m, n_variables) gradients at z."""
+        slopes = self._program.constraints(z)[1].take(self._rows, axis=0)
+        slopes *= self._sign[:, None]
+        return slopes
 
     def multipliers(self, y: Array) -> Array:
         """(n_rows,) multipliers of the rows in CasADi's convention, from those (m,) of the
         inequalities."""
         multipliers = np.zeros(len(self._program.below))
-        np.add.at(multipliers, self._rows, -self._sign * y)
+        multipliers[self._upper] = y[: len(self._upper)]
+        multipliers[self._lower] -= y[len(self._upper) :]
         return multipliers

@@ -23,10 +23,9 @@ import numpy as np
 
 from hybrid_opt.polishing.inequalities import Inequalities
 from hybrid_opt.polishing.interior_steps import direction, estimated, kept, largest, until
-from hybrid_opt.polishing.program import Program
 from hybrid_opt.polishing.residuals import UNKNOWN, residuals
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.polishing.solvers import Answer
+from hybrid_opt.polishing.solvers import Answer, Program
 from symbolic.array import Array
 
 PUSH = 1e-4
@@ -77,15 +76,40 @@ DISTANT = 2e-2
 
 @dataclass
 class _State:
-    """An iterate with its slacks, multipliers and evaluated inequalities."""
+    """An iterate, n variables and m inequalities.
+
+    Attributes:
+        z: (n,) variables.
+        slack: (m + 2 n,) of the inequalities, then what the lower and the upper bounds leave.
+        dual: (m + 2 n,) their multipliers.
+        h, A: (m,) and (m, n) evaluated inequalities.
+    """
 
     z: Array
-    s: Array
-    y: Array
-    low: Array
-    high: Array
+    slack: Array
+    dual: Array
     h: Array
     A: Array
+
+
+@dataclass(frozen=True)
+class _Error:
+    """Residuals of the barrier's conditions, multipliers scaled as in the paper.
+
+    Attributes:
+        rest: the largest one without complementarity.
+        least, most: products of slacks and multipliers.
+        scale: of these.
+    """
+
+    rest: float
+    least: float
+    most: float
+    scale: float
+
+    def at(self, mu: float) -> float:
+        """The largest of all for a barrier."""
+        return max(self.rest, max(self.most - mu, mu - self.least) / self.scale)
 
 
 class DenseSolver:
@@ -98,6 +122,7 @@ class DenseSolver:
         # Bounds are a hair wider than they are, so that no rounding puts an iterate on one.
         hair = HAIR * (program.high - program.low)
         self._low, self._high = program.low - hair, program.high + hair
+        self._width = self._high - self._low
         self._inner = self._low + 1e-3 * hair, self._high - 1e-3 * hair
         self._price, self._renewals = 0.0, 0
 
@@ -107,14 +132,15 @@ class DenseSolver:
         wanted = self._settings.max_iterations
         iterations, message = 0, "Maximum_Iterations_Exceeded"
         for iterations in range(self._settings.solve.patience * wanted + 1):
-            if self._error(now, 0.0) <= self._settings.solve.tolerance:
+            error = self._error(now)
+            if error.at(0.0) <= self._settings.solve.tolerance:
                 message = "Solve_Succeeded"
                 break
             violation = np.max(-now.h, initial=0.0)
             if iterations >= wanted and violation <= self._settings.solve.feasible:
                 message = "Stopped_Feasible"
                 break
-            self._lower_barrier(now)
+            self._lower_barrier(error)
             if not self._advance(now) and not self._renew(now):
                 message = "Step_Too_Short"
                 break
@@ -135,139 +161,123 @@ class DenseSolver:
         )
 
     def _start(self) -> _State:
-        low, high = self._low, self._high
-        push = PUSH * (high - low)
-        z = np.clip(self._program.start, low + push, high - push)
-        h, A = self._rows.at(z)
-        s = np.maximum(h, SLACK)
-        return _State(z, s, self._mu / s, self._mu / (z - low), self._mu / (high - z), h, A)
+        push = PUSH * self._width
+        z = np.clip(self._program.start, self._low + push, self._high - push)
+        h, A = self._rows.values(z), self._rows.slopes(z)
+        slack = self._slack(z, np.maximum(h, SLACK))
+        return _State(z, slack, self._mu / slack, h, A)
 
-    def _error(self, now: _State, mu: float) -> float:
-        """Largest residual of the barrier's conditions, multipliers scaled as in the paper."""
-        program = self._program
-        n = len(now.y) + 2 * len(now.z)
-        mean = (now.y.sum() + now.low.sum() + now.high.sum()) / n
-        scale = max(1.0, mean / 100.0)
-        slope = program.cost - now.A.T @ now.y - now.low + now.high
-        products = (
-            now.s * now.y,
-            (now.z - self._low) * now.low,
-            (self._high - now.z) * now.high,
-        )
-        return float(
-            max(
-                np.abs(slope).max() / scale,
-                np.abs(now.h - now.s).max(initial=0.0),
-                *(np.abs(product - mu).max(initial=0.0) / scale for product in products),
-            )
-        )
+    def _slack(self, z: Array, s: Array) -> Array:
+        """All slacks, of those of the inequalities."""
+        return np.concatenate([s, z - self._low, self._high - z])
 
-    def _lower_barrier(self, now: _State) -> None:
+    def _error(self, now: _State) -> _Error:
+        m, n = now.A.shape
+        scale = max(1.0, float(now.dual.sum()) / len(now.dual) / 100.0)
+        slope = self._program.cost - now.dual[:m] @ now.A - now.dual[m : m + n] + now.dual[m + n :]
+        products = now.slack * now.dual
+        rest = max(
+            float(np.abs(slope).max()) / scale,
+            float(np.abs(now.h - now.slack[:m]).max(initial=0.0)),
+        )
+        return _Error(rest, float(products.min()), float(products.max()), scale)
+
+    def _lower_barrier(self, error: _Error) -> None:
         least = self._settings.solve.tolerance / SOLVED
-        while self._mu > least and self._error(now, self._mu) <= SOLVED * self._mu:
+        while self._mu > least and error.at(self._mu) <= SOLVED * self._mu:
             self._mu = max(least, min(LINEAR * self._mu, self._mu**POWER))
 
     def _advance(self, now: _State) -> bool:
         """One step; whether one was found."""
-        program, mu = self._program, self._mu
-        D = now.y / now.s
-        to_low, to_high = now.z - self._low, self._high - now.z
+        mu, (m, n) = self._mu, now.A.shape
+        y, s = now.dual[:m], now.slack[:m]
         # Rows that are far from ruling are left out of the curvature: most of its cost, and next to
         # nothing of the step.
-        least = np.where(now.s > now.y, DISTANT, NEGLIGIBLE) * now.y.max(initial=0.0)
-        ruling = np.where(now.y > least, now.y, 0.0)
-        M = program.curvature(now.z, self._rows.multipliers(ruling)) + (now.A.T * D) @ now.A
-        M[np.diag_indices_from(M)] += now.low / to_low + now.high / to_high
-        r = now.h - now.s
-        fixed = -program.cost + mu / to_low - mu / to_high
-        dz = direction(M, fixed + now.A.T @ (mu / now.s - D * r), self._high - self._low)
+        least = np.where(s > y, DISTANT, NEGLIGIBLE) * y.max(initial=0.0)
+        ruling = np.where(y > least, y, 0.0)
+        D, ideal = now.dual / now.slack, mu / now.slack
+        M = self._program.curvature(now.z, self._rows.multipliers(ruling))
+        M += (now.A * D[:m, None]).T @ now.A
+        M.flat[:: n + 1] += D[m : m + n] + D[m + n :]
+        r = now.h - s
+        right = (ideal[:m] - D[:m] * r) @ now.A - self._program.cost
+        right += ideal[m : m + n] - ideal[m + n :]
+        dz = direction(M, right, self._width)
         if dz is None:
             return False
-        ds = now.A @ dz + r
-        dy = mu / now.s - D * ds - now.y
-        dlow = mu / to_low - now.low / to_low * dz - now.low
-        dhigh = mu / to_high + now.high / to_high * dz - now.high
-        found = self._search(now, dz, ds)
+        change = np.concatenate([now.A @ dz + r, dz, -dz])
+        by_dual = ideal - D * change - now.dual
+        found = self._search(now, dz, change)
         if found is None:
             return self._heed(now)
-        now.z, now.s, now.h, now.A = found
-        keep = max(TO_BOUNDARY, 1.0 - mu)
-        dual = min(
-            largest(v, dv, keep) for v, dv in ((now.y, dy), (now.low, dlow), (now.high, dhigh))
-        )
-        now.y = kept(now.y + dual * dy, mu / now.s)
-        now.low = kept(now.low + dual * dlow, mu / (now.z - self._low))
-        now.high = kept(now.high + dual * dhigh, mu / (self._high - now.z))
+        now.z, now.slack, now.h = found
+        now.A = self._rows.slopes(now.z)
+        share = largest(now.dual, by_dual, max(TO_BOUNDARY, 1.0 - mu))
+        now.dual = kept(now.dual + share * by_dual, mu / now.slack)
         self._heed(now)
         return True
 
     def _heed(self, now: _State) -> bool:
         """Raise the multipliers of rows that shortened the last step, which bend away faster than
         their slope tells: with them their curvature enters the next one. Whether any was raised."""
-        raised = np.where(self._blocking, np.minimum(1.0, RAISED * now.y), 0.0)
-        changed = bool((raised > now.y).any())
-        now.y = np.maximum(now.y, raised)
-        return changed
+        blocking = np.flatnonzero(self._blocking)
+        y = now.dual[blocking]
+        raised = np.maximum(y, np.minimum(1.0, RAISED * y))
+        now.dual[blocking] = raised
+        return bool((raised > y).any())
 
-    def _search(
-        self, now: _State, dz: Array, ds: Array
-    ) -> tuple[Array, Array, Array, Array] | None:
-        """Along a direction until an iterate is good enough: z, s, h, A; None if none is.
+    def _search(self, now: _State, dz: Array, change: Array) -> tuple[Array, Array, Array] | None:
+        """Along a direction until an iterate is good enough: z, slack, h; None if none is.
 
         Rows that hold go on to hold: their slack is what they keep, so that an answer may be
         taken wherever it is cut off.
         """
-        program, mu = self._program, self._mu
+        mu, m = self._mu, len(now.h)
         keep = max(TO_BOUNDARY, 1.0 - mu)
-        theta = float(np.abs(now.h - now.s).sum())
-        self._price = max(self._price, PENALTY * now.y.max(initial=0.0)) if theta > 0.0 else 0.0
-        slope = float(
-            program.cost @ dz
-            - mu * (ds / now.s).sum()
-            - mu * (dz / (now.z - self._low) - dz / (self._high - now.z)).sum()
-            - self._price * theta
-        )
-        before = self._merit(now.z, now.s, theta)
+        kept_s, ds = now.slack[:m], change[:m]
+        theta = float(np.abs(now.h - kept_s).sum())
+        self._price = max(self._price, PENALTY * now.dual[:m].max(initial=0.0)) if theta else 0.0
+        slope = float(self._program.cost @ dz) - mu * float((change / now.slack).sum())
+        slope -= self._price * theta
+        before = self._merit(now.z, now.slack, theta)
         rounding = 1e-14 * max(1.0, abs(before))
-        held = now.h >= now.s
-        alpha = min(
-            largest(now.s, ds, keep),
-            largest(now.z - self._low, dz, keep),
-            largest(self._high - now.z, -dz, keep),
-        )
-        self._blocking = np.zeros(len(now.s), dtype=np.bool_)
+        held, left = now.h >= kept_s, (1.0 - keep) * kept_s
+        alpha = largest(now.slack, change, keep)
+        self._blocking = np.zeros(m, dtype=np.bool_)
         for _ in range(TRIALS):
-            z, s = np.clip(now.z + alpha * dz, *self._inner), now.s + alpha * ds
-            h, A = self._rows.at(z)
+            z = (now.z + alpha * dz).clip(*self._inner)
+            h = self._rows.values(z)
             share = SHORTENED[0]
             if np.isfinite(h).all():
-                lost = np.flatnonzero(held & (h < (1.0 - keep) * now.s))
+                lost = np.flatnonzero(held & (h < left))
                 if len(lost):
-                    share = until(now.s[lost], alpha * ds[lost], h[lost])
+                    share = until(kept_s[lost], alpha * ds[lost], h[lost])
                     self._blocking[lost] = True
                 else:
-                    s = np.maximum(np.where(held, h, np.maximum(s, h)), LEAST)
-                    merit = self._merit(z, s, float(np.abs(h - s).sum()))
+                    s = np.where(held, h, np.maximum(kept_s + alpha * ds, h))
+                    slack = self._slack(z, np.maximum(s, LEAST))
+                    merit = self._merit(z, slack, float(np.abs(h - slack[:m]).sum()))
                     if merit <= before + ARMIJO * alpha * slope + rounding:
-                        return z, s, h, A
+                        return z, slack, h
                     share = -slope * alpha / (2.0 * (merit - before - slope * alpha))
             alpha *= min(max(share, SHORTENED[0]), SHORTENED[1])
         return None
 
     def _renew(self, now: _State) -> bool:
         """Slacks as large as at the start; whether that changes anything."""
+        m = len(now.h)
         s = np.maximum(now.h, min(SLACK, 10.0 * self._mu))
-        changed = not np.allclose(s, now.s, rtol=1e-6)
-        now.y = np.where(s > now.s, self._mu / s, now.y)
-        now.s = s
+        old = now.slack[:m].copy()
+        changed = not np.allclose(s, old, rtol=1e-6)
+        now.dual[:m] = np.where(s > old, self._mu / s, now.dual[:m])
+        now.slack[:m] = s
         self._renewals += 1
         return changed and self._renewals <= RENEWALS
 
-    def _merit(self, z: Array, s: Array, theta: float) -> float:
+    def _merit(self, z: Array, slack: Array, theta: float) -> float:
         """The barrier's objective, and the price of the violation of h = s."""
-        program = self._program
-        logs = np.log(s).sum() + np.log(z - self._low).sum() + np.log(self._high - z).sum()
-        return float(program.cost @ z - self._mu * logs + self._price * theta)
+        logs = float(np.log(slack).sum())
+        return float(self._program.cost @ z) - self._mu * logs + self._price * theta
 
 
 def dense(program: Program, settings: PolishSettings) -> Answer:

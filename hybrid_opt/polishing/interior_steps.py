@@ -41,11 +41,8 @@ def direction(M: Array, right: Array, width: Array) -> Array | None:
 def largest(value: Array, change: Array, keep: float) -> float:
     """Largest share of a change, at most 1, that leaves values above zero: of each at least the
     share 1 - keep."""
-    falling = change < 0.0
-    if not falling.any():
-        return 1.0
-    with np.errstate(over="ignore"):
-        return float(min(1.0, (-keep * value[falling] / change[falling]).min()))
+    steepest = float((change / value).min(initial=0.0))
+    return min(1.0, keep / -steepest) if steepest < 0.0 else 1.0
 
 
 def until(value: Array, change: Array, reached: Array) -> float:

@@ -8,10 +8,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from hybrid_opt.polishing.program import Program
 from hybrid_opt.polishing.residuals import UNKNOWN, residuals
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.polishing.solvers import Answer
+from hybrid_opt.polishing.solvers import Answer, Program
 from symbolic.array import Array
 
 Buffers = tuple[memoryview, ...]

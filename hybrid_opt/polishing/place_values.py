@@ -9,21 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from codegen.function import NumericFunction, PreparedBatch
+from codegen.function import NumericFunction
 from hybrid_opt.polishing.functions import RowFunctions
 from hybrid_opt.polishing.layout import PlaceRow
+from hybrid_opt.polishing.place_groups import ArmRows, CurvatureSums, Indices, Pull, RowGroup
 from hybrid_opt.polishing.sample_values import NEGLIGIBLE
 from symbolic.array import Array
 from symbolic.smooth.keys import ClosureKey, Order
 from symbolic.smooth.place import PlaceConstraint
 from symbolic.workcell.decision import POSE_SIZE
-
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -44,71 +43,8 @@ class Places:
     q: tuple[Array, Array]
 
 
-@dataclass(frozen=True)
-class _Group:
-    """Rows of one family: their indices and places, and their functions.
-
-    Attributes:
-        moving: whether the rate is among what they depend on.
-        arms: whose joints are.
-    """
-
-    rows: Indices
-    places: Indices
-    first: PreparedBatch
-    second: PreparedBatch
-    moving: bool
-    arms: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class _Pull:
-    """How a group's rows depend on an arm's joints.
-
-    Attributes:
-        group: which one.
-        at: (rows,) positions of the rows' places among the arm's.
-        columns: of the group's gradient that are by the arm's joints.
-        q: the group's input.
-        slopes: (rows, n) the gradients by the joints, where the arm keeps them.
-    """
-
-    group: int
-    at: Indices
-    columns: slice
-    q: Array
-    slopes: Array
-
-
-@dataclass(frozen=True)
-class _Arm:
-    """An arm where rows need it.
-
-    Attributes:
-        places: which ones.
-        position: of each place among them.
-        rows, at: all rows that depend on its joints, and the positions of their places.
-        slopes: (rows, n) their gradients by the joints.
-        pulls: of these rows group by group.
-    """
-
-    places: Indices
-    position: Indices
-    first: PreparedBatch
-    second: PreparedBatch
-    rows: Indices
-    at: Indices
-    slopes: Array
-    pulls: tuple[_Pull, ...]
-
-    @property
-    def joints(self) -> int:
-        """How many it has."""
-        return int(self.first.outputs["q"].shape[1])
-
-
 class PlaceValues:
-    """Rows at places, from the waypoints."""
+    """Rows at places, from the waypoints. Inside, rows stand group by group."""
 
     def __init__(
         self,
@@ -118,56 +54,80 @@ class PlaceValues:
         functions: RowFunctions,
     ) -> None:
         """Rows' places are indices into `places`."""
-        self._count, self._places = len(rows), places
-        self._at = np.array([row.place for row in rows], dtype=np.intp)
         members: dict[str, list[int]] = {}
         for k, row in enumerate(rows):
             members.setdefault(row.constraint.family, []).append(k)
-        self._groups = [
-            self._group(rows, np.array(own, dtype=np.intp), functions) for own in members.values()
-        ]
-        free_rows, self._columns = places.free
-        moved, self._free_rows = np.unique(free_rows, return_inverse=True)
-        self._basis, self._rate_basis = places.basis[:, moved], places.rate_basis[:, moved]
+        self._order = np.array([k for own in members.values() for k in own], dtype=np.intp)
+        self._position = np.argsort(self._order)
+        self._places, n = places, len(rows)
+        self._at = np.array([rows[k].place for k in self._order.tolist()], dtype=np.intp)
         self._size = functions.model.workcell.task.extended_size
+        self._joints = [q.shape[1] for q in places.q]
+        self._shared = {
+            "pose": np.zeros((n, POSE_SIZE)),
+            "rate": np.zeros((n, POSE_SIZE)),
+            "q_1": np.zeros((n, self._joints[0])),
+            "q_2": np.zeros((n, self._joints[1])),
+            "value": np.zeros(n),
+        }
+        self._groups, start = list[RowGroup](), 0
+        for own in members.values():
+            constraints = [rows[k].constraint for k in own]
+            self._groups.append(self._group(constraints, start, functions))
+            start += len(own)
+        self._starts = [group.rows.start for group in self._groups] + [n]
         self._arms = [self._arm(arm, closures) for arm in range(len(places.q))]
-        self._row_basis = self._basis[self._at][:, self._free_rows]
-        self._row_rate_basis = self._rate_basis[self._at][:, self._free_rows]
-        self._moving = any(group.moving for group in self._groups)
+        self._index_variables()
 
-    def _group(self, rows: tuple[PlaceRow, ...], own: Indices, functions: RowFunctions) -> _Group:
-        constraints = [rows[k].constraint for k in own.tolist()]
-        first, second = (
-            functions.of(constraints[0], order).prepared(len(own)) for order in get_args(Order)
-        )
+    def _index_variables(self) -> None:
+        """How rows follow the variables: by their places' rows of the bases."""
+        free_rows, self._columns = self._places.free
+        moved, free_rows = np.unique(free_rows, return_inverse=True)
+        basis, rate = self._places.basis, self._places.rate_basis
+        self._whole = basis[self._at], rate[self._at]
+        self._moved = basis[:, moved], rate[:, moved]
+        self._free = tuple(part[self._at][:, free_rows] for part in self._moved)
+        self._by_pose, self._by_rate = np.zeros((2, len(self._at), self._size))
+        n, size = len(moved), self._size
+        outer = free_rows[:, None] * n + free_rows
+        self._entries = (outer * size + self._columns[:, None]) * size + self._columns
+
+    def _group(
+        self, constraints: Sequence[PlaceConstraint], start: int, functions: RowFunctions
+    ) -> RowGroup:
+        one, rows = constraints[0], slice(start, start + len(constraints))
+        given = {name: array[rows] for name, array in self._shared.items()}
+        first = functions.of(one, "first").prepared(len(constraints), given=given)
         if "numbers" in first.inputs:
             first.inputs["numbers"][...] = row_numbers(constraints, functions)[0]
-        arms = constraints[0].arms(functions.model)
-        return _Group(own, self._at[own], first, second, constraints[0].moving, arms)
+        second = partial(functions.of, one, "second")
+        return RowGroup(rows, first, second, one.moving, one.arms(functions.model))
 
-    def _arm(self, arm: int, closures: Mapping[ClosureKey, NumericFunction]) -> _Arm:
-        needed = [group.places for group in self._groups if arm in group.arms]
-        at = np.unique(np.concatenate([np.empty(0, dtype=np.intp), *needed]))
-        position = np.full(len(self._places.basis), -1, dtype=np.intp)
-        position[at] = np.arange(len(at))
-        first, second = (
-            closures[ClosureKey(arm, order)].prepared(max(1, len(at))) for order in get_args(Order)
-        )
-        first.inputs["q_reference"][: len(at)] = self._places.q[arm][at]
-        chosen = [k for k, group in enumerate(self._groups) if arm in group.arms]
-        rows = np.concatenate([np.empty(0, dtype=np.intp), *(self._groups[k].rows for k in chosen)])
-        slopes, pulls, start = np.empty((len(rows), first.outputs["q"].shape[1])), list[_Pull](), 0
-        for k in chosen:
-            group = self._groups[k]
-            own = slopes[start : start + len(group.rows)]
+    def _arm(self, arm: int, closures: Mapping[ClosureKey, NumericFunction]) -> ArmRows:
+        n, chosen = len(self._at), [g for g in self._groups if arm in g.arms]
+        empty = np.empty(0, dtype=np.intp)
+        rows = np.concatenate([empty, *(np.arange(n)[group.rows] for group in chosen)])
+        places = np.unique(self._at[rows])
+        position = np.zeros(len(self._places.basis), dtype=np.intp)
+        position[places] = np.arange(len(places))
+        first, second = (closures[ClosureKey(arm, order)] for order in get_args(Order))
+        batch = first.prepared(max(1, len(places)))
+        batch.inputs["q_reference"][: len(places)] = self._places.q[arm][places]
+        slopes, pulls, start = np.empty((len(rows), self._joints[arm])), dict[int, Pull](), 0
+        for k, group in enumerate(self._groups):
+            if arm not in group.arms:
+                continue
             begin = 12 if group.moving else 6
-            for other in group.arms[: group.arms.index(arm)]:
-                begin += self._places.q[other].shape[1]
-            columns, q = slice(begin, begin + slopes.shape[1]), group.first.inputs[f"q_{arm + 1}"]
-            pulls.append(_Pull(k, position[group.places], columns, q, own))
-            start += len(group.rows)
-        where = position[self._at[rows]]
-        return _Arm(at, position, first, second, rows, where, slopes, tuple(pulls))
+            begin += sum(self._joints[other] for other in group.arms[: group.arms.index(arm)])
+            columns = slice(begin, begin + self._joints[arm])
+            count = group.rows.stop - group.rows.start
+            own = slopes[start : start + count]
+            pulls[k] = Pull(group.first.outputs["gradient"], columns, own)
+            start += count
+        basis = self._places.basis[places]
+        return ArmRows(
+            places, position, position[self._at], basis, batch, second, rows, slopes, pulls
+        )
 
     def first(self, waypoints: Array) -> tuple[Array, Array]:
         """Values (rows,) and gradients (rows, variables) by the path's variables.
@@ -177,83 +137,77 @@ class PlaceValues:
 
         What is found on the way is kept for `second` at the same waypoints.
         """
-        extended, rate = self._places.basis @ waypoints, self._places.rate_basis @ waypoints
-        pose, rate = extended[:, :POSE_SIZE], rate[:, :POSE_SIZE]
-        for arm in self._arms:
-            count = len(arm.places)
-            arm.first.inputs["pose"][:count] = extended[arm.places]
-            q = arm.first(count)["q"]
-            for pull in arm.pulls:
-                np.take(q, pull.at, axis=0, out=pull.q, mode="clip")
-        values = np.empty(self._count)
-        by_pose, by_rate = np.zeros((2, self._count, self._size))
+        return self.values(waypoints), self.gradients()
+
+    def values(self, waypoints: Array) -> Array:
+        """(rows,) at extended waypoints (n_waypoints, 6 + m)."""
+        path = np.ascontiguousarray(waypoints[:, :POSE_SIZE])
+        for name, basis in zip(("pose", "rate"), self._whole, strict=True):
+            np.matmul(basis, path, out=self._shared[name])
+        for arm, joints in zip(self._arms, ("q_1", "q_2"), strict=True):
+            if len(arm.places):
+                np.matmul(arm.basis, waypoints, out=arm.first.inputs["pose"])
+                q = arm.first()["q"]
+                np.take(q, arm.at, axis=0, out=self._shared[joints], mode="clip")
         for group in self._groups:
-            inputs = group.first.inputs
-            np.take(pose, group.places, axis=0, out=inputs["pose"], mode="clip")
+            group.first()
+        return self._shared["value"][self._position]
+
+    def gradients(self) -> Array:
+        """(rows, variables) by the path's variables, where `values` was called last."""
+        by_pose, by_rate = self._by_pose, self._by_rate
+        for group in self._groups:
+            gradient = group.first.outputs["gradient"]
+            by_pose[group.rows, :POSE_SIZE] = gradient[:, :POSE_SIZE]
             if group.moving:
-                np.take(rate, group.places, axis=0, out=inputs["rate"], mode="clip")
-            found = group.first()
-            values[group.rows] = found["value"]
-            by_pose[group.rows, :POSE_SIZE] = found["gradient"][:, :6]
-            if group.moving:
-                by_rate[group.rows, :POSE_SIZE] = found["gradient"][:, 6:12]
+                by_rate[group.rows, :POSE_SIZE] = gradient[:, POSE_SIZE : 2 * POSE_SIZE]
+        by_pose[:, POSE_SIZE:] = 0.0
         for arm in self._arms:
-            for pull in arm.pulls:
-                gradient = self._groups[pull.group].first.outputs["gradient"]
-                pull.slopes[...] = gradient[:, pull.columns]
+            if not len(arm.rows):
+                continue
+            for pull in arm.pulls.values():
+                pull.slopes[...] = pull.gradient[:, pull.columns]
             # The interface's arrays are transposed matrices (`codegen.signature`).
-            follow = arm.first.outputs["follow"][arm.at]
-            by_pose[arm.rows] += np.matmul(follow, arm.slopes[:, :, None])[:, :, 0]
-        total = self._row_basis * by_pose[:, self._columns]
-        if self._moving:
-            total += self._row_rate_basis * by_rate[:, self._columns]
-        return values, total
+            follow = arm.first.outputs["follow"].take(arm.at[arm.rows], axis=0)
+            by_pose[arm.rows] += np.einsum("rij,rj->ri", follow, arm.slopes)
+        total = self._free[0] * by_pose.take(self._columns, axis=1)
+        for group in self._groups:
+            if group.moving:
+                rate = by_rate[group.rows].take(self._columns, axis=1)
+                total[group.rows] += self._free[1][group.rows] * rate
+        return np.asarray(total.take(self._position, axis=0))
 
     def second(self, weight: Array) -> Array:
         """Second derivatives (variables, variables) of the values weighted by (rows,), where
-        `first` was called last."""
-        n, size = self._basis.shape[1], self._size
-        total = np.zeros((n * n, size * size))
-        least = NEGLIGIBLE * np.abs(weight).max(initial=0.0)
-        pulls = [np.zeros((len(arm.places), arm.joints)) for arm in self._arms]
+        `gradients` was called last."""
+        weight = weight[self._order]
+        size = np.abs(weight)
+        chosen = np.flatnonzero(size > NEGLIGIBLE * size.max(initial=0.0))
+        bounds = chosen.searchsorted(self._starts).tolist()
+        pulls = [
+            np.zeros((len(arm.places), n)) for arm, n in zip(self._arms, self._joints, strict=True)
+        ]
+        sums = CurvatureSums(*self._moved, self._size)
         for k, group in enumerate(self._groups):
-            chosen = np.flatnonzero(np.abs(weight[group.rows]) > least)
-            count = len(chosen)
-            if not count:
+            rows = chosen[bounds[k] : bounds[k + 1]]
+            if not len(rows):
                 continue
-            own, at = weight[group.rows[chosen]], group.places[chosen]
-            inputs = group.second.inputs
-            for name, values in group.first.inputs.items():
-                inputs[name][:count] = values[chosen]
-            inputs["weight"][:count] = own
-            hessian = group.second(count)["hessian"][:count]
+            own, at, local = weight[rows], self._at[rows], rows - group.rows.start
+            hessian = group.curvatures(local, own)
             for index in group.arms:
                 arm = self._arms[index]
-                (pull,) = (pull for pull in arm.pulls if pull.group == k)
-                np.add.at(pulls[index], pull.at[chosen], own[:, None] * pull.slopes[chosen])
+                slopes = own[:, None] * arm.pulls[k].slopes[local]
+                np.add.at(pulls[index], arm.at[rows], slopes)
             if group.moving:
-                self._add_moving(total, at, hessian)
+                sums.add_moving(at, hessian)
             else:
-                self._add(total, at, self._reduced(hessian, group.arms, at, POSE_SIZE))
-        for index in range(len(self._arms)):
-            self._close(total, index, pulls[index])
-        at = self._free_rows * size + self._columns
-        whole = total.reshape(n, n, size, size).transpose(0, 2, 1, 3).reshape(size * n, size * n)
-        return np.asarray(whole[np.ix_(at, at)])
-
-    def _close(self, total: Array, index: int, slopes: Array) -> None:
-        """Add the closure's curvature at the places of an arm where rows pull at its joints."""
-        arm = self._arms[index]
-        active = np.flatnonzero(np.abs(slopes).max(axis=1, initial=0.0) > 0.0)
-        count = len(active)
-        if not count:
-            return
-        found, inputs = arm.first.outputs, arm.second.inputs
-        inputs["pose"][:count] = arm.first.inputs["pose"][active]
-        inputs["q"][:count] = found["q"][active]
-        inputs["nu"][:count] = np.matmul(found["pull"][active], slopes[active, :, None])[:, :, 0]
-        hessian, at = arm.second(count)["hessian"][:count], arm.places[active]
-        self._add(total, at, self._reduced(hessian, (index,), at, self._size))
+                sums.add(at, self._reduced(hessian, group.arms, at, POSE_SIZE))
+        for index, arm in enumerate(self._arms):
+            active = np.flatnonzero(pulls[index].any(axis=1))
+            if len(active):
+                hessian, at = arm.curvatures(active, pulls[index][active]), arm.places[active]
+                sums.add(at, self._reduced(hessian, (index,), at, self._size))
+        return sums.total().take(self._entries)
 
     def _reduced(self, hessian: Array, arms: tuple[int, ...], at: Indices, own: int) -> Array:
         """T^T H T: by extended pose (rows, 6 + m, 6 + m), the joints of some arms following it.
@@ -261,40 +215,20 @@ class PlaceValues:
         Args:
             hessian: by the first `own` entries of the extended pose and by the joints.
         """
+        if not arms and own == self._size:
+            return hessian
         reduced = np.zeros((len(at), self._size, self._size))
         reduced[:, :own, :own] = hessian[:, :own, :own]
         if not arms:
             return reduced
         follows = [self._arms[k].first.outputs["follow"][self._arms[k].position[at]] for k in arms]
-        follow = np.concatenate(follows, axis=2)
+        follow = follows[0] if len(arms) == 1 else np.concatenate(follows, axis=2)
         mixed = np.matmul(follow, hessian[:, own:, :own])
         reduced[:, :, :own] += mixed
         reduced[:, :own, :] += np.swapaxes(mixed, 1, 2)
         turned = np.swapaxes(follow, 1, 2)
         reduced += np.matmul(np.matmul(follow, hessian[:, own:, own:]), turned)
         return reduced
-
-    def _add(self, total: Array, at: Indices, blocks: Array) -> None:
-        """Carry second derivatives (rows, 6 + m, 6 + m) by the extended pose over to the
-        waypoints."""
-        basis = self._basis[at]
-        _add_blocks(total, basis, basis, blocks)
-
-    def _add_moving(self, total: Array, at: Indices, hessian: Array) -> None:
-        """The same of second derivatives (rows, 12, 12) by pose and rate."""
-        bases = (self._basis[at], self._rate_basis[at])
-        blocks = np.zeros((len(at), self._size, self._size))
-        for i, left in enumerate(bases):
-            for j, right in enumerate(bases):
-                part = hessian[:, 6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
-                blocks[:, :POSE_SIZE, :POSE_SIZE] = part
-                _add_blocks(total, left, right, blocks)
-
-
-def _add_blocks(total: Array, left: Array, right: Array, blocks: Array) -> None:
-    n = left.shape[1]
-    outer = (left[:, :, None] * right[:, None, :]).reshape(-1, n * n)
-    total += outer.T @ blocks.reshape(len(blocks), -1)
 
 
 def row_numbers(

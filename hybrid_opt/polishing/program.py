@@ -19,7 +19,6 @@ another set of rows costs no more than choosing them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 
@@ -45,29 +44,6 @@ SLACK = 0.1
 
 LEVEL_BOUND = 2e3
 """Bound of |phi| and |a|; beyond anything the targets ask for."""
-
-
-class Program(Protocol):
-    """A nonlinear program: minimise cost . z within bounds, constraints within theirs.
-
-    Attributes:
-        cost: (n_variables,) gradient of the objective, which is linear.
-        start, low, high: (n_variables,).
-        below, above: (n_rows,) bounds of the constraints, infinite where there is none.
-    """
-
-    cost: Array
-    start: Array
-    low: Array
-    high: Array
-    below: Array
-    above: Array
-
-    def constraints(self, z: Array) -> tuple[Array, Array]:
-        """Values (n_rows,) and Jacobian (n_rows, n_variables) at z."""
-
-    def curvature(self, z: Array, multipliers: Array) -> Array:
-        """(n_variables, n_variables) second derivatives of multipliers . constraints at z."""
 
 
 class SmoothCell:
@@ -127,7 +103,7 @@ def place_values(cell: SmoothCell, rows: tuple[PlaceRow, ...], carry: PlacedCarr
 
 
 class SmoothProgram:
-    """The program of a set of rows near one candidate; attributes as of `Program`, and:
+    """The program of a set of rows near one candidate; attributes as of `solvers.Program`, and:
 
     Attributes:
         layout: where everything stands.
@@ -176,7 +152,13 @@ class SmoothProgram:
             required[row] / row.constraint.scale for row in layout.place_rows
         ]
         self._fixed = self._fixed_part()
+        self._offset = np.zeros(layout.n_rows)
+        self._offset[layout.forces] = self._lacking - self._anchor
+        self._offset[layout.sides] = -target.offset
+        self._offset[layout.patches] = self._patch_lacking
         self._known = b""
+        self._values = self._offset
+        self._jacobian: Array | None = None
 
     def _index_rows(self) -> None:
         """Rows as arrays: what each takes of the values at samples, and its scale."""
@@ -234,50 +216,72 @@ class SmoothProgram:
         fixed[layout.sides, layout.level] = -self._target.direction
         return fixed
 
-    def constraints(self, z: Array) -> tuple[Array, Array]:
-        """See `Program`; what was evaluated last is remembered."""
+    def values(self, z: Array) -> Array:
+        """See `solvers.Program`; what was evaluated last is remembered."""
         key = z.tobytes()
         if key != self._known:
-            self._found = self._evaluated(z)
+            self._values, self._jacobian = self._evaluated(z), None
             self._known = key
-        return self._found
+        return self._values
 
-    def _evaluated(self, z: Array) -> tuple[Array, Array]:
-        layout, half = self.layout, self._cell.unit.half
+    def constraints(self, z: Array) -> tuple[Array, Array]:
+        """See `solvers.Program`: what gave the values at z knows its slopes as well."""
+        values = self.values(z)
+        if self._jacobian is None:
+            self._jacobian = self._slopes()
+        return values, self._jacobian
+
+    def _evaluated(self, z: Array) -> Array:
+        layout = self.layout
         x = self._cell.unit.unscaled(z[layout.decision])
         values = self._fixed @ z
-        values[layout.forces] -= self._anchor
-        values[layout.sides] -= self._target.offset
-        jacobian = self._fixed.copy()
-
-        split, slope = self._forces.first(x)
-        at = self._force_column
-        first, second = self._mix.T
-        values[layout.forces] += first * split[at, 0] + second * split[at, 1]
-        values[layout.forces] += self._lacking + self._lacking_slope @ (x - self._x)
-        jacobian[layout.forces, layout.decision] = (
-            first[:, None] * slope[at, 0] + second[:, None] * slope[at, 1] + self._lacking_slope
-        ) * half
+        values += self._offset
+        split = self._forces.values(x).take(self._force_column, axis=0)
+        split *= self._mix
+        forces = values[layout.forces]
+        forces += split[:, 0]
+        forces += split[:, 1]
+        if self._cell.robust is not None:
+            forces += self._lacking_slope @ (x - self._x)
         if len(self._pressed):
-            margin, slope = self._patches.first(x)
-            values[layout.patches] = margin[self._pressed_column, self._pressed]
-            values[layout.patches] += self._patch_lacking
-            jacobian[layout.patches, layout.decision] = (
-                slope[self._pressed_column, self._pressed] * half
-            )
+            margin = self._patches.values(x)
+            values[layout.patches] += margin[self._pressed_column, self._pressed]
         if len(self._scale):
-            value, slope = self._places.first(self._cell.waypoints(x))
-            values[layout.places] = value / self._scale
-            jacobian[layout.places, layout.decision] = slope * half / self._scale[:, None]
-        return values, jacobian
+            value = self._places.values(self._cell.waypoints(x))
+            value /= self._scale
+            values[layout.places] = value
+        return values
+
+    def _slopes(self) -> Array:
+        """The Jacobian where the values were found last."""
+        layout, n = self.layout, self.layout.n_var
+        jacobian = self._fixed.copy()
+        slope = self._forces.gradients(n).take(self._force_column, axis=0)
+        slope *= self._mix[:, :, None]
+        forces = jacobian[layout.forces, layout.decision]
+        np.add(slope[:, 0], slope[:, 1], out=forces)
+        if self._cell.robust is not None:
+            forces += self._lacking_slope
+        if len(self._pressed):
+            slope = self._patches.gradients(n)
+            jacobian[layout.patches, layout.decision] = slope[self._pressed_column, self._pressed]
+        if len(self._scale):
+            by_path = self._places.gradients()
+            by_path /= self._scale[:, None]
+            jacobian[layout.places, layout.decision] = by_path
+        jacobian[:, layout.decision] *= self._cell.unit.half
+        return jacobian
 
     def curvature(self, z: Array, multipliers: Array) -> Array:
-        """See `Program`."""
+        """See `solvers.Program`."""
         self.constraints(z)
         layout, half = self.layout, self._cell.unit.half
         x = self._cell.unit.unscaled(z[layout.decision])
+        weighted = multipliers[layout.forces, None] * self._mix
+        columns = self._force_column
         weight = np.zeros((self._forces.count, 2))
-        np.add.at(weight, self._force_column, multipliers[layout.forces, None] * self._mix)
+        for k, own in enumerate(weighted.T):
+            weight[:, k] = np.bincount(columns, own, len(weight))
         total = self._forces.second(x, weight)
         if len(self._pressed):
             weight = np.zeros((self._patches.count, 2))

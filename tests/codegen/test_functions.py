@@ -101,6 +101,26 @@ def test_a_prepared_batch_equals_a_batch_to_the_bit(make: Make) -> None:
         prepared(12)
 
 
+def test_a_prepared_batch_works_on_arrays_that_it_is_given(make: Make) -> None:
+    rng = np.random.default_rng(2)
+    function = make(random_function(rng, ca.MX))
+    name = function.output_names[0]
+    matrices = rng.standard_normal((9, *function.input_shapes[0]))
+    vector, found = (
+        rng.standard_normal(function.input_shapes[1]),
+        np.zeros((9, *function.output_shapes[0])),
+    )
+    rows = slice(2, 7)
+    prepared = function.prepared(5, ["vector"], {"matrix": matrices[rows], name: found[rows]})
+    prepared.inputs["vector"][...] = vector
+    prepared()
+    np.testing.assert_array_equal(found[rows], function.batch(matrices[rows], vector)[name])
+    assert not found[:2].any()
+    assert not found[7:].any()
+    with pytest.raises(CodegenError, match="matrix"):
+        function.prepared(4, ["vector"], {"matrix": matrices[rows]})
+
+
 def test_empty_batch(make: Make) -> None:
     found = make(small()).batch(np.empty((0, 3)), np.zeros((4, 2)))
     assert {name: array.shape for name, array in found.items()} == {

@@ -89,6 +89,19 @@ def test_sine_and_cosine_are_right_to_a_unit_in_the_last_place(cache: Cache, lan
         assert np.isnan(value).all()
 
 
+@pytest.mark.parametrize("lanes", WIDTHS)
+def test_rounding_up_and_down_is_exact(cache: Cache, lanes: int) -> None:
+    x = ca.SX.sym("x")
+    made = in_lanes(ca.Function("rounded", [x], [ca.ceil(x), ca.floor(x)]), cache, lanes)
+    rng = np.random.default_rng(0)
+    special = [0.0, -0.0, 0.5, -0.5, 1.0, -1.0, 2.0**52 + 0.5, -(2.0**53), np.inf, -np.inf]
+    numbers = np.concatenate([special, rng.normal(0.0, 3.0, 100), rng.normal(0.0, 1e17, 20)])
+    found = list(made.batch(numbers).values())
+    same_bits({"up": found[0]}, {"up": np.ceil(numbers)})
+    same_bits({"down": found[1]}, {"down": np.floor(numbers)})
+    assert np.isnan([made.batch(np.full(3, np.nan))[name] for name in made.output_names]).all()
+
+
 def test_a_branch_runs_where_a_lane_wants_it(cache: Cache) -> None:
     x, y = ca.SX.sym("x", 2), ca.SX.sym("y")
     double = ca.Function("double", [x, y], [2.0 * x, y])

@@ -12,10 +12,9 @@ import pytest
 
 from hybrid_opt.polishing.interior import dense
 from hybrid_opt.polishing.ipopt import ipopt
-from hybrid_opt.polishing.program import Program
 from hybrid_opt.polishing.residuals import residuals
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.polishing.solvers import Answer
+from hybrid_opt.polishing.solvers import Answer, Program
 from symbolic.array import Array
 
 Solver = Callable[[Program, PolishSettings], Answer]
@@ -37,6 +36,9 @@ class Written:
     high: Array
     below: Array
     above: Array
+
+    def values(self, z: Array) -> Array:
+        return self.constraints(z)[0]
 
     def constraints(self, z: Array) -> tuple[Array, Array]:
         found = ca.Function("g", [self.z], [self.g, ca.densify(ca.jacobian(self.g, self.z))])(z)
