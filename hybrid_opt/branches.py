@@ -87,16 +87,20 @@ class BranchCompetition:
 
     def __str__(self) -> str:
         first = self.pairs[0]
-        tried = sum(pair.rounds > 0 for pair in self.pairs)
+        tried = [pair for pair in self.pairs if pair.rounds]
         text = (
             f"start branches {first.branches[0]} and {first.branches[1]}, best of "
-            f"{tried} pairs in {self.evaluations} evaluations under the time law {self.time_law}: "
-            f"hypervolume {first.hypervolume:.4f}"
+            f"{len(tried)} pairs in {self.evaluations} evaluations under the time law "
+            f"{self.time_law}, those by which {len(self.pairs)} pairs were tried out included: "
         )
-        others = [pair for pair in self.pairs[1:] if pair.rounds]
-        if not others:
+        if not first.hypervolume:
+            return f"{text}no pair found a feasible carry, least penalty {first.least_penalty:.4f}"
+        text = f"{text}hypervolume {first.hypervolume:.4f}"
+        if len(tried) == 1:
             return text
-        second = max(others, key=lambda pair: pair.hypervolume)
+        second = max(tried[1:], key=lambda pair: pair.hypervolume)
+        if not second.hypervolume:
+            return f"{text}; the others found no feasible carry"
         return (
             f"{text}, {first.hypervolume - second.hypervolume:.4f} more than branches "
             f"{second.branches[0]} and {second.branches[1]}"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.branches import BranchCompetition, search_branches
+from hybrid_opt.branches import BranchCompetition, PairResult, search_branches
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.branch_choice import decided_cell, read_branches, store_branches
 from hybrid_opt.cell import Cell
@@ -43,7 +43,28 @@ def test_every_pair_is_there_once_and_the_best_wins(cell: Cell, found: BranchCom
     assert found.pairs[0].rounds == most
     assert found.pairs[0].hypervolume == max(p.hypervolume for p in found.pairs) > 0.4
     assert found.evaluations == sum(pair.evaluations for pair in found.pairs)
-    assert "more than branches" in str(found)
+    others = [pair.hypervolume for pair in found.pairs[1:] if pair.rounds]
+    assert ("more than branches" in str(found)) == (max(others) > 0.0)
+
+
+def test_who_won_and_by_how_much_is_told() -> None:
+    won = PairResult((2, 0), 2, 120, 0.5, 0.4, 0.6)
+    second = PairResult((1, 1), 1, 80, 0.2, 0.3, 0.7)
+    lost = replace(second, feasible_share=0.0, hypervolume=0.0)
+    out = replace(lost, branches=(0, 0), rounds=0, evaluations=33)
+
+    def told(*pairs: PairResult) -> str:
+        return str(BranchCompetition(pairs, 233, "constant"))
+
+    head = "start branches 2 and 0, best of 2 pairs in 233 evaluations under the time law constant"
+    tried = "those by which 3 pairs were tried out included"
+    assert told(won, second, out) == (
+        f"{head}, {tried}: hypervolume 0.4000, 0.1000 more than branches 1 and 1"
+    )
+    assert told(won, lost, out).endswith("hypervolume 0.4000; the others found no feasible carry")
+    assert told(won, out).endswith("hypervolume 0.4000")
+    nothing = replace(won, feasible_share=0.0, hypervolume=0.0, least_penalty=1.2)
+    assert told(nothing, lost).endswith("no pair found a feasible carry, least penalty 1.2000")
 
 
 def test_halving_gives_the_better_half_more(found: BranchCompetition) -> None:
@@ -92,7 +113,7 @@ def test_drivable_carries_choose_branches_under_the_ramped_law() -> None:
     cell = Cell(replace(workcell, task=task, start_branch=(SEARCHED, -1)), DRIVABLE_OBJECTIVES)
     found = search_branches(cell, evaluations=50, rng=np.random.default_rng(1))
     assert found.time_law == "ramped"
-    assert "evaluations under the time law ramped: hypervolume" in str(found)
+    assert "evaluations under the time law ramped" in str(found)
     ramped = Cell(replace(workcell, start_branch=(SEARCHED, -1)))
     assert found == search_branches(ramped, evaluations=50, rng=np.random.default_rng(1))
     assert found.pairs[0].hypervolume > 0.0
