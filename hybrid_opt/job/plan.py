@@ -31,8 +31,7 @@ from hybrid_opt.job.straight import (
     Straight,
     followed,
     held_at,
-    lift_line,
-    pad_line,
+    lines_around,
     standing_still,
     timed,
 )
@@ -211,31 +210,21 @@ class JobModel:
             pose: (2, 6) of the box where the carry begins and ends.
             known: (2, joints) about where the joints are then [rad].
         """
-        cell, speed = self.workcell, handling.pressing_speed
         places = (
             self._collisions.standing(pose[0], handling.lift_height),
             self._collisions.standing(pose[1], handling.set_down_height),
         )
         checker = self._collisions.checker(places)
-        before: list[_Part] = []
-        after: list[_Part] = []
-        q = known[0]
-        if places[0].height > 0.0:
-            line = lift_line("lift", places[0].pose, pose[0], handling.lifting_speed)
-            before.append(self._part(checker, line, q, at_end=True))
-            q = before[0].motion.q[0]
-        ways = (handling.stand_off, 0.0)
-        line = pad_line(cell, "approach", places[0].pose, ways, speed)
-        before.insert(0, self._part(checker, line, q, at_end=True))
-        q = known[1]
-        if places[1].height > 0.0:
-            line = lift_line("set_down", pose[1], places[1].pose, handling.lifting_speed)
-            after.append(self._part(checker, line, q, at_end=False))
-            q = after[0].motion.q[-1]
-        line = pad_line(cell, "retreat", places[1].pose, ways[::-1], speed)
-        after.append(self._part(checker, line, q, at_end=False))
+        stands = places[0].pose, places[1].pose
+        lines = lines_around(self.workcell, handling, stands, pose)
+        found: tuple[list[_Part], list[_Part]] = ([], [])
+        for parts, outwards, q, end in zip(found, lines, known, (0, -1), strict=True):
+            for line in outwards:
+                parts.append(self._part(checker, line, q, at_end=end == 0))
+                q = parts[-1].motion.q[end]
+        before, after = found
         stands_on = (places[0].bodies, places[1].bodies)
-        return _Around(tuple(before), tuple(after), stands_on, checker)
+        return _Around(tuple(before[::-1]), tuple(after), stands_on, checker)
 
     def _part(self, checker: CollisionChecker, line: Straight, known: Array, at_end: bool) -> _Part:
         q = followed(self.workcell, self._posture, line, known, at_end)

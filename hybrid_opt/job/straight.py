@@ -17,6 +17,7 @@ from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array
 from symbolic.physics.pose import box_rotation
 from symbolic.robot.arm import REACH_TOLERANCE
+from symbolic.workcell.handling import Handling
 from symbolic.workcell.records import Workcell
 
 SAMPLES = 401
@@ -91,6 +92,26 @@ def pad_line(
         for end, distance in enumerate(ways):
             held[arm, end, :3] -= distance * (rotation @ contact.T_box_pad[:3, 2])
     return Straight(name, np.tile(box, (2, 1)), held, speed)
+
+
+def lines_around(
+    workcell: Workcell, handling: Handling, stands: tuple[Array, Array], pose: Array
+) -> tuple[list[Straight], list[Straight]]:
+    """What moves straight before a carry and after it, either list from the carry outwards.
+
+    Args:
+        handling: how; the workcell's own or another.
+        stands: (6,) poses of the box where it stands before and after the carry.
+        pose: (2, 6) of the box where the carry begins and ends.
+    """
+    away, speed = handling.stand_off, handling.pressing_speed
+    before = [pad_line(workcell, "approach", stands[0], (away, 0.0), speed)]
+    after = [pad_line(workcell, "retreat", stands[1], (0.0, away), speed)]
+    if not np.array_equal(stands[0], pose[0]):
+        before.insert(0, lift_line("lift", stands[0], pose[0], handling.lifting_speed))
+    if not np.array_equal(stands[1], pose[1]):
+        after.insert(0, lift_line("set_down", pose[1], stands[1], handling.lifting_speed))
+    return before, after
 
 
 def followed(

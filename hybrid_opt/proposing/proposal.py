@@ -9,7 +9,6 @@ as it is read from the file.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,15 +21,17 @@ from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
 from hybrid_opt.proposing.completion import Found, changes, decision_bounds
+from hybrid_opt.proposing.grasping import grasp_blocked
 from hybrid_opt.proposing.pairing import Pair
 from hybrid_opt.proposing.planner import Budget, Stray, freedom, plan
 from hybrid_opt.proposing.problem import Problem, read_problem
 from hybrid_opt.proposing.reasons import no_path
+from hybrid_opt.proposing.settings import ProposeSettings
 from hybrid_opt.proposing.setup import Setup, prepare
 from hybrid_opt.proposing.trial import BranchLostError, Trial
 from hybrid_opt.proposing.via_points import MOST_VIA_POINTS, fit, shortened
 from symbolic.array import Array
-from symbolic.errors import SettingsError, WorkcellError
+from symbolic.errors import WorkcellError
 
 ROUNDS = ((2000, 2), (6000, 6), (20000, 16), (60000, 24))
 """Configurations that may be looked at for a path, and pairs of ways to hold that get so many."""
@@ -59,33 +60,6 @@ SPINS = 12
 
 
 @dataclass(frozen=True)
-class ProposeSettings:
-    """How a carry is looked for.
-
-    Attributes:
-        seconds: for all of it.
-        feasible: least and largest share of random candidates within the bounds that is feasible.
-        bases: whether the robots' bases are proposed too; of those in the file only the height
-            counts.
-        clock: what seconds are counted by.
-    """
-
-    seconds: float = 120.0
-    feasible: tuple[float, float] = (0.02, 0.20)
-    bases: bool = False
-    clock: Callable[[], float] = time.monotonic
-
-    def __post_init__(self) -> None:
-        if not 1.0 <= self.seconds <= 1e6:
-            raise SettingsError(f"seconds: found {self.seconds:g}; allowed is 1 to 1e6")
-        low, high = self.feasible
-        if not 0.0 < low < high <= 1.0:
-            raise SettingsError(
-                f"feasible: found {low:g} and {high:g}; allowed are shares 0 < least < largest <= 1"
-            )
-
-
-@dataclass(frozen=True)
 class Proposal:
     """A workcell with a certified carry.
 
@@ -96,6 +70,8 @@ class Proposal:
         feasible_share: of random candidates within the bounds.
         candidates: by which that was measured.
         seconds: that it took.
+        blocked: what is in the way of the pads before the carry or after it, '' where nothing is,
+            or no time was left to look.
     """
 
     problem: Problem
@@ -104,6 +80,7 @@ class Proposal:
     feasible_share: float
     candidates: int
     seconds: float
+    blocked: str = ""
 
     def text(self, folder: Path) -> str:
         """The workcell file, for a folder: the problem file's text, completed.
@@ -121,6 +98,7 @@ class Proposal:
             f"spins {spins} deg, start branches {self.found.branches[0]} and "
             f"{self.found.branches[1]}; {100.0 * self.feasible_share:.1f} % of "
             f"{self.candidates} random candidates feasible; {self.seconds:.1f} s"
+            + (f"; no whole job yet: {self.blocked}" if self.blocked else "")
         )
 
 
@@ -299,6 +277,8 @@ class _Search:
         if not judgement.feasible:
             self.refusals.append(why)
             return None
+        self.tell("the pads' way to the box")
+        blocked = "" if self.out_of_time else grasp_blocked(last)
         return Proposal(
             self.problem,
             replace(moved, branches=last.branches),
@@ -306,6 +286,7 @@ class _Search:
             bounds.share,
             bounds.candidates,
             self.spent,
+            blocked,
         )
 
     def _trial(self, found: Found, begin: tuple[Array, Array]) -> Trial:

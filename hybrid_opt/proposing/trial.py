@@ -43,6 +43,7 @@ class Trial:
     Attributes:
         workcell: the cell, its start branches as they were found.
         branches: per robot its start branch among the ranked ones.
+        model: its symbolic model.
         evaluator: what judges.
     """
 
@@ -61,7 +62,7 @@ class Trial:
         self.branches = (found[0], found[1])
         begin = [np.array(model.branches[i][found[i]].q) for i in (0, 1)]
         self.workcell = replace(workcell, start_branch=self.branches)
-        model = replace(model, workcell=self.workcell, start=(begin[0], begin[1]))
+        self.model = model = replace(model, workcell=self.workcell, start=(begin[0], begin[1]))
         functions = {
             name: InterpretedFunction(dense(function))
             for name, function in cell_functions(model).items()
