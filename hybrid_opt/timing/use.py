@@ -6,6 +6,7 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import robust_model
+from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.records import Excess, Place, TimingLimits
 from symbolic.array import Array
 from symbolic.functions.candidate import TIMING_TOLERANCE
@@ -19,6 +20,12 @@ FRICTION_ROUNDING = 1e-6
 
 RECOMPUTED_TOLERANCE = TIMING_TOLERANCE
 """Largest excess of a recomputed limit, as a share of it."""
+
+NEAR = 0.98
+"""Share of a limit of robust forces from which on they are told exactly."""
+
+AT_A_TIME = 2000
+"""Samples of a carry whose cases are held in memory together."""
 
 FORCE_FLOOR = 1e-9
 """A contact with less normal force than this carries nothing [N]."""
@@ -54,7 +61,7 @@ def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict
     if limits_pressure(workcell, limits):
         ratios["pressure shift"] = carry.pressure_shift / radius
     if limits.force is not None:
-        ratios["normal force"] = limited_force(carry, workcell, limits) / limits.force
+        ratios["normal force"] = _near_limit(carry, workcell, limits) / limits.force
     if limits.reference_speed:
         ratios["path speed"] = np.maximum(
             linear / task.reference_speed, angular / task.reference_angular_speed
@@ -68,6 +75,23 @@ def limited_force(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Arr
         return carry.normal_force
     commanded, leading = robust_model(workcell).hold(carry, workcell.uncertainty)
     return np.maximum(carry.normal_force, np.stack([leading, commanded], axis=1))
+
+
+def _near_limit(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array:
+    """As `limited_force`; robust ones that are below `NEAR` of the limit may be told as the planned
+    ones, where a larger one is there: to see that takes a thirtieth of the time."""
+    if not limits.robust or limits.force is None or not workcell.has_facing_pads:
+        return limited_force(carry, workcell, limits)
+    n = len(carry)
+    points = PathPoints(carry.pose, carry.rate, carry.second_rate, np.zeros(n), np.ones(n))
+    found = carry.normal_force.copy()
+    known = False
+    for part in np.array_split(np.arange(n), -(-n // AT_A_TIME)):
+        level = np.full(len(part), NEAR * limits.force)
+        rows, force, _ = robust_path(workcell).beyond(points.at(part), level)
+        found[part[rows]] = np.maximum(found[part[rows]], force)
+        known = known or len(rows) > 0
+    return found if known else limited_force(carry, workcell, limits)
 
 
 def limits_pressure(workcell: Workcell, limits: TimingLimits) -> bool:

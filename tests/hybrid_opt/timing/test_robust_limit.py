@@ -9,6 +9,7 @@ import pytest
 
 from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.timing import TimingLimits, TimingModel, TimingStatus, time_path
+from hybrid_opt.timing.use import limit_ratios, limit_use
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Uncertainty
 from tests.hybrid_opt.timing.cells import initial, timing_of
@@ -52,3 +53,21 @@ def test_a_limit_below_what_holds_still_in_every_case_is_told() -> None:
 def test_robust_forces_need_a_limit() -> None:
     with pytest.raises(SettingsError, match="give one"):
         TimingLimits(robust=True)
+
+
+@pytest.mark.parametrize("share", [0.9, 1.0, 1.1])
+def test_the_use_of_the_limit_is_that_of_all_cases(share: float) -> None:
+    """Cases far below the limit are left out, where others are near it."""
+    model = unsure()
+    plain = time_path(model, initial(), TimingLimits(force=60.0)).carry
+    assert plain is not None
+    held = RobustModel(model.workcell).robust_force(plain)
+    limit = share * float(held.peak.max())
+    limits = TimingLimits(force=limit, robust=True)
+    use = limit_use(plain, model.workcell, limits, model.joint_names)["normal force"]
+    assert use.ratio == pytest.approx(held.peak.max() / limit, rel=1e-6)
+    every = limit_ratios(plain, model.workcell, limits)["normal force"].max(axis=1)
+    needed = np.maximum(held.commanded, held.leading) / limit
+    near = needed > 0.985
+    np.testing.assert_allclose(every[near], needed[near], rtol=1e-6)
+    assert (every < needed * (1.0 + 1e-6)).all()
