@@ -155,9 +155,21 @@ class CompiledFunction(NumericFunction):
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> Callable[[int], None]:
         ports = self._ports(inputs, batched, outputs)
+        address, one, side_by_side = ctypes.addressof(ports), self._run, self._run_lanes
+        wide, idle, idle_lanes = self.lanes > 1, self._idle, self._idle_lanes
 
-        def run(count: int, _memory: object = (inputs, outputs)) -> None:
-            self._run_chunk(ctypes.addressof(ports), 0, count)
+        # As `_run_chunk`, without the calls between: small functions take no longer than these.
+        def run(count: int, _memory: object = (inputs, outputs, ports)) -> None:
+            if wide and count > 1:
+                work = self._take_lane_work()
+                status = side_by_side(address, work.address, 0, count)
+                idle_lanes.append(work)
+            else:
+                work = self._take_work()
+                status = one(address, work.address, 0, count)
+                idle.append(work)
+            if status != _SUCCESS:
+                self._check(status, " of the batch")
 
         return run
 

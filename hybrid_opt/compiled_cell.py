@@ -103,10 +103,24 @@ class CompiledCell:
         Raises:
             DualArmError: the model or its code cannot be built.
         """
+        return self.made(name, lambda: make(self.model), *details, lanes=lanes, levels=levels)
+
+    def made(
+        self,
+        name: str,
+        make: Callable[[], Mapping[str, ca.Function]],
+        *details: str,
+        lanes: int = 1,
+        levels: Mapping[str, int] | None = None,
+    ) -> dict[str, NumericFunction]:
+        """As `functions`, for what is made of less than the whole model.
+
+        Raises:
+            DualArmError: the code cannot be built.
+        """
         if not self.is_identified:
-            return build(make(self.model), self.cache, lanes=lanes, levels=levels).functions
-        key = self.key(name, *details)
-        return load_or_build(key, lambda: make(self.model), self.cache, lanes=lanes, levels=levels)
+            return build(make(), self.cache, lanes=lanes, levels=levels).functions
+        return load_or_build(self.key(name, *details), make, self.cache, lanes=lanes, levels=levels)
 
     @cached_property
     def evaluators(self) -> dict[str, NumericFunction]:

@@ -205,9 +205,12 @@ class CollisionChecker:
         if not len(rows):
             return hits
         self._place(pose[rows], q_1[rows], q_2[rows])
-        for local, k in enumerate(rows.tolist()):
+        queries: dict[int, list[int]] = {}
+        for k, pair in np.argwhere(wanted).tolist():
+            queries.setdefault(k, []).append(pair)
+        for local, (k, pairs) in enumerate(queries.items()):
             resting_pairs = self._resting_pairs(pose[k, :3])
-            for pair in np.flatnonzero(wanted[k]).tolist():
+            for pair in pairs:
                 resting = pair in resting_pairs
                 i, j = self._pairs[pair]
                 first = self.judge.shrunk_payload if resting else i

@@ -6,6 +6,8 @@ most the tolerance (`symbolic.geometry.pairs.pair_tolerance`).
 
 from __future__ import annotations
 
+import math
+
 import fcl
 import numpy as np
 
@@ -115,7 +117,7 @@ class Judge:
         if distance <= 0.0:
             return 0.0
         between = np.subtract(result.nearest_points[1], result.nearest_points[0])
-        length = float(np.linalg.norm(between))
+        length = math.sqrt(between @ between)
         if length < SMALLEST_SIZE:
             return 0.0
         u = between / length

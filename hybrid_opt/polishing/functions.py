@@ -31,8 +31,9 @@ COMPILED = (
     JointLimit(0, 0, "lower"),
     JointLimit(1, 0, "lower"),
 )
-"""Members of the families whose functions are compiled: they are in nearly every solve. Every
-clearance of an arm is a family of its own, of which a solve needs a few: these are interpreted."""
+"""Members of the families whose functions are compiled at once: nearly every solve has them. Every
+clearance of an arm is a family of its own, of which a cell has hundreds and a solve needs a few:
+these are compiled when a solve first asks for them, and kept."""
 
 ARMS = (0, 1)
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
@@ -54,18 +55,24 @@ higher ones compile three times as long and gain nothing (measured on the rack: 
 within 5 %, one slower by 40 %)."""
 
 
+_LATER_LEVELS: dict[Order, int] = {"first": 1, "second": 0}
+"""The same of what is compiled when it is asked for: 0.1 and 0.2 s each on the rack. Few second
+derivatives of clearances are ever needed."""
+
+
 class RowFunctions:
-    """The functions of rows at places; what was not compiled is built when first asked for."""
+    """The functions of rows at places; what is not known is built when first asked for."""
 
     def __init__(
         self,
         model: CellBodies,
-        compiled: Mapping[RowKey, NumericFunction],
+        known: Mapping[RowKey, NumericFunction],
         gaps: NumericFunction,
+        compiled: CompiledCell | None = None,
     ) -> None:
-        self.model, self._compiled = model, compiled
-        self._gaps, self._place = gaps, Place(model)
-        self._interpreted: dict[RowKey, NumericFunction] = {}
+        """compiled: what compiles others and keeps them; None interprets them."""
+        self.model, self._known = model, dict(known)
+        self._gaps, self._place, self._cell = gaps, Place(model), compiled
         self.numbers = lru_cache(maxsize=None)(self._numbers)
         self.obstacle = lru_cache(maxsize=None)(self._place.obstacle)
         self.separable = frozenset(self._place.separable())
@@ -73,12 +80,19 @@ class RowFunctions:
     def of(self, constraint: PlaceConstraint, order: Order) -> NumericFunction:
         """See `symbolic.smooth.place.row_function`."""
         key = RowKey(constraint.family, order)
-        if key in self._compiled:
-            return self._compiled[key]
-        if key not in self._interpreted:
-            function = row_function(self._place, constraint, order)
-            self._interpreted[key] = InterpretedFunction(function)
-        return self._interpreted[key]
+        if key not in self._known:
+            self._known[key] = self._built(key, constraint)
+        return self._known[key]
+
+    def _built(self, key: RowKey, constraint: PlaceConstraint) -> NumericFunction:
+        def make() -> dict[str, ca.Function]:
+            return {key.name: row_function(self._place, constraint, key.order)}
+
+        if self._cell is None:
+            return InterpretedFunction(make()[key.name])
+        level = _LATER_LEVELS[key.order]
+        name, levels = f"polish {key.name}", {key.name: level}
+        return self._cell.made(name, make, str(level), levels=levels)[key.name]
 
     def _numbers(self, constraint: PlaceConstraint) -> Array:
         """See `PlaceConstraint.numbers`."""
@@ -146,7 +160,9 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     return PolishFunctions(
         samples={key: built[key.name] for key in sample_keys if key.name in built},
         closures={key: built[key.name] for key in closure_keys},
-        rows=RowFunctions(compiled.bodies, {key: built[key.name] for key in row_keys}, built[GAPS]),
+        rows=RowFunctions(
+            compiled.bodies, {key: built[key.name] for key in row_keys}, built[GAPS], compiled
+        ),
         driven=driven_functions_of(compiled) if driven else None,
     )
 

@@ -220,7 +220,7 @@ class DenseSolver:
     def _heed(self, now: _State) -> bool:
         """Raise the multipliers of rows that shortened the last step, which bend away faster than
         their slope tells: with them their curvature enters the next one. Whether any was raised."""
-        blocking = np.flatnonzero(self._blocking)
+        blocking = self._blocking.nonzero()[0]
         y = now.dual[blocking]
         raised = np.maximum(y, np.minimum(1.0, RAISED * y))
         now.dual[blocking] = raised
@@ -249,7 +249,7 @@ class DenseSolver:
             h = self._rows.values(z)
             share = SHORTENED[0]
             if np.isfinite(h).all():
-                lost = np.flatnonzero(held & (h < left))
+                lost = (held & (h < left)).nonzero()[0]
                 if len(lost):
                     share = until(kept_s[lost], alpha * ds[lost], h[lost])
                     self._blocking[lost] = True

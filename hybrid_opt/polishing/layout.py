@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 from symbolic.smooth.place import PlaceConstraint
 
@@ -63,7 +63,7 @@ class Layout:
             n_var,
             tuple(sorted(row for row in listed if isinstance(row, ForceRow))),
             tuple(sorted(row for row in listed if isinstance(row, PressureRow))),
-            tuple(sorted(places, key=lambda row: (repr(row.constraint), row.place))),
+            tuple(sorted(places, key=lambda row: (_name(row.constraint), row.place))),
         )
 
     @cached_property
@@ -110,3 +110,8 @@ class Layout:
     def n_rows(self) -> int:
         """All of them."""
         return int(self.places.stop)
+
+
+@cache
+def _name(constraint: PlaceConstraint) -> str:
+    return repr(constraint)

@@ -182,7 +182,7 @@ class PlaceValues:
         `gradients` was called last."""
         weight = weight[self._order]
         size = np.abs(weight)
-        chosen = np.flatnonzero(size > NEGLIGIBLE * size.max(initial=0.0))
+        chosen = (size > NEGLIGIBLE * size.max(initial=0.0)).nonzero()[0]
         bounds = chosen.searchsorted(self._starts).tolist()
         pulls = [
             np.zeros((len(arm.places), n)) for arm, n in zip(self._arms, self._joints, strict=True)

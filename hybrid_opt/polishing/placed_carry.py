@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from symbolic.array import Array
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.smooth.reach import Reach
 from symbolic.workcell.decision import POSE_SIZE, extended_waypoints, place_redundant
+
+_Found = TypeVar("_Found")
 
 DIPS_BELOW = 0.1
 """Pairs that stay farther apart than this are not looked at between places [m]."""
@@ -53,6 +56,7 @@ class PlacedCarry:
     peak: Array
     shift: Array
     _distances: Distances = field(repr=False)
+    _known: dict[object, Any] = field(default_factory=dict, repr=False)
 
     @property
     def is_followed(self) -> bool:
@@ -64,6 +68,13 @@ class PlacedCarry:
         bound where nothing touches [m]."""
         return self._distances.at(wanted)
 
+    def once(self, key: object, find: Callable[[], _Found]) -> _Found:
+        """What several kinds of constraints want to know of this candidate, found by the first."""
+        if key not in self._known:
+            self._known[key] = find()
+        found: _Found = self._known[key]
+        return found
+
 
 class Distances:
     """Distances of one candidate; each is measured when it is first asked for, and kept."""
@@ -71,20 +82,26 @@ class Distances:
     def __init__(
         self,
         bounds: Array,
-        dips: Array,
+        lowered: Array,
         measure: Callable[[Array, NDArray[np.bool_]], object],
     ) -> None:
-        """bounds, dips: (n, n_pairs) and what they are lower beside; measure: raises bounds."""
-        self._bounds, self._dips, self._measure = bounds.copy(), dips, measure
-        self._known = np.zeros(bounds.shape, dtype=np.bool_)
+        """bounds, lowered: (n, n_pairs), the latter with the dips beside each place; measure:
+        raises bounds. Nothing is copied until something is measured."""
+        self._bounds, self._lowered, self._measure = bounds, lowered, measure
+        self._raised, self._distances = bounds, lowered
+        self._unknown = np.ones(bounds.shape, dtype=np.bool_)
 
     def at(self, wanted: NDArray[np.bool_]) -> Array:
         """All of them, the wanted measured."""
-        fresh = wanted & ~self._known
+        fresh = wanted & self._unknown
         if fresh.any():
-            self._measure(self._bounds, fresh)
-            self._known |= fresh
-        return np.asarray(self._bounds - self._dips)
+            if self._raised is self._bounds:
+                self._raised, self._distances = self._bounds.copy(), self._lowered.copy()
+            self._measure(self._raised, fresh)
+            where = fresh.nonzero()
+            self._distances[where] += self._raised[where] - self._bounds[where]
+            self._unknown[where] = False
+        return self._distances
 
 
 class CarryReader:
@@ -151,7 +168,7 @@ class CarryReader:
             shift=found["pressure_shift"] / self._radii,
             _distances=Distances(
                 bounds,
-                bounds - lowered,
+                lowered,
                 lambda raised, wanted: evaluator.checker.measure(*held, raised, wanted),
             ),
         )

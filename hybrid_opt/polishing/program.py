@@ -254,16 +254,16 @@ class SmoothProgram:
 
     def _slopes(self) -> Array:
         """The Jacobian where the values were found last."""
-        layout, n = self.layout, self.layout.n_var
+        layout = self.layout
         jacobian = self._fixed.copy()
-        slope = self._forces.gradients(n).take(self._force_column, axis=0)
+        slope = self._forces.gradients.take(self._force_column, axis=0)
         slope *= self._mix[:, :, None]
         forces = jacobian[layout.forces, layout.decision]
         np.add(slope[:, 0], slope[:, 1], out=forces)
         if self._cell.robust is not None:
             forces += self._lacking_slope
         if len(self._pressed):
-            slope = self._patches.gradients(n)
+            slope = self._patches.gradients
             jacobian[layout.patches, layout.decision] = slope[self._pressed_column, self._pressed]
         if len(self._scale):
             by_path = self._places.gradients()

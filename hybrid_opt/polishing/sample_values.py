@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from codegen.function import NumericFunction, PreparedBatch
 from symbolic.array import Array
@@ -79,60 +78,72 @@ class SampleValues:
             wanted: samples without which a call is left out.
             rounding: of the time law's kinks, see `symbolic.smooth.samples.sample_functions`.
         """
-        self._calls: list[_Call] = []
         self._rounding, self._columns = rounding, dict[int, _Columns]()
-        order: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)]
-        for block in blocks:
-            chosen = np.isin(block.samples, list(wanted)).any(axis=1)
-            if not chosen.any():
+        chosen = [
+            block.samples[np.isin(block.samples, list(wanted)).any(axis=1)] for block in blocks
+        ]
+        served = np.concatenate([samples.ravel() for samples in chosen])
+        self.count = len(served)
+        self.column = np.full(1 + max(int(block.samples.max(initial=0)) for block in blocks), -1)
+        self.column[served] = np.arange(self.count)
+        n_var = next(iter(functions.values())).input_shapes[0][0]
+        self._x, self._values = np.zeros(n_var), np.zeros((self.count, 2))
+        self._gradients = np.zeros((self.count, 2, n_var))
+        self._calls, self._starts = list[_Call](), [0]
+        for block, samples in zip(blocks, chosen, strict=True):
+            if not len(samples):
                 continue
-            order.append(block.samples[chosen].ravel())
-            basis = block.basis[chosen]
+            rows = slice(self._starts[-1], self._starts[-1] + samples.size)
             first, second = (
                 functions[SampleKey(quantity, block.block, o)] for o in get_args(Order)
             )
-            batch = first.prepared(len(basis), SHARED)
+            n, served_each = samples.shape
+            given = {
+                "x": self._x,
+                "values": self._values[rows].reshape(n, -1),
+                "gradient": self._gradients[rows].reshape(n, -1, n_var),
+            }
+            batch = first.prepared(n, SHARED, given)
+            basis = block.basis[np.isin(block.samples, samples).all(axis=1)]
             batch.inputs["basis"][...] = basis
             batch.inputs["rounding"][...] = rounding
-            self._calls.append(_Call(batch, second, basis, block.samples.shape[1]))
-        served = np.concatenate(order)
-        self.count = len(served)
-        self.column = np.full(1 + max(int(block.samples.max(initial=0)) for block in blocks), -1)
-        self.column[served] = np.arange(len(served))
+            self._calls.append(_Call(batch, second, basis, served_each))
+            self._starts.append(rows.stop)
 
     def first(self, x: Array) -> tuple[Array, Array]:
         """Values (count, 2) and their gradients (count, 2, n_var)."""
-        return self.values(x), self.gradients(len(x))
+        return self.values(x).copy(), self.gradients.copy()
 
     def values(self, x: Array) -> Array:
-        """(count, 2) at x."""
-        values = [np.empty((0, 2))]
+        """(count, 2) at x, overwritten by the next call."""
+        self._x[...] = x
         for call in self._calls:
-            call.first.inputs["x"][...] = x
-            values.append(call.first()["values"].reshape(-1, 2))
-        return np.concatenate(values)
+            call.first()
+        return self._values
 
-    def gradients(self, n: int) -> Array:
-        """(count, 2, n) where `values` was called last."""
-        outputs = [call.first.outputs["gradient"].reshape(-1, 2, n) for call in self._calls]
-        return np.concatenate([np.empty((0, 2, n)), *outputs])
+    @property
+    def gradients(self) -> Array:
+        """(count, 2, n_var) where `values` was called last, overwritten with them."""
+        return self._gradients
 
     def second(self, x: Array, weight: Array) -> Array:
         """(n_var, n_var) second derivatives of the values weighted by (count, 2)."""
-        total, start = np.zeros((len(x), len(x))), 0
-        least = NEGLIGIBLE * np.abs(weight).max(initial=0.0)
+        total = np.zeros((len(x), len(x)))
+        size = np.abs(weight).max(axis=1, initial=0.0)
+        matter = (size > NEGLIGIBLE * size.max(initial=0.0)).nonzero()[0]
+        bounds = matter.searchsorted(self._starts).tolist()
         for k, call in enumerate(self._calls):
-            n = len(call.basis)
-            own = weight[start : start + n * call.served].reshape(n, -1)
-            start += n * call.served
-            matter = np.flatnonzero(np.abs(own).max(axis=1) > least)
-            if count := len(matter):
-                columns = self._columns_of(k, len(x))
-                columns.batch.inputs["x"][...] = x
-                columns.basis[:count] = call.basis[matter][:, None]
-                columns.weight[:count] = own[matter][:, None]
-                columns.batch(count * len(x))
-                total += columns.curvature[:count].sum(axis=0)
+            rows = matter[bounds[k] : bounds[k + 1]] - self._starts[k]
+            if not len(rows):
+                continue
+            at = np.unique(rows // call.served) if call.served > 1 else rows
+            own = weight[self._starts[k] : self._starts[k + 1]].reshape(len(call.basis), -1)
+            columns, count = self._columns_of(k, len(x)), len(at)
+            columns.batch.inputs["x"][...] = x
+            columns.basis[:count] = call.basis[at][:, None]
+            columns.weight[:count] = own[at][:, None]
+            columns.batch(count * len(x))
+            total += columns.curvature[:count].sum(axis=0)
         return total
 
     def _columns_of(self, k: int, n_var: int) -> _Columns:

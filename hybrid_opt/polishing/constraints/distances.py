@@ -57,12 +57,15 @@ class DistanceKind(Kind[PlaceRow]):
 
     def violations(self, carry: PlacedCarry) -> dict[int, Array]:
         """(reached,) distances of every pair that comes too close [m], by pair."""
+        return carry.once("violations", lambda: self._violations(carry))
+
+    def _violations(self, carry: PlacedCarry) -> dict[int, Array]:
         close = carry.lowered < self.least
         pairs = np.flatnonzero(close.any(axis=0)).tolist()
         if not pairs:
             return {}
         truth = carry.distance(close)
-        return {pair: truth[:, pair] for pair in pairs}
+        return {pair: truth[:, pair].copy() for pair in pairs}
 
     def _measured(self, carry: PlacedCarry, rows: Sequence[PlaceRow]) -> Array:
         """Least distance in the window of each row."""

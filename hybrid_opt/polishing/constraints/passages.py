@@ -128,4 +128,4 @@ def violated_passages(
 
 def gaps_of(kind: DistanceKind, carry: PlacedCarry, pair: int) -> Array:
     """(reached, n) gaps of a separable pair along every direction [m]."""
-    return kind.rows.gaps(pair, carry.pose[: carry.reached])
+    return carry.once(("gaps", pair), lambda: kind.rows.gaps(pair, carry.pose[: carry.reached]))
