@@ -59,7 +59,7 @@ def agree(workcell: Workcell, fully: bool = True) -> None:
     interpreted = CandidateEvaluator(workcell, functions=functions)
     x = np.vstack([around(workcell, 6, 7, 1.0), around(workcell, 6, 8, 10.0)])
     found, expected = compiled.evaluate(x), interpreted.evaluate(x)
-    assert 0.0 < expected.feasible.mean() < 1.0
+    assert len(np.unique(expected.reason)) > 1, "verdicts of one kind prove little"
     outputs = compiled.outputs(x)
     pairs = {name: (getattr(found, name), values) for name, values in vars(expected).items()}
     pairs |= {name: (outputs[name], values) for name, values in interpreted.outputs(x).items()}
