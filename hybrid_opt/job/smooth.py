@@ -37,7 +37,9 @@ EVERY = 4
 RESTS = 1e-3
 """Share of an acceleration limit below which a joint counts as at rest."""
 
-_SLOWEST = 0.5
+_SLOWER = (0.95, 0.5)
+"""Factors tried as the lower end of the search for one: few are below the first."""
+
 _RESOLUTION = 1e-4
 """Of the factor by which a timing is slowed."""
 
@@ -84,12 +86,13 @@ def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing
 
     factor = 1.0
     if excess(factor) > 0.0:
-        if excess(_SLOWEST) > 0.0:
+        slow = next((slower for slower in _SLOWER if excess(slower) <= 0.0), None)
+        if slow is None:
             raise JobError(
                 "the carry's timing cannot be smoothed within its limits; choose a slower timing"
             )
         # A root within _RESOLUTION that lies on the slow side.
-        factor = brentq(excess, _SLOWEST, 1.0, xtol=_RESOLUTION / 2.0) - _RESOLUTION
+        factor = brentq(excess, slow, 1.0, xtol=_RESOLUTION / 2.0) - _RESOLUTION
     found = driven(factor)
     use = limit_use(found, model.workcell, limits, model.joint_names)
     place = worst(use).place

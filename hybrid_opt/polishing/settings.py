@@ -267,7 +267,7 @@ class PolishSettings:
 
     attempts: int = 6
     method: Method = "pascoletti-serafini"
-    max_iterations: int = 30
+    max_iterations: int = 20
     rounds: int = 7
     max_seconds: float = 60.0
     margin: float = 1e-6

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -136,7 +137,7 @@ class Task:
         """Number of variables of the box path, the first of the decision vector."""
         return POSE_SIZE * len(self.free_indices)
 
-    @property
+    @cached_property
     def free_entries(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows and columns (n_path,) of the path's variables among the extended waypoints
         (n_waypoints, 6 + m), whose columns are the pose and the redundant joints."""
@@ -146,7 +147,10 @@ class Task:
             moving = np.flatnonzero(joint.lower < joint.upper)
             rows.append(moving)
             columns.append(np.full(len(moving), POSE_SIZE + k))
-        return np.concatenate(rows), np.concatenate(columns)
+        found = np.concatenate(rows), np.concatenate(columns)
+        for part in found:  # every caller gets the same
+            part.flags.writeable = False
+        return found
 
     @property
     def n_var(self) -> int:
