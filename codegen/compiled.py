@@ -61,10 +61,7 @@ class CompiledFunction(NumericFunction):
             sizes = (ctypes.c_longlong * 4)()
             loaded.dual_arm_sizes(sizes)
         except (OSError, AttributeError) as error:
-            raise CodegenError(
-                f"{self.name}: the compiled library cannot be loaded: {error}; if its folder does "
-                "not allow programs, name another one in the environment variable DUAL_ARM_CACHE"
-            ) from error
+            raise cannot_load(self.name, error) from error
         self._once.argtypes = [ctypes.c_void_p] * 3
         self._run.argtypes = [ctypes.c_void_p] * 2 + [ctypes.c_longlong] * 2
         self._once.restype = self._run.restype = ctypes.c_longlong
@@ -155,21 +152,10 @@ class CompiledFunction(NumericFunction):
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> Callable[[int], None]:
         ports = self._ports(inputs, batched, outputs)
-        address, one, side_by_side = ctypes.addressof(ports), self._run, self._run_lanes
-        wide, idle, idle_lanes = self.lanes > 1, self._idle, self._idle_lanes
+        address = ctypes.addressof(ports)
 
-        # As `_run_chunk`, without the calls between: small functions take no longer than these.
         def run(count: int, _memory: object = (inputs, outputs, ports)) -> None:
-            if wide and count > 1:
-                work = self._take_lane_work()
-                status = side_by_side(address, work.address, 0, count)
-                idle_lanes.append(work)
-            else:
-                work = self._take_work()
-                status = one(address, work.address, 0, count)
-                idle.append(work)
-            if status != _SUCCESS:
-                self._check(status, " of the batch")
+            self._run_chunk(address, 0, count)
 
         return run
 
@@ -250,6 +236,14 @@ class _Work:
 
 
 _warned = False
+
+
+def cannot_load(name: str, error: Exception) -> CodegenError:
+    """Why a library in the cache is of no use, and what to do."""
+    return CodegenError(
+        f"{name}: the compiled library cannot be loaded: {error}; if its folder does not allow "
+        "programs, name another one in the environment variable DUAL_ARM_CACHE"
+    )
 
 
 def warn_one_lane(name: str, reason: str) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from codegen.cache import FORMAT, Cache, digest
+from codegen.compiled import cannot_load
 from codegen.compiler import FLAGS, find_compiler
-from codegen.errors import CodegenError
 from codegen.interpreted import warn_interpreted
 
 LEVEL = 3
@@ -42,12 +42,23 @@ def load_or_build_library(name: str, text: str, cache: Cache | None = None) -> c
         compiler.compile(source, library, LEVEL)
         return {}
 
+    def find() -> ctypes.CDLL | None:
+        entry = cache.find(key)
+        try:
+            return None if entry is None else ctypes.CDLL(str(entry.library))
+        except OSError:
+            return None  # intact, but made against another C library: to be made again
+
+    # A lock writes: what is there already needs none.
+    loaded = find()
+    if loaded is not None:
+        return loaded
     with cache.lock(key):
-        entry = cache.find(key) or cache.store(key, make)
+        loaded = find()
+        if loaded is not None:
+            return loaded
+        entry = cache.store(key, make)
     try:
         return ctypes.CDLL(str(entry.library))
     except OSError as error:
-        raise CodegenError(
-            f"{name}: the compiled library cannot be loaded: {error}; if its folder does not "
-            "allow programs, name another one in the environment variable DUAL_ARM_CACHE"
-        ) from error
+        raise cannot_load(name, error) from error

@@ -38,7 +38,7 @@ RESTS = 1e-3
 """Share of an acceleration limit below which a joint counts as at rest."""
 
 _SLOWER = (0.95, 0.5)
-"""Factors tried as the lower end of the search for one: few are below the first."""
+"""Factors tried as the lower end of the search for one, the mildest first."""
 
 _RESOLUTION = 1e-4
 """Of the factor by which a timing is slowed."""

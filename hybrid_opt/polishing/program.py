@@ -186,7 +186,7 @@ class SmoothProgram:
         self._x, robust, layout = x, self._cell.robust, self.layout
         self._lacking = np.zeros(len(layout.force_rows))
         self._lacking_slope = np.zeros((len(layout.force_rows), len(x)))
-        split, slope = self._forces.first(x)
+        split = self._forces.values(x)
         at, sample = self._force_column, [row.sample for row in layout.force_rows]
         if robust is None:
             self._lacking = np.einsum("rk,rk->r", self._mix, carry.split[sample] - split[at])
@@ -196,7 +196,7 @@ class SmoothProgram:
         self._lacking = force[sample, self._owner] / unit
         self._lacking -= np.einsum("rk,rk->r", self._mix, split[at])
         self._lacking_slope = by_x[sample, self._owner] / unit[:, None]
-        self._lacking_slope -= np.einsum("rk,rkx->rx", self._mix, slope[at])
+        self._lacking_slope -= np.einsum("rk,rkx->rx", self._mix, self._forces.gradients[at])
 
     def _correct_pressure(self, x: Array, carry: PlacedCarry) -> None:
         """What the rounded time law takes off the rows' pressure at the candidate."""
@@ -204,7 +204,7 @@ class SmoothProgram:
         if len(self._pressed):
             sample = [row.sample for row in self.layout.pressure_rows]
             margin = 1.0 - carry.shift[sample, self._pressed] ** 2
-            found = self._patches.first(x)[0]
+            found = self._patches.values(x)
             self._patch_lacking = margin - found[self._pressed_column, self._pressed]
 
     def _fixed_part(self) -> Array:

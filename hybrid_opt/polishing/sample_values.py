@@ -110,10 +110,6 @@ class SampleValues:
             self._calls.append(_Call(batch, second, basis, served_each))
             self._starts.append(rows.stop)
 
-    def first(self, x: Array) -> tuple[Array, Array]:
-        """Values (count, 2) and their gradients (count, 2, n_var)."""
-        return self.values(x).copy(), self.gradients.copy()
-
     def values(self, x: Array) -> Array:
         """(count, 2) at x, overwritten by the next call."""
         self._x[...] = x

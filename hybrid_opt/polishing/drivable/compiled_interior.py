@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from functools import cache
+from functools import cache as remembered
 from importlib.resources import files
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
-from codegen.cache import default_folder
+from codegen.cache import Cache
 from codegen.library import load_or_build_library
 from hybrid_opt.polishing.drivable import interior
 from hybrid_opt.polishing.drivable.interior import Answer, Ending, QuadraticProgram
@@ -38,22 +39,25 @@ class _Program(ctypes.Structure):
     )
 
 
-def interior_method() -> Method:
+def interior_method(cache: Cache | None = None) -> Method:
     """The compiled method; without a C compiler, with a warning, the interpreted one.
+
+    Args:
+        cache: where the library is kept; by default the user's.
 
     Raises:
         CodegenError: it cannot be compiled, cached or loaded.
     """
-    return _method(str(default_folder()))
+    return _method((cache or Cache()).folder)
 
 
-@cache
-def _method(_folder: str) -> Method:
-    folder = files("hybrid_opt.polishing.drivable")
-    text = "\n".join(folder.joinpath(name).read_text() for name in ("bordered.c", "interior.c"))
+@remembered
+def _method(folder: Path) -> Method:
+    sources = files("hybrid_opt.polishing.drivable")
+    text = "\n".join(sources.joinpath(name).read_text() for name in ("bordered.c", "interior.c"))
     for name in CONSTANTS:
         text = text.replace(f"@{name}@", repr(getattr(interior, name)))
-    library = load_or_build_library("interior", text)
+    library = load_or_build_library("interior", text, Cache(folder))
     return interior.solve if library is None else _Compiled(library)
 
 

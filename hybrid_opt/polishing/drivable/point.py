@@ -17,6 +17,7 @@ import numpy as np
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.constraints.active import ActiveSet
 from hybrid_opt.polishing.constraints.kind import Surroundings
+from hybrid_opt.polishing.drivable.compiled_interior import interior_method
 from hybrid_opt.polishing.drivable.memory import Memory
 from hybrid_opt.polishing.drivable.proposal import Proposal, Proposer, Reached
 from hybrid_opt.polishing.drivable.timed import Goal, PathJudge, TimedPath, force_range
@@ -82,7 +83,12 @@ class DrivableSolver:
         self.active = ActiveSet(Surroundings(evaluator, cell, settings))
         self.reader = CarryReader(evaluator, grid, functions.rows)
         self.proposer = Proposer(
-            cell, functions.driven, driver.timer.intervals, settings.drivable, driver.robust
+            cell,
+            functions.driven,
+            driver.timer.intervals,
+            settings.drivable,
+            interior_method(evaluator.compiled.cache),
+            driver.robust,
         )
         self.driver = driver
         self.half = cell.unit.half[: task.n_path]

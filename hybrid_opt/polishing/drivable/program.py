@@ -190,7 +190,7 @@ class JointProgram:
             return beyond
         x = self._at.x.copy()
         x[: self.n_path] += self._half * d[: self.n_path]
-        value, _ = self._places.first(extended_waypoints(self._grid.workcell.task, x))
+        value = self._places.values(extended_waypoints(self._grid.workcell.task, x))
         lacking = (self._required - value) / self._place_scale
         foretold = self.geometry + self._geometry_slope @ d[: self.n_path]
         beyond[: len(lacking)] = lacking - foretold[: len(lacking)]

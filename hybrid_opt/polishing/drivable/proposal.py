@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hybrid_opt.polishing.drivable import quadratic
 from hybrid_opt.polishing.drivable.bordered import BorderedMatrix
-from hybrid_opt.polishing.drivable.compiled_interior import interior_method
+from hybrid_opt.polishing.drivable.compiled_interior import Method
 from hybrid_opt.polishing.drivable.functions import DrivenFunctions
 from hybrid_opt.polishing.drivable.interior import QuadraticProgram
 from hybrid_opt.polishing.drivable.intervals import IntervalGrid, IntervalValues
@@ -92,14 +92,21 @@ class Proposer:
         functions: DrivenFunctions,
         intervals: int,
         settings: DrivableSettings,
+        method: Method,
         robust: bool = False,
     ) -> None:
-        """intervals: pieces of constant u''. robust: whether robust forces are limited."""
+        """Prepare programs.
+
+        Args:
+            intervals: pieces of constant u''.
+            method: solves quadratic programs.
+            robust: whether robust forces are limited.
+        """
         self._cell, self._functions = cell, functions
         self._task, self._driven = cell.task, settings
         self._intervals = IntervalGrid(cell.workcell, intervals, robust)
         self._half = cell.unit.half[: cell.task.n_path]
-        self._method = interior_method()
+        self._method = method
 
     def step(self, best: Reached, goal: Goal, radius: float, lenient: bool) -> Proposal | None:
         """A step within the box; None where there is none."""

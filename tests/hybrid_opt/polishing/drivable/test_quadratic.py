@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from codegen import library
-from hybrid_opt.polishing.drivable import compiled_interior, quadratic
+from codegen.cache import Cache
+from hybrid_opt.polishing.drivable import quadratic
 from hybrid_opt.polishing.drivable.bordered import BorderedMatrix, BorderedRows
 from hybrid_opt.polishing.drivable.compiled_interior import Method, interior_method
 from hybrid_opt.polishing.drivable.interior import Answer, QuadraticProgram
@@ -141,12 +143,13 @@ def test_compiled_and_interpreted_answers_agree() -> None:
         assert value(of, outer.d) == pytest.approx(value(of, inner.d), abs=1e-8, rel=1e-8)
 
 
-def test_without_a_compiler_the_method_is_interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_the_method_is_interpreted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(library, "find_compiler", lambda: None)
-    monkeypatch.setattr(compiled_interior, "default_folder", lambda: "of no compiler")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        assert interior_method() is solve_inside
+        assert interior_method(Cache(tmp_path)) is solve_inside
 
 
 def test_clarabel_answers_where_the_own_method_does_not() -> None:
