@@ -131,14 +131,17 @@ class CandidateEvaluator:
             return self.driver.outputs(self._candidate, x)
         return self._candidate.batch(x, threads=self._threads)
 
-    def evaluate(self, x: Array) -> Evaluations:
+    def evaluate(self, x: Array, with_collisions: bool = True) -> Evaluations:
         """Verdicts on decision vectors (n, n_var).
+
+        Args:
+            with_collisions: see `sampled`.
 
         Raises:
             SettingsError: x has the wrong shape.
         """
         x = self._checked(x)
-        sampled = self.sampled(x)
+        sampled = self.sampled(x, with_collisions)
         whole = self._kernel is None or self._needs is not None
         return self._judge(x, sampled, sampled.outputs if whole else self.outputs(x))
 

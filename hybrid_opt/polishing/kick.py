@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.polishing.feasible import first_feasible
 from hybrid_opt.polishing.settings import KickSettings
 from symbolic.array import Array
 
@@ -38,9 +39,5 @@ def kicked(
     far = (np.abs(candidates - x) / (high - low)).max(axis=1) > settings.distance
     if not far.any():
         return None
-    found = evaluator.evaluate(candidates[far])
-    values = np.where(found.feasible, found.objectives[:, objective], np.inf)
-    best = int(np.argmin(values))
-    if not np.isfinite(values[best]):
-        return None
-    return candidates[far][best], found.objectives[best]
+    rows, objectives = first_feasible(evaluator, candidates[far], 1, objective)
+    return (candidates[far][rows[0]], objectives[0]) if len(rows) else None

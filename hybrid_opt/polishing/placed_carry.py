@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,6 +24,12 @@ _Found = TypeVar("_Found")
 DIPS_BELOW = 0.1
 """Pairs that stay farther apart than this are not looked at between places [m]."""
 
+AT_ONCE = 8
+"""Distances that are measured together where the first low one ends a search."""
+
+Stretch = tuple[slice, int]
+"""Places of the path, from a start that is given, and a pair."""
+
 
 @dataclass(frozen=True)
 class PlacedCarry:
@@ -34,8 +41,6 @@ class PlacedCarry:
         q: both arms' joint positions, (m, n) each [rad]; beyond `reached` without meaning.
         reached: places before the first that an arm does not reach.
         stranded: the arms that do not reach all places.
-        clearance: (reached, n_pairs) lower bounds of every active pair's distance [m].
-        lowered: the same with the dips that are to be expected beside each place.
         manipulability: (reached, 2) |det J| over its least value.
         split: (n, 2) on samples: normal component, tangential magnitude of the required force [N].
         force: (n, 2) on samples: the normal forces that are minimised, planned or robust ones [N].
@@ -48,8 +53,6 @@ class PlacedCarry:
     q: tuple[Array, Array]
     reached: int
     stranded: tuple[int, ...]
-    clearance: Array
-    lowered: Array
     manipulability: Array
     split: Array
     force: Array
@@ -63,10 +66,29 @@ class PlacedCarry:
         """Whether both arms reach all places."""
         return self.reached == len(self.pose)
 
+    @property
+    def clearance(self) -> Array:
+        """(reached, n_pairs) lower bounds of every active pair's distance [m]."""
+        return self._distances.bounds
+
+    @property
+    def lowered(self) -> Array:
+        """The same with the dips that are to be expected beside each place."""
+        return self._distances.lowered
+
     def distance(self, wanted: NDArray[np.bool_]) -> Array:
         """(reached, n_pairs) as `lowered`, those wanted raised by what FCL's distance exceeds the
         bound where nothing touches [m]."""
         return self._distances.at(wanted)
+
+    def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
+        """The least distance in each stretch, as of `distance` where bounds are below a limit
+        [m]."""
+        return self._distances.least(stretches, below)
+
+    def keeps(self, limits: Array) -> bool:
+        """Whether every pair keeps its limit (n_pairs,) at all places [m]."""
+        return self._distances.keep(limits)
 
     def once(self, key: object, find: Callable[[], _Found]) -> _Found:
         """What several kinds of constraints want to know of this candidate, found by the first."""
@@ -77,31 +99,88 @@ class PlacedCarry:
 
 
 class Distances:
-    """Distances of one candidate; each is measured when it is first asked for, and kept."""
+    """Distances of one candidate; each is measured when it is first asked for, and kept.
+
+    Attributes:
+        bounds, lowered: (n, n_pairs), the latter with the dips beside each place [m].
+    """
 
     def __init__(
         self,
-        bounds: Array,
-        lowered: Array,
-        measure: Callable[[Array, NDArray[np.bool_]], object],
+        find: Callable[[], Array],
+        measure: Callable[[NDArray[np.intp], Array, NDArray[np.bool_]], object],
     ) -> None:
-        """bounds, lowered: (n, n_pairs), the latter with the dips beside each place; measure:
-        raises bounds. Nothing is copied until something is measured."""
-        self._bounds, self._lowered, self._measure = bounds, lowered, measure
-        self._raised, self._distances = bounds, lowered
-        self._unknown = np.ones(bounds.shape, dtype=np.bool_)
+        """find: gives the bounds; measure: raises those of some places (k,), (k, n_pairs), where
+        wanted. Neither is done before it is needed."""
+        self._find, self._measure = find, measure
+
+    @cached_property
+    def bounds(self) -> Array:
+        """See the class."""
+        return self._find()
+
+    @cached_property
+    def lowered(self) -> Array:
+        """See the class."""
+        near = self.bounds.min(axis=0, initial=np.inf) < DIPS_BELOW
+        lowered = self.bounds.copy()
+        lowered[:, near] = dipped(self.bounds[:, near])
+        return lowered
+
+    @cached_property
+    def _found(self) -> Array:
+        return self.lowered.copy()
+
+    @cached_property
+    def _unknown(self) -> NDArray[np.bool_]:
+        return np.ones(self.bounds.shape, dtype=np.bool_)
 
     def at(self, wanted: NDArray[np.bool_]) -> Array:
         """All of them, the wanted measured."""
-        fresh = wanted & self._unknown
-        if fresh.any():
-            if self._raised is self._bounds:
-                self._raised, self._distances = self._bounds.copy(), self._lowered.copy()
-            self._measure(self._raised, fresh)
-            where = fresh.nonzero()
-            self._distances[where] += self._raised[where] - self._bounds[where]
-            self._unknown[where] = False
-        return self._distances
+        self._learn(*(wanted & self._unknown).nonzero())
+        return self._found
+
+    def _learn(self, places: NDArray[np.intp], pairs: NDArray[np.intp]) -> None:
+        """Measure pairs at places, side by side."""
+        if not len(places):
+            return
+        rows, local = np.unique(places, return_inverse=True)
+        wanted = np.zeros((len(rows), self.bounds.shape[1]), dtype=np.bool_)
+        wanted[local, pairs] = True
+        raised = self.bounds[rows]
+        self._measure(rows, raised, wanted)
+        self._found[places, pairs] += raised[local, pairs] - self.bounds[places, pairs]
+        self._unknown[places, pairs] = False
+
+    def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
+        """See `PlacedCarry.least`. No distance is below its bound: of each stretch the lowest is
+        measured until that is one that is known."""
+        open_, found = list(range(len(stretches))), [np.inf] * len(stretches)
+        while open_:
+            lowest = dict[int, tuple[int, int]]()
+            for k in open_:
+                where, pair = stretches[k]
+                place = where.start + int(self._found[where, pair].argmin())
+                found[k] = float(self._found[place, pair])
+                if self._unknown[place, pair] and self.bounds[place, pair] < below:
+                    lowest[k] = place, pair
+            chosen = np.array(sorted(set(lowest.values())), dtype=np.intp).reshape(-1, 2)
+            self._learn(chosen[:, 0], chosen[:, 1])
+            open_ = list(lowest)
+        return found
+
+    def keep(self, limits: Array) -> bool:
+        """See `PlacedCarry.keeps`. The lowest are measured first: the first that does not keep its
+        limit tells."""
+        places, pairs = (self.lowered < limits).nonzero()
+        order = np.argsort(self.lowered[places, pairs], kind="stable")
+        for first in range(0, len(order), AT_ONCE):
+            some = order[first : first + AT_ONCE]
+            fresh = some[self._unknown[places[some], pairs[some]]]
+            self._learn(places[fresh], pairs[fresh])
+            if (self._found[places[some], pairs[some]] < limits[pairs[some]]).any():
+                return False
+        return True
 
 
 class CarryReader:
@@ -146,19 +225,13 @@ class CarryReader:
         ]
         force = found["normal_force"]
         minimised = force if self._robust is None else self._robust.forces(found)
-        held = (pose[:reached], q_1[:reached], q_2[:reached])
-        bounds = evaluator.checker.bounds(*held)
-        near = bounds.min(axis=0, initial=np.inf) < DIPS_BELOW
-        lowered = bounds.copy()
-        lowered[:, near] = dipped(bounds[:, near])
+        held = pose[:reached], q_1[:reached], q_2[:reached]
         return PlacedCarry(
             pose=pose,
             rate=rate,
             q=(q_1, q_2),
             reached=reached,
             stranded=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
-            clearance=bounds,
-            lowered=lowered,
             manipulability=np.sqrt(np.maximum(np.column_stack(squares), 0.0))[:reached],
             split=np.column_stack(
                 [force[:, 0] - force[:, 1], found["tangential_force"].sum(axis=1)]
@@ -167,8 +240,9 @@ class CarryReader:
             peak=minimised.max(axis=0) / task.reference_force,
             shift=found["pressure_shift"] / self._radii,
             _distances=Distances(
-                bounds,
-                lowered,
-                lambda raised, wanted: evaluator.checker.measure(*held, raised, wanted),
+                lambda: evaluator.checker.bounds(*held),
+                lambda rows, raised, wanted: evaluator.checker.measure(
+                    held[0][rows], held[1][rows], held[2][rows], raised, wanted
+                ),
             ),
         )

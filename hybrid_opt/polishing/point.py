@@ -187,7 +187,7 @@ class PolishSolver:
             if (
                 carry.is_followed
                 and level(target, carry.peak) < level(target, best.carry.peak)
-                and not self._active.violated(carry, best.carry, required)
+                and not self._active.violates(carry, best.carry, required)
             ):
                 return part, carry
         return None

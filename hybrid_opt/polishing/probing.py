@@ -14,6 +14,7 @@ import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.archive import LEAST_SPAN
+from hybrid_opt.polishing.feasible import first_feasible
 from hybrid_opt.polishing.plan import Attempt
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.targets import balance, extreme
@@ -50,9 +51,8 @@ def random_starts(
     """Feasible ones among random candidates, at most so many."""
     shape = settings.probe.candidates, evaluator.n_var
     candidates = rng.uniform(evaluator.lower, evaluator.upper, shape)
-    found = evaluator.evaluate(candidates)
-    chosen = np.flatnonzero(found.feasible)[:count]
-    return [Start(candidates[k], found.objectives[k]) for k in chosen]
+    rows, objectives = first_feasible(evaluator, candidates, count)
+    return list(map(Start, candidates[rows], objectives))
 
 
 def halve(pool: list[Start], objective: int | None, solve: Callable[[Start], Start]) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 from hybrid_opt.polishing.constraints.clearances import Clearances
+from hybrid_opt.polishing.constraints.distances import DistanceKind
 from hybrid_opt.polishing.constraints.forces import Forces
 from hybrid_opt.polishing.constraints.joint_limits import JointLimits
 from hybrid_opt.polishing.constraints.kind import Kind, Surroundings
@@ -32,10 +33,11 @@ class ActiveSet:
     def __init__(self, around: Surroundings) -> None:
         self.forces = Forces(around)
         self._movable = around.movable
+        self._distances = Clearances(around)
         sampled: dict[type, Kind[Any]] = {ForceRow: self.forces, PressureRow: Pressure(around)}
         driven = around.workcell.task.time_law == "optimal"
         self._kinds: dict[type, Kind[Any]] = ({} if driven else sampled) | {
-            Clearance: Clearances(around),
+            Clearance: self._distances,
             Separation: Separations(around),
             Passing: Passings(around),
             JointLimit: JointLimits(around),
@@ -55,6 +57,17 @@ class ActiveSet:
         """
         violated = self._rows(lambda kind: kind.violated(carry, known))
         return {row for row in violated if row not in asked or not isinstance(row, ForceRow)}
+
+    def violates(self, carry: PlacedCarry, known: PlacedCarry, asked: Collection[Row]) -> bool:
+        """Whether a step violates anything, as `violated` has it; distances, the dearest, last and
+        only until one is too small."""
+        return any(
+            row not in asked or not isinstance(row, ForceRow)
+            for kind in self._kinds.values()
+            if not isinstance(kind, DistanceKind)
+            for row in kind.violated(carry, known)
+            if self._counts(row)
+        ) or not carry.keeps(self._distances.least)
 
     def required(
         self, carry: PlacedCarry, rows: Iterable[Row], lenient: bool = False
@@ -84,12 +97,11 @@ class ActiveSet:
         return self._kinds[type(row.constraint) if isinstance(row, PlaceRow) else type(row)]
 
     def _rows(self, ask: Callable[[Kind[Any]], Iterable[Row]]) -> set[Row]:
-        return {
-            row
-            for kind in self._kinds.values()
-            for row in ask(kind)
-            if not isinstance(row, PlaceRow) or self._movable(row.place)
-        }
+        kinds = self._kinds.values()
+        return {row for kind in kinds for row in ask(kind) if self._counts(row)}
+
+    def _counts(self, row: Row) -> bool:
+        return not isinstance(row, PlaceRow) or self._movable(row.place)
 
     def _by_kind(
         self, rows: Iterable[Row], ask: Callable[[Kind[Any], list[Row]], list[float]]

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid_opt.polishing.constraints.kind import Kind, Surroundings
 from hybrid_opt.polishing.layout import PlaceRow
@@ -69,15 +68,11 @@ class DistanceKind(Kind[PlaceRow]):
 
     def _measured(self, carry: PlacedCarry, rows: Sequence[PlaceRow]) -> Array:
         """Least distance in the window of each row."""
-        low: NDArray[np.bool_] = np.zeros(carry.clearance.shape, dtype=np.bool_)
-        around = [
+        stretches = [
             (slice(max(0, row.place - self.window), row.place + self.window + 1), pair_of(row))
             for row in rows
         ]
-        for where in around:
-            low[where] = carry.clearance[where] < self.near_settings.measured_below
-        measured = carry.distance(low)
-        return np.array([measured[where].min() for where in around])
+        return np.array(carry.least(stretches, self.near_settings.measured_below))
 
 
 def pair_of(row: PlaceRow) -> int:

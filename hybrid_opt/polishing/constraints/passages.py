@@ -9,8 +9,10 @@ to one that rises, the payload passes an edge, and the height of that kink gets 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_opt.polishing.constraints.distances import DistanceKind
 from hybrid_opt.polishing.constraints.kind import Surroundings
@@ -29,18 +31,16 @@ class Separations(DistanceKind):
         """Along every stretch where the payload is near, at a few places each."""
         settings, grid = self.near_settings, self.around.cell.grid
         beside = grid.places(settings.beside_kink)
+        stretches = (
+            (settings.gap_distance, grid.places(settings.gap_stride)),
+            (settings.far_gap_distance, grid.places(settings.far_gap_stride)),
+        )
         for pair, gaps in near_gaps(self, carry):
             kinks = [kink for kink, _ in edges(gaps, settings.kink_distance)]
-            height = gaps.max(axis=1)
-            stretches = (
-                (settings.gap_distance, settings.gap_stride),
-                (settings.far_gap_distance, settings.far_gap_stride),
-            )
             places = {
                 place
                 for distance, stride in stretches
-                for place in lowest(height, distance)
-                + lowest(height, distance, grid.places(stride))
+                for place in lowest(gaps.height, distance, stride)
                 if all(abs(place - kink) >= beside for kink in kinks)
             }
             for place in sorted(places):
@@ -77,35 +77,52 @@ class Passings(DistanceKind):
                 yield passing(pair, gaps, kink, place)
 
 
-def edges(gaps: Array, limit: float) -> list[tuple[int, int]]:
-    """Kinks lower than a limit [m]: the place before each, and the lower one of both beside it.
+@dataclass(frozen=True)
+class Gaps:
+    """A separable pair's gaps along every direction at m places.
 
-    Args:
-        gaps: (m, n) of every place along every direction [m].
+    Attributes:
+        along: (m, n) [m].
+        best: (m,) direction of the largest.
+        height: (m,) that one [m].
     """
-    best, height = gaps.argmax(axis=1), gaps.max(axis=1)
+
+    along: Array
+    best: NDArray[np.intp]
+    height: Array
+
+    @classmethod
+    def of(cls, along: Array) -> Gaps:
+        """Of all gaps."""
+        best = along.argmax(axis=1)
+        return cls(along, best, along[np.arange(len(best)), best])
+
+
+def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
+    """Kinks lower than a limit [m]: the place before each, and the lower one of both beside it."""
+    best, height, along = gaps.best, gaps.height, gaps.along
     return [
         (k, k + int(height[k + 1] < height[k]))
         for k in np.flatnonzero(best[1:] != best[:-1]).tolist()
         if height[k : k + 2].min() < limit
-        and gaps[k + 1, best[k]] < gaps[k, best[k]]
-        and gaps[k + 1, best[k + 1]] > gaps[k, best[k + 1]]
+        and along[k + 1, best[k]] < along[k, best[k]]
+        and along[k + 1, best[k + 1]] > along[k, best[k + 1]]
     ]
 
 
-def passing(pair: int, gaps: Array, kink: int, place: int) -> PlaceRow:
+def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PlaceRow:
     """The row of a kink of `edges`."""
-    before, after = (int(gaps[k].argmax()) for k in (kink, kink + 1))
+    before, after = (int(gaps.best[k]) for k in (kink, kink + 1))
     return PlaceRow(Passing(pair, before, after), place)
 
 
-def separation(pair: int, gaps: Array, place: int) -> PlaceRow:
+def separation(pair: int, gaps: Gaps, place: int) -> PlaceRow:
     """The row of the largest gap at a place."""
-    return PlaceRow(Separation(pair, int(gaps[place].argmax())), place)
+    return PlaceRow(Separation(pair, int(gaps.best[place])), place)
 
 
-def near_gaps(kind: DistanceKind, carry: PlacedCarry) -> Iterable[tuple[int, Array]]:
-    """Every separable pair that comes near, and its (reached, n) gaps [m]."""
+def near_gaps(kind: DistanceKind, carry: PlacedCarry) -> Iterable[tuple[int, Gaps]]:
+    """Every separable pair that comes near, and its gaps."""
     farthest = kind.near_settings.far_gap_distance
     for pair in np.flatnonzero(carry.clearance.min(axis=0) < farthest).tolist():
         if pair in kind.rows.separable:
@@ -114,7 +131,7 @@ def near_gaps(kind: DistanceKind, carry: PlacedCarry) -> Iterable[tuple[int, Arr
 
 def violated_passages(
     kind: DistanceKind, carry: PlacedCarry, known: PlacedCarry
-) -> Iterable[tuple[int, Array, int, list[tuple[int, int]]]]:
+) -> Iterable[tuple[int, Gaps, int, list[tuple[int, int]]]]:
     """Places that are too close: pair, gaps of the known candidate, place, its kinks nearby."""
     window = kind.around.cell.grid.places(kind.near_settings.kink_window)
     for pair, distance in kind.violations(carry).items():
@@ -126,6 +143,10 @@ def violated_passages(
             yield pair, gaps, place, [k for k in kinks if abs(k[1] - place) <= window]
 
 
-def gaps_of(kind: DistanceKind, carry: PlacedCarry, pair: int) -> Array:
-    """(reached, n) gaps of a separable pair along every direction [m]."""
-    return carry.once(("gaps", pair), lambda: kind.rows.gaps(pair, carry.pose[: carry.reached]))
+def gaps_of(kind: DistanceKind, carry: PlacedCarry, pair: int) -> Gaps:
+    """Of a separable pair, at the places that are reached."""
+
+    def find() -> Gaps:
+        return Gaps.of(kind.rows.gaps(pair, carry.pose[: carry.reached]))
+
+    return carry.once(("gaps", pair), find)

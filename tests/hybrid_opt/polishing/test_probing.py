@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hybrid_opt.evaluate.evaluations import COLLISION, REASONS
+from hybrid_opt.polishing.feasible import first_feasible
 from hybrid_opt.polishing.probing import Start, better_half, halve, random_starts
 from hybrid_opt.polishing.settings import PolishSettings
 from tests.hybrid_opt.polishing.test_front import evaluator, polished
@@ -21,6 +24,21 @@ def test_random_starts_are_feasible_and_the_same_for_the_same_seed() -> None:
         judged = evaluator().evaluate(start.x)
         assert judged.feasible[0]
         np.testing.assert_array_equal(judged.objectives[0], start.objectives)
+
+
+@pytest.mark.parametrize("objective", [None, 0, 1])
+def test_the_first_feasible_ones_are_those_of_a_verdict_on_all(objective: int | None) -> None:
+    judge = evaluator()
+    x = np.random.default_rng(2).uniform(judge.lower, judge.upper, (800, judge.n_var))
+    found = judge.evaluate(x)
+    rows = np.flatnonzero(found.feasible)
+    assert (found.reason == REASONS.index(COLLISION)).any()
+    if objective is not None:
+        rows = rows[np.argsort(found.objectives[rows, objective])]
+    for count in (1, 5, 800):
+        chosen, objectives = first_feasible(judge, x, count, objective)
+        np.testing.assert_array_equal(chosen, rows[:count])
+        np.testing.assert_array_equal(objectives, found.objectives[rows[:count]])
 
 
 @given(

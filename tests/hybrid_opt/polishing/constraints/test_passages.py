@@ -6,18 +6,17 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.polishing.constraints.passages import edges, passing, separation
+from hybrid_opt.polishing.constraints.passages import Gaps, edges, passing, separation
 from hybrid_opt.polishing.layout import PlaceRow
-from symbolic.array import Array
 from symbolic.smooth.passage import Passing, Separation
 
 PLACES, LOW = 120, 0.06
 
 
-def v_shape(kink: float, height: float, slope: float = 3e-3) -> Array:
-    """(PLACES, 2) gaps that cross at a place: one falls, the other rises."""
+def v_shape(kink: float, height: float, slope: float = 3e-3) -> Gaps:
+    """Two gaps that cross at a place: one falls, the other rises."""
     away = np.arange(PLACES) - kink
-    return np.column_stack([height - slope * away, height + slope * away])
+    return Gaps.of(np.column_stack([height - slope * away, height + slope * away]))
 
 
 @given(kink=st.floats(20.0, 100.0), height=st.floats(-0.02, LOW - 0.01))
@@ -31,14 +30,14 @@ def test_where_an_edge_is_passed_there_is_one_kink(kink: float, height: float) -
 
 
 def test_a_kink_that_stays_away_is_none() -> None:
-    assert edges(np.full((PLACES, 3), 0.2), LOW) == []
+    assert edges(Gaps.of(np.full((PLACES, 3), 0.2)), LOW) == []
     assert edges(v_shape(50.0, 0.2), LOW) == []
 
 
 def test_a_change_of_direction_that_is_no_dip_is_no_kink() -> None:
     away = np.arange(PLACES) - 60.0
     both_rise = np.column_stack([0.02 + 1e-4 * away, 0.02 + 2e-4 * away])
-    assert edges(both_rise, LOW) == []
+    assert edges(Gaps.of(both_rise), LOW) == []
 
 
 def test_a_separation_is_of_the_largest_gap() -> None:
