@@ -9,27 +9,31 @@ from symbolic.array import Array
 
 
 class Inequalities:
-    """The sides of a program's rows that have a bound: the upper ones first, then the lower."""
+    """The sides of a program's rows that have a bound: the upper ones first, then the lower.
+
+    Attributes:
+        rows, sign, shift: (m,) each is sign * the program's row + shift.
+    """
 
     def __init__(self, program: Program) -> None:
         self._program = program
         self._upper = np.flatnonzero(np.isfinite(program.above))
         self._lower = np.flatnonzero(np.isfinite(program.below))
-        self._rows = np.concatenate([self._upper, self._lower])
-        self._sign = np.concatenate([-np.ones(len(self._upper)), np.ones(len(self._lower))])
-        self._shift = np.concatenate([program.above[self._upper], -program.below[self._lower]])
+        self.rows = np.concatenate([self._upper, self._lower])
+        self.sign = np.concatenate([-np.ones(len(self._upper)), np.ones(len(self._lower))])
+        self.shift = np.concatenate([program.above[self._upper], -program.below[self._lower]])
 
     def values(self, z: Array) -> Array:
         """(m,) at z."""
-        values = self._program.values(z).take(self._rows)
-        values *= self._sign
-        values += self._shift
+        values = self._program.values(z).take(self.rows)
+        values *= self.sign
+        values += self.shift
         return values
 
     def slopes(self, z: Array) -> Array:
         """(m, n_variables) gradients at z."""
-        slopes = self._program.constraints(z)[1].take(self._rows, axis=0)
-        slopes *= self._sign[:, None]
+        slopes = self._program.constraints(z)[1].take(self.rows, axis=0)
+        slopes *= self.sign[:, None]
         return slopes
 
     def multipliers(self, y: Array) -> Array:

@@ -75,7 +75,7 @@ DISTANT = 2e-2
 
 
 @dataclass
-class _State:
+class State:
     """An iterate, n variables and m inequalities.
 
     Attributes:
@@ -93,7 +93,7 @@ class _State:
 
 
 @dataclass(frozen=True)
-class _Error:
+class Error:
     """Residuals of the barrier's conditions, multipliers scaled as in the paper.
 
     Attributes:
@@ -160,18 +160,18 @@ class DenseSolver:
             iterations=iterations,
         )
 
-    def _start(self) -> _State:
+    def _start(self) -> State:
         push = PUSH * self._width
         z = np.clip(self._program.start, self._low + push, self._high - push)
         h, A = self._rows.values(z), self._rows.slopes(z)
         slack = self._slack(z, np.maximum(h, SLACK))
-        return _State(z, slack, self._mu / slack, h, A)
+        return State(z, slack, self._mu / slack, h, A)
 
     def _slack(self, z: Array, s: Array) -> Array:
         """All slacks, of those of the inequalities."""
         return np.concatenate([s, z - self._low, self._high - z])
 
-    def _error(self, now: _State) -> _Error:
+    def _error(self, now: State) -> Error:
         m, n = now.A.shape
         scale = max(1.0, float(now.dual.sum()) / len(now.dual) / 100.0)
         slope = self._program.cost - now.dual[:m] @ now.A - now.dual[m : m + n] + now.dual[m + n :]
@@ -180,14 +180,14 @@ class DenseSolver:
             float(np.abs(slope).max()) / scale,
             float(np.abs(now.h - now.slack[:m]).max(initial=0.0)),
         )
-        return _Error(rest, float(products.min()), float(products.max()), scale)
+        return Error(rest, float(products.min()), float(products.max()), scale)
 
-    def _lower_barrier(self, error: _Error) -> None:
+    def _lower_barrier(self, error: Error) -> None:
         least = self._settings.solve.tolerance / SOLVED
         while self._mu > least and error.at(self._mu) <= SOLVED * self._mu:
             self._mu = max(least, min(LINEAR * self._mu, self._mu**POWER))
 
-    def _advance(self, now: _State) -> bool:
+    def _advance(self, now: State) -> bool:
         """One step; whether one was found."""
         mu, (m, n) = self._mu, now.A.shape
         y, s = now.dual[:m], now.slack[:m]
@@ -217,7 +217,7 @@ class DenseSolver:
         self._heed(now)
         return True
 
-    def _heed(self, now: _State) -> bool:
+    def _heed(self, now: State) -> bool:
         """Raise the multipliers of rows that shortened the last step, which bend away faster than
         their slope tells: with them their curvature enters the next one. Whether any was raised."""
         blocking = self._blocking.nonzero()[0]
@@ -226,7 +226,7 @@ class DenseSolver:
         now.dual[blocking] = raised
         return bool((raised > y).any())
 
-    def _search(self, now: _State, dz: Array, change: Array) -> tuple[Array, Array, Array] | None:
+    def _search(self, now: State, dz: Array, change: Array) -> tuple[Array, Array, Array] | None:
         """Along a direction until an iterate is good enough: z, slack, h; None if none is.
 
         Rows that hold go on to hold: their slack is what they keep, so that an answer may be
@@ -263,7 +263,7 @@ class DenseSolver:
             alpha *= min(max(share, SHORTENED[0]), SHORTENED[1])
         return None
 
-    def _renew(self, now: _State) -> bool:
+    def _renew(self, now: State) -> bool:
         """Slacks as large as at the start; whether that changes anything."""
         m = len(now.h)
         s = np.maximum(now.h, min(SLACK, 10.0 * self._mu))

@@ -16,12 +16,12 @@ import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
+from hybrid_opt.polishing.compiled_interior import dense_method
 from hybrid_opt.polishing.constraints.active import ActiveSet
 from hybrid_opt.polishing.constraints.kind import Surroundings
 from hybrid_opt.polishing.constraints.learned import Learned
 from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.grid import Grid
-from hybrid_opt.polishing.interior import dense
 from hybrid_opt.polishing.ipopt import ipopt
 from hybrid_opt.polishing.layout import Row
 from hybrid_opt.polishing.placed_carry import CarryReader, PlacedCarry
@@ -118,7 +118,8 @@ class PolishSolver:
             max_iterations=near.iterations,
             solve=replace(settings.solve, barrier=near.barrier),
         )
-        self._solve = {"ipopt": ipopt, "dense": dense}[settings.solve.solver]
+        cache = evaluator.compiled.cache
+        self._solve = ipopt if settings.solve.solver == "ipopt" else dense_method(cache)
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
         self._reader = CarryReader(evaluator, grid, functions.rows, robust)
 

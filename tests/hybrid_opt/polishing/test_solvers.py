@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
+from codegen import library
+from codegen.cache import Cache
+from hybrid_opt.polishing.compiled_interior import dense_method
 from hybrid_opt.polishing.interior import dense
 from hybrid_opt.polishing.ipopt import ipopt
 from hybrid_opt.polishing.residuals import residuals
@@ -19,7 +24,12 @@ from symbolic.array import Array
 
 Solver = Callable[[Program, PolishSettings], Answer]
 
-SOLVERS = pytest.mark.parametrize("solve", [ipopt, dense])
+
+def compiled(program: Program, settings: PolishSettings) -> Answer:
+    return dense_method()(program, settings)
+
+
+SOLVERS = pytest.mark.parametrize("solve", [ipopt, dense, compiled])
 
 LONG = PolishSettings(max_iterations=200)
 
@@ -132,6 +142,47 @@ def test_an_impossible_program_is_told(solve: Solver) -> None:
     assert answer.residuals.feasibility > 0.5
 
 
+def rough(z: ca.SX) -> ca.SX:
+    """Rows that bend both ways, some of them violated at the start."""
+    rng = np.random.default_rng(3)
+    A, b = ca.DM(rng.normal(size=(30, 5))), ca.DM(rng.uniform(-0.1, 1.0, 30))
+    return ca.mtimes(A, z) - b + 0.3 * ca.cos(3.0 * ca.mtimes(A, z)) - 0.2
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 3, 5, 8, 13])
+def test_compiled_steps_are_the_interpreted_ones(iterations: int) -> None:
+    program = written(rough, [-1.0, 0.3, 0.0, 0.2, -0.1], [0.0] * 5)
+    # One row of two sides, whose multipliers are told together.
+    program.below[0] = program.values(program.start)[0] - 0.5
+    settings = PolishSettings(max_iterations=iterations)
+    answer, expected = compiled(program, settings), dense(program, settings)
+    assert (answer.message, answer.iterations) == (expected.message, expected.iterations)
+    np.testing.assert_allclose(answer.z, expected.z, atol=1e-9)
+    for found, wanted in zip(answer.multipliers, expected.multipliers, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-7)
+    assert answer.residuals.stationarity == pytest.approx(expected.residuals.stationarity, abs=1e-7)
+
+
+def test_compiled_steps_start_anew_where_none_is_found() -> None:
+    """Rows that are no number beyond a ring: no trial is taken for a while."""
+
+    def rows(z: ca.SX) -> ca.SX:
+        return ca.vertcat(ca.sqrt(1.1 - ca.sumsqr(z)) - 2.0, ca.sumsqr(z) - 1.0)
+
+    program = written(rows, [-1.0, -2.0], [0.1, 0.2])
+    answer, expected = compiled(program, LONG), dense(program, LONG)
+    assert answer.message == expected.message
+    np.testing.assert_allclose(answer.z, expected.z, atol=1e-6)
+
+
+def test_without_a_compiler_steps_are_interpreted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(library, "find_compiler", lambda: None)
+    with warnings.catch_warnings(action="ignore"):
+        assert dense_method(Cache(tmp_path)) is dense
+
+
 def test_ipopt_is_not_cut_off_where_it_violates_something() -> None:
     """From outside into a thin curved strip, which steps along its tangent leave again."""
     z = ca.SX.sym("z", 2)
@@ -154,14 +205,15 @@ def test_ipopt_is_not_cut_off_where_it_violates_something() -> None:
     assert patient.residuals.feasibility <= few.solve.feasible
 
 
-def test_the_dense_method_keeps_what_holds_wherever_it_is_cut_off() -> None:
+@pytest.mark.parametrize("solve", [dense, compiled])
+def test_the_dense_method_keeps_what_holds_wherever_it_is_cut_off(solve: Solver) -> None:
     def rows(z: ca.SX) -> ca.SX:
         return ca.vertcat(1.0 - ca.sumsqr(z), z[1] + 0.5 * z[0] - 3.0)
 
     program = written(rows, [-1.0, -0.1], [-2.0, 0.7])
     costs = [float(program.cost @ program.start)]
     for iterations in (1, 2, 4, 8, 16):
-        answer = dense(program, PolishSettings(max_iterations=iterations))
+        answer = solve(program, PolishSettings(max_iterations=iterations))
         assert answer.iterations <= iterations
         assert answer.residuals.feasibility == 0.0
         costs.append(float(program.cost @ answer.z))
