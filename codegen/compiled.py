@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import threading
 import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.errors import CodegenError, SlowerWarning
-from codegen.function import NumericFunction, available_cores
+from codegen.function import NativeCall, NumericFunction, available_cores
 from codegen.signature import Signature
 from symbolic.array import Array
 
@@ -67,6 +68,7 @@ class CompiledFunction(NumericFunction):
         self._once.restype = self._run.restype = ctypes.c_longlong
         self._work_sizes = tuple(int(size) for size in sizes)
         self._idle: deque[_Work] = deque()
+        self._own = threading.local()
         self.lanes = 1
         self._run_lanes, self._idle_lanes = self._run, deque[_Work]()
         if hasattr(loaded, "dual_arm_run_lanes"):
@@ -150,14 +152,26 @@ class CompiledFunction(NumericFunction):
 
     def _prepared(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
-    ) -> Callable[[int], None]:
+    ) -> tuple[Callable[[int], None], Callable[[], NativeCall]]:
         ports = self._ports(inputs, batched, outputs)
         address = ctypes.addressof(ports)
 
         def run(count: int, _memory: object = (inputs, outputs, ports)) -> None:
             self._run_chunk(address, 0, count)
 
-        return run
+        return run, lambda: self._native(address)
+
+    def _native(self, ports: int) -> NativeCall:
+        """Work memory is this thread's own, and stays."""
+        own = self._own.__dict__
+        if not own:
+            own["work"], own["lanes"] = self._take_work(), None
+            if self.lanes > 1:
+                own["lanes"] = self._take_lane_work()
+        one, lanes = (ctypes.cast(f, ctypes.c_void_p).value for f in (self._run, self._run_lanes))
+        if self.lanes == 1:
+            return NativeCall(one or 0, 0, ports, own["work"].address, 0)
+        return NativeCall(one or 0, lanes or 0, ports, own["work"].address, own["lanes"].address)
 
     def _run_chunk(self, ports_address: int, begin: int, end: int) -> None:
         if self.lanes > 1 and end - begin > 1:

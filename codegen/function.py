@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -155,17 +156,19 @@ class NumericFunction(ABC):
         outputs = dict(zip(names[split:], own[split:], strict=True))
         batched = [name not in shared for name in self.input_names]
         arrays = list(inputs.values()), list(outputs.values())
-        return PreparedBatch(inputs, outputs, n, self._prepared(arrays[0], batched, arrays[1]))
+        run, native = self._prepared(arrays[0], batched, arrays[1])
+        return PreparedBatch(inputs, outputs, n, run, native)
 
     def _prepared(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
-    ) -> Callable[[int], None]:
-        """What evaluates the first so many of a batch on fixed arrays."""
+    ) -> tuple[Callable[[int], None], Callable[[], NativeCall] | None]:
+        """What evaluates the first so many of a batch on fixed arrays, and what tells C how; None
+        where it cannot."""
 
         def run(count: int) -> None:
             self._evaluate_batch(inputs, batched, outputs, count, 1)
 
-        return run
+        return run, None
 
     @abstractmethod
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
@@ -225,6 +228,23 @@ class NumericFunction(ABC):
         return CodegenError(f"{self.name}: input '{name}' has shape {found}, needed is {needed}")
 
 
+@dataclass(frozen=True)
+class NativeCall:
+    """Addresses with which C evaluates a prepared batch, as long as that is there.
+
+    Attributes:
+        one, lanes: of `dual_arm_run` and `dual_arm_run_lanes` of `codegen/c`; 0 without lanes.
+        ports: of arguments and results.
+        work, lane_work: of their work memory.
+    """
+
+    one: int
+    lanes: int
+    ports: int
+    work: int
+    lane_work: int
+
+
 class PreparedBatch:
     """A batch that is evaluated over and over. Not to be shared between threads.
 
@@ -239,9 +259,17 @@ class PreparedBatch:
         outputs: dict[str, Array],
         size: int,
         run: Callable[[int], None],
+        native: Callable[[], NativeCall] | None = None,
     ) -> None:
         """See `NumericFunction.prepared`."""
         self.inputs, self.outputs, self.size, self._run = inputs, outputs, size, run
+        self._native = native
+
+    @property
+    def native(self) -> NativeCall | None:
+        """How C evaluates the batch, in the thread that asks; None where functions are
+        interpreted."""
+        return None if self._native is None else self._native()
 
     def __call__(self, count: int | None = None) -> dict[str, Array]:
         """Evaluate all, or the first `count` of them, and return the outputs.

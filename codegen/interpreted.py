@@ -45,7 +45,7 @@ class InterpretedFunction(NumericFunction):
 
     def _prepared(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
-    ) -> Callable[[int], None]:
+    ) -> tuple[Callable[[int], None], None]:
         buffers = []
         for k in range(len(outputs[0]) if outputs else 0):
             buffer, evaluate = self.function.buffer()
@@ -61,7 +61,7 @@ class InterpretedFunction(NumericFunction):
                 if buffer.ret():
                     raise CodegenError(f"{self.name}: the function failed")
 
-        return run
+        return run, None
 
     def _evaluate_batch(
         self,

@@ -37,13 +37,18 @@ class RowGroup:
 
     def curvatures(self, chosen: Indices, weight: Array) -> Array:
         """(k, n, n) weighted Hessians of chosen rows (k,), counted from the group's first."""
-        if self._second is None:
-            self._second = self.function().prepared(self.rows.stop - self.rows.start)
-        inputs, count = self._second.inputs, len(chosen)
+        inputs, count = self.second.inputs, len(chosen)
         for name, values in self.first.inputs.items():
             np.take(values, chosen, axis=0, out=inputs[name][:count], mode="clip")
         inputs["weight"][:count] = weight
-        return self._second(count)["hessian"][:count]
+        return self.second(count)["hessian"][:count]
+
+    @property
+    def second(self) -> PreparedBatch:
+        """The second derivatives' evaluations."""
+        if self._second is None:
+            self._second = self.function().prepared(self.rows.stop - self.rows.start)
+        return self._second
 
 
 @dataclass(frozen=True)
@@ -90,13 +95,18 @@ class ArmRows:
     def curvatures(self, active: Indices, pull: Array) -> Array:
         """(k, n, n) Hessians of the closure at active places (k,), by what pulls at the joints
         there (k, joints)."""
-        if self._second is None:
-            self._second = self.function.prepared(len(self.places))
-        found, inputs, count = self.first.outputs, self._second.inputs, len(active)
+        found, inputs, count = self.first.outputs, self.second.inputs, len(active)
         inputs["pose"][:count] = self.first.inputs["pose"][active]
         inputs["q"][:count] = found["q"][active]
         inputs["nu"][:count] = np.einsum("kij,kj->ki", found["pull"][active], pull)
-        return self._second(count)["hessian"][:count]
+        return self.second(count)["hessian"][:count]
+
+    @property
+    def second(self) -> PreparedBatch:
+        """The evaluations of the closure's second derivatives."""
+        if self._second is None:
+            self._second = self.function.prepared(len(self.places))
+        return self._second
 
 
 class CurvatureSums:

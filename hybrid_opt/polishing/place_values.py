@@ -44,7 +44,17 @@ class Places:
 
 
 class PlaceValues:
-    """Rows at places, from the waypoints. Inside, rows stand group by group."""
+    """Rows at places, from the waypoints. Inside, rows stand group by group.
+
+    Attributes:
+        order: (n,) the row that stands where.
+        at: (n,) its place.
+        shared: arrays (n, ...) of what its functions take and of its value.
+        groups, arms: what evaluates them.
+        whole: (n, n_waypoints) bases of poses and rates at its place.
+        by_variable: (m, n_path) the same of each place by the path's variables.
+        size: entries of an extended pose.
+    """
 
     def __init__(
         self,
@@ -57,26 +67,26 @@ class PlaceValues:
         members: dict[str, list[int]] = {}
         for k, row in enumerate(rows):
             members.setdefault(row.constraint.family, []).append(k)
-        self._order = np.array([k for own in members.values() for k in own], dtype=np.intp)
-        self._position = np.argsort(self._order)
+        self.order = np.array([k for own in members.values() for k in own], dtype=np.intp)
+        self._position = np.argsort(self.order)
         self._places, n = places, len(rows)
-        self._at = np.array([rows[k].place for k in self._order.tolist()], dtype=np.intp)
-        self._size = functions.model.workcell.task.extended_size
+        self.at = np.array([rows[k].place for k in self.order.tolist()], dtype=np.intp)
+        self.size = functions.model.workcell.task.extended_size
         self._joints = [q.shape[1] for q in places.q]
-        self._shared = {
+        self.shared = {
             "pose": np.zeros((n, POSE_SIZE)),
             "rate": np.zeros((n, POSE_SIZE)),
             "q_1": np.zeros((n, self._joints[0])),
             "q_2": np.zeros((n, self._joints[1])),
             "value": np.zeros(n),
         }
-        self._groups, start = list[RowGroup](), 0
+        self.groups, start = list[RowGroup](), 0
         for own in members.values():
             constraints = [rows[k].constraint for k in own]
-            self._groups.append(self._group(constraints, start, functions))
+            self.groups.append(self._group(constraints, start, functions))
             start += len(own)
-        self._starts = [group.rows.start for group in self._groups] + [n]
-        self._arms = [self._arm(arm, closures) for arm in range(len(places.q))]
+        self._starts = [group.rows.start for group in self.groups] + [n]
+        self.arms = [self._arm(arm, closures) for arm in range(len(places.q))]
         self._index_variables()
 
     def _index_variables(self) -> None:
@@ -84,11 +94,12 @@ class PlaceValues:
         free_rows, self._columns = self._places.free
         moved, free_rows = np.unique(free_rows, return_inverse=True)
         basis, rate = self._places.basis, self._places.rate_basis
-        self._whole = basis[self._at], rate[self._at]
+        self.whole = basis[self.at], rate[self.at]
         self._moved = basis[:, moved], rate[:, moved]
-        self._free = tuple(part[self._at][:, free_rows] for part in self._moved)
-        self._by_pose, self._by_rate = np.zeros((2, len(self._at), self._size))
-        n, size = len(moved), self._size
+        self.by_variable = tuple(part[:, free_rows] for part in self._moved)
+        self._free = tuple(part[self.at] for part in self.by_variable)
+        self._by_pose, self._by_rate = np.zeros((2, len(self.at), self.size))
+        n, size = len(moved), self.size
         outer = free_rows[:, None] * n + free_rows
         self._entries = (outer * size + self._columns[:, None]) * size + self._columns
 
@@ -96,7 +107,7 @@ class PlaceValues:
         self, constraints: Sequence[PlaceConstraint], start: int, functions: RowFunctions
     ) -> RowGroup:
         one, rows = constraints[0], slice(start, start + len(constraints))
-        given = {name: array[rows] for name, array in self._shared.items()}
+        given = {name: array[rows] for name, array in self.shared.items()}
         first = functions.of(one, "first").prepared(len(constraints), given=given)
         if "numbers" in first.inputs:
             first.inputs["numbers"][...] = row_numbers(constraints, functions)[0]
@@ -104,17 +115,17 @@ class PlaceValues:
         return RowGroup(rows, first, second, one.moving, one.arms(functions.model))
 
     def _arm(self, arm: int, closures: Mapping[ClosureKey, NumericFunction]) -> ArmRows:
-        n, chosen = len(self._at), [g for g in self._groups if arm in g.arms]
+        n, chosen = len(self.at), [g for g in self.groups if arm in g.arms]
         empty = np.empty(0, dtype=np.intp)
         rows = np.concatenate([empty, *(np.arange(n)[group.rows] for group in chosen)])
-        places = np.unique(self._at[rows])
+        places = np.unique(self.at[rows])
         position = np.zeros(len(self._places.basis), dtype=np.intp)
         position[places] = np.arange(len(places))
         first, second = (closures[ClosureKey(arm, order)] for order in get_args(Order))
         batch = first.prepared(max(1, len(places)))
         batch.inputs["q_reference"][: len(places)] = self._places.q[arm][places]
         slopes, pulls, start = np.empty((len(rows), self._joints[arm])), dict[int, Pull](), 0
-        for k, group in enumerate(self._groups):
+        for k, group in enumerate(self.groups):
             if arm not in group.arms:
                 continue
             begin = 12 if group.moving else 6
@@ -126,7 +137,7 @@ class PlaceValues:
             start += count
         basis = self._places.basis[places]
         return ArmRows(
-            places, position, position[self._at], basis, batch, second, rows, slopes, pulls
+            places, position, position[self.at], basis, batch, second, rows, slopes, pulls
         )
 
     def first(self, waypoints: Array) -> tuple[Array, Array]:
@@ -142,27 +153,27 @@ class PlaceValues:
     def values(self, waypoints: Array) -> Array:
         """(rows,) at extended waypoints (n_waypoints, 6 + m)."""
         path = np.ascontiguousarray(waypoints[:, :POSE_SIZE])
-        for name, basis in zip(("pose", "rate"), self._whole, strict=True):
-            np.matmul(basis, path, out=self._shared[name])
-        for arm, joints in zip(self._arms, ("q_1", "q_2"), strict=True):
+        for name, basis in zip(("pose", "rate"), self.whole, strict=True):
+            np.matmul(basis, path, out=self.shared[name])
+        for arm, joints in zip(self.arms, ("q_1", "q_2"), strict=True):
             if len(arm.places):
                 np.matmul(arm.basis, waypoints, out=arm.first.inputs["pose"])
                 q = arm.first()["q"]
-                np.take(q, arm.at, axis=0, out=self._shared[joints], mode="clip")
-        for group in self._groups:
+                np.take(q, arm.at, axis=0, out=self.shared[joints], mode="clip")
+        for group in self.groups:
             group.first()
-        return self._shared["value"][self._position]
+        return self.shared["value"][self._position]
 
     def gradients(self) -> Array:
         """(rows, variables) by the path's variables, where `values` was called last."""
         by_pose, by_rate = self._by_pose, self._by_rate
-        for group in self._groups:
+        for group in self.groups:
             gradient = group.first.outputs["gradient"]
             by_pose[group.rows, :POSE_SIZE] = gradient[:, :POSE_SIZE]
             if group.moving:
                 by_rate[group.rows, :POSE_SIZE] = gradient[:, POSE_SIZE : 2 * POSE_SIZE]
         by_pose[:, POSE_SIZE:] = 0.0
-        for arm in self._arms:
+        for arm in self.arms:
             if not len(arm.rows):
                 continue
             for pull in arm.pulls.values():
@@ -171,7 +182,7 @@ class PlaceValues:
             follow = arm.first.outputs["follow"].take(arm.at[arm.rows], axis=0)
             by_pose[arm.rows] += np.einsum("rij,rj->ri", follow, arm.slopes)
         total = self._free[0] * by_pose.take(self._columns, axis=1)
-        for group in self._groups:
+        for group in self.groups:
             if group.moving:
                 rate = by_rate[group.rows].take(self._columns, axis=1)
                 total[group.rows] += self._free[1][group.rows] * rate
@@ -180,33 +191,33 @@ class PlaceValues:
     def second(self, weight: Array) -> Array:
         """Second derivatives (variables, variables) of the values weighted by (rows,), where
         `gradients` was called last."""
-        weight = weight[self._order]
+        weight = weight[self.order]
         size = np.abs(weight)
         chosen = (size > NEGLIGIBLE * size.max(initial=0.0)).nonzero()[0]
         bounds = chosen.searchsorted(self._starts).tolist()
         pulls = [
-            np.zeros((len(arm.places), n)) for arm, n in zip(self._arms, self._joints, strict=True)
+            np.zeros((len(arm.places), n)) for arm, n in zip(self.arms, self._joints, strict=True)
         ]
-        sums = CurvatureSums(*self._moved, self._size)
-        for k, group in enumerate(self._groups):
+        sums = CurvatureSums(*self._moved, self.size)
+        for k, group in enumerate(self.groups):
             rows = chosen[bounds[k] : bounds[k + 1]]
             if not len(rows):
                 continue
-            own, at, local = weight[rows], self._at[rows], rows - group.rows.start
+            own, at, local = weight[rows], self.at[rows], rows - group.rows.start
             hessian = group.curvatures(local, own)
             for index in group.arms:
-                arm = self._arms[index]
+                arm = self.arms[index]
                 slopes = own[:, None] * arm.pulls[k].slopes[local]
                 np.add.at(pulls[index], arm.at[rows], slopes)
             if group.moving:
                 sums.add_moving(at, hessian)
             else:
                 sums.add(at, self._reduced(hessian, group.arms, at, POSE_SIZE))
-        for index, arm in enumerate(self._arms):
+        for index, arm in enumerate(self.arms):
             active = np.flatnonzero(pulls[index].any(axis=1))
             if len(active):
                 hessian, at = arm.curvatures(active, pulls[index][active]), arm.places[active]
-                sums.add(at, self._reduced(hessian, (index,), at, self._size))
+                sums.add(at, self._reduced(hessian, (index,), at, self.size))
         return sums.total().take(self._entries)
 
     def _reduced(self, hessian: Array, arms: tuple[int, ...], at: Indices, own: int) -> Array:
@@ -215,13 +226,13 @@ class PlaceValues:
         Args:
             hessian: by the first `own` entries of the extended pose and by the joints.
         """
-        if not arms and own == self._size:
+        if not arms and own == self.size:
             return hessian
-        reduced = np.zeros((len(at), self._size, self._size))
+        reduced = np.zeros((len(at), self.size, self.size))
         reduced[:, :own, :own] = hessian[:, :own, :own]
         if not arms:
             return reduced
-        follows = [self._arms[k].first.outputs["follow"][self._arms[k].position[at]] for k in arms]
+        follows = [self.arms[k].first.outputs["follow"][self.arms[k].position[at]] for k in arms]
         follow = follows[0] if len(arms) == 1 else np.concatenate(follows, axis=2)
         mixed = np.matmul(follow, hessian[:, own:, :own])
         reduced[:, :, :own] += mixed

@@ -25,10 +25,11 @@ from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.ipopt import ipopt
 from hybrid_opt.polishing.layout import Row
 from hybrid_opt.polishing.placed_carry import CarryReader, PlacedCarry
-from hybrid_opt.polishing.program import SmoothCell, SmoothProgram
+from hybrid_opt.polishing.program import SmoothProgram
 from hybrid_opt.polishing.residuals import UNKNOWN, Residuals
 from hybrid_opt.polishing.robust_samples import RobustSamples
 from hybrid_opt.polishing.settings import PolishSettings, TrustSettings
+from hybrid_opt.polishing.smooth_cell import SmoothCell
 from hybrid_opt.polishing.solvers import Answer
 from hybrid_opt.polishing.targets import Target, level
 from hybrid_opt.polishing.trust import TrustRegion
@@ -106,7 +107,8 @@ class PolishSolver:
         if evaluator.objective_names == ROBUST_OBJECTIVES:
             robust = RobustSamples(evaluator.workcell)
         rounding = settings.solve.rounding
-        self._cell = SmoothCell(evaluator.workcell, functions, grid, robust, rounding)
+        cache = evaluator.compiled.cache
+        self._cell = SmoothCell(evaluator.workcell, functions, grid, robust, rounding, cache)
         self._settings = settings
         wide = replace(settings.solve, barrier=settings.solve.wide_barrier)
         self._wide = replace(settings, solve=wide)
@@ -118,7 +120,6 @@ class PolishSolver:
             max_iterations=near.iterations,
             solve=replace(settings.solve, barrier=near.barrier),
         )
-        cache = evaluator.compiled.cache
         self._solve = ipopt if settings.solve.solver == "ipopt" else dense_method(cache)
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
         self._reader = CarryReader(evaluator, grid, functions.rows, robust)

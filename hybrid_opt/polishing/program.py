@@ -22,69 +22,23 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hybrid_opt.polishing.decision import UnitBox
-from hybrid_opt.polishing.functions import PolishFunctions
-from hybrid_opt.polishing.grid import Grid
+from hybrid_opt.polishing.compiled_rows import RowParts
 from hybrid_opt.polishing.layout import Layout, PlaceRow, Row
 from hybrid_opt.polishing.place_values import Places, PlaceValues
 from hybrid_opt.polishing.placed_carry import PlacedCarry
 from hybrid_opt.polishing.residuals import Residuals, residuals
-from hybrid_opt.polishing.robust_samples import RobustSamples
 from hybrid_opt.polishing.sample_values import SampleValues
+from hybrid_opt.polishing.smooth_cell import SmoothCell
 from hybrid_opt.polishing.solvers import Answer
 from hybrid_opt.polishing.targets import Target, needed_level
 from symbolic.array import Array
 from symbolic.smooth.keys import Quantity
-from symbolic.smooth.samples import branch_coefficients, sample_blocks
-from symbolic.workcell.decision import POSE_SIZE, extended_waypoints
-from symbolic.workcell.records import Workcell
 
 SLACK = 0.1
 """What the epigraph variables start above the peak forces, in units of the span."""
 
 LEVEL_BOUND = 2e3
 """Bound of |phi| and |a|; beyond anything the targets ask for."""
-
-
-class SmoothCell:
-    """What all smooth programs of a cell share.
-
-    Attributes:
-        workcell, task, functions, grid: the cell's.
-        unit: the scaled decision vector.
-        free: rows and columns of the variables among the extended waypoints.
-        blocks: how samples are divided among functions.
-        coefficients: see `branch_coefficients`.
-        robust: robust forces where they are minimised, None for the planned ones.
-        rounding: of the time law's kinks, see `SolveSettings.rounding`.
-    """
-
-    def __init__(
-        self,
-        workcell: Workcell,
-        functions: PolishFunctions,
-        grid: Grid,
-        robust: RobustSamples | None = None,
-        rounding: float = 0.0,
-    ) -> None:
-        self.rounding, self.robust = rounding, robust
-        self.workcell, self.task = workcell, workcell.task
-        self.functions, self.grid = functions, grid
-        self.unit = UnitBox.of(workcell.task)
-        self.blocks = sample_blocks(workcell.task)
-        self.coefficients = branch_coefficients(workcell)
-        self.free = workcell.task.free_entries
-        self._n_path = workcell.task.n_path
-        fixed = [waypoint.lower for waypoint in self.task.waypoints]
-        self._fixed = np.column_stack([fixed, *[joint.lower for joint in self.task.redundant]])
-
-    def waypoints(self, x: Array) -> Array:
-        """As `extended_waypoints`, which looks up what is known here and unwraps what need not
-        be."""
-        points = self._fixed.copy()
-        points[self.free] = x[: self._n_path]
-        turns = points[1:, 3:POSE_SIZE] - points[:-1, 3:POSE_SIZE]
-        return extended_waypoints(self.task, x) if np.abs(turns).max() > np.pi else points
 
 
 def place_values(cell: SmoothCell, rows: tuple[PlaceRow, ...], carry: PlacedCarry) -> PlaceValues:
@@ -159,6 +113,28 @@ class SmoothProgram:
         self._known = b""
         self._values = self._offset
         self._jacobian: Array | None = None
+        self._compiled = cell.bind(self._parts())
+
+    def _parts(self) -> RowParts:
+        cell, layout = self._cell, self.layout
+        return RowParts(
+            unit=cell.unit,
+            fixed=self._fixed,
+            offset=self._offset,
+            first_patch=layout.patches.start,
+            first_place=layout.places.start,
+            forces=self._forces,
+            patches=self._patches,
+            places=self._places,
+            mix=self._mix,
+            force_column=self._force_column,
+            pressed_column=self._pressed_column,
+            pressed=self._pressed,
+            scale=self._scale,
+            slope=None if cell.robust is None else (self._lacking_slope, self._x),
+            still=cell.still,
+            free=cell.free,
+        )
 
     def _index_rows(self) -> None:
         """Rows as arrays: what each takes of the values at samples, and its scale."""
@@ -232,6 +208,8 @@ class SmoothProgram:
         return values, self._jacobian
 
     def _evaluated(self, z: Array) -> Array:
+        if self._compiled is not None:
+            return self._compiled.evaluate(z, self._cell.waypoints)
         layout = self.layout
         x = self._cell.unit.unscaled(z[layout.decision])
         values = self._fixed @ z
@@ -254,6 +232,8 @@ class SmoothProgram:
 
     def _slopes(self) -> Array:
         """The Jacobian where the values were found last."""
+        if self._compiled is not None:
+            return self._compiled.slopes()
         layout = self.layout
         jacobian = self._fixed.copy()
         slope = self._forces.gradients.take(self._force_column, axis=0)
@@ -276,6 +256,16 @@ class SmoothProgram:
         """See `solvers.Program`."""
         self.constraints(z)
         layout, half = self.layout, self._cell.unit.half
+        full = np.zeros((layout.n_variables, layout.n_variables))
+        second = self._second(z, multipliers)
+        full[layout.decision, layout.decision] = second * np.outer(half, half)
+        return full
+
+    def _second(self, z: Array, multipliers: Array) -> Array:
+        """(n_var, n_var) second derivatives by the decision vector itself."""
+        if self._compiled is not None:
+            return self._compiled.curvature(multipliers)
+        layout = self.layout
         x = self._cell.unit.unscaled(z[layout.decision])
         weighted = multipliers[layout.forces, None] * self._mix
         columns = self._force_column
@@ -290,9 +280,7 @@ class SmoothProgram:
             total += self._patches.second(x, weight)
         if len(self._scale):
             total += self._places.second(multipliers[layout.places] / self._scale)
-        full = np.zeros((layout.n_variables, layout.n_variables))
-        full[layout.decision, layout.decision] = total * np.outer(half, half)
-        return full
+        return total
 
     def residuals_at(self, x: Array, carry: PlacedCarry, answer: Answer) -> Residuals:
         """Residuals at a candidate that is not the answer itself, with the answer's multipliers."""

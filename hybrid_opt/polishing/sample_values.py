@@ -23,7 +23,7 @@ SHARED = ["x", "rounding"]
 
 
 @dataclass(frozen=True)
-class _Call:
+class SampleCall:
     """One function over some of its samples.
 
     Attributes:
@@ -40,7 +40,7 @@ class _Call:
 
 
 @dataclass(frozen=True)
-class _Columns:
+class Columns:
     """The second derivatives of one function along every direction of x: each of its samples is
     evaluated n_var times.
 
@@ -62,6 +62,9 @@ class SampleValues:
     Attributes:
         column: (n_samples,) position of a sample among the values, -1 where it has none.
         count: of samples with values.
+        calls, starts: functions with values, and the first value of each; all values follow.
+        x: (n_var,) where they are evaluated.
+        found, gradients: (count, 2), (count, 2, n_var) there.
     """
 
     def __init__(
@@ -78,7 +81,7 @@ class SampleValues:
             wanted: samples without which a call is left out.
             rounding: of the time law's kinks, see `symbolic.smooth.samples.sample_functions`.
         """
-        self._rounding, self._columns = rounding, dict[int, _Columns]()
+        self._rounding, self._columns = rounding, dict[int, Columns]()
         chosen = [
             block.samples[np.isin(block.samples, list(wanted)).any(axis=1)] for block in blocks
         ]
@@ -87,54 +90,49 @@ class SampleValues:
         self.column = np.full(1 + max(int(block.samples.max(initial=0)) for block in blocks), -1)
         self.column[served] = np.arange(self.count)
         n_var = next(iter(functions.values())).input_shapes[0][0]
-        self._x, self._values = np.zeros(n_var), np.zeros((self.count, 2))
-        self._gradients = np.zeros((self.count, 2, n_var))
-        self._calls, self._starts = list[_Call](), [0]
+        self.x, self.found = np.zeros(n_var), np.zeros((self.count, 2))
+        self.gradients = np.zeros((self.count, 2, n_var))
+        self.calls, self.starts = list[SampleCall](), [0]
         for block, samples in zip(blocks, chosen, strict=True):
             if not len(samples):
                 continue
-            rows = slice(self._starts[-1], self._starts[-1] + samples.size)
+            rows = slice(self.starts[-1], self.starts[-1] + samples.size)
             first, second = (
                 functions[SampleKey(quantity, block.block, o)] for o in get_args(Order)
             )
             n, served_each = samples.shape
             given = {
-                "x": self._x,
-                "values": self._values[rows].reshape(n, -1),
-                "gradient": self._gradients[rows].reshape(n, -1, n_var),
+                "x": self.x,
+                "values": self.found[rows].reshape(n, -1),
+                "gradient": self.gradients[rows].reshape(n, -1, n_var),
             }
             batch = first.prepared(n, SHARED, given)
             basis = block.basis[np.isin(block.samples, samples).all(axis=1)]
             batch.inputs["basis"][...] = basis
             batch.inputs["rounding"][...] = rounding
-            self._calls.append(_Call(batch, second, basis, served_each))
-            self._starts.append(rows.stop)
+            self.calls.append(SampleCall(batch, second, basis, served_each))
+            self.starts.append(rows.stop)
 
     def values(self, x: Array) -> Array:
-        """(count, 2) at x, overwritten by the next call."""
-        self._x[...] = x
-        for call in self._calls:
+        """(count, 2) at x, overwritten by the next call, as are `gradients`."""
+        self.x[...] = x
+        for call in self.calls:
             call.first()
-        return self._values
-
-    @property
-    def gradients(self) -> Array:
-        """(count, 2, n_var) where `values` was called last, overwritten with them."""
-        return self._gradients
+        return self.found
 
     def second(self, x: Array, weight: Array) -> Array:
         """(n_var, n_var) second derivatives of the values weighted by (count, 2)."""
         total = np.zeros((len(x), len(x)))
         size = np.abs(weight).max(axis=1, initial=0.0)
         matter = (size > NEGLIGIBLE * size.max(initial=0.0)).nonzero()[0]
-        bounds = matter.searchsorted(self._starts).tolist()
-        for k, call in enumerate(self._calls):
-            rows = matter[bounds[k] : bounds[k + 1]] - self._starts[k]
+        bounds = matter.searchsorted(self.starts).tolist()
+        for k, call in enumerate(self.calls):
+            rows = matter[bounds[k] : bounds[k + 1]] - self.starts[k]
             if not len(rows):
                 continue
             at = np.unique(rows // call.served) if call.served > 1 else rows
-            own = weight[self._starts[k] : self._starts[k + 1]].reshape(len(call.basis), -1)
-            columns, count = self._columns_of(k, len(x)), len(at)
+            own = weight[self.starts[k] : self.starts[k + 1]].reshape(len(call.basis), -1)
+            columns, count = self.columns_of(k, len(x)), len(at)
             columns.batch.inputs["x"][...] = x
             columns.basis[:count] = call.basis[at][:, None]
             columns.weight[:count] = own[at][:, None]
@@ -142,10 +140,10 @@ class SampleValues:
             total += columns.curvature[:count].sum(axis=0)
         return total
 
-    def _columns_of(self, k: int, n_var: int) -> _Columns:
+    def columns_of(self, k: int, n_var: int) -> Columns:
         """Of a call; most programs need those of few."""
         if k not in self._columns:
-            call = self._calls[k]
+            call = self.calls[k]
             n = len(call.basis)
             batch = call.second.prepared(n * n_var, SHARED)
             batch.inputs["rounding"][...] = self._rounding
@@ -153,5 +151,5 @@ class SampleValues:
             inputs = (batch.inputs[name] for name in ("basis", "weight"))
             basis, weight = (array.reshape(n, n_var, *array.shape[1:]) for array in inputs)
             curvature = batch.outputs["curvature"].reshape(n, n_var, n_var)
-            self._columns[k] = _Columns(batch, basis, weight, curvature)
+            self._columns[k] = Columns(batch, basis, weight, curvature)
         return self._columns[k]

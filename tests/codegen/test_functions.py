@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from typing import Any
 
@@ -99,6 +100,32 @@ def test_a_prepared_batch_equals_a_batch_to_the_bit(make: Make) -> None:
     assert prepared() is found
     with pytest.raises(CodegenError, match="room for 11"):
         prepared(12)
+
+
+def test_c_evaluates_a_prepared_batch_as_python_does(cache: Cache) -> None:
+    rng = np.random.default_rng(4)
+    function = compile_function(random_function(rng, ca.MX), cache)
+    prepared = function.prepared(9)
+    for array in prepared.inputs.values():
+        array[...] = rng.standard_normal(array.shape)
+    expected = {name: array.copy() for name, array in prepared().items()}
+    for array in prepared.outputs.values():
+        array[...] = np.nan
+    native = prepared.native
+    assert native is not None
+    run = ctypes.CFUNCTYPE(ctypes.c_longlong, *[ctypes.c_void_p] * 2, *[ctypes.c_longlong] * 2)
+    assert run(native.one)(native.ports, native.work, 0, 4) == -1
+    if native.lanes:
+        assert run(native.lanes)(native.ports, native.lane_work, 4, 9) == -1
+    else:
+        assert run(native.one)(native.ports, native.work, 4, 9) == -1
+    for name, wanted in expected.items():
+        np.testing.assert_array_equal(prepared.outputs[name], wanted)
+
+
+def test_interpreted_functions_have_no_address() -> None:
+    function = InterpretedFunction(dense(random_function(np.random.default_rng(4), ca.MX)))
+    assert function.prepared(2).native is None
 
 
 def test_a_prepared_batch_works_on_arrays_that_it_is_given(make: Make) -> None:

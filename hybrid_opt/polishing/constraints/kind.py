@@ -10,8 +10,8 @@ from typing import Generic, TypeVar
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.layout import ForceRow, PlaceRow, PressureRow
 from hybrid_opt.polishing.placed_carry import PlacedCarry
-from hybrid_opt.polishing.program import SmoothCell
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.smooth_cell import SmoothCell
 from hybrid_opt.polishing.targets import Target
 from symbolic.workcell.records import Workcell
 

@@ -26,9 +26,9 @@ from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.layout import PlaceRow
 from hybrid_opt.polishing.placed_carry import CarryReader, PlacedCarry
 from hybrid_opt.polishing.point import Solution
-from hybrid_opt.polishing.program import SmoothCell
 from hybrid_opt.polishing.residuals import Residuals
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.smooth_cell import SmoothCell
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Task

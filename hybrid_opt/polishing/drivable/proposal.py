@@ -23,9 +23,10 @@ from hybrid_opt.polishing.drivable.program import Iterate, JointProgram, Linear,
 from hybrid_opt.polishing.drivable.timed import Goal, TimedPath
 from hybrid_opt.polishing.layout import PlaceRow, Row
 from hybrid_opt.polishing.placed_carry import PlacedCarry
-from hybrid_opt.polishing.program import SmoothCell, place_values
+from hybrid_opt.polishing.program import place_values
 from hybrid_opt.polishing.residuals import Residuals
 from hybrid_opt.polishing.settings import DrivableSettings
+from hybrid_opt.polishing.smooth_cell import SmoothCell
 from symbolic.array import Array
 
 LEAST_SQUARED, LARGEST_SQUARED = 0.9, 3.0

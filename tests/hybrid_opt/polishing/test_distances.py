@@ -15,8 +15,8 @@ from hybrid_opt.polishing.constraints.kind import Surroundings
 from hybrid_opt.polishing.functions import polish_functions
 from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.placed_carry import CarryReader, Distances
-from hybrid_opt.polishing.program import SmoothCell
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.smooth_cell import SmoothCell
 from symbolic.array import Array
 from symbolic.workcell.decision import initial_decision
 from tests.hybrid_opt.polishing.test_front import evaluator

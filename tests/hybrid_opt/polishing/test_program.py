@@ -13,7 +13,8 @@ from hybrid_opt.polishing.functions import polish_functions
 from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.layout import ForceRow, PlaceRow, PressureRow, Row
 from hybrid_opt.polishing.placed_carry import CarryReader
-from hybrid_opt.polishing.program import SmoothCell, SmoothProgram
+from hybrid_opt.polishing.program import SmoothProgram
+from hybrid_opt.polishing.smooth_cell import SmoothCell
 from hybrid_opt.polishing.targets import Target
 from symbolic.array import Array
 from symbolic.smooth.clearance import Clearance
@@ -58,10 +59,12 @@ def made(path: Path) -> tuple[SmoothProgram, Array]:
     return program_of(evaluator(path))
 
 
-def program_of(judge: CandidateEvaluator) -> tuple[SmoothProgram, Array]:
+def program_of(judge: CandidateEvaluator, interpreted: bool = False) -> tuple[SmoothProgram, Array]:
     """A program with rows of every kind around the hand-made trajectory, and a point near it."""
     task, grid = judge.workcell.task, Grid(judge.workcell.task)
     cell = SmoothCell(judge.workcell, polish_functions(judge.compiled), grid)
+    if interpreted:
+        cell.bind = lambda parts: None
     x = initial_decision(task)
     carry = CarryReader(judge, grid, cell.functions.rows).read(x)
     box, *_ = sorted(cell.functions.rows.separable)
@@ -102,10 +105,39 @@ def test_curvature_is_that_of_the_constraints(path: Path) -> None:
 
 @pytest.mark.slow
 def test_derivatives_by_the_path_of_a_slide_are_exact(tmp_path: Path) -> None:
-    program, z = program_of(CandidateEvaluator(rack_on_rail(tmp_path, 0.3, 0.1)))
+    judge = CandidateEvaluator(rack_on_rail(tmp_path, 0.3, 0.1))
+    program, z = program_of(judge)
     assert len(z) == 18 + 5 + 3
     require_jacobian(program, z)
     require_curvature(program, z)
+    require_same(program, program_of(judge, interpreted=True)[0], z)
+
+
+@CELLS
+def test_rows_put_together_in_c_are_those_of_numpy(path: Path) -> None:
+    (program, z), (other, _) = made(path), program_of(evaluator(path), interpreted=True)
+    require_same(program, other, z)
+    # A whole turn more is none.
+    task, turned = evaluator(path).workcell.task, z.copy()
+    turned[5] += 4.0 * np.pi / (task.upper[5] - task.lower[5])
+    require_same(program, other, turned)
+    places = program.layout.places
+    values = program.constraints(z)[0][places].copy()
+    np.testing.assert_allclose(program.constraints(turned)[0][places], values, atol=1e-9)
+
+
+def require_same(program: SmoothProgram, other: SmoothProgram, z: Array) -> None:
+    """Values and derivatives are, but for rounding; first where few rows matter, then all."""
+    rng = np.random.default_rng(2)
+    for few in (True, False):
+        multipliers = rng.normal(size=program.layout.n_rows)
+        if few:
+            multipliers[rng.random(len(multipliers)) < 0.8] *= 1e-12
+        for found, wanted in zip(program.constraints(z), other.constraints(z), strict=True):
+            np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+        wanted = other.curvature(z, multipliers)
+        scale = np.abs(wanted).max()
+        np.testing.assert_allclose(program.curvature(z, multipliers), wanted, atol=1e-9 * scale)
 
 
 def require_jacobian(program: SmoothProgram, z: Array) -> None:

@@ -14,9 +14,10 @@ from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.layout import ForceRow, Row
 from hybrid_opt.polishing.placed_carry import CarryReader
 from hybrid_opt.polishing.point import PolishSolver, SolveStart
-from hybrid_opt.polishing.program import SmoothCell, SmoothProgram
+from hybrid_opt.polishing.program import SmoothProgram
 from hybrid_opt.polishing.robust_samples import RobustSamples
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.smooth_cell import SmoothCell
 from hybrid_opt.polishing.targets import balance
 from symbolic.workcell.decision import initial_decision
 from tests.hybrid_opt.polishing.test_program import TARGET, evaluator

@@ -13,7 +13,8 @@ from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.layout import PlaceRow
 from hybrid_opt.polishing.placed_carry import CarryReader
-from hybrid_opt.polishing.program import SmoothCell, place_values
+from hybrid_opt.polishing.program import place_values
+from hybrid_opt.polishing.smooth_cell import SmoothCell
 from symbolic.array import Array
 from symbolic.smooth.reach import Reach
 from symbolic.workcell.decision import initial_decision
