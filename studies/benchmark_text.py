@@ -61,4 +61,6 @@ def _peak(figures: Mapping[str, Any]) -> list[str]:
 
 def _shares(figures: Mapping[str, Any]) -> list[str]:
     parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in figures["shares"].items())
-    return [f"feasible {100 * figures['feasible_share']:.0f} %; compiled time: {parts}"]
+    ratio = figures.get("compiled_over_paper")
+    joint = [] if ratio is None else [f"{ratio:.2f} times a candidate of the allocation paper"]
+    return [*joint, f"feasible {100 * figures['feasible_share']:.0f} %; compiled time: {parts}"]

@@ -77,6 +77,9 @@ def _parser() -> argparse.ArgumentParser:
         "--carries", type=whole(1, 10**6), default=40, help="how many, in turn of all kinds"
     )
     parser.add_argument(
+        "--skip", type=whole(0, 10**6), default=0, help="how many of these are done already"
+    )
+    parser.add_argument(
         "--pads",
         choices=("driven", "rigid"),
         default="driven",
@@ -95,7 +98,9 @@ def _run(options: argparse.Namespace) -> int:
     rng = np.random.default_rng(options.seed)
     print("cell      candidate   timing   friction  force [N]  threshold  first slip [s]  planned")
     with TemporaryDirectory() as folder:
-        for case in islice(_cases(options.files, Path(folder), rng), options.carries):
+        for case in islice(
+            _cases(options.files, Path(folder), rng), options.skip, options.skip + options.carries
+        ):
             factor, begins, planned = _threshold(case, settings)
             found.append(factor)
             away_in_time.append(abs(begins - planned))

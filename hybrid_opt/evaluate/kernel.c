@@ -28,7 +28,7 @@ typedef struct {
    size) or null. */
 typedef struct {
   const double *x, *begin; /* begin: both arms' joints at the first box pose, or the cell's own */
-  long long n, with_collisions, room;
+  long long n, with_collisions, all_forces, room;
   double *time, *violation, *violation_time;
   long long *first_sample, *first_reason, *reached;
   unsigned char* colliding;
@@ -42,6 +42,11 @@ typedef struct {
 #define MOST_OF(what)                                                                        \
   MOST(MOST(MOST(path_##what, start_##what), MOST(predict_##what, sample_##what)),           \
        MOST(MOST(clearance_##what, piece_poses_##what), begin_##what))
+#ifdef FORCES_COME_LAST
+#define MOST_OF_ALL(what) MOST(MOST_OF(what), forces_##what)
+#else
+#define MOST_OF_ALL(what) MOST_OF(what)
+#endif
 #define AFTER_STATES 2 /* outputs of `sample` before those that can be asked for */
 
 typedef struct {
@@ -49,10 +54,10 @@ typedef struct {
       second_rate[N_SAMPLES][6], q[N_SAMPLES][2][MOST_JOINTS], state[2][2][STATE],
       outputs[SAMPLE_SIZE], begin[2][MOST_JOINTS],
       clearance[N_PAIRS + 1], quaternions[4 * N_PIECES], positions[3 * N_PIECES],
-      w[MOST_OF(W) + 1];
-  const lanes_real* arg[MOST_OF(ARG) + 8];
-  lanes_real* res[MOST_OF(RES) + 64];
-  lanes_int iw[MOST_OF(IW) + 1];
+      w[MOST_OF_ALL(W) + 1];
+  const lanes_real* arg[MOST_OF_ALL(ARG) + 8];
+  lanes_real* res[MOST_OF_ALL(RES) + 64];
+  lanes_int iw[MOST_OF_ALL(IW) + 1];
 } scratch;
 
 /* One per thread, kept as long as the thread. */
@@ -135,6 +140,72 @@ static int follow(const batch_data* batch, long long first, int m) {
   }
   return 0;
 }
+
+#ifdef FORCES_COME_LAST
+static double larger(double x, double y) { return x > y || y != y ? x : y; }
+
+/* The forces of the candidate in lane l, several of its samples side by side. */
+static int press(const batch_data* batch, long long row, int l) {
+  scratch* s = own;
+  lanes_real pose[POSE_SIZE], rate[6], second_rate[6], q[2][MOST_JOINTS], found[FORCES_SIZE];
+  const double* time = batch->time + row * N_SAMPLES;
+  for (int first = 0; first < N_SAMPLES; first += DUAL_ARM_LANES) {
+    int m = N_SAMPLES - first < DUAL_ARM_LANES ? N_SAMPLES - first : DUAL_ARM_LANES;
+    for (int i = 0; i < DUAL_ARM_LANES; ++i) {
+      int k = first + (i < m ? i : m - 1);
+      for (int j = 0; j < POSE_SIZE; ++j) pose[j][i] = s->pose[k][j][l];
+      for (int j = 0; j < 6; ++j) rate[j][i] = s->rate[k][j][l];
+      for (int j = 0; j < 6; ++j) second_rate[j][i] = s->second_rate[k][j][l];
+      for (int a = 0; a < 2; ++a)
+        for (int j = 0; j < N_JOINTS[a]; ++j) q[a][j][i] = s->q[k][a][j][l];
+    }
+    s->arg[0] = pose;
+    s->arg[1] = rate;
+    s->arg[2] = second_rate;
+    for (int a = 0; a < 2; ++a) s->arg[3 + a] = q[a];
+    for (int o = 0; o <= N_FORCES; ++o) s->res[o] = found + FORCES_AT[o];
+    if (forces(s->arg, s->res, s->iw, s->w)) return 1;
+    for (int o = 0; o < N_FORCES; ++o) {
+      int output = FORCES_OUTPUT[o], size = OUTPUT_SIZE[output];
+      if (!batch->wanted[output]) continue;
+      double* into = batch->wanted[output] + (row * N_SAMPLES + first) * size;
+      for (int i = 0; i < m; ++i)
+        for (int j = 0; j < size; ++j) *into++ = found[FORCES_AT[o] + j][i];
+    }
+    for (int i = 0; i < m; ++i) {
+      int k = first + i;
+      double since = k ? time[k] - time[k - 1] : 0.0;
+      double until = k + 1 < N_SAMPLES ? time[k + 1] - time[k] : 0.0;
+      double part = (since + until) / (2.0 * time[N_SAMPLES - 1]);
+      for (int c = 0; c < N_FORCE_CONSTRAINTS; ++c) {
+        int column = N_CONSTRAINTS - N_FORCE_CONSTRAINTS + c;
+        double value = found[FORCES_AT[N_FORCES] + c][i];
+        double* worst = batch->violation + row * N_CONSTRAINTS + column;
+        if (batch->wanted[CONSTRAINT_OUTPUT])
+          batch->wanted[CONSTRAINT_OUTPUT][(row * N_SAMPLES + k) * N_CONSTRAINTS + column] = value;
+        *worst = larger(*worst, larger(value, 0.0));
+        if (!(value > 0.0)) continue;
+        batch->violation_time[row * N_CONSTRAINTS + column] += part;
+        if (k >= batch->first_sample[row]) continue;
+        batch->first_sample[row] = k;
+        batch->first_reason[row] = column;
+      }
+    }
+  }
+  return 0;
+}
+
+/* The forces of those candidates of a pass that violate nothing so far, or of all. */
+static int press_all(const batch_data* batch, long long first, int m) {
+  for (int l = 0; l < m; ++l) {
+    const unsigned char* colliding = batch->colliding + (first + l) * N_SAMPLES;
+    int wanted = batch->all_forces || (batch->first_sample[first + l] == N_SAMPLES &&
+                                       !memchr(colliding, 1, N_SAMPLES));
+    if (wanted && press(batch, first + l, l)) return 1;
+  }
+  return 0;
+}
+#endif
 
 static placed piece_place(long long piece, int l) {
   const scratch* s = own;
@@ -268,6 +339,9 @@ DUAL_ARM_EXPORT long long dual_arm_evaluate(batch_data* batch, const judge_data*
     s->res[3] = s->second_rate[0];
     if (path(s->arg, s->res, s->iw, s->w) || follow(batch, first, m)) return -1;
     if (batch->with_collisions && collide(batch, judge, first, m)) return -1;
+#ifdef FORCES_COME_LAST
+    if (press_all(batch, first, m)) return -1;
+#endif
   }
   return batch->n;
 }

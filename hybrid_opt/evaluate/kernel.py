@@ -30,7 +30,13 @@ from hybrid_opt.evaluate.kernel_data import (
 )
 from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
 from symbolic.array import Array
-from symbolic.functions.candidate import CONSTRAINTS, sample_sizes
+from symbolic.functions.candidate import (
+    CONSTRAINTS,
+    FORCE_CONSTRAINTS,
+    force_sizes,
+    forces_come_last,
+    sample_sizes,
+)
 from symbolic.geometry.pairs import CellGeometry
 
 _LEAST_ROOM = 4096
@@ -66,6 +72,7 @@ class Kernel:
         with_collisions: bool = True,
         threads: int = 1,
         begin: Array | None = None,
+        all_forces: bool = False,
     ) -> SampledVerdicts:
         """Evaluate decision vectors (n, n_var).
 
@@ -76,6 +83,8 @@ class Kernel:
                 those of the cell's start branches.
             threads: to spread the candidates over; 0 for one per core. Has no influence on the
                 results; FCL's part runs in the calling thread.
+            all_forces: False leaves forces at zero, in cells whose forces a program finds, where
+                something else is violated already.
 
         Raises:
             CodegenError: memory is short.
@@ -103,7 +112,11 @@ class Kernel:
                 asked[name][rows].ctypes.data if name in asked else None for name in self._sizes
             ]
             found = self._run(
-                {k: v[rows] for k, v in arrays.items()}, addresses, with_collisions, begin
+                {k: v[rows] for k, v in arrays.items()},
+                addresses,
+                begin,
+                with_collisions=with_collisions,
+                all_forces=all_forces,
             )
             for part in found:
                 part["candidate"] += first
@@ -129,20 +142,20 @@ class Kernel:
         self,
         arrays: Mapping[str, NDArray[Any]],
         wanted: Sequence[int | None],
-        with_collisions: bool,
         begin: Array | None,
+        **choices: bool,
     ) -> list[NDArray[np.void]]:
         """The kernel on candidates of one thread; the pairs that it leaves open."""
         n = len(arrays["x"])
-        room = np.empty(self._room if with_collisions else 0, self._open_pair)
+        room = np.empty(self._room if choices["with_collisions"] else 0, self._open_pair)
         pointers = (ctypes.c_void_p * len(wanted))(*wanted)
         batch = BatchData(
             n=n,
             begin=None if begin is None else begin.ctypes.data,
-            with_collisions=with_collisions,
             room=self._room,
             wanted=ctypes.addressof(pointers),
             open=room.ctypes.data,
+            **choices,
             **{name: array.ctypes.data for name, array in arrays.items()},
         )
         at, found = 0, []
@@ -204,7 +217,7 @@ def load_kernel(
     task = compiled.workcell.task
     x = np.random.default_rng(0).uniform(task.lower, task.upper, (kernel.lanes + 1, task.n_var))
     every = tuple(sample_sizes(compiled.workcell))
-    if _same(kernel.evaluate(x, every), one_by_one(outputs(x), checker)):
+    if _same(kernel.evaluate(x, every, all_forces=True), one_by_one(outputs(x), checker)):
         return kernel
     warn_one_lane("kernel", "it differs from the functions that it is made of")
     return None
@@ -239,6 +252,7 @@ def _definitions(geometry: CellGeometry) -> str:
         "N_OUTPUTS": len(sizes),
         "SAMPLE_SIZE": sum(sizes.values()),
         "CONSTRAINT_AT": starts["constraint"],
+        "CONSTRAINT_OUTPUT": list(sizes).index("constraint"),
     }
     lists = {
         "N_JOINTS": joints,
@@ -247,6 +261,19 @@ def _definitions(geometry: CellGeometry) -> str:
         "Q_AT": [starts["q_1"], starts["q_2"]],
         "LOST_AT": [starts["lost_1"], starts["lost_2"]],
     }
+    if forces_come_last(workcell):
+        of_forces = force_sizes(workcell)
+        ends = np.cumsum(list(of_forces.values()))
+        numbers |= {
+            "FORCES_COME_LAST": 1,
+            "N_FORCES": len(of_forces) - 1,
+            "FORCES_SIZE": sum(of_forces.values()),
+            "N_FORCE_CONSTRAINTS": len(FORCE_CONSTRAINTS),
+        }
+        lists |= {
+            "FORCES_AT": [0, *ends[:-1].tolist()],
+            "FORCES_OUTPUT": [list(sizes).index(name) for name in list(of_forces)[:-1]],
+        }
     lines = [f"#define {name} {value}" for name, value in numbers.items()]
     for name, values in lists.items():
         entries = ", ".join(map(str, values))

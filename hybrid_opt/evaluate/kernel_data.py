@@ -58,7 +58,7 @@ class BatchData(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("x", "begin")),
-        *((name, ctypes.c_longlong) for name in ("n", "with_collisions", "room")),
+        *((name, ctypes.c_longlong) for name in ("n", "with_collisions", "all_forces", "room")),
         *((name, ctypes.c_void_p) for name in ("time", "violation", "violation_time")),
         *((name, ctypes.c_void_p) for name in ("first_sample", "first_reason", "reached")),
         *((name, ctypes.c_void_p) for name in ("colliding", "wanted", "open")),

@@ -19,6 +19,7 @@ from symbolic.robot.arm import (
     follow_function,
     prediction_function,
     start_function,
+    torque_function,
     track_function,
 )
 from symbolic.workcell.records import Workcell
@@ -153,6 +154,9 @@ _LOAD_SIZES = {
     "moment_residual": 3,
 }
 
+FORCE_CONSTRAINTS = CONSTRAINTS[6:]
+"""Those that depend on the contact forces."""
+
 SAMPLE_NAMES = frozenset(
     (*_LOAD_SIZES, *(f"{name}_{i}" for i in (1, 2) for name in TRACK_OUTPUTS), "constraint")
 )
@@ -170,6 +174,19 @@ def sample_sizes(workcell: Workcell) -> dict[str, int]:
     return sizes | {"constraint": len(CONSTRAINTS)}
 
 
+def forces_come_last(workcell: Workcell) -> bool:
+    """Whether a candidate's forces are found after all else is known of it, where that is free of
+    violations: a program solves for them, and then nothing but objectives depends on them."""
+    return workcell.task.allocation == "joint"
+
+
+def force_sizes(workcell: Workcell) -> dict[str, int]:
+    """Outputs of `sample_functions`' `forces`, and their entries."""
+    torques = [f"joint_torque_{i}" for i in (1, 2)]
+    sizes = _LOAD_SIZES | {name: sample_sizes(workcell)[name] for name in torques}
+    return sizes | {"force_constraint": len(FORCE_CONSTRAINTS)}
+
+
 def sample_functions(model: CellModel) -> dict[str, ca.Function]:
     """A candidate's function in parts, to be put together sample by sample; not for 'optimal'.
 
@@ -177,7 +194,9 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
     second_rate (6, n). begin: -> joints of both arms at the first box pose. start: first pose, such
     joints -> state_1, state_2 before the first sample. predict: state_1, state_2, second pose ->
     both states before it. sample: pose, rate, second_rate, state_1, state_2 -> next_state_1,
-    next_state_2, then `sample_sizes`.
+    next_state_2, then `sample_sizes`. Where `forces_come_last` these are without forces, all zero,
+    and forces: pose, rate, second_rate, joints of both arms -> `force_sizes`, the last of them
+    those entries of the constraints.
     """
     workcell = model.workcell
     x = ca.MX.sym("x", workcell.task.n_var)
@@ -188,7 +207,9 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
     motion = [path.time, whole, path.rate, path.second_rate]
     pose = ca.MX.sym("pose", workcell.task.extended_size)
     box = [pose[:6], *[ca.MX.sym(name, 6) for name in ("rate", "second_rate")]]
-    outputs = dict(zip(LOAD_OUTPUTS, load_function(workcell).call(box), strict=True))
+    load = dict(zip(LOAD_OUTPUTS, load_function(workcell).call(box), strict=True))
+    apart = forces_come_last(workcell)
+    outputs = {k: ca.MX(ca.DM.zeros(v.shape)) for k, v in load.items()} if apart else load
     states, starts, following, predicted = [], [], [], []
     begins = [ca.MX.sym(f"begin_{i + 1}", len(q)) for i, q in enumerate(model.start)]
     for i in (0, 1):
@@ -215,7 +236,29 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
         "start": ca.Function("start", [pose, *begins], starts),
         "predict": ca.Function("predict", [*states, pose], predicted),
         "sample": ca.Function("sample", given, results, [v.name() for v in given], names),
+        **({"forces": _forces_function(model, pose, box, load)} if apart else {}),
     }
+
+
+def _forces_function(
+    model: CellModel, pose: ca.MX, box: list[ca.MX], load: dict[str, ca.MX]
+) -> ca.Function:
+    """See `sample_functions`."""
+    workcell = model.workcell
+    joints = [ca.MX.sym(f"q_{i + 1}", model.robots[i].n_joints) for i in (0, 1)]
+    outputs = dict(load)
+    for i, q in enumerate(joints):
+        arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
+        torque = torque_function(*arm, f"arm_{i + 1}_torque")
+        outputs[f"joint_torque_{i + 1}"] = torque(q, pose, load[f"wrench_{i + 1}"])
+    known = [ca.DM.zeros(1)] * (len(_CONSTRAINT_INPUTS) - 3)
+    of_forces = [outputs[name] for name in _CONSTRAINT_INPUTS[-3:]]
+    constraint = _constraint_function(workcell)(*known, *of_forces)
+    outputs["force_constraint"] = constraint[-len(FORCE_CONSTRAINTS) :]
+    names = list(force_sizes(workcell))
+    given = [pose, *box[1:], *joints]
+    results = [outputs[name] for name in names]
+    return ca.Function("forces", given, results, [v.name() for v in given], names)
 
 
 def _track(model: CellModel, i: int, pose: ca.MX, wrench: ca.MX) -> dict[str, ca.MX]:

@@ -31,7 +31,8 @@ def cell_functions(model: CellModel) -> dict[str, ca.Function]:
 def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
     """What a whole evaluation is put together from, sample by sample.
 
-    path, begin, start, predict, sample: see `symbolic.functions.candidate.sample_functions`.
+    path, begin, start, predict, sample and, of some cells, forces: see
+    `symbolic.functions.candidate.sample_functions`.
     clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
     """
     placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)

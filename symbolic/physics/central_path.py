@@ -5,7 +5,7 @@
 
 The method is primal-dual with a predictor and a corrector (Mehrotra, SIAM J. Optim. 2, 1992): each
 step aims at the central path's place of a smaller weight, to second order by what a first step
-to weight zero leaves out. It starts within the cones, the load balanced, and takes some ten steps;
+to weight zero leaves out. It starts within the cones, the load balanced, and takes some six steps;
 at most `STEPS`, each of which is passed over once the weight is small enough, so that the whole is
 one expression and compiles. The wrench of the last contact is what the others leave, so that
 6 (k - 1) components are free.
@@ -35,8 +35,12 @@ CENTRING, CENTRED = 30, 1e-8
 Newton's decrement, over the weight, that counts as being there."""
 
 STEPS = 30
-STEP_SHARE = 0.97
-"""Of the way to the cones' boundary that a step goes at most."""
+STEP_SHARE, LAST_SHARE, APPROACH = 0.97, 0.999, 100.0
+"""Of the way to the cones' boundary that a step goes at most; the same near the end, where what is
+left may be this many times the weight, over the effort."""
+
+START_WEIGHT = 0.5
+"""Weight of a start, over the effort there per degree."""
 
 PROGRAMS = 16
 """How many programs' functions are kept."""
@@ -139,9 +143,10 @@ def _step(program: Program) -> ca.Function:
     first = steps(ca.SX(0.0), none)
     far = _length([step.lowest_of_state for step in first], 1.0)
     final = FINAL_WEIGHT * equations.effort
-    aimed = ca.fmax((1.0 - far) ** 3 * weight, final)
+    aimed = ca.fmax((1.0 - far) ** 2 * weight, final)
     second = steps(aimed, [step.second_order for step in first])
-    length = _length([step.lowest for step in second], STEP_SHARE)
+    share = ca.fmin(ca.fmax(STEP_SHARE, 1.0 - APPROACH * weight / equations.effort), LAST_SHARE)
+    length = _length([step.lowest for step in second], share)
     change = ca.vertcat(*[step.change for step in second])
     gap = sum(step.gap_after(length) for step in second)
     return ca.Function(
@@ -172,7 +177,7 @@ def _barrier_step(program: Program) -> ca.Function:
     return ca.Function("barrier_step", inputs, ca.cse([found, downhill > CENTRED * weight]))
 
 
-def _length(lowest: list[ca.SX], share: float) -> ca.SX:
+def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
     """Of a step, at most whole, that goes at most a share of the way to the boundary."""
     return ca.fmin(1.0, share / ca.fmax(-least(lowest), share))
 
@@ -239,7 +244,8 @@ def _start(program: Program) -> ca.Function:
     cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
     states = program.start(cell)
     degree = sum(patch.degree for patch in program.patches)
-    weight = program.effort([own[:WRENCH_SIZE] for own in states], cell) / degree
+    effort = program.effort([own[:WRENCH_SIZE] for own in states], cell)
+    weight = effort * (START_WEIGHT / degree)
     pairs = zip(program.patches, states, strict=True)
     iterate = ca.vertcat(*[patch.centred(own, weight) for patch, own in pairs])
     return ca.Function("start", cell, ca.cse([iterate]))

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 
 import casadi as ca
 
+from symbolic.expression import reciprocal
+
 Numbers = Sequence[ca.SX]
 
 
@@ -32,7 +34,7 @@ class Elimination:
         self._factors: list[list[ca.SX]] = []  # column by column, below the diagonal
         self._over_pivot: list[ca.SX] = []
         for p in range(k):
-            over = 1.0 / rows[p][p]
+            over = reciprocal(rows[p][p])
             column = [rows[i][p] for i in range(p + 1, n)]
             factor = [value * over for value in column]
             for i in range(p + 1, n):

@@ -14,6 +14,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.expression import reciprocal
 from symbolic.physics.central_path import differentiable_least_effort, least_effort
 from symbolic.physics.closure import (
     WRENCH_SIZE,
@@ -36,7 +37,7 @@ SCALE_FLOOR = 1e-9
 START_FLOOR = 1e-3
 """Squeeze over the scale to start from where nothing has to be carried."""
 
-START_SHARE = 0.5
+START_SHARE = 0.97
 """Of the way to the cones' boundary that the load takes a start from the squeeze."""
 
 BEYOND = 1e12
@@ -94,7 +95,7 @@ class Grasp:
         rest = ca.mtimes(self._load_to_last, load)
         for i, (wrench, to_last) in enumerate(zip(wrenches, self._pads_to_last, strict=True)):
             rest -= ca.mtimes(to_last, self.units(i, *sizes) * wrench)
-        return rest / self.units(len(self.patches) - 1, *sizes)
+        return rest * reciprocal(self.units(len(self.patches) - 1, *sizes))
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """Half the sum of all squared forces."""

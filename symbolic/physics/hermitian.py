@@ -114,5 +114,5 @@ def multiplied(x: list[list[Complex]], y: list[list[Complex]]) -> list[list[Comp
 
 def hermitian_part(x: list[list[Complex]]) -> Hermitian:
     """Half the sum of a matrix and its conjugate transpose."""
-    below = [((x[i][j][0] + x[j][i][0]) / 2.0, (x[i][j][1] - x[j][i][1]) / 2.0) for i, j in SLOTS]
+    below = [(0.5 * (x[i][j][0] + x[j][i][0]), 0.5 * (x[i][j][1] - x[j][i][1])) for i, j in SLOTS]
     return Hermitian((x[0][0][0], x[1][1][0], x[2][2][0]), (below[0], below[1], below[2]))

@@ -19,7 +19,7 @@ from typing import Literal
 
 import casadi as ca
 
-from symbolic.expression import Expression
+from symbolic.expression import Expression, reciprocal
 from symbolic.physics.central_path import differentiable_least_effort, least_effort
 from symbolic.physics.closure import WRENCH_SIZE
 from symbolic.physics.patch_cone import cross_2, patch_slack
@@ -31,6 +31,13 @@ Objective = Literal["effort", "squeeze"]
 
 SCALE_FLOOR, START_FLOOR = 1e-9, 1e-3
 """Force scale [N] and squeeze over it to start from where nothing has to be carried."""
+
+START_SHARE = 0.97
+"""Of the way to the cones' boundary that what is to be carried takes a start."""
+
+LOWEST = (4.0 / 3.0) ** 0.5
+"""Bound of what a wrench without normal force takes from a patch's eigenvalues, over its length:
+their sum is zero and that of their squares is twice its square (Samuelson)."""
 
 BALANCE_SIZE = 9
 CELL_SIZES = (("balance", BALANCE_SIZE), ("friction", 2), ("radius", 2))
@@ -131,11 +138,12 @@ class OppositePads:
         # Moments about pad 2: (p_1 - p_2) x f_1 and the contacts' own make up what is required.
         moment_2 = moment - balance[8] * tangent + wrench[0] * balance[6:8] - balance[3:5]
         about_n = balance[5] - cross_2(balance[6:8], tangent) - friction[0] * radius[0] * wrench[5]
+        over_mu, over_r = reciprocal(friction[1]), reciprocal(radius[1])
         return ca.vertcat(
             wrench[0] - balance[0],
-            (balance[1:3] - tangent) / friction[1],
-            moment_2 / radius[1],
-            about_n / (friction[1] * radius[1]),
+            (balance[1:3] - tangent) * over_mu,
+            moment_2 * over_r,
+            about_n * (over_mu * over_r),
         )
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
@@ -147,19 +155,21 @@ class OppositePads:
         return ca.sumsqr(ca.vertcat(*forces)) / 2.0
 
     def start(self, cell: list[ca.SX]) -> list[ca.SX]:
-        """Wrenches well within both cones, from pressing hard."""
+        """Wrenches within both cones, pressed as hard as what else they carry asks."""
         balance, friction, radius = cell
-        _, tilt, about_n = _shared_evenly(cell)
+        # Tangential forces that leave little moment to be carried: least squares, scaled.
+        over_mu_1, over_mu_2 = 1.0 / friction[0] ** 2, 1.0 / friction[1] ** 2
+        lever = balance[8] / ca.sum1(radius)
+        by_lever = lever / ca.sum1(radius)
+        tangent = (over_mu_2 * balance[1:3] - by_lever * balance[3:5]) / (
+            over_mu_1 + over_mu_2 + lever**2
+        )
+        lighter = ca.fmax(balance[0], 0.0)
+        asked = [_length(wrench[1:]) for wrench in _shared(cell, tangent, lighter)]
         # The squeeze itself tilts the box where the pads do not face one another.
         overlap = 1.0 - _length(balance[6:8]) / ca.sum1(radius)
-        asked = (
-            _length(balance[1:3]) / ca.sum1(friction)
-            + _length(tilt) / ca.sum1(radius)
-            + ca.fabs(about_n) / ca.sum1(friction * radius)
-            + ca.fabs(balance[0])
-            + START_FLOOR
-        )
-        return _evenly(cell, 2.0 * asked / overlap + ca.fmax(balance[0], 0.0))
+        pressed = LOWEST * ca.fmax(*asked) / (START_SHARE * overlap) + START_FLOOR
+        return _shared(cell, tangent, pressed + lighter)
 
 
 def even_slack(balance: ca.SX, friction: ca.SX, radius: ca.SX, n_1: ca.SX) -> ca.SX:
@@ -183,20 +193,18 @@ def even_slack(balance: ca.SX, friction: ca.SX, radius: ca.SX, n_1: ca.SX) -> ca
     return ca.mmin(ca.vertcat(*left))
 
 
-def _shared_evenly(cell: list[ca.SX]) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Tangential force of contact 1 in proportion to friction; the moments in the contact plane,
-    but for the squeeze's, and about n that then are to be carried."""
-    balance, friction, _ = cell
-    tangent = friction[0] / ca.sum1(friction) * balance[1:3]
-    about_n = balance[5] - cross_2(balance[6:8], tangent)
-    return tangent, balance[8] * tangent + balance[3:5], about_n
-
-
 def _evenly(cell: list[ca.SX], n_1: ca.SX) -> list[ca.SX]:
-    """Scaled wrenches (6,) of both contacts under a normal force of contact 1, moments in
-    proportion to radii and torsion to friction times radius."""
+    """`_shared` with tangential forces in proportion to friction."""
+    balance, friction, _ = cell
+    return _shared(cell, friction[0] / ca.sum1(friction) * balance[1:3], n_1)
+
+
+def _shared(cell: list[ca.SX], tangent: ca.SX, n_1: ca.SX) -> list[ca.SX]:
+    """Scaled wrenches (6,) of both contacts under a normal force and a tangential force (2,) of
+    contact 1, moments in proportion to radii and torsion to friction times radius."""
     balance, friction, radius = cell
-    tangent, tilt, about_n = _shared_evenly(cell)
+    tilt = balance[8] * tangent + balance[3:5]
+    about_n = balance[5] - cross_2(balance[6:8], tangent)
     # A share over the contact's own friction or radius is the whole over the sum of both.
     first = ca.vertcat(
         n_1,

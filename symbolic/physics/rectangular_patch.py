@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from symbolic.expression import reciprocal
 from symbolic.physics.closure import POINT_SIZE, STATE_SIZE, WRENCH_SIZE, corner_modes
 from symbolic.physics.elimination import Elimination
 from symbolic.physics.patches import BarrierPatch, StateStep, least
@@ -83,7 +84,7 @@ class RectangularPatch:
         x, y = self.half_x / radius, self.half_y / radius
         n, t_x, t_y, q_x, q_y, m, n_xy, x_x, x_xy, y_y, y_xy, more = ca.vertsplit(state)
         return [
-            [n, q_x / x, q_y / y, n_xy],
+            [n, q_x * (1.0 / x), q_y * (1.0 / y), n_xy],
             [t_x, x_x, x * more - y * m, x_xy],
             [t_y, x * m + y * more, y_y, y_xy],
         ]
@@ -93,7 +94,7 @@ class RectangularPatch:
         radius = (self.half_x**2 + self.half_y**2) ** 0.5
         x, y = self.half_x / radius, self.half_y / radius
         (n, n_x, n_y, n_xy), (t_x, x_x, x_y, x_xy), (t_y, y_x, y_y, y_xy) = waves
-        outer = [n, t_x, t_y, n_x / x, n_y / y, x * y_x - y * x_y]
+        outer = [n, t_x, t_y, n_x * (1.0 / x), n_y * (1.0 / y), x * y_x - y * x_y]
         return [*outer, n_xy, x_x, x_xy, y_y, y_xy, x * x_y + y * y_x]
 
 
@@ -136,7 +137,7 @@ class LocalRectangle:
         """
         parts, waves = range(POINT_SIZE), range(WAVES)
         sums = [
-            [_wave_sums([stiff[i, j] / WAVES**2 for stiff in self.stiff]) for j in range(i + 1)]
+            [_wave_sums([stiff[i, j] * WAVES**-2 for stiff in self.stiff]) for j in range(i + 1)]
             for i in parts
         ]
 
@@ -160,7 +161,7 @@ class RectangleAim:
         """From what the multipliers become where nothing moves, per corner."""
         self._local, self._given = local, given
         waves = [_wave_sums([g[i] for g in given]) for i in range(POINT_SIZE)]
-        whole = [value / WAVES for value in local.patch.gathered(waves)]
+        whole = [value * (1.0 / WAVES) for value in local.patch.gathered(waves)]
         self._reduced = local.eliminated(whole)
         self.pull = ca.vertcat(*self._reduced[WRENCH_SIZE:])
 
@@ -203,7 +204,7 @@ def corners_of(waves: list[list[ca.SX]]) -> list[ca.SX]:
     """The corners' forces (3,) from `RectangularPatch.waves`."""
     sums = [_wave_sums(wave) for wave in waves]
     # Corners (+, +), (-, +), (-, -), (+, -) have these waves' signs in common with the waves.
-    return [ca.vertcat(*[each[k] for each in sums]) / WAVES for k in (0, 3, 1, 2)]
+    return [ca.vertcat(*[each[k] for each in sums]) * (1.0 / WAVES) for k in (0, 3, 1, 2)]
 
 
 def _wave_sums(values: list[ca.SX]) -> list[ca.SX]:
@@ -215,7 +216,7 @@ def _wave_sums(values: list[ca.SX]) -> list[ca.SX]:
 
 
 def _inverse(f: ca.SX) -> ca.SX:
-    return _J * f / _determinant(f)
+    return _J * f * reciprocal(_determinant(f))
 
 
 def _determinant(f: ca.SX) -> ca.SX:
@@ -235,6 +236,6 @@ def _product(a: ca.SX, b: ca.SX, c: ca.SX) -> ca.SX:
 
 def _lowest(f: ca.SX, move: ca.SX) -> ca.SX:
     """What a move adds to the lower eigenvalue of a corner's matrix, over the matrix."""
-    over = 1.0 / _determinant(f)
+    over = reciprocal(_determinant(f))
     mean = ca.dot(f, _J * move) * over
     return mean - ca.sqrt(ca.fmax(mean**2 - _determinant(move) * over, 0.0))

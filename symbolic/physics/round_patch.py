@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from symbolic.expression import reciprocal
 from symbolic.physics import hermitian
 from symbolic.physics.closure import WRENCH_SIZE
 from symbolic.physics.elimination import Elimination
@@ -88,7 +89,7 @@ class LocalDisc:
         self.multiplier = Hermitian.of(ca.vertcat(*numbers[:-1], 0.0, numbers[-1]))
         self.gap = self.matrix.trace_with(self.multiplier)
         self.adjugate = self.matrix.adjugate()
-        self.inverse = self.adjugate.scaled(1.0 / self.matrix.determinant(self.adjugate))
+        self.inverse = self.adjugate.scaled(reciprocal(self.matrix.determinant(self.adjugate)))
         self.multiplier_adjugate = self.multiplier.adjugate()
         self._elimination = Elimination(_stiffness(self.inverse, self.multiplier), 1)
         self.stiffness = ca.vertcat(*[ca.horzcat(*row) for row in self._elimination.left])
@@ -137,7 +138,7 @@ class DiscStep:
         for k in (0, 1):
             terms = [times(by_row[k][j], local.multiplier.at(j, k))[0] for j in range(3)]
             shares.append(given.diagonal[k] - sum(terms))
-        half = left / 2.0
+        half = 0.5 * left
         target = Hermitian(
             (shares[0], shares[1], left[0] - shares[0] - shares[1]),
             ((half[3], half[4]), (half[1], half[2]), (ca.SX(0.0), half[5])),
@@ -239,13 +240,13 @@ def _lowest(matrix: Hermitian, adjugate: Hermitian, change: Hermitian) -> ca.SX:
     least of which is -2 s cos(a / 3), cos(a) = q / (2 s^3): a smooth function of sin((pi - a) / 2),
     for which a cubic from above stands.
     """
-    over = 1.0 / matrix.determinant(adjugate)
+    over = reciprocal(matrix.determinant(adjugate))
     of_change = change.adjugate()
     trace = adjugate.trace_with(change) * over
     minors = matrix.trace_with(of_change) * over
     product = change.determinant(of_change) * over
-    mean = trace / 3.0
-    s = ca.sqrt(ca.fmax(mean**2 - minors / 3.0, LEAST_SPREAD))
+    mean = trace * (1.0 / 3.0)
+    s = ca.sqrt(ca.fmax(mean**2 - minors * (1.0 / 3.0), LEAST_SPREAD))
     q = ((mean - trace) * mean + minors) * mean - product
     v = ca.sqrt(ca.fmin(ca.fmax(0.5 + q / (4.0 * s**3), 0.0), 1.0))
     c_0, c_1, c_2, c_3 = COSINE

@@ -147,6 +147,16 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     )
 
 
+def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
+    """Joints (n,), extended pose and wrench as of `track_function` to its joint_torque (n,)."""
+    q, pose = ca.SX.sym("q", model.n_joints), ca.SX.sym("pose", model.pose_size)
+    wrench = ca.SX.sym("wrench", 6)
+    rotation = rotation_matrix(model.orientation, pose[3:6])
+    _, _, jacobian = model.kinematics(q)
+    torque = joint_torque(robot, contact, jacobian, rotation, wrench)
+    return _function(name, [q, pose, wrench], [torque])
+
+
 def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str, ca.Function]:
     """The steps of `track_function`; those that begin with a condition do nothing without it.
 

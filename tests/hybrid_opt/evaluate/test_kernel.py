@@ -16,10 +16,18 @@ from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.kernel import Kernel, load_kernel
 from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
 from symbolic.array import Array
-from symbolic.functions.candidate import SAMPLE_NAMES, sample_functions, sample_sizes
+from symbolic.functions.candidate import (
+    SAMPLE_NAMES,
+    force_sizes,
+    sample_functions,
+    sample_sizes,
+)
+from symbolic.workcell.decision import initial_decision
 from symbolic.workcell.file import load
 from tests.hybrid_opt.evaluate.test_evaluation import TRANSFER, candidates
 from tests.symbolic.cells import RACK, hand_model
+
+UNEVEN = RACK.parent / "uneven.toml"
 
 FIELDS = ("objectives", "penalised", "feasible", "reason", "position", "violation_time")
 
@@ -145,6 +153,27 @@ def test_a_candidate_that_is_no_number_disturbs_no_other() -> None:
 def test_every_objective_gets_what_it_needs(objectives: tuple[str, ...]) -> None:
     x = mixed(RACK, 30, 6)
     assert_same(fused(RACK, objectives).evaluate(x), stepwise(RACK, objectives).evaluate(x))
+
+
+@pytest.mark.parametrize("lanes", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_forces_that_come_last_are_those_of_one_by_one(lanes: int) -> None:
+    """Where a program finds them: of all where that is wanted, else of what violates nothing."""
+    x, ours, made = mixed(UNEVEN, 21, 7), fused(UNEVEN), kernel(UNEVEN, lanes)
+    x[::4] = initial_decision(ours.workcell.task)
+    whole, names = one_by_one(ours.outputs(x), ours.checker), tuple(SAMPLE_NAMES)
+    assert_same_samples(made.evaluate(x, names, all_forces=True), whole)
+    found = made.evaluate(x, names, threads=2)
+    kept = (found.first_reason < 0) & ~found.colliding.any(axis=1)
+    assert 5 < np.count_nonzero(kept) < 21
+    for name in force_sizes(ours.workcell).keys() & SAMPLE_NAMES:
+        np.testing.assert_array_equal(found.outputs[name][kept], whole.outputs[name][kept], name)
+        assert not found.outputs[name][~kept].any(), name
+    for name in ("violation", "violation_time", "q_1", "constraint"):
+        np.testing.assert_array_equal(found.outputs[name][kept], whole.outputs[name][kept], name)
+    np.testing.assert_array_equal(found.colliding, whole.colliding)
+    verdicts, expected = ours.evaluate(x), stepwise(UNEVEN).evaluate(x)
+    for name in ("penalised", "feasible", "reason", "position", "violation", "violation_time"):
+        np.testing.assert_array_equal(getattr(verdicts, name), getattr(expected, name), name)
 
 
 def test_sizes_are_those_of_the_functions() -> None:
