@@ -176,25 +176,28 @@ class RobustModel:
         step = max(1, BATCH // len(motion.pose))
         while left:
             cases = random_cases(self.workcell, force.uncertainty, min(step, left), rng)
-            share = self._shares(motion, force, cases)
+            # Only what needs more than the closest so far can say more; beyond 1 all are counted.
+            share = self._shares(motion, force, cases, min(closest, 1.0))
             failing += int((share > 1.0 + HOLDS).sum())
             closest = max(closest, float(share.max()))
             left -= len(cases)
         return SampledCheck(n, failing, closest)
 
-    def _shares(self, motion: HeldMotion, force: RobustForce, cases: Array) -> Array:
-        """(k,) largest share of the commanded force that each case needs; `SCREENED` for less."""
+    def _shares(
+        self, motion: HeldMotion, force: RobustForce, cases: Array, screened: float
+    ) -> Array:
+        """(k,) largest share of the commanded force that each case needs; `screened` for less."""
         n, k = len(motion.pose), len(cases)
         parts = (motion.pose, motion.rate, motion.second_rate)
         rows = tuple(np.tile(values, (k, 1)) for values in parts)
         repeated = np.repeat(cases, n, axis=0)
         commanded, follower = np.tile(force.commanded, k), 1 - force.leader
-        left = ~self._cases.surely_held(rows, repeated, SCREENED * commanded, force.leader)
-        share = np.full(n * k, SCREENED)
+        left = ~self._cases.surely_held(rows, repeated, screened * commanded, force.leader)
+        share = np.full(n * k, screened)
         if left.any():
             some = tuple(values[left] for values in rows)
             needed = self._cases.least(some, repeated[left], force.leader)
-            share[left] = np.maximum(SCREENED, needed[:, follower] / commanded[left])
+            share[left] = np.maximum(screened, needed[:, follower] / commanded[left])
         return np.asarray(share.reshape(k, n).max(axis=1))
 
     def price(
