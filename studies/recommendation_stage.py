@@ -120,17 +120,18 @@ def recommend_from(
         export=export_command(Path(file), found.force),
         considered=len(drivable.x),
         durations=_force_table(cell, drivable, others, found),
-        price=_price(found.carry, campaign.configuration.settings.seed),
+        price=_price(found.carry, campaign.configuration.settings.seed, threads),
     )
     return stored_recommendation(found, told)
 
 
-def _price(carry: ho.Carry, seed: int) -> StoredPrice | None:
+def _price(carry: ho.Carry, seed: int, threads: int) -> StoredPrice | None:
     """What robustness costs the recommended carry; None where no set leaves friction and patches,
     and where the pads cannot hold whatever happens."""
     try:
         model = robust_model(carry.workcell)
-        return stored_price(robust_price(model, carry, np.random.default_rng(seed), LEADER))
+        rng = np.random.default_rng(seed)
+        return stored_price(robust_price(model, carry, rng, LEADER, threads=threads))
     except SettingsError:
         return None
 

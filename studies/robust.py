@@ -64,7 +64,7 @@ def _run(options: argparse.Namespace) -> int:
     factors = factors[factors < model.allowed_factor]
     price = model.price(carry, factors, leader)
     largest = model.largest_factor(carry, reference, leader)
-    check = model.check(carry, held, options.cases, np.random.default_rng(options.seed))
+    check = model.check(carry, held, options.cases, np.random.default_rng(options.seed), threads=0)
     print(f"{cell.workcell.name}: arm {options.leader} leads, the other's force is commanded")
     print(f"  least peak forces, nothing uncertain {_both(held.nominal.max(axis=0))} N")
     print(f"  peak forces that hold in all cases   {_both(held.peak)} N")

@@ -43,7 +43,9 @@ class CaseForces:
                 for function in (case_squeeze_function, case_slack_function)
             ]
 
-    def least(self, motion: tuple[Array, ...], cases: Array, leader: int) -> Array:
+    def least(
+        self, motion: tuple[Array, ...], cases: Array, leader: int, threads: int = 1
+    ) -> Array:
         """(m, 2) least normal forces [N]: what is to be commanded of one robot, and what the
         leading one then presses with.
 
@@ -51,19 +53,25 @@ class CaseForces:
             motion: poses and their time derivatives (m, 6) each.
             cases: (m, 15).
             leader: index of the robot whose force is not commanded.
+            threads: 0 for one per core.
         """
         function = self._functions(1 - leader)[0]
-        return function.batch(*motion, cases)["normal_force"]
+        return function.batch(*motion, cases, threads=threads)["normal_force"]
 
     def surely_held(
-        self, motion: tuple[Array, ...], cases: Array, force: Array, leader: int
+        self,
+        motion: tuple[Array, ...],
+        cases: Array,
+        force: Array,
+        leader: int,
+        threads: int = 1,
     ) -> NDArray[np.bool_]:
         """(m,) whether a pressure that is known beforehand holds under commanded forces (m,) [N];
         where not, another one still may."""
         slack = self._functions(1 - leader)[1]
         arm = (float(1 - leader),) if self.workcell.has_facing_pads else ()
-        found = slack.batch(*motion, cases, force, *arm)["slack"].ravel() > 0.0
-        return np.asarray(found, dtype=np.bool_)
+        found = slack.batch(*motion, cases, force, *arm, threads=threads)["slack"]
+        return np.asarray(found.ravel() > 0.0, dtype=np.bool_)
 
     def leading_share(self, leader: int) -> float:
         """What the leading robot presses more for each newton more that is commanded."""

@@ -169,22 +169,40 @@ class RobustModel:
         return RobustForce(leader, chosen, nominal, commanded, leading)
 
     def check(
-        self, motion: HeldMotion, force: RobustForce, n: int, rng: np.random.Generator
+        self,
+        motion: HeldMotion,
+        force: RobustForce,
+        n: int,
+        rng: np.random.Generator,
+        threads: int = 1,
     ) -> SampledCheck:
-        """Hold n random cases of the set against the commanded forces, at every sample."""
+        """Hold n random cases of the set against the commanded forces, at every sample.
+
+        Args:
+            motion: whose forces they are.
+            force: what is commanded.
+            n: how many cases.
+            rng: draws them.
+            threads: 0 for one per core; has no influence on what is found.
+        """
         failing, closest, left = 0, SCREENED, n
         step = max(1, BATCH // len(motion.pose))
         while left:
             cases = random_cases(self.workcell, force.uncertainty, min(step, left), rng)
             # Only what needs more than the closest so far can say more; beyond 1 all are counted.
-            share = self._shares(motion, force, cases, min(closest, 1.0))
+            share = self._shares(motion, force, cases, min(closest, 1.0), threads)
             failing += int((share > 1.0 + HOLDS).sum())
             closest = max(closest, float(share.max()))
             left -= len(cases)
         return SampledCheck(n, failing, closest)
 
     def _shares(
-        self, motion: HeldMotion, force: RobustForce, cases: Array, screened: float
+        self,
+        motion: HeldMotion,
+        force: RobustForce,
+        cases: Array,
+        screened: float,
+        threads: int,
     ) -> Array:
         """(k,) largest share of the commanded force that each case needs; `screened` for less."""
         n, k = len(motion.pose), len(cases)
@@ -192,11 +210,12 @@ class RobustModel:
         rows = tuple(np.tile(values, (k, 1)) for values in parts)
         repeated = np.repeat(cases, n, axis=0)
         commanded, follower = np.tile(force.commanded, k), 1 - force.leader
-        left = ~self._cases.surely_held(rows, repeated, screened * commanded, force.leader)
+        enough = screened * commanded
+        left = ~self._cases.surely_held(rows, repeated, enough, force.leader, threads)
         share = np.full(n * k, screened)
         if left.any():
             some = tuple(values[left] for values in rows)
-            needed = self._cases.least(some, repeated[left], force.leader)
+            needed = self._cases.least(some, repeated[left], force.leader, threads)
             share[left] = np.maximum(screened, needed[:, follower] / commanded[left])
         return np.asarray(share.reshape(k, n).max(axis=1))
 

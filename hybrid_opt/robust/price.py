@@ -61,6 +61,7 @@ def robust_price(
     rng: np.random.Generator,
     leader: int = 0,
     cases: int = CASES,
+    threads: int = 1,
 ) -> RobustPrice:
     """What robustness against the workcell's set costs a carry; against `USUAL` without one.
 
@@ -69,6 +70,7 @@ def robust_price(
         rng: draws the random cases.
         leader: index of the arm that keeps its place.
         cases: how many.
+        threads: that hold them against the forces, 0 for one per core.
 
     Raises:
         SettingsError: the set leaves no friction or patch, or there is no such arm.
@@ -87,7 +89,7 @@ def robust_price(
         commanded=force.peak,
         limit=limit,
         largest_factor=model.largest_factor(motion, limit, leader, uncertainty),
-        check=model.check(motion, force, cases, rng),
+        check=model.check(motion, force, cases, rng, threads),
     )
 
 

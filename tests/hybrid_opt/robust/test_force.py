@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hybrid_opt.evaluate.objectives import OBJECTIVES
-from hybrid_opt.robust.cases import worst_cases
-from hybrid_opt.robust.force import BoxMotion, RobustModel, allowed_factor
+from hybrid_opt.robust.cases import random_cases, worst_cases
+from hybrid_opt.robust.force import BATCH, SCREENED, BoxMotion, RobustModel, allowed_factor
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Uncertainty, Workcell
@@ -83,6 +83,20 @@ def test_no_random_case_needs_more_and_some_need_nearly_as_much() -> None:
     assert 0.9 < check.closest <= 1.0
     weaker = replace(force, commanded=0.9 * force.commanded)
     assert not model().check(motion(), weaker, 3000, rng).holds
+
+
+def test_the_closest_case_is_that_of_every_case_at_every_sample() -> None:
+    """In several turns, of which each looks only at what is closer than those before."""
+    moved = motion()
+    force = model().robust_force(moved)
+    n = 3 * BATCH // len(moved.pose)
+    check = model().check(moved, force, n, np.random.default_rng(5))
+    assert model().check(moved, force, n, np.random.default_rng(5), threads=2) == check
+    rng, step = np.random.default_rng(5), BATCH // len(moved.pose)
+    parts = [random_cases(model().workcell, SET, min(step, n - k), rng) for k in range(0, n, step)]
+    needed = model().least_squeeze(moved, np.concatenate(parts), force.leader)
+    share = needed[:, :, 1 - force.leader] / force.commanded
+    assert check.closest == share.max() > SCREENED
 
 
 @pytest.mark.slow
