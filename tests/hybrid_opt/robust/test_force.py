@@ -10,7 +10,14 @@ import pytest
 
 from hybrid_opt.evaluate.objectives import OBJECTIVES
 from hybrid_opt.robust.cases import random_cases, worst_cases
-from hybrid_opt.robust.force import BATCH, SCREENED, BoxMotion, RobustModel, allowed_factor
+from hybrid_opt.robust.force import (
+    BATCH,
+    HOLDS,
+    SCREENED,
+    BoxMotion,
+    RobustModel,
+    allowed_factor,
+)
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Uncertainty, Workcell
@@ -85,18 +92,21 @@ def test_no_random_case_needs_more_and_some_need_nearly_as_much() -> None:
     assert not model().check(motion(), weaker, 3000, rng).holds
 
 
-def test_the_closest_case_is_that_of_every_case_at_every_sample() -> None:
+@pytest.mark.parametrize("factor", [0.98, 0.95])
+def test_the_closest_case_is_that_of_every_case_at_every_sample(factor: float) -> None:
     """In several turns, of which each looks only at what is closer than those before."""
-    moved = motion()
+    moved, rng = motion(), np.random.default_rng(5)
     force = model().robust_force(moved)
-    n = 3 * BATCH // len(moved.pose)
-    check = model().check(moved, force, n, np.random.default_rng(5))
-    assert model().check(moved, force, n, np.random.default_rng(5), threads=2) == check
-    rng, step = np.random.default_rng(5), BATCH // len(moved.pose)
-    parts = [random_cases(model().workcell, SET, min(step, n - k), rng) for k in range(0, n, step)]
-    needed = model().least_squeeze(moved, np.concatenate(parts), force.leader)
-    share = needed[:, :, 1 - force.leader] / force.commanded
+    force = replace(force, commanded=factor * force.commanded)
+    step = BATCH // len(moved.pose)
+    check = model().check(moved, force, 3 * step, np.random.default_rng(5))
+    assert model().check(moved, force, 3 * step, np.random.default_rng(5), threads=2) == check
+    cases = np.concatenate([random_cases(model().workcell, SET, step, rng) for _ in range(3)])
+    needed = model().least_squeeze(moved, cases, force.leader)[:, :, 1 - force.leader]
+    share = (needed / force.commanded).max(axis=1)
     assert check.closest == share.max() > SCREENED
+    assert check.failing == (share > 1.0 + HOLDS).sum()
+    assert check.holds == (factor > 0.965)
 
 
 @pytest.mark.slow
