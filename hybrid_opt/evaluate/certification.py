@@ -90,3 +90,10 @@ def certificates(
         samples = [np.linspace(0.0, 1.0, len(path.q_1)) for path in some]
         found += certify_all(checker, partial(configurations, some, posture), samples)
     return found
+
+
+def failed_at(certificate: Certificate) -> float | None:
+    """Path parameter where a carry is not proven free, None where it is throughout."""
+    if certificate.is_free:
+        return None
+    return 0.0 if certificate.lost else certificate.at_parameter

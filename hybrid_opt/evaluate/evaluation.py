@@ -14,13 +14,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry
 from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificates
+from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificates, failed_at
 from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
 from hybrid_opt.evaluate.evaluations import (
     BETWEEN_SAMPLES,
@@ -31,6 +32,7 @@ from hybrid_opt.evaluate.evaluations import (
     Evaluations,
 )
 from hybrid_opt.evaluate.kernel import Kernel, load_kernel
+from hybrid_opt.evaluate.known_proofs import KnownProofs
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective, select_objectives
 from hybrid_opt.evaluate.sampled import SampledVerdicts, collision_shares, one_by_one
 from hybrid_opt.evaluate.time_law import carry_under_time_law
@@ -95,6 +97,7 @@ class CandidateEvaluator:
         self._needs = _needs(self.objectives)
         self._kernel: Kernel | None = None
         self._begin: Array | None = None
+        self._proofs = KnownProofs()
         if functions is None and self.driver is None:
             self._kernel = load_kernel(self.compiled, self.checker, self.outputs)
 
@@ -120,6 +123,7 @@ class CandidateEvaluator:
             )
         other = copy(self)
         other._begin = np.concatenate([q_1, q_2]).astype(float)
+        other._proofs = KnownProofs()
         return other
 
     def outputs(self, x: Array) -> dict[str, Array]:
@@ -224,8 +228,7 @@ class CandidateEvaluator:
             unproven = np.flatnonzero(front & ~proven)
             if len(unproven) == 0:
                 break
-            paths = self._paths(np.ascontiguousarray(evaluations.x[unproven]))
-            failures = self._failures_between_samples(paths)
+            failures = self._failures_between_samples(evaluations.x[unproven])
             for row, failure in zip(unproven.tolist(), failures, strict=True):
                 proven[row] = failure is None
                 if failure is not None:
@@ -240,11 +243,16 @@ class CandidateEvaluator:
             violation=violation,
         )
 
-    def _failures_between_samples(self, paths: Sequence[SampledPath | None]) -> list[float | None]:
-        """Path parameter where a carry is not proven free, None where it is throughout."""
-        known = [path for path in paths if path is not None]
-        verdicts = iter(certificates(self.checker, self.functions["posture"], known))
-        return [0.0 if path is None else _failure(next(verdicts)) for path in paths]
+    def _failures_between_samples(self, x: Array) -> list[float | None]:
+        """Path parameter where carries (n, n_var) are not proven free, None where one is."""
+
+        def find(rows: NDArray[np.intp]) -> list[float | None]:
+            paths = self._paths(x[rows])
+            known = [path for path in paths if path is not None]
+            verdicts = iter(certificates(self.checker, self.functions["posture"], known))
+            return [0.0 if path is None else failed_at(next(verdicts)) for path in paths]
+
+        return self._proofs.failures(x[:, : self.workcell.task.n_path], find)
 
     def _checked(self, x: Array) -> Array:
         x = np.ascontiguousarray(np.atleast_2d(x), dtype=float)
@@ -311,13 +319,6 @@ class CandidateEvaluator:
             violation,
             violation_time,
         )
-
-
-def _failure(certificate: Certificate) -> float | None:
-    """Path parameter where a carry is not proven free, None where it is throughout."""
-    if certificate.is_free:
-        return None
-    return 0.0 if certificate.lost else certificate.at_parameter
 
 
 def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:

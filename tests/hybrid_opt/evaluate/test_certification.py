@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from codegen.function import NumericFunction
 from hybrid_opt import metaheuristics
+from hybrid_opt.collision.certify import Certificate
+from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.evaluate.certification import (
     LostPathError,
     SampledPath,
@@ -21,7 +27,7 @@ from symbolic.array import Array
 from symbolic.physics.pose import inverse, pose_matrix
 from symbolic.robot.arm import box_flange
 from symbolic.robot.model import build_robot_model
-from symbolic.workcell.decision import extended_waypoints
+from symbolic.workcell.decision import extended_waypoints, initial_decision
 from symbolic.workcell.file import load
 from tests.symbolic.workcell.samples import RACK
 
@@ -141,3 +147,32 @@ def test_every_member_of_a_certified_front_is_proven_free(evaluator: CandidateEv
     # What the search saw stays; a second pass changes nothing.
     np.testing.assert_array_equal(after.penalised, before.penalised)
     np.testing.assert_array_equal(evaluator.certified(after).feasible, after.feasible)
+
+
+def test_carries_that_share_a_path_are_certified_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under the drivable law only force limits tell them apart."""
+    task = replace(load(RACK).task, time_law="optimal")
+    cell = replace(load(RACK), task=task)
+    evaluator = CandidateEvaluator(cell, ("duration", "peak_force"))
+    touching = np.array(task.initial).reshape(-1)
+    touching[: task.n_path] += np.random.default_rng(3).normal(0.0, 1e-3, task.n_path)
+    x = np.repeat([initial_decision(task), np.append(touching, 60.0)], 3, axis=0)
+    x[:, -1] = np.tile([54.0, 57.0, 60.0], 2)
+    certified = list[SampledPath]()
+
+    def counting(
+        checker: CollisionChecker, posture: NumericFunction, paths: Sequence[SampledPath]
+    ) -> list[Certificate]:
+        certified.extend(paths)
+        verdicts = certificates(checker, posture, paths)
+        moved = np.array([path.waypoints for path in paths]) != extended_waypoints(task, x[0])
+        return [
+            replace(verdict, is_free=False, at_parameter=0.25) if other.any() else verdict
+            for verdict, other in zip(verdicts, moved, strict=True)
+        ]
+
+    monkeypatch.setattr("hybrid_opt.evaluate.evaluation.certificates", counting)
+    found = [evaluator.certified(evaluator.evaluate(one)) for one in x]
+    assert [bool(one.feasible[0]) for one in found] == [True] * 3 + [False] * 3
+    assert all(one.position[0] == 0.25 for one in found[3:])
+    assert len(certified) == 2
