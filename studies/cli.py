@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn, get_args
 
@@ -14,13 +15,13 @@ from hybrid_opt.campaign.execution import ExecutorName
 from hybrid_opt.campaign.settings import FirstGeneration
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.metaheuristics.problem import ConstraintHandling
-from hybrid_opt.polishing.settings import DRIVABLE_ATTEMPTS, PolishSettings
+from hybrid_opt.polishing.settings import DRIVABLE_ATTEMPTS, PolishSettings, quick_settings
 from hybrid_opt.recommending.wish import Wish
 from symbolic.errors import SettingsError
 
 _DEFAULT = CampaignSettings()
 
-QUICK_EVALUATIONS, QUICK_REPLICAS, QUICK_POLISH_ATTEMPTS = 300, 2, 2
+QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 2
 """Of a small but complete study."""
 
 
@@ -46,7 +47,8 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         "--quick",
         action="store_true",
         help=f"a small but complete study: {QUICK_REPLICAS} replicas of {QUICK_EVALUATIONS} "
-        "evaluations where no other numbers are given, its pictures as PNG only (default: off)",
+        "evaluations where no other numbers are given, polished to half as many points in fewer "
+        "attempts, its pictures as PNG only (default: off)",
     )
     search.add_argument(
         "--evaluations",
@@ -120,7 +122,7 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         metavar="N",
         help="attempts that the polish of one front may take before it is filled between its ends "
         f"(default: {PolishSettings().attempts}, for a drivable one {DRIVABLE_ATTEMPTS}, "
-        f"with --quick {QUICK_POLISH_ATTEMPTS})",
+        f"with --quick {quick_settings().attempts})",
     )
     after.add_argument(
         "--drivable",
@@ -226,24 +228,22 @@ def campaign_settings(
 
 
 def polish_settings(
-    options: argparse.Namespace, usual: bool, attempts: int | None = None
+    options: argparse.Namespace, usual: bool, settings: PolishSettings
 ) -> PolishSettings | None:
     """How the options want fronts polished, None for not at all.
 
     Args:
         usual: whether they are polished where the options do not say.
-        attempts: at one front likewise.
+        settings: where they say nothing of them.
 
     Raises:
         SettingsError: a value is not allowed.
     """
     if not (usual if options.polish is None else options.polish):
         return None
-    if options.polish_attempts is not None:
-        attempts = options.polish_attempts
-    elif options.quick:
-        attempts = QUICK_POLISH_ATTEMPTS
-    return PolishSettings() if attempts is None else PolishSettings(attempts=attempts)
+    chosen = quick_settings() if options.quick else settings
+    asked = options.polish_attempts
+    return chosen if asked is None else replace(chosen, attempts=asked)
 
 
 def wish(options: argparse.Namespace) -> Wish:

@@ -31,7 +31,7 @@ def main(
     # Imported only now: meanwhile the server of the workers loads much of the same.
     from hybrid_opt.campaign import Progress
     from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, FORCE_PAIRS, PAPER_OBJECTIVES
-    from hybrid_opt.polishing.settings import DRIVABLE_ATTEMPTS
+    from hybrid_opt.polishing.settings import usual_settings
     from hybrid_opt.witness.outcome import mujoco_module
     from studies.cli import (
         campaign_parser,
@@ -67,9 +67,9 @@ def main(
         polishable = alone or (not driven and settings.objectives in FORCE_PAIRS)
         execution = execution_settings(options, Path("results") / path.stem)
         study = StudySettings(
-            polish=polish_settings(options, polishable, DRIVABLE_ATTEMPTS if alone else None),
+            polish=polish_settings(options, polishable, usual_settings(cell.task.time_law)),
             drivable=options.drivable,
-            drivable_polish=polish_settings(options, True, DRIVABLE_ATTEMPTS),
+            drivable_polish=polish_settings(options, True, usual_settings("optimal")),
             wish=wish(options),
             simulate=options.simulate,
             report=options.report,

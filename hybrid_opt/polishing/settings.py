@@ -313,3 +313,13 @@ DRIVABLE_ATTEMPTS = 10
 def usual_settings(time_law: str) -> PolishSettings:
     """The settings where nothing else is asked for."""
     return PolishSettings(attempts=DRIVABLE_ATTEMPTS) if time_law == "optimal" else PolishSettings()
+
+
+def quick_settings() -> PolishSettings:
+    """Settings of a small study: fronts of half as many points from fewer attempts, and a shorter
+    tournament, after which one replica of eight stayed in a slower basin (docs/drivable.md)."""
+    return PolishSettings(
+        attempts=2,
+        fill=FillSettings(members=25),
+        drivable=DrivableSettings(turn=1, members=12),
+    )
