@@ -9,17 +9,16 @@ speeds are passed a little earlier or later, is mended by slowing down uniformly
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import cache
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import JobError
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.records import Timing
-from hybrid_opt.timing.use import limit_use, worst
+from hybrid_opt.timing.records import Excess, Timing
+from hybrid_opt.timing.use import limit_ratios, use_of, worst
 from symbolic.array import Array
 
 WIDTH = 0.05
@@ -42,6 +41,12 @@ _SLOWER = (0.95, 0.5)
 
 _RESOLUTION = 1e-4
 """Of the factor by which a timing is slowed."""
+
+_UNUSED = 1e-4
+"""Share of the limit used most that may be left unused."""
+
+_INSIDE = 0.01
+"""Share of an interval of factors that is kept from its ends."""
 
 
 def rests_at_ends(timing: Timing) -> bool:
@@ -75,32 +80,85 @@ def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing
     motion = model.path_motion(carry.x).between(u)
     limits = timing.limits
 
-    def driven(factor: float) -> Carry:
+    def driven(factor: float) -> _Driven:
         time = np.asarray(EVERY * STEP / factor * np.arange(len(u)))
-        return model.carry(motion, time, factor * rate, factor**2 * second)
+        carry = model.carry(motion, time, factor * rate, factor**2 * second)
+        ratios = limit_ratios(carry, model.workcell, limits)
+        return _Driven(factor, carry, ratios, use_of(ratios, carry, model.joint_names))
 
-    @cache
-    def excess(factor: float) -> float:
-        use = limit_use(driven(factor), model.workcell, limits, model.joint_names)
-        return worst(use).ratio - 1.0
-
-    factor = 1.0
-    if excess(factor) > 0.0:
-        slow = next((slower for slower in _SLOWER if excess(slower) <= 0.0), None)
-        if slow is None:
-            raise JobError(
-                "the carry's timing cannot be smoothed within its limits; choose a slower timing"
-            )
-        # A root within _RESOLUTION that lies on the slow side.
-        factor = brentq(excess, slow, 1.0, xtol=_RESOLUTION / 2.0) - _RESOLUTION
-    found = driven(factor)
-    use = limit_use(found, model.workcell, limits, model.joint_names)
-    place = worst(use).place
-    reason = f"{found.duration:.3f} s without jumps of the acceleration; most used: {place}"
-    slowed = timing.slowed * factor
+    found = _fastest(driven)
+    place = worst(found.use).place
+    reason = f"{found.carry.duration:.3f} s without jumps of the acceleration; most used: {place}"
     return replace(
-        timing, reason=reason, place=place, carry=found, use=use, grid_speed=None, slowed=slowed
+        timing,
+        reason=reason,
+        place=place,
+        carry=found.carry,
+        use=found.use,
+        grid_speed=None,
+        slowed=timing.slowed * found.factor,
     )
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """A timing slowed by a factor, and how far it uses its limits."""
+
+    factor: float
+    carry: Carry
+    ratios: dict[str, Array]
+    use: dict[str, Excess]
+
+    @property
+    def excess(self) -> float:
+        return worst(self.use).ratio - 1.0
+
+    @property
+    def columns(self) -> Array:
+        """Every use but that of friction, which is tight by construction."""
+        parts = [ratio.ravel() for name, ratio in self.ratios.items() if name != "friction"]
+        return np.concatenate(parts)
+
+
+def _fastest(driven: Callable[[float], _Driven]) -> _Driven:
+    """What is driven with the largest factor up to 1 that holds the limits.
+
+    Raises:
+        JobError: none does that is not below half.
+    """
+    fast = driven(1.0)
+    if fast.excess <= 0.0:
+        return fast
+    slow = next((found for found in map(driven, _SLOWER) if found.excess <= 0.0), None)
+    if slow is None:
+        raise JobError(
+            "the carry's timing cannot be smoothed within its limits; choose a slower timing"
+        )
+    turn = 0
+    while slow.excess < -_UNUSED and fast.factor - slow.factor > _RESOLUTION:
+        turn += 1
+        # Every third is halfway, in case the guesses come nearer from one side only.
+        middle = (slow.factor + fast.factor) / 2.0
+        between = driven(middle if turn % 3 == 0 else _between(slow, fast))
+        if between.excess <= 0.0:
+            slow = between
+        else:
+            fast = between
+    return slow
+
+
+def _between(slow: _Driven, fast: _Driven) -> float:
+    """A factor between two at which what is exceeded with one of them is used fully.
+
+    Accelerations, forces and torques are nearly affine in the factor's square, so that hardly more
+    than one guess is needed.
+    """
+    low, high, least = slow.columns, fast.columns, 1.0 - _UNUSED / 2.0
+    beyond = (high > least) & (high > low)
+    share = ((least - low[beyond]) / (high[beyond] - low[beyond])).min(initial=1.0)
+    # Not too near either end: what is not affine would hold it there.
+    share = float(np.clip(share, _INSIDE, 1.0 - _INSIDE))
+    return float(np.sqrt(slow.factor**2 + share * (fast.factor**2 - slow.factor**2)))
 
 
 def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from hybrid_opt.carry import Carry
@@ -114,8 +116,17 @@ def limit_use(
     Args:
         joint_names: names of both arms' joints.
     """
-    use = {}
-    for name, ratio in limit_ratios(carry, workcell, limits).items():
+    return use_of(limit_ratios(carry, workcell, limits), carry, joint_names)
+
+
+def use_of(
+    ratios: Mapping[str, Array],
+    carry: Carry,
+    joint_names: tuple[tuple[str, ...], tuple[str, ...]],
+) -> dict[str, Excess]:
+    """`limit_use` where a carry's `limit_ratios` are known."""
+    workcell, use = carry.workcell, {}
+    for name, ratio in ratios.items():
         sample, column = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
         robot, joint = "", ""
         if name in JOINT_CONSTRAINTS:

@@ -7,6 +7,7 @@ import pytest
 
 from hybrid_opt.job.smooth import acceleration_at_ends, rests_at_ends, smoothed
 from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, time_path, time_with_jerk
+from hybrid_opt.timing.use import limit_use, worst
 from symbolic.physics.path import path_basis
 from symbolic.workcell.decision import waypoints_of
 from tests.hybrid_opt.job.jobs import rack, rack_jobs, rack_timing
@@ -48,6 +49,19 @@ def test_a_time_optimal_timing_loses_its_jumps(width: float) -> None:
     assert (np.abs(second) / limit).max() <= 1.005
     torque = np.concatenate([robot.torque_max for robot in cell.robots])
     assert (np.abs(carry.torque) / torque).max() <= 1.005
+
+
+@pytest.mark.parametrize("force", [50.5, 55.0, 60.0])
+@pytest.mark.parametrize("width", [0.03, 0.08])
+def test_it_is_slowed_no_more_than_a_limit_asks_for(force: float, width: float) -> None:
+    model, limits = rack().timing_model, TimingLimits(force=force)
+    timing = time_path(model, rack().initial, limits)
+    found = smoothed(model, timing, width)
+    assert found.carry is not None
+    use = limit_use(found.carry, model.workcell, limits, model.joint_names)
+    assert found.use == use
+    assert 0.5 * timing.slowed < found.slowed < timing.slowed
+    assert 1.0 - 1e-3 < worst(use).ratio <= 1.0
 
 
 def test_a_timing_at_rest_stays_as_it_is() -> None:
