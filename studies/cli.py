@@ -47,7 +47,7 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         "--quick",
         action="store_true",
         help=f"a small but complete study: {QUICK_REPLICAS} replicas of {QUICK_EVALUATIONS} "
-        "evaluations where no other numbers are given, polished to half as many points in fewer "
+        "evaluations where no other numbers are given, polished to a third as many points in fewer "
         "attempts, its pictures as PNG only (default: off)",
     )
     search.add_argument(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 import hybrid_opt as ho
 from codegen.function import available_cores
-from hybrid_opt.campaign import CampaignFolder, Progress, Stage
+from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Progress, Stage
 from hybrid_opt.campaign.layout import RECOMMENDATION, RECOMMENDED, STAGES
 from hybrid_opt.campaign.recommended import (
     ForceTable,
@@ -36,6 +37,9 @@ from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
+from hybrid_opt.work.job import Emit, Executor, Job, answer_all
+from hybrid_opt.work.processes import ProcessExecutor
+from hybrid_opt.work.serial import SerialExecutor
 from studies.drivable import (
     DrivableFronts,
     drivable_fronts,
@@ -53,8 +57,10 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
         with progress.stage("recommendation", 1, "carry") as advance:
-            threads = folder.execution.jobs  # those of the workers, which wait meanwhile
-            found = recommend_from(folder.root, wish, folder.root / RECOMMENDED, threads)
+            request = _Request(folder.root, wish, folder.execution.jobs)
+            (found,) = answer_all(
+                _executor(folder.execution), Job(_nothing, _recommended), [request]
+            )
             if found is None:  # also after an earlier attempt that was interrupted
                 (folder.root / RECOMMENDATION).unlink(missing_ok=True)
             else:
@@ -62,6 +68,31 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
             advance(1)
 
     return Stage("recommendation", run, dict(wish.given))
+
+
+@dataclass(frozen=True)
+class _Request:
+    """A carry to recommend, in so many threads: those of the workers, which wait meanwhile."""
+
+    root: Path
+    wish: ho.Wish
+    threads: int
+
+
+def _executor(execution: ExecutionSettings) -> Executor:
+    """A worker here, where the folder is: its libraries are loaded already, which takes this
+    process a second."""
+    alone = execution.jobs == 1 or execution.executor != "processes"
+    return SerialExecutor() if alone else ProcessExecutor(1)
+
+
+def _nothing() -> None:
+    """A recommendation needs nothing but its folder."""
+
+
+def _recommended(_: None, request: _Request, emit: Emit) -> StoredRecommendation | None:
+    path = request.root / RECOMMENDED
+    return recommend_from(request.root, request.wish, path, request.threads)
 
 
 def read_recommendation(root: Path) -> StoredRecommendation | None:

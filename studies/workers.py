@@ -9,6 +9,7 @@ from hybrid_opt.work.processes import warm_up
 WORKERS_LOAD = (
     "hybrid_opt.campaign.polish_stage",
     "studies.timing_stage",
+    "studies.recommendation_stage",
     "studies.report.generate",
 )
 """Modules that the work of a study needs."""

@@ -316,10 +316,10 @@ def usual_settings(time_law: str) -> PolishSettings:
 
 
 def quick_settings() -> PolishSettings:
-    """Settings of a small study: fronts of half as many points from fewer attempts, and a shorter
+    """Settings of a small study: a third as many points from fewer attempts, and a shorter
     tournament, after which one replica of eight stayed in a slower basin (docs/drivable.md)."""
     return PolishSettings(
         attempts=2,
-        fill=FillSettings(members=25),
-        drivable=DrivableSettings(turn=1, members=12),
+        fill=FillSettings(members=16),
+        drivable=DrivableSettings(turn=1, members=10),
     )
