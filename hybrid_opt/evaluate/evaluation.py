@@ -202,15 +202,9 @@ class CandidateEvaluator:
                 x, wanted, with_collisions=False, begin=self._begin
             ).outputs
         lost = np.any((outputs["lost_1"] > 0.0) | (outputs["lost_2"] > 0.0), axis=1)
+        task, q_1, q_2 = self.workcell.task, outputs["q_1"], outputs["q_2"]
         return [
-            None
-            if lost[k]
-            else SampledPath(
-                self.workcell.task,
-                extended_waypoints(self.workcell.task, x[k]),
-                outputs["q_1"][k],
-                outputs["q_2"][k],
-            )
+            None if lost[k] else SampledPath(task, extended_waypoints(task, x[k]), q_1[k], q_2[k])
             for k in range(len(x))
         ]
 
