@@ -33,6 +33,9 @@ HALVING_WINS = 0.06
 PROOF_DEPTH = 12
 """Halvings of an interval in a proof."""
 
+HOPELESS_DEPTH = 3
+"""Halvings of an interval with an end too near for any proof: they only look for collisions."""
+
 
 @dataclass(frozen=True)
 class PassingTouch:
@@ -58,7 +61,7 @@ class MotionVerdict:
         status: 'free' is proven; 'collision' was found by FCL; 'undecided' where a clearance is
             too small to be told at the finest subdivision.
         touch: the earliest collision, else the earliest undecided interval, else None.
-        unsafe: (n - 1,) intervals with a collision or undecided.
+        unsafe: (n - 1,) intervals with a collision or undecided, up to the earliest collision.
         intervals: intervals examined, halves included.
         added: configurations added between the samples.
     """
@@ -180,7 +183,8 @@ class _Sweep:
     def run(self, depth: int) -> list[MotionVerdict]:
         configuration, clearance = self.sampled.configuration, self.sampled.clearance
         n, n_motions = len(self.owner), len(self.sampled.lengths)
-        unsafe = np.zeros(n, dtype=bool)
+        unsafe, left = np.zeros(n, dtype=bool), list[PassingTouch]()
+        beyond = np.full(n_motions, n)  # a motion's earliest interval with a collision so far
         hits: list[PassingTouch] = []
         examined, added = np.zeros(n_motions, dtype=int), np.zeros(n_motions, dtype=int)
         ends = _End(configuration, clearance.copy(), np.zeros(clearance.shape, dtype=bool))
@@ -199,16 +203,20 @@ class _Sweep:
                 for row in np.flatnonzero(hit >= 0).tolist():
                     unsafe[work.index[row]] = True
                     hits.append(self._touch(work, row, int(hit[row]), fraction))
-            work = self._uncleared(work[~unsafe[work.index]])
-            if not len(work.index) or level == depth:
+                    np.minimum.at(beyond, self.owner[work.index[row]], work.index[row])
+            # What comes after a collision says nothing new.
+            work = self._uncleared(work[work.index < beyond[self.owner[work.index]]])
+            given_up = self._given_up(work, level, depth)
+            unsafe[work.index[given_up]] = True
+            left += [
+                self._touch(work, row, int(np.flatnonzero(work.pending[row])[0]), 0.5)
+                for row in np.flatnonzero(given_up).tolist()
+            ]
+            work = work[~given_up]
+            if not len(work.index):
                 break
             added += self._per_motion(work)
             work = self._halves(work)
-        left = [
-            self._touch(work, row, int(np.flatnonzero(work.pending[row])[0]), 0.5)
-            for row in range(len(work.index))
-        ]
-        unsafe[work.index] = True
         return [
             self._verdict(k, unsafe, (hits, left), int(examined[k]), int(added[k]))
             for k in range(n_motions)
@@ -266,6 +274,17 @@ class _Sweep:
         pending: NDArray[np.bool_] = work.pending & ~(kept > self.required[work.index])
         left: NDArray[np.bool_] = np.any(pending, axis=1)
         return replace(work, pending=pending)[left]
+
+    def _given_up(self, work: _Intervals, level: int, depth: int) -> NDArray[np.bool_]:
+        """(m,) intervals that stay undecided: those with an end from which no shorter one could be
+        proven either, at the last level all."""
+        hopeless = np.full(len(work.index), level == depth)
+        if HOPELESS_DEPTH <= level < depth:
+            required = self.required[work.index]
+            for end in (work.a, work.b):
+                asked = work.pending & end.measured & ~(end.clearance > required)
+                hopeless |= self.checker.too_near(end.configuration, asked, required).any(axis=1)
+        return hopeless
 
     def _measure(self, work: _Intervals, end: _End, last: bool) -> NDArray[np.intp]:
         """Raise bounds to a proven distance where halving alone would take too long.

@@ -221,6 +221,29 @@ class CollisionChecker:
                 clearance[k, pair] = np.fmax(clearance[k, pair], apart)
         return hits
 
+    def too_near(
+        self, configuration: Array, wanted: NDArray[np.bool_], required: Array
+    ) -> NDArray[np.bool_]:
+        """Which wanted pairs of n configurations nothing can prove to be farther apart than
+        required: FCL's distance, never more than micrometres below the truth, is not either.
+
+        Args:
+            configuration: (n, 6 + all joints).
+            wanted, required: (n, n_pairs), distances in metres. Of a payload that may rest on a
+                body nothing is said.
+        """
+        found = np.zeros(wanted.shape, dtype=bool)
+        rows = np.flatnonzero(wanted.any(axis=1))
+        if len(rows):
+            self._place(*self.split(configuration[rows]))
+        for local, row in enumerate(rows.tolist()):
+            resting = self._resting_pairs(configuration[row, :3])
+            for pair in np.flatnonzero(wanted[row]).tolist():
+                apart = self.judge.distance(local, *self._pairs[pair])
+                near = apart <= required[row, pair] - FCL_RESOLUTION
+                found[row, pair] = near and pair not in resting
+        return found
+
     def min_distance(
         self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None
     ) -> tuple[float, Touch | None]:

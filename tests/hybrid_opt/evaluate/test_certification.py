@@ -127,6 +127,32 @@ def test_certificates_are_the_same_together_and_alone(evaluator: CandidateEvalua
             np.testing.assert_array_equal(a.motion.unsafe, b.motion.unsafe)
 
 
+def test_what_no_proof_can_show_is_given_up_early(
+    evaluator: CandidateEvaluator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same paths are proven free and the others fail at the same places, with fewer queries."""
+    rng, judge = np.random.default_rng(8), evaluator.checker.judge
+    spread = 0.05 * (evaluator.upper - evaluator.lower)
+    x = evaluator.workcell.task.initial.reshape(-1) + spread * rng.uniform(
+        -1.0, 1.0, (400, evaluator.n_var)
+    )
+    # Lowered, the box passes boards so closely that nothing can be proven.
+    heights = evaluator.workcell.task.free_entries[1] == 2
+    x[:, heights] -= np.linspace(0.0, 0.03, len(x))[:, None]
+    x = x[evaluator.evaluate(x).feasible]
+    before = judge.calls
+    early = [evaluator.certificate(one) for one in x]
+    between = judge.calls
+    monkeypatch.setattr("hybrid_opt.collision.between.HOPELESS_DEPTH", 99)
+    late = [evaluator.certificate(one) for one in x]
+    assert [one.is_free for one in early] == [one.is_free for one in late]
+    failed = [pair for pair in zip(early, late, strict=True) if not pair[0].is_free]
+    assert len(failed) >= 3
+    step = 1.0 / (evaluator.workcell.task.samples - 1)
+    assert all(abs(a.at_parameter - b.at_parameter) <= step for a, b in failed)
+    assert between - before < 0.5 * (judge.calls - between)
+
+
 def test_the_initial_trajectory_is_proven_free(evaluator: CandidateEvaluator) -> None:
     verdict = evaluator.certificate(evaluator.workcell.task.initial.reshape(-1))
     assert verdict.is_free
