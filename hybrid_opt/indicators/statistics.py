@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import mannwhitneyu, rankdata
 
 from symbolic.array import Array
 
@@ -88,6 +87,9 @@ def rank_test(
         first, second: (n,), (m,) values; NaN are left out.
         names: how to call the samples.
     """
+    # Not imported at the top: it takes half a second, and the workers of a study rank nothing.
+    from scipy.stats import mannwhitneyu, rankdata
+
     x, y = _ranked(first), _ranked(second)
     if len(x) == 0 or len(y) == 0:
         nan = float("nan")
