@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,20 @@ from codegen.interpreted import warn_interpreted
 
 LEVEL = 3
 """Optimisation level: what is written by hand is short."""
+
+
+def c_text(package: str, names: Sequence[str], constants: Mapping[str, float] | None = None) -> str:
+    """C files of a package, one after the other, with values in place of every @NAME@.
+
+    Args:
+        package: that they are in.
+        names: of the files, in order.
+        constants: by name.
+    """
+    text = "\n".join(files(package).joinpath(name).read_text() for name in names)
+    for name, value in (constants or {}).items():
+        text = text.replace(f"@{name}@", repr(value))
+    return text
 
 
 def load_or_build_library(name: str, text: str, cache: Cache | None = None) -> ctypes.CDLL | None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from functools import cache as remembered
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 
 from codegen.cache import Cache
-from codegen.library import load_or_build_library
+from codegen.library import c_text, load_or_build_library
 from hybrid_opt.polishing import interior, interior_steps
 from hybrid_opt.polishing.interior import DenseSolver, Error, State, dense
 from hybrid_opt.polishing.settings import PolishSettings
@@ -65,9 +64,7 @@ def dense_method(cache: Cache | None = None) -> Method:
 
 @remembered
 def _method(folder: Path) -> Method:
-    text = files("hybrid_opt.polishing").joinpath("interior.c").read_text()
-    for name, value in _CONSTANTS.items():
-        text = text.replace(f"@{name}@", repr(value))
+    text = c_text("hybrid_opt.polishing", ["interior.c"], _CONSTANTS)
     library = load_or_build_library("dense_interior", text, Cache(folder))
     if library is None:
         return dense

@@ -10,14 +10,13 @@ import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache as remembered
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 
 from codegen.cache import Cache
 from codegen.errors import CodegenError
-from codegen.library import load_or_build_library
+from codegen.library import c_text, load_or_build_library
 from hybrid_opt.polishing.decision import UnitBox
 from hybrid_opt.polishing.place_groups import ArmRows, Indices, RowGroup
 from hybrid_opt.polishing.place_values import PlaceValues
@@ -93,8 +92,7 @@ def row_binder(cache: Cache | None = None) -> Binder:
 
 @remembered
 def _binder(folder: Path) -> Binder:
-    sources = files("hybrid_opt.polishing")
-    text = "\n".join(sources.joinpath(name).read_text() for name in ("rows.c", "row_curvatures.c"))
+    text = c_text("hybrid_opt.polishing", ["rows.c", "row_curvatures.c"])
     library = load_or_build_library("rows", text, Cache(folder))
     if library is None:
         return lambda parts: None

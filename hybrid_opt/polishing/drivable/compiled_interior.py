@@ -5,14 +5,13 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from functools import cache as remembered
-from importlib.resources import files
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
 from codegen.cache import Cache
-from codegen.library import load_or_build_library
+from codegen.library import c_text, load_or_build_library
 from hybrid_opt.polishing.drivable import interior
 from hybrid_opt.polishing.drivable.interior import Answer, Ending, QuadraticProgram
 
@@ -53,10 +52,8 @@ def interior_method(cache: Cache | None = None) -> Method:
 
 @remembered
 def _method(folder: Path) -> Method:
-    sources = files("hybrid_opt.polishing.drivable")
-    text = "\n".join(sources.joinpath(name).read_text() for name in ("bordered.c", "interior.c"))
-    for name in CONSTANTS:
-        text = text.replace(f"@{name}@", repr(getattr(interior, name)))
+    constants = {name: getattr(interior, name) for name in CONSTANTS}
+    text = c_text("hybrid_opt.polishing.drivable", ["bordered.c", "interior.c"], constants)
     library = load_or_build_library("interior", text, Cache(folder))
     return interior.solve if library is None else _Compiled(library)
 
