@@ -195,7 +195,8 @@ class CollisionChecker:
         """Raise the bounds (n, n_pairs) of wanted pairs, in place, to a proven distance [m].
 
         See `Judge.separation`; a bound that is higher already stays. For a payload that
-        may rest on a body, the distance of the payload smaller by the resting tolerance counts.
+        may rest on a body, the distance of the payload smaller by the resting tolerance counts, and
+        the pair's own tolerance beside it: it may come nearer than that.
 
         Returns:
             (n,) the first wanted pair of each sample that collides, or -1.
@@ -215,6 +216,8 @@ class CollisionChecker:
                 i, j = self._pairs[pair]
                 first = self.judge.shrunk_payload if resting else i
                 apart = self.judge.separation(local, first, j)
+                if resting:
+                    apart += float(self.geometry.tolerance[pair])
                 if apart <= self.free_beyond[pair] and self._judge_pair(local, pair, resting):
                     hits[k] = pair
                     break

@@ -79,13 +79,22 @@
     return traces;
   }
 
+  /* Of a legend below a picture so wide [px], whose columns are as wide as its longest entry. */
+  function legendHeight(traces, width) {
+    const entries = traces.filter((trace) => trace.showlegend !== false);
+    const longest = Math.max(...entries.map((trace) => trace.name.length));
+    const columns = Math.max(1, Math.floor(width / (50 + 6 * longest)));
+    return 19 * Math.ceil(entries.length / columns);
+  }
+
   function drawFront() {
     const view = data.views[state.view];
     const traces = frontTraces(view);
     const range = state.whole ? view.whole : view.first;
-    const narrow = $("front-plot").clientWidth < 750;
+    const below = 60 + legendHeight(traces, $("front-plot").clientWidth - 85);
+    $("front-plot").style.height = `${340 + below}px`;
     const layout = { font: FONT, hovermode: "closest",
-      margin: { l: 70, r: 15, t: 20, b: narrow ? 190 : 120 },
+      margin: { l: 70, r: 15, t: 20, b: below },
       xaxis: { title: { text: plain(view.xTitle), standoff: 8 }, range: range[0].slice() },
       yaxis: { title: { text: plain(view.yTitle) }, range: range[1].slice() },
       legend: { orientation: "h", yref: "container", y: 0.01, yanchor: "bottom",

@@ -10,6 +10,7 @@ import pinocchio as pin
 import pytest
 
 from hybrid_opt.errors import JobError
+from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import PHASES, Job, Phase
 from hybrid_opt.job.sampling import sample_job
 from hybrid_opt.job.straight import lift_line, timed
@@ -21,6 +22,7 @@ from symbolic.physics.pose import pose_matrix
 from symbolic.robot.model import gravity_in_root
 from symbolic.robot.urdf import arm_model, link_frame
 from symbolic.workcell.handling import Handling
+from symbolic.workcell.records import Uncertainty
 from tests.hybrid_opt.job.jobs import rack, rack_job, rack_jobs, rack_timing
 
 
@@ -207,6 +209,16 @@ def test_without_a_height_nothing_is_lifted() -> None:
         "retreat",
     ]
     assert job.stands_on == ((), ())
+
+
+def test_a_box_may_stand_where_pads_may_be_displaced() -> None:
+    """All else is kept farther from it by the displacement."""
+    cell = replace(rack().workcell, uncertainty=Uncertainty(pad_position=0.003))
+    timing = rack_timing()
+    assert timing.carry is not None
+    job = JobModel(cell).plan(replace(timing, carry=replace(timing.carry, workcell=cell)))
+    assert tuple(phase.name for phase in job.phases) == PHASES
+    assert job.stands_on == rack_job().stands_on
 
 
 def test_what_presses_too_hard_is_refused() -> None:
