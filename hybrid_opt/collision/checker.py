@@ -215,9 +215,8 @@ class CollisionChecker:
                 resting = pair in resting_pairs
                 i, j = self._pairs[pair]
                 first = self.judge.shrunk_payload if resting else i
-                apart = self.judge.separation(local, first, j)
-                if resting:
-                    apart += float(self.geometry.tolerance[pair])
+                nearer = float(self.geometry.tolerance[pair]) if resting else 0.0
+                apart = self.judge.separation(local, first, j) + nearer
                 if apart <= self.free_beyond[pair] and self._judge_pair(local, pair, resting):
                     hits[k] = pair
                     break
