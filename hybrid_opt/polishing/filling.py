@@ -89,7 +89,7 @@ def filling(
         The attempt; None where the front has enough points, or no side of a gap is left.
     """
     found = gaps(archive)
-    if len(found) + 1 >= settings.members:
+    if len(found) + 1 >= settings.solved:
         return None
     for gap in sorted(found, key=lambda gap: -gap.width):
         sides = (gap.first, gap.second, 1), (gap.second, gap.first, -1)

@@ -17,6 +17,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import FORCE_PAIRS
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost
+from hybrid_opt.polishing.chords import Chord, between, chord_of, widest
 from hybrid_opt.polishing.filling import Edge, crept, filling
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.kick import kicked
@@ -86,7 +87,7 @@ class ForceRun(PolishRun[Attempt]):
         self._solver, self._mirror = polisher.solver, mirror_of(polisher.evaluator.workcell)
         self._tried: set[tuple[int | None, bytes]] = set()
         self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
-        self._images: list[int] = []
+        self._unproven: list[int] = []
         self._ahead = 0
 
     def _solution(self, attempt: Attempt) -> Solution:
@@ -96,7 +97,7 @@ class ForceRun(PolishRun[Attempt]):
     def all(self, rng: np.random.Generator) -> None:
         """The front's points, then probes far from it, then ends and middle in turns while attempts
         last; then what lies between. Mirror images are taken in all the way, and certified together
-        in the end."""
+        with points on chords in the end."""
         self._do(points(self._archive, self._settings))
         self._ahead = self._left()
         for objective in (0, 1, None) if self._mirror is None else (0, None):
@@ -106,7 +107,7 @@ class ForceRun(PolishRun[Attempt]):
             if self._stalls[None] < self._settings.front.middle_stalls:
                 self._turn((None,), rng)
         self._fill()
-        self._certify_images()
+        self._certify_unproven()
 
     def _probe(self, objective: int | None, rng: np.random.Generator) -> None:
         """Short solves from random feasible candidates and from the front's best point, then again
@@ -130,19 +131,33 @@ class ForceRun(PolishRun[Attempt]):
         halve(pool, objective, solve)
 
     def _fill(self) -> None:
-        """Attempts between the ends, until the front is even or no side of a gap is left."""
+        """Attempts between the ends, until the front is even or no side of a gap is left; then
+        points on chords between neighbours."""
         tried: set[Edge] = set()
         self._most += self._settings.fill.attempts * self._settings.attempts
         while self._left() > 0:
             found = filling(self._archive, tried, self._settings.fill)
             if found is None:
-                return
+                break
             tried |= {found.edge, self._reflected(found.edge)}
             self._do([found.attempt])
             outcome = self.outcomes[-1]
             if outcome.status == "accepted" and crept(self._archive, found, outcome.objectives):
                 edge = outcome.x.tobytes(), *found.edge[1:]
                 tried |= {edge, self._reflected(edge)}
+        self._fill_by_chords()
+
+    def _fill_by_chords(self) -> None:
+        archive, fill, tried = self._archive, self._settings.fill, set[Chord]()
+        while len(archive.rows()) < fill.members and (gap := widest(archive, tried)) is not None:
+            first, second = chord_of(archive, gap)
+            image = self._reflected_bytes(second), self._reflected_bytes(first)
+            tried |= {(first, second), image}
+            found = between(self._evaluator, archive, gap, fill)
+            if found is not None:
+                archive.add(*found)
+                self._unproven.append(len(archive.x) - 1)
+                self._take_image(found[0])
 
     def _reflected(self, edge: Edge) -> Edge:
         """The mirror image of a side of a gap, itself where it has none."""
@@ -158,16 +173,20 @@ class ForceRun(PolishRun[Attempt]):
 
     def _take(self, attempt: Attempt, outcome: PolishOutcome) -> None:
         super()._take(attempt, outcome)
-        if outcome.status != "accepted" or (image := self._image(outcome.x)) is None:
+        if outcome.status == "accepted":
+            self._take_image(outcome.x)
+
+    def _take_image(self, x: Array) -> None:
+        if (image := self._image(x)) is None:
             return
         found = self._evaluator.evaluate(image)
         if found.feasible[0] and not self._archive.dominates(found.objectives[0]):
             self._archive.add(image, found.objectives[0])
-            self._images.append(len(self._archive.x) - 1)
+            self._unproven.append(len(self._archive.x) - 1)
 
-    def _certify_images(self) -> None:
-        """Leave out images that are not proven free of collisions between the samples."""
-        standing = [k for k in self._archive.rows() if k in self._images]
+    def _certify_unproven(self) -> None:
+        """Leave out what no solve made and is not proven free of collisions between the samples."""
+        standing = [k for k in self._archive.rows() if k in self._unproven]
         if standing:
             x = np.array([self._archive.x[k] for k in standing])
             proven = self._evaluator.certified(self._evaluator.evaluate(x)).feasible

@@ -129,7 +129,7 @@ class FrontSettings:
             optimal.
     """
 
-    own_share: float = 1.0 / 6.0
+    own_share: float = 1.0 / 8.0
     progress: float = 2e-5
     middle_stalls: int = 1
     small_radius: float = 0.1
@@ -174,7 +174,10 @@ class FillSettings:
     """How a front is filled once its ends are known, see `hybrid_opt.polishing.filling`.
 
     Attributes:
-        members: points that the front is to have.
+        solved: points up to which gaps are filled by solves.
+        members: points that the front is to have; beyond those, the rest lies on chords between
+            neighbours, see `hybrid_opt.polishing.chords`.
+        chord: points that are evaluated on each.
         attempts: at most, for each of `PolishSettings.attempts`.
         stride: from the neighbour that an attempt starts from, along both objectives, at most, in
             units of the front's extent.
@@ -185,8 +188,10 @@ class FillSettings:
             `PolishSettings.rounds`, `PolishSettings.max_iterations` and `SolveSettings.barrier`.
     """
 
-    members: int = 50
-    attempts: int = 6
+    solved: int = 50
+    members: int = 60
+    chord: int = 16
+    attempts: int = 5
     stride: float = 0.2
     far: float = 0.1
     far_radius: float = 1.0
@@ -265,7 +270,7 @@ class PolishSettings:
         near, trust, solve, front, kick, probe, fill, drivable: the parts' own.
     """
 
-    attempts: int = 6
+    attempts: int = 8
     method: Method = "pascoletti-serafini"
     max_iterations: int = 20
     rounds: int = 7

@@ -10,7 +10,7 @@ from hybrid_opt.polishing.filling import TAIL, Edge, crept, filling, gaps
 from hybrid_opt.polishing.settings import FillSettings
 from symbolic.array import Array
 
-SETTINGS = FillSettings(members=10, stride=10.0, far=0.4)
+SETTINGS = FillSettings(solved=10, stride=10.0, far=0.4)
 
 
 def front(*objectives: tuple[float, float]) -> GrowingFront:
@@ -90,7 +90,7 @@ def test_a_point_beside_the_start_has_crept() -> None:
 
 
 def test_enough_points_are_enough() -> None:
-    assert filling(front((0.0, 1.0), (1.0, 0.0)), set(), FillSettings(members=2)) is None
+    assert filling(front((0.0, 1.0), (1.0, 0.0)), set(), FillSettings(solved=2)) is None
     assert filling(front((0.0, 1.0)), set(), SETTINGS) is None
 
 
