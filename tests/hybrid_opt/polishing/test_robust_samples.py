@@ -73,7 +73,7 @@ def test_a_carry_is_polished_for_its_robust_forces() -> None:
     """From the hand-made path: the balanced middle of the true robust forces comes down."""
     judge = unsure()
     functions = polish_functions(judge.compiled)
-    settings = PolishSettings(rounds=3)
+    settings = PolishSettings(rounds=6)
     x = initial_decision(judge.workcell.task)
     start = judge.evaluate(x).objectives[0]
     target = balance(start, np.full(2, 0.01))
