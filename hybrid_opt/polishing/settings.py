@@ -325,6 +325,6 @@ def quick_settings() -> PolishSettings:
     tournament, after which one replica of eight stayed in a slower basin (docs/drivable.md)."""
     return PolishSettings(
         attempts=2,
-        fill=FillSettings(members=16),
+        fill=FillSettings(solved=16, members=16),
         drivable=DrivableSettings(turn=1, members=10),
     )
