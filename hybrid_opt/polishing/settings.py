@@ -164,7 +164,7 @@ class ProbeSettings:
     """
 
     starts: int = 8
-    middle_starts: int = 4
+    middle_starts: int = 8
     rounds: int = 3
     candidates: int = 1000
 

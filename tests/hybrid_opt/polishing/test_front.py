@@ -86,10 +86,14 @@ def test_every_point_is_feasible_for_the_full_evaluator_and_certified() -> None:
 
 def test_residuals_of_accepted_points_are_told() -> None:
     accepted = [o for o in polished().outcomes if o.status == "accepted"]
+    # Whatever a program asked for beyond that, what is accepted holds.
+    found = evaluator().evaluate(np.array([outcome.x for outcome in accepted]))
+    assert found.feasible.all()
+    np.testing.assert_array_equal(found.objectives, [o.objectives for o in accepted])
     for outcome in accepted:
-        # Where the last step was a part of a refused one, the program asked for more than it kept.
-        assert outcome.residuals.feasibility < 0.5
-        assert np.isfinite(outcome.residuals.stationarity)
+        residuals = outcome.residuals
+        # Feasibility may be large where the last step was a part of a refused one.
+        assert np.isfinite([residuals.stationarity, residuals.feasibility]).all()
         assert outcome.iterations > 0
 
 
