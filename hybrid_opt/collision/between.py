@@ -59,7 +59,7 @@ class MotionVerdict:
 
     Attributes:
         status: 'free' is proven; 'collision' was found by FCL; 'undecided' where a clearance is
-            too small to be told at the finest subdivision.
+            too small for a proof, or to be told at the finest subdivision.
         touch: the earliest collision, else the earliest undecided interval, else None.
         unsafe: (n - 1,) intervals with a collision or undecided, up to the earliest collision.
         intervals: intervals examined, halves included.

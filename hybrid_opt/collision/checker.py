@@ -240,10 +240,9 @@ class CollisionChecker:
             self._place(*self.split(configuration[rows]))
         for local, row in enumerate(rows.tolist()):
             resting = self._resting_pairs(configuration[row, :3])
-            for pair in np.flatnonzero(wanted[row]).tolist():
+            for pair in set(np.flatnonzero(wanted[row]).tolist()) - resting:
                 apart = self.judge.distance(local, *self._pairs[pair])
-                near = apart <= required[row, pair] - FCL_RESOLUTION
-                found[row, pair] = near and pair not in resting
+                found[row, pair] = apart <= required[row, pair] - FCL_RESOLUTION
         return found
 
     def min_distance(
