@@ -22,6 +22,7 @@ from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.campaign.simulated import read_simulations
 from hybrid_opt.polishing.drivable.point import is_polishable
+from hybrid_opt.polishing.front import knows_forces
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
 from studies.drivable import is_drivable, known_paths
@@ -115,9 +116,9 @@ def run_study(
     """
     cell, competition = decided_cell(workcell, settings, execution)
     alone = is_drivable(cell, settings.objectives)
-    if not cell.has_facing_pads:
-        progress.note("the polish knows two round pads that face one another: search alone")
-        study = replace(study, polish=None, drivable_polish=None)
+    if not alone and not knows_forces(cell, settings.objectives):
+        progress.note("the polish of robust forces knows two round pads that face one another: off")
+        study = replace(study, polish=None)
     polish = study.polish if alone else study.drivable_polish
     if polish is not None and not is_polishable(cell.task):
         progress.note("the drivable carries of this cell cannot be polished: search alone")

@@ -1,4 +1,4 @@
-"""The rows of a smooth program in C: `rows.c` and `row_curvatures.c`.
+"""The rows of a smooth program in C: `rows.c`, `row_curvatures.c` and `held.c`.
 
 What NumPy does between the functions of CasADi, in many small arrays, takes longer than the
 functions themselves. Here C calls them, on the arrays that were prepared for them.
@@ -18,7 +18,8 @@ from codegen.cache import Cache
 from codegen.errors import CodegenError
 from codegen.library import c_text, load_or_build_library
 from hybrid_opt.polishing.decision import UnitBox
-from hybrid_opt.polishing.place_groups import ArmRows, Indices, RowGroup
+from hybrid_opt.polishing.force_values import ForceValues
+from hybrid_opt.polishing.place_groups import ArmRows, Indices
 from hybrid_opt.polishing.place_values import PlaceValues
 from hybrid_opt.polishing.row_records import (
     INPUTS,
@@ -29,12 +30,14 @@ from hybrid_opt.polishing.row_records import (
     ProgramRecord,
     SamplesRecord,
     call_of,
+    group_record,
+    held_record,
 )
 from hybrid_opt.polishing.sample_values import NEGLIGIBLE, SampleValues
 from symbolic.array import Array
 
 _DONE, _UNWRAP = 0, -2
-_FORCES, _PRESSURE, _ARMS, _GROUPS = 1, 101, 201, 301
+_FORCES, _LOADS, _PRESSURE, _ARMS, _GROUPS = 1, 51, 101, 201, 301
 """As in `row_curvatures.c`: from where what has to be prepared is counted."""
 
 
@@ -48,7 +51,7 @@ class RowParts:
         offset: (n_rows,) of the values.
         first_patch, first_place: first rows of the pressure and at places.
         forces, patches, places: what is evaluated.
-        mix, force_column: (n_forces, 2), (n_forces,): what force rows take of `forces`.
+        mix: (n_forces, 2) what force rows take of `forces`.
         pressed_column, pressed: (n_patches,) likewise of `patches`: column and robot.
         scale: (n_places,).
         slope: (n_forces, n_var) what is added to slopes of forces, and x (n_var,) where nothing is
@@ -61,11 +64,10 @@ class RowParts:
     offset: Array
     first_patch: int
     first_place: int
-    forces: SampleValues
+    forces: ForceValues
     patches: SampleValues
     places: PlaceValues
     mix: Array
-    force_column: Indices
     pressed_column: Indices
     pressed: Indices
     scale: Array
@@ -92,7 +94,7 @@ def row_binder(cache: Cache | None = None) -> Binder:
 
 @remembered
 def _binder(folder: Path) -> Binder:
-    text = c_text("hybrid_opt.polishing", ["rows.c", "row_curvatures.c"])
+    text = c_text("hybrid_opt.polishing", ["rows.c", "row_curvatures.c", "held.c"])
     library = load_or_build_library("rows", text, Cache(folder))
     if library is None:
         return lambda parts: None
@@ -103,7 +105,8 @@ def _binder(folder: Path) -> Binder:
     library.dual_arm_rows_slopes.restype = None
 
     def bind(parts: RowParts) -> CompiledRows | None:
-        batches = [call.first for part in (parts.forces, parts.patches) for call in part.calls]
+        sampled = *parts.forces.parts, parts.patches
+        batches = [call.first for part in sampled for call in part.calls]
         batches += [group.first for group in parts.places.groups]
         batches += [arm.first for arm in parts.places.arms]
         return None if any(b.native is None for b in batches) else CompiledRows(library, parts)
@@ -128,8 +131,13 @@ class CompiledRows:
         self._z, self._multipliers = np.empty(width), np.empty(n_rows)
         self._curvature = np.empty((n_var, n_var))
         self._blocks = list[ctypes.Array[BlockRecord]]()
-        self._samples = [self._of_samples(part) for part in (parts.forces, parts.patches)]
-        self._groups = (GroupRecord * len(places.groups))(*map(self._of_group, places.groups))
+        self._sampled = (parts.forces.split, parts.patches, *parts.forces.parts[1:])
+        self._samples = [self._of_samples(part) for part in self._sampled]
+        held = parts.forces.held
+        loads = ctypes.addressof(self._samples[-1])
+        self._held = None if held is None else held_record(held, loads, self._memory)
+        groups = [group_record(group, self._memory) for group in places.groups]
+        self._groups = (GroupRecord * len(groups))(*groups)
         self._arms = (ArmRecord * 2)(*map(self._of_arm, places.arms, ("q_1", "q_2")))
         slope, x_0 = parts.slope or (None, None)
         self._program = ProgramRecord(
@@ -146,6 +154,7 @@ class CompiledRows:
             groups=len(places.groups),
             samples=ctypes.addressof(self._samples[0]),
             patches=ctypes.addressof(self._samples[1]),
+            held=None if self._held is None else ctypes.addressof(self._held),
             group=ctypes.addressof(self._groups),
             arm=ctypes.addressof(self._arms),
             negligible=NEGLIGIBLE,
@@ -173,7 +182,7 @@ class CompiledRows:
                 multipliers=self._multipliers,
             ),
             **self._memory.indices(
-                force_column=parts.force_column,
+                force_column=parts.forces.column,
                 pressed_column=parts.pressed_column,
                 pressed_robot=parts.pressed,
                 order=places.order,
@@ -238,8 +247,9 @@ class CompiledRows:
             )
             held.hessian = self._memory.of(arm.second.outputs["hessian"])
         else:
-            of, k = (0, which - _FORCES) if which < _PRESSURE else (1, which - _PRESSURE)
-            samples = (self._parts.forces, self._parts.patches)[of]
+            firsts = (_FORCES, _PRESSURE, _LOADS)
+            of = 0 if which < _LOADS else 2 if which < _PRESSURE else 1
+            samples, k = self._sampled[of], which - firsts[of]
             columns, block = samples.columns_of(k, len(samples.x)), self._blocks[of][k]
             block.second, batch = call_of(columns.batch), columns.batch
             block.x, block.columns, block.weight, block.curvature = map(
@@ -265,31 +275,15 @@ class CompiledRows:
         return SamplesRecord(
             count=samples.count,
             blocks=len(blocks),
+            width=samples.width,
             block=self._memory.of(blocks),
             **self._memory.reals(
                 x=samples.x,
                 values=samples.found,
                 gradients=samples.gradients,
-                weight=np.empty((samples.count, 2)),
+                weight=np.empty((samples.count, samples.width)),
             ),
         )
-
-    def _of_group(self, group: RowGroup) -> GroupRecord:
-        gradient, inputs = group.first.outputs["gradient"], group.first.inputs
-        record = GroupRecord(
-            start=group.rows.start,
-            stop=group.rows.stop,
-            moving=group.moving,
-            arms=sum(1 << arm for arm in group.arms),
-            width=gradient.shape[1],
-            first=call_of(group.first),
-            **self._memory.reals(gradient=gradient),
-        )
-        for k, name in enumerate(INPUTS):
-            if name in inputs:
-                record.given[k] = self._memory.of(inputs[name])
-                record.sizes[k] = inputs[name][0].size
-        return record
 
     def _of_arm(self, arm: ArmRows, joints_of: str) -> ArmRecord:
         found = arm.first.outputs

@@ -8,13 +8,13 @@ the full evaluator and certified between the samples before it is believed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.objectives import FORCE_PAIRS
+from hybrid_opt.evaluate.objectives import FORCE_PAIRS, ROBUST_OBJECTIVES
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.chords import Chord, between, chord_of, widest
@@ -30,6 +30,13 @@ from hybrid_opt.polishing.run import Polisher, PolishRun
 from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.workcell.records import Workcell
+
+
+def knows_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
+    """Whether the pads' forces are known: planned ones of any pads, robust ones of two round pads
+    that face one another."""
+    return workcell.has_facing_pads or tuple(objectives) != ROBUST_OBJECTIVES
 
 
 class FrontPolisher(Polisher):
@@ -45,19 +52,20 @@ class FrontPolisher(Polisher):
 
         Raises:
             SettingsError: the evaluator's objectives are not both peak forces, planned or robust,
-                or its pads are not two round ones that face one another.
+                its pads do not close their grasp, or robust forces are those of other pads than two
+                round ones that face one another.
             DualArmError: the functions cannot be built.
         """
-        if not evaluator.workcell.has_facing_pads:
-            raise SettingsError(
-                "the polish knows the forces of two round pads that face one another, and no "
-                "others: switch it off"
-            )
         if evaluator.objective_names not in FORCE_PAIRS:
             named = " or ".join(" and ".join(pair) for pair in FORCE_PAIRS)
             raise SettingsError(
                 f"the polish minimises {named}; the objectives are "
                 f"{', '.join(evaluator.objective_names)}: switch the polish off for them"
+            )
+        if not knows_forces(evaluator.workcell, evaluator.objective_names):
+            raise SettingsError(
+                "the polish of robust forces knows two round pads that face one another, and no "
+                "others: switch it off"
             )
         super().__init__(evaluator, settings)
         known = functions or polish_functions(evaluator.compiled)

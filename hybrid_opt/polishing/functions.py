@@ -16,12 +16,22 @@ from hybrid_opt.polishing.drivable.functions import DrivenFunctions, driven_func
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
 from symbolic.smooth.closure import closure_functions
+from symbolic.smooth.held import held_functions
 from symbolic.smooth.joint_limit import JointLimit
-from symbolic.smooth.keys import Block, ClosureKey, Order, Quantity, RowKey, SampleKey
+from symbolic.smooth.keys import (
+    Block,
+    ClosureKey,
+    HeldKey,
+    Order,
+    Quantity,
+    RowKey,
+    SampleKey,
+)
 from symbolic.smooth.passage import GAPS, Passing, Separation, gap_function
 from symbolic.smooth.place import Place, PlaceConstraint, row_function
 from symbolic.smooth.reach import Reach
 from symbolic.smooth.samples import sample_functions
+from symbolic.workcell.records import Workcell
 
 COMPILED = (
     Reach(0),
@@ -44,6 +54,7 @@ _LANE_LEVELS = dict.fromkeys(
     [
         *(SampleKey(quantity, "inner", "first").name for quantity in QUANTITIES),
         *(SampleKey(quantity, block, "second").name for quantity in QUANTITIES for block in BLOCKS),
+        *(HeldKey(order).name for order in ORDERS),
         *(ClosureKey(arm, order).name for arm in ARMS for order in ORDERS),
         *(RowKey(constraint.family, order).name for constraint in COMPILED for order in ORDERS),
         GAPS,
@@ -109,6 +120,7 @@ class PolishFunctions:
 
     Attributes:
         samples: forces and pressure, see `symbolic.smooth.samples`.
+        held: forces that are allocated jointly, see `symbolic.smooth.held`; else none.
         closures: inverse kinematics of both arms, see `symbolic.smooth.closure`.
         rows: constraints at places of the path.
         driven: limits along a driven path, only under the time law 'optimal'.
@@ -117,7 +129,19 @@ class PolishFunctions:
     samples: Mapping[SampleKey, NumericFunction]
     closures: Mapping[ClosureKey, NumericFunction]
     rows: RowFunctions = field(repr=False)
+    held: Mapping[HeldKey, NumericFunction] = field(default_factory=dict)
     driven: DrivenFunctions | None = None
+
+
+def quantities_of(workcell: Workcell) -> tuple[Quantity, ...]:
+    """What a cell's programs ask at samples. What is driven has limits at the intervals of its
+    timing, not at samples; pads that press jointly keep their pressure, and where they do not face
+    one another nothing is in closed form."""
+    if workcell.task.time_law == "optimal":
+        return ()
+    if workcell.task.allocation == "paper":
+        return "force", "pressure"
+    return ("force", "load") if workcell.has_facing_pads else ("load",)
 
 
 def polish_functions(compiled: CompiledCell) -> PolishFunctions:
@@ -127,14 +151,16 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
         DualArmError: the cell's model cannot be built, or its functions not be compiled.
     """
     driven = compiled.workcell.task.time_law == "optimal"
+    quantities = quantities_of(compiled.workcell)
 
     @cache
     def make() -> dict[str, ca.Function]:
         model = compiled.model
         place, functions = Place(model), dict[str, ca.Function]()
-        # What is driven has limits at the intervals of its timing, not at samples.
-        for quantity in () if driven else QUANTITIES:
+        for quantity in quantities:
             functions |= _named(sample_functions(model.workcell, quantity))
+        if "load" in quantities:
+            functions |= _named(held_functions(model.workcell))
         for arm in ARMS:
             functions |= _named(closure_functions(model, arm))
         for constraint in COMPILED:
@@ -159,6 +185,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     row_keys = [RowKey(constraint.family, order) for constraint in COMPILED for order in ORDERS]
     return PolishFunctions(
         samples={key: built[key.name] for key in sample_keys if key.name in built},
+        held={key: built[key.name] for key in map(HeldKey, ORDERS) if key.name in built},
         closures={key: built[key.name] for key in closure_keys},
         rows=RowFunctions(
             compiled.bodies, {key: built[key.name] for key in row_keys}, built[GAPS], compiled
@@ -168,6 +195,8 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
 
 
 def _named(
-    functions: Mapping[SampleKey, ca.Function] | Mapping[ClosureKey, ca.Function],
+    functions: Mapping[SampleKey, ca.Function]
+    | Mapping[ClosureKey, ca.Function]
+    | Mapping[HeldKey, ca.Function],
 ) -> dict[str, ca.Function]:
     return {key.name: function for key, function in functions.items()}

@@ -8,10 +8,14 @@ from functools import cache, cached_property
 
 from symbolic.smooth.place import PlaceConstraint
 
+HELD = 5
+"""Branch of a force row that is the joint allocation's, after the paper's five."""
+
 
 @dataclass(frozen=True, order=True)
 class ForceRow:
-    """One branch of `normal_force_branches` of one robot at a sample, to stay below its peak."""
+    """One branch of `normal_force_branches` of one robot at a sample, or `HELD`, to stay below its
+    peak."""
 
     robot: int
     branch: int

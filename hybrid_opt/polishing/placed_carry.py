@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
@@ -42,7 +42,8 @@ class PlacedCarry:
         reached: places before the first that an arm does not reach.
         stranded: the arms that do not reach all places.
         manipulability: (reached, 2) |det J| over its least value.
-        split: (n, 2) on samples: normal component, tangential magnitude of the required force [N].
+        split: (n, 2) on samples: normal component, tangential magnitude of the required force [N];
+            without meaning where the pads do not face one another.
         force: (n, 2) on samples: the normal forces that are minimised, planned or robust ones [N].
         peak: (2,) their peaks over their references.
         shift: (n, 2) on samples: shifts of the centres of pressure over their patches' radii.
@@ -233,9 +234,7 @@ class CarryReader:
             reached=reached,
             stranded=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
             manipulability=np.sqrt(np.maximum(np.column_stack(squares), 0.0))[:reached],
-            split=np.column_stack(
-                [force[:, 0] - force[:, 1], found["tangential_force"].sum(axis=1)]
-            ),
+            split=self._split(found),
             force=minimised,
             peak=minimised.max(axis=0) / task.reference_force,
             shift=found["pressure_shift"] / self._radii,
@@ -246,3 +245,13 @@ class CarryReader:
                 ),
             ),
         )
+
+    def _split(self, found: Mapping[str, Array]) -> Array:
+        """See `PlacedCarry.split`. By the paper's allocation both tangential forces point the same
+        way."""
+        along = found["normal_force"][:, 0] - found["normal_force"][:, 1]
+        if self._evaluator.workcell.task.allocation == "paper":
+            return np.column_stack([along, found["tangential_force"].sum(axis=1)])
+        whole = found["contact_force"][:, :3] + found["contact_force"][:, 3:]
+        square = (whole**2).sum(axis=1) - along**2
+        return np.column_stack([along, np.sqrt(np.maximum(square, 0.0))])

@@ -23,7 +23,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from hybrid_opt.polishing.compiled_rows import RowParts
-from hybrid_opt.polishing.layout import Layout, PlaceRow, Row
+from hybrid_opt.polishing.force_values import ForceValues
+from hybrid_opt.polishing.layout import HELD, Layout, PlaceRow, Row
 from hybrid_opt.polishing.place_values import Places, PlaceValues
 from hybrid_opt.polishing.placed_carry import PlacedCarry
 from hybrid_opt.polishing.residuals import Residuals, residuals
@@ -32,7 +33,6 @@ from hybrid_opt.polishing.smooth_cell import SmoothCell
 from hybrid_opt.polishing.solvers import Answer
 from hybrid_opt.polishing.targets import Target, needed_level
 from symbolic.array import Array
-from symbolic.smooth.keys import Quantity
 
 SLACK = 0.1
 """What the epigraph variables start above the peak forces, in units of the span."""
@@ -82,8 +82,12 @@ class SmoothProgram:
         """
         self._cell, self._target = cell, target
         self.layout = layout = Layout.of(cell.task.n_var, required)
-        self._forces = self._samples("force", {row.sample for row in layout.force_rows})
-        self._patches = self._samples("pressure", {row.sample for row in layout.pressure_rows})
+        sampled = cell.blocks, cell.functions
+        self._forces = ForceValues(layout.force_rows, *sampled, cell.rounding)
+        pressed = {row.sample for row in layout.pressure_rows}
+        self._patches = SampleValues(
+            "pressure", cell.blocks, cell.functions.samples, pressed, cell.rounding
+        )
         self._places = place_values(cell, layout.place_rows, carry)
         self._index_rows()
         self._correct_forces(x, carry)
@@ -127,7 +131,6 @@ class SmoothProgram:
             patches=self._patches,
             places=self._places,
             mix=self._mix,
-            force_column=self._force_column,
             pressed_column=self._pressed_column,
             pressed=self._pressed,
             scale=self._scale,
@@ -145,32 +148,30 @@ class SmoothProgram:
         self._owner = robot
         self._mix = self._cell.coefficients[robot, branch] / (reference * span)[:, None]
         self._anchor = self._target.anchor[robot] / span
-        self._force_column = self._forces.column[sample]
+        self._sample = sample
         pressed = np.array([(r.robot, r.sample) for r in self.layout.pressure_rows])
         self._pressed, sample = pressed.reshape(-1, 2).astype(np.intp).T
         self._pressed_column = self._patches.column[sample]
         self._scale = np.array([row.constraint.scale for row in self.layout.place_rows])
 
-    def _samples(self, quantity: Quantity, wanted: set[int]) -> SampleValues:
-        cell = self._cell
-        return SampleValues(quantity, cell.blocks, cell.functions.samples, wanted, cell.rounding)
-
     def _correct_forces(self, x: Array, carry: PlacedCarry) -> None:
-        """What the rows' forces lack at the candidate: what the rounded time law takes off them, or
-        what makes planned forces robust ones, with their slopes
-        (see `hybrid_opt.polishing.robust_samples`)."""
+        """What the rows' forces lack at the candidate: what the rounded time law takes off them and
+        the joint allocation's barriers add, or what makes planned forces robust ones, with their
+        slopes (see `hybrid_opt.polishing.robust_samples`)."""
         self._x, robust, layout = x, self._cell.robust, self.layout
         self._lacking = np.zeros(len(layout.force_rows))
         self._lacking_slope = np.zeros((len(layout.force_rows), len(x)))
-        split = self._forces.values(x)
-        at, sample = self._force_column, [row.sample for row in layout.force_rows]
+        at, sample = self._forces.column, self._sample
+        found = self._forces.values(x)[at]
         if robust is None:
-            self._lacking = np.einsum("rk,rk->r", self._mix, carry.split[sample] - split[at])
+            held = np.array([row.branch == HELD for row in layout.force_rows])[:, None]
+            exact = np.where(held, carry.force[sample], carry.split[sample])
+            self._lacking = np.einsum("rk,rk->r", self._mix, exact - found)
             return
         force, by_x = robust.first(x)
         unit = self._cell.task.reference_force[self._owner] * self._target.span[self._owner]
         self._lacking = force[sample, self._owner] / unit
-        self._lacking -= np.einsum("rk,rk->r", self._mix, split[at])
+        self._lacking -= np.einsum("rk,rk->r", self._mix, found)
         self._lacking_slope = by_x[sample, self._owner] / unit[:, None]
         self._lacking_slope -= np.einsum("rk,rkx->rx", self._mix, self._forces.gradients[at])
 
@@ -214,11 +215,11 @@ class SmoothProgram:
         x = self._cell.unit.unscaled(z[layout.decision])
         values = self._fixed @ z
         values += self._offset
-        split = self._forces.values(x).take(self._force_column, axis=0)
-        split *= self._mix
+        taken = self._forces.values(x).take(self._forces.column, axis=0)
+        taken *= self._mix
         forces = values[layout.forces]
-        forces += split[:, 0]
-        forces += split[:, 1]
+        forces += taken[:, 0]
+        forces += taken[:, 1]
         if self._cell.robust is not None:
             forces += self._lacking_slope @ (x - self._x)
         if len(self._pressed):
@@ -236,7 +237,7 @@ class SmoothProgram:
             return self._compiled.slopes()
         layout = self.layout
         jacobian = self._fixed.copy()
-        slope = self._forces.gradients.take(self._force_column, axis=0)
+        slope = self._forces.gradients.take(self._forces.column, axis=0)
         slope *= self._mix[:, :, None]
         forces = jacobian[layout.forces, layout.decision]
         np.add(slope[:, 0], slope[:, 1], out=forces)
@@ -268,7 +269,7 @@ class SmoothProgram:
         layout = self.layout
         x = self._cell.unit.unscaled(z[layout.decision])
         weighted = multipliers[layout.forces, None] * self._mix
-        columns = self._force_column
+        columns = self._forces.column
         weight = np.zeros((self._forces.count, 2))
         for k, own in enumerate(weighted.T):
             weight[:, k] = np.bincount(columns, own, len(weight))

@@ -40,12 +40,12 @@ static void reduced(const double *H, integer width, integer own, const double *F
 static integer add_samples(const Program *p, Samples *s) {
   const integer nv = p->n_var;
   double most = 0.0;
-  for (integer k = 0; k < 2 * s->count; k++) most = fmax(most, fabs(s->weight[k]));
+  for (integer k = 0; k < s->width * s->count; k++) most = fmax(most, fabs(s->weight[k]));
   for (Block *b = s->block; b < s->block + s->blocks; b++) {
     integer count = 0;
-    const integer each = 2 * b->served;
+    const integer each = s->width * b->served;
     for (integer k = 0; k < b->n; k++) {
-      const double *weight = s->weight + 2 * b->start + k * each;
+      const double *weight = s->weight + s->width * b->start + k * each;
       int matters = 0;
       for (integer i = 0; i < each; i++) matters |= fabs(weight[i]) > p->negligible * most;
       if (!matters) continue;
@@ -143,9 +143,11 @@ static integer add_arm(const Program *p, const Arm *arm) {
   return 0;
 }
 
+static integer add_held(const Program *p);
+
 /* Second derivatives where the slopes were found last. Returns DONE, FAILED, or the number of what
-   has to be prepared first: blocks of forces from 1, of pressure from 101, arms from 201, groups
-   from 301. */
+   has to be prepared first: blocks of forces from 1, of loads from 51, of pressure from
+   101, arms from 201, groups from 301. */
 __attribute__((visibility("default"))) integer dual_arm_rows_curvature(const Program *p) {
   const integer nv = p->n_var;
   integer lacks;
@@ -155,6 +157,7 @@ __attribute__((visibility("default"))) integer dual_arm_rows_curvature(const Pro
     for (int i = 0; i < 2; i++)
       p->samples->weight[2 * p->force_column[r] + i] += p->multipliers[r] * p->mix[2 * r + i];
   if ((lacks = add_samples(p, p->samples))) return lacks;
+  if (p->held && (lacks = add_held(p))) return lacks < 0 ? lacks : 50 + lacks;
   if (p->pressed) {
     memset(p->patches->weight, 0, sizeof(double) * 2 * p->patches->count);
     for (integer r = 0; r < p->pressed; r++)

@@ -1,4 +1,4 @@
-"""What `rows.c` and `row_curvatures.c` read, as records of ctypes."""
+"""What `rows.c`, `row_curvatures.c` and `held.c` read, as records of ctypes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import PreparedBatch
+from hybrid_opt.polishing.force_values import HeldValues
+from hybrid_opt.polishing.place_groups import RowGroup
 from symbolic.array import Array
 
 INPUTS = ("pose", "rate", "q_1", "q_2", "numbers", "weight")
@@ -45,8 +47,20 @@ class SamplesRecord(ctypes.Structure):
     """All samples of one quantity."""
 
     _fields_ = (
-        *_integers("count", "blocks"),
+        *_integers("count", "blocks", "width"),
         *_pointers("block", "x", "values", "gradients", "weight"),
+    )
+
+
+class HeldRecord(ctypes.Structure):
+    """Samples whose forces are allocated jointly."""
+
+    _fields_ = (
+        *_integers("count", "start", "size"),
+        *_pointers("at", "loads"),
+        ("first", CallRecord),
+        ("second", CallRecord),
+        *_pointers("load", "slope", "state", "states", "weight", "curvature", "active"),
     )
 
 
@@ -86,7 +100,8 @@ class ProgramRecord(ctypes.Structure):
         *_integers("n", "first_place", "waypoints", "size", "groups"),
         *_pointers("z", "centre", "half", "fixed", "offset"),
         *_pointers("force_column", "pressed_column", "pressed_robot"),
-        *_pointers("mix", "lacking_slope", "x_0", "samples", "patches", "order", "place", "scale"),
+        *_pointers("mix", "lacking_slope", "x_0", "samples", "patches", "held"),
+        *_pointers("order", "place", "scale"),
         *_pointers("free_row", "free_column", "whole", "whole_rate", "free", "free_rate", "still"),
         *_pointers("group", "arm", "pose", "rate", "value", "points", "x"),
         *_pointers("values", "jacobian", "curvature", "multipliers"),
@@ -125,3 +140,44 @@ def call_of(batch: PreparedBatch) -> CallRecord:
     native = batch.native
     assert native is not None, "interpreted functions have no address"
     return CallRecord(native.one, native.lanes, native.ports, native.work, native.lane_work)
+
+
+def held_record(held: HeldValues, loads: int, memory: Memory) -> HeldRecord:
+    """loads: address of the loads' record."""
+    first, second = held.first, held.second
+    return HeldRecord(
+        count=len(held.at),
+        start=held.start,
+        size=first.outputs["state"].shape[1],
+        loads=loads,
+        first=call_of(first),
+        second=call_of(second),
+        **memory.reals(
+            load=first.inputs["load"],
+            slope=first.outputs["slope"],
+            state=first.outputs["state"],
+            states=second.inputs["state"],
+            weight=second.inputs["weight"],
+            curvature=second.outputs["curvature"],
+        ),
+        **memory.indices(at=held.at, active=np.empty(len(held.at), dtype=np.intp)),
+    )
+
+
+def group_record(group: RowGroup, memory: Memory) -> GroupRecord:
+    """Of rows of one family; what second derivatives need is filled in when they are asked for."""
+    gradient, inputs = group.first.outputs["gradient"], group.first.inputs
+    record = GroupRecord(
+        start=group.rows.start,
+        stop=group.rows.stop,
+        moving=group.moving,
+        arms=sum(1 << arm for arm in group.arms),
+        width=gradient.shape[1],
+        first=call_of(group.first),
+        **memory.reals(gradient=gradient),
+    )
+    for k, name in enumerate(INPUTS):
+        if name in inputs:
+            record.given[k] = memory.of(inputs[name])
+            record.sizes[k] = inputs[name][0].size
+    return record

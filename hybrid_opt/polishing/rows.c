@@ -27,15 +27,28 @@ typedef struct {
 } Block;
 
 typedef struct {
-  integer count, blocks;
+  integer count, blocks, width; /* values of each */
   Block *block;
-  double *x;               /* (n_var,) input of all */
-  const double *values;    /* (count, 2) */
-  const double *gradients; /* (count, 2, n_var) */
-  double *weight;          /* (count, 2) to work in */
+  double *x;            /* (n_var,) input of all */
+  const double *values; /* (count, width) */
+  double *gradients;    /* (count, width, n_var) */
+  double *weight;       /* (count, width) to work in */
 } Samples;
 
-enum { POSE = 6, INPUTS = 6 };
+enum { POSE = 6, INPUTS = 6, LOAD = 6 };
+
+/* Samples whose forces are allocated jointly. */
+typedef struct {
+  integer count, start, size; /* the first among all of the forces' samples; numbers of a state */
+  const integer *at;          /* (count,) each one's load */
+  Samples *loads;
+  Call first, second;
+  double *load;                  /* (count, LOAD) input of the first, whose values are the forces' */
+  const double *slope, *state;   /* (count, 2, LOAD), (count, size) */
+  double *states, *weight;       /* inputs of the second */
+  const double *curvature;       /* (count, LOAD, LOAD) */
+  integer *active;               /* (count,) to work in */
+} Held;
 
 /* Rows of one family at places. */
 typedef struct {
@@ -72,6 +85,7 @@ typedef struct {
   const double *mix;               /* (forces, 2) */
   const double *lacking_slope, *x_0; /* (forces, n_var), null without */
   Samples *samples, *patches;
+  Held *held;                      /* null without */
   const integer *order, *place;    /* (n,) row of each, and its place */
   const double *scale;             /* (n,) in the order of rows */
   const integer *free_row, *free_column; /* (n_path,) */
@@ -140,6 +154,9 @@ static int places_run(const Program *p) {
   return 1;
 }
 
+static int held_run(const Program *p);
+static void held_slopes(const Program *p);
+
 /* Values at z; `unwrapped` tells that the waypoints are placed already. */
 __attribute__((visibility("default"))) integer dual_arm_rows_values(const Program *p,
                                                                     integer unwrapped) {
@@ -151,6 +168,7 @@ __attribute__((visibility("default"))) integer dual_arm_rows_values(const Progra
     for (integer i = nv; i < n; i++) p->values[r] += fixed[i] * p->z[i];
   }
   if (!samples_run(p->samples, p->x, nv)) return FAILED;
+  if (p->held && !held_run(p)) return FAILED;
   for (integer r = 0; r < p->forces; r++) {
     const double *split = p->samples->values + 2 * p->force_column[r];
     p->values[r] += p->mix[2 * r] * split[0] + p->mix[2 * r + 1] * split[1];
@@ -179,6 +197,7 @@ static integer joints_at(const Program *p, const Group *g, int arm) {
 __attribute__((visibility("default"))) void dual_arm_rows_slopes(const Program *p) {
   const integer nv = p->n_var, n = nv + 3, size = p->size;
   memcpy(p->jacobian, p->fixed, sizeof(double) * p->n_rows * n);
+  if (p->held) held_slopes(p);
   for (integer r = 0; r < p->forces; r++) {
     const double *slope = p->samples->gradients + 2 * nv * p->force_column[r];
     for (integer i = 0; i < nv; i++) {

@@ -10,7 +10,7 @@ import numpy as np
 
 from codegen.function import NumericFunction, PreparedBatch
 from symbolic.array import Array
-from symbolic.smooth.keys import Order, Quantity, SampleKey
+from symbolic.smooth.keys import WIDTHS, Order, Quantity, SampleKey
 from symbolic.smooth.samples import SampleBlock
 
 NEGLIGIBLE = 1e-7
@@ -27,7 +27,7 @@ class SampleCall:
     """One function over some of its samples.
 
     Attributes:
-        first: both values of each sample, with gradients.
+        first: all values of each sample, with gradients.
         second: the function of second derivatives, of one direction each.
         basis: (calls, ., .) the samples' windows.
         served: samples that each call serves.
@@ -57,14 +57,15 @@ class Columns:
 
 
 class SampleValues:
-    """Two values of each of some samples, from the decision vector.
+    """Some values of each of some samples, from the decision vector.
 
     Attributes:
         column: (n_samples,) position of a sample among the values, -1 where it has none.
         count: of samples with values.
-        calls, starts: functions with values, and the first value of each; all values follow.
+        width: values of each.
+        calls, starts: functions with values, and the first sample of each; all samples follow.
         x: (n_var,) where they are evaluated.
-        found, gradients: (count, 2), (count, 2, n_var) there.
+        found, gradients: (count, width), (count, width, n_var) there.
     """
 
     def __init__(
@@ -74,24 +75,26 @@ class SampleValues:
         functions: Mapping[SampleKey, NumericFunction],
         wanted: Collection[int],
         rounding: float,
+        beyond: int = 0,
     ) -> None:
         """A program's samples.
 
         Args:
             wanted: samples without which a call is left out.
             rounding: of the time law's kinks, see `symbolic.smooth.samples.sample_functions`.
+            beyond: samples whose values follow, which others find.
         """
         self._rounding, self._columns = rounding, dict[int, Columns]()
         chosen = [
             block.samples[np.isin(block.samples, list(wanted)).any(axis=1)] for block in blocks
         ]
         served = np.concatenate([samples.ravel() for samples in chosen])
-        self.count = len(served)
+        self.count, self.width = len(served) + beyond, WIDTHS[quantity]
         self.column = np.full(1 + max(int(block.samples.max(initial=0)) for block in blocks), -1)
-        self.column[served] = np.arange(self.count)
+        self.column[served] = np.arange(len(served))
         n_var = next(iter(functions.values())).input_shapes[0][0]
-        self.x, self.found = np.zeros(n_var), np.zeros((self.count, 2))
-        self.gradients = np.zeros((self.count, 2, n_var))
+        self.x, self.found = np.zeros(n_var), np.zeros((self.count, self.width))
+        self.gradients = np.zeros((self.count, self.width, n_var))
         self.calls, self.starts = list[SampleCall](), [0]
         for block, samples in zip(blocks, chosen, strict=True):
             if not len(samples):
@@ -114,14 +117,14 @@ class SampleValues:
             self.starts.append(rows.stop)
 
     def values(self, x: Array) -> Array:
-        """(count, 2) at x, overwritten by the next call, as are `gradients`."""
+        """(count, width) at x, overwritten by the next call, as are `gradients`."""
         self.x[...] = x
         for call in self.calls:
             call.first()
         return self.found
 
     def second(self, x: Array, weight: Array) -> Array:
-        """(n_var, n_var) second derivatives of the values weighted by (count, 2)."""
+        """(n_var, n_var) second derivatives of the values weighted by (count, width)."""
         total = np.zeros((len(x), len(x)))
         size = np.abs(weight).max(axis=1, initial=0.0)
         matter = (size > NEGLIGIBLE * size.max(initial=0.0)).nonzero()[0]

@@ -24,7 +24,8 @@ class SmoothCell:
         unit: the scaled decision vector.
         free: rows and columns of the variables among the extended waypoints.
         blocks: how samples are divided among functions.
-        coefficients: see `branch_coefficients`.
+        coefficients: (2, 6, 2) those of `branch_coefficients`, and of `layout.HELD`, by which both
+            forces are what they are.
         robust: robust forces where they are minimised, None for the planned ones.
         rounding: of the time law's kinks, see `SolveSettings.rounding`.
         still: (n_waypoints, 6 + m) extended waypoints without the variables.
@@ -45,7 +46,8 @@ class SmoothCell:
         self.functions, self.grid = functions, grid
         self.unit = UnitBox.of(workcell.task)
         self.blocks = sample_blocks(workcell.task)
-        self.coefficients = branch_coefficients(workcell)
+        own = np.eye(2)[:, None]
+        self.coefficients = np.concatenate([branch_coefficients(workcell), own], axis=1)
         self.free = workcell.task.free_entries
         self.bind = row_binder(cache)
         self._n_path = workcell.task.n_path

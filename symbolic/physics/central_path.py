@@ -87,24 +87,25 @@ def differentiable_least_effort(program: Program, *cell: ca.MX) -> ca.MX:
     First derivatives are those of the central path: the last step is differentiated, the
     iterate it starts from is not. Second ones are not to be had so.
     """
-    iterate, _ = _barrier_step(program)(_centred(program)(*cell), 1.0, *cell)
+    iterate, _ = _barrier_step(program)(centred(program)(*cell), 1.0, *cell)
     return _wrenches(program, iterate)
 
 
 @lru_cache(PROGRAMS)
-def central_path(program: Program) -> ca.Function:
-    """The cell to an iterate of all patches near the end of the central path."""
+def central_path(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
+    """The cell to an iterate of all patches near the central path's place of a last weight."""
     cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
-    iterate = _repeated(program, _step(program), STEPS, _start(program)(*cell), cell)
+    step = _step(program, final_weight)
+    iterate = _repeated(program, step, STEPS, _start(program)(*cell), cell)
     return ca.Function("central_path", cell, [iterate])
 
 
 @lru_cache(PROGRAMS)
-def _centred(program: Program) -> ca.Function:
+def centred(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """The cell to an iterate on the central path. Its derivatives count as zero."""
     cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
-    near = central_path(program)(*cell)
-    iterate = _repeated(program, _barrier_step(program), CENTRING, near, cell)
+    near = central_path(program, final_weight)(*cell)
+    iterate = _repeated(program, _barrier_step(program, final_weight), CENTRING, near, cell)
     constant = {"is_diff_in": [False] * len(cell), "is_diff_out": [False]}
     return ca.Function("centred", cell, [iterate], constant)
 
@@ -124,7 +125,7 @@ def _repeated(
 
 
 @lru_cache(PROGRAMS)
-def _step(program: Program) -> ca.Function:
+def _step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """An iterate, a flag that does not matter and the cell to the next one and whether to go on."""
     iterate, cell = _symbols(program)
     owns = zip(program.patches, ca.vertsplit(iterate, _ends(program)), strict=True)
@@ -142,7 +143,7 @@ def _step(program: Program) -> ca.Function:
     none = [ca.SX.zeros(patch.correction_size) for patch in program.patches]
     first = steps(ca.SX(0.0), none)
     far = _length([step.lowest_of_state for step in first], 1.0)
-    final = FINAL_WEIGHT * equations.effort
+    final = final_weight * equations.effort
     aimed = ca.fmax((1.0 - far) ** 2 * weight, final)
     second = steps(aimed, [step.second_order for step in first])
     share = ca.fmin(ca.fmax(STEP_SHARE, 1.0 - APPROACH * weight / equations.effort), LAST_SHARE)
@@ -157,13 +158,13 @@ def _step(program: Program) -> ca.Function:
 
 
 @lru_cache(PROGRAMS)
-def _barrier_step(program: Program) -> ca.Function:
+def _barrier_step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """As `_step`, to the one whose state is of the final weight, by Newton's step of the barriers
     alone; where it has arrived there, its derivatives by the cell are those of the central path."""
     iterate, cell = _symbols(program)
     owns = ca.vertsplit(iterate, _ends(program))
     wrenches = [own[:WRENCH_SIZE] for own in owns]
-    weight = FINAL_WEIGHT * _efforts(program, wrenches, cell)[0]
+    weight = final_weight * _efforts(program, wrenches, cell)[0]
     patches = zip(program.patches, owns, strict=True)
     barriers = [patch.barrier(own, weight) for patch, own in patches]
     stiff = [own.stiffness for own in barriers]

@@ -54,10 +54,15 @@ def patch_slack(wrench: Expression) -> Expression:
     return pressure * friction - (normal * wrench[5] - cross_2(moment, tangent)) ** 2
 
 
+def patch_potential(wrench: Expression) -> Expression:
+    """The barrier log N - log slack at a scaled wrench (6,)."""
+    return ca.log(wrench[0]) - ca.log(patch_slack(wrench))
+
+
 @cache
 def patch_barrier() -> ca.Function:
-    """Gradient (6,) and Hessian (6, 6) of the barrier log N - log slack at a scaled wrench."""
+    """Gradient (6,) and Hessian (6, 6) of the barrier at a scaled wrench."""
     wrench = ca.SX.sym("wrench", WRENCH_SIZE)
-    gradient = ca.gradient(ca.log(wrench[0]) - ca.log(patch_slack(wrench)), wrench)
+    gradient = ca.gradient(patch_potential(wrench), wrench)
     hessian = ca.densify(ca.jacobian(gradient, wrench))
     return ca.Function("patch_barrier", [wrench], ca.cse([gradient, hessian]))

@@ -27,6 +27,10 @@ class Patch(Protocol):
         """Entries of an iterate: state, then multipliers."""
 
     @property
+    def state_size(self) -> int:
+        """Entries of a program's state, with which an iterate begins."""
+
+    @property
     def correction_size(self) -> int:
         """Entries of a correction."""
 
@@ -42,6 +46,9 @@ class Patch(Protocol):
 
     def barrier(self, iterate: ca.SX, weight: ca.SX) -> BarrierPatch:
         """The patch's weighted barrier at an iterate's state, whatever the multipliers."""
+
+    def potential(self, state: ca.SX) -> ca.SX:
+        """The barrier at a program's state, of which `centred` has the multipliers."""
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
         """As `Step.lowest_of_state`, of a change of a program's state."""

@@ -41,6 +41,7 @@ class RectangularPatch:
     half_x: float
     half_y: float
     iterate_size: int = 2 * STATE_SIZE
+    state_size: int = STATE_SIZE
     correction_size: int = STATE_SIZE
     degree: float = CORNERS
 
@@ -63,6 +64,10 @@ class RectangularPatch:
             return StateStep(alone, whole.lowest_of_state)
 
         return BarrierPatch(local.stiffness, aim.pull, step)
+
+    def potential(self, state: ca.SX) -> ca.SX:
+        """See `symbolic.physics.patches.Patch`."""
+        return -0.5 * sum(ca.log(_determinant(f)) for f in self._corners(state))
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
         """Exactly: each corner has two eigenvalues."""

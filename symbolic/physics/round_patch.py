@@ -22,7 +22,7 @@ from symbolic.physics.hermitian import (
     multiplied,
     times,
 )
-from symbolic.physics.patch_cone import patch_barrier, patch_slack
+from symbolic.physics.patch_cone import patch_barrier, patch_potential, patch_slack
 from symbolic.physics.patches import BarrierPatch, StateStep
 
 FREE_SIZE, MULTIPLIER_SIZE = WRENCH_SIZE + 1, hermitian.SIZE - 1
@@ -40,6 +40,7 @@ class RoundPatch:
     """A disc."""
 
     iterate_size: int = FREE_SIZE + MULTIPLIER_SIZE
+    state_size: int = WRENCH_SIZE
     correction_size: int = hermitian.SIZE
     degree: float = 3.0
 
@@ -65,6 +66,10 @@ class RoundPatch:
             return StateStep(ca.vertcat(change, rest), _mean_bound(slope, curvature, change))
 
         return BarrierPatch(weight * curvature, -weight * slope, step)
+
+    def potential(self, state: ca.SX) -> ca.SX:
+        """See `symbolic.physics.patches.Patch`."""
+        return patch_potential(state)
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
         """See `symbolic.physics.patches.Patch`."""

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 Order = Literal["first", "second"]
 """Values with their first derivatives, or weighted second derivatives."""
 
-Quantity = Literal["force", "pressure"]
-"""force: F_n and F_t [N]. pressure: 1 - (shift / patch radius)^2 of contacts 1 and 2."""
+Quantity = Literal["force", "pressure", "load"]
+"""force: F_n and F_t [N]. pressure: 1 - (shift / patch radius)^2 of contacts 1 and 2. load: force
+and moment about the box frame's origin, along the box's axes [N, N m]."""
+
+WIDTHS: Mapping[Quantity, int] = {"force": 2, "pressure": 2, "load": 6}
+"""Values of each sample."""
 
 Block = Literal["inner", "first", "last", "path"]
 """Inner samples, one at a call; the first two; the last two; all of another time law."""
@@ -27,6 +32,18 @@ class SampleKey:
     def name(self) -> str:
         """Of the CasADi function."""
         return f"{self.quantity}_{self.block}_{self.order}"
+
+
+@dataclass(frozen=True, order=True)
+class HeldKey:
+    """A function of what a sample's load asks of the pads, see `symbolic.smooth.held`."""
+
+    order: Order
+
+    @property
+    def name(self) -> str:
+        """Of the CasADi function."""
+        return f"held_{self.order}"
 
 
 @dataclass(frozen=True, order=True)

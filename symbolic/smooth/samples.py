@@ -1,9 +1,11 @@
 """What the smooth problem asks at samples: forces and pressure, with exact derivatives.
 
-All normal forces are the largest of functions that are linear in the normal component F_n and
-the tangential magnitude F_t of the required force (`contact_forces.normal_force_branches`), so
-that these two, and not the kinked forces, are differentiated. How much of each patch the shift of
-the centre of pressure leaves is differentiated as it is: its kinks are those of the forces.
+By the paper's allocation all normal forces are the largest of functions that are linear in the
+normal component F_n and the tangential magnitude F_t of the required force
+(`contact_forces.normal_force_branches`), so that these two, and not the kinked forces, are
+differentiated. How much of each patch the shift of the centre of pressure leaves is differentiated
+as it is: its kinks are those of the forces. Where forces are allocated jointly, what they have to
+hold is differentiated here, and `symbolic.smooth.held` goes on from there.
 
 With the constant-speed law the motion at a sample depends on a window of five neighbouring
 samples alone (two finite differences). One small function serves all inner samples, its window's
@@ -77,20 +79,22 @@ def branch_coefficients(workcell: Workcell) -> Array:
 
 
 def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[SampleKey, ca.Function]:
-    """Two values of each sample and their derivatives, for every block of `sample_blocks`.
+    """w = WIDTHS[quantity] values of each sample and their derivatives, for every block of
+    `sample_blocks`.
 
     For a block that serves k samples, with x (n_var,) and basis (n_waypoints, width) of the
     window and rounding (see `timed_path`), both without effect where the block is the whole path:
 
-    first: x, basis, rounding -> values (2 k,), both of the first sample, both of the second, ...,
-        and gradient (n_var, 2 k), one column for each value.
-    second: x, basis, rounding, weight (2 k,), along (n_var,) -> curvature (n_var,), the Hessian of
+    first: x, basis, rounding -> values (w k,), all of the first sample, all of the second, ...,
+        and gradient (n_var, w k), one column for each value.
+    second: x, basis, rounding, weight (w k,), along (n_var,) -> curvature (n_var,), the Hessian of
         weight . values times along.
 
     One direction at a call keeps the second derivatives' code a tenth as long as a whole Hessian's:
     lanes take its columns side by side, and it stays in the processor's cache.
     """
-    sample = _split_function(workcell) if quantity == "force" else _margin_function(workcell)
+    makers = {"force": _split_function, "pressure": _margin_function, "load": _load_function}
+    sample = makers[quantity](workcell)
     if workcell.task.time_law != "constant":
         return _whole_path(workcell, quantity, sample)
     columns: dict[Block, tuple[int, ...]] = {"inner": (2,), "first": (0, 1), "last": (3, 4)}
@@ -195,6 +199,13 @@ def _margin_function(workcell: Workcell) -> ca.Function:
     squares = ca.vertcat(ca.sumsqr(shift.shift_1), ca.sumsqr(shift.shift_2))
     radius = ca.DM([contact.patch_radius for contact in contacts])
     return ca.Function("sample_margin", [wrench], [1.0 - squares / radius**2])
+
+
+def _load_function(workcell: Workcell) -> ca.Function:
+    """Force and moment (6,) about the centre of mass to those about the box frame's origin."""
+    wrench, centre = ca.SX.sym("wrench", 6), ca.DM(workcell.payload.centre_of_mass)
+    about = wrench[3:] + ca.cross(ca.SX(centre), wrench[:3])
+    return ca.Function("sample_load", [wrench], [ca.vertcat(wrench[:3], about)])
 
 
 def _split_function(workcell: Workcell) -> ca.Function:

@@ -34,7 +34,9 @@ class ActiveSet:
         self.forces = Forces(around)
         self._movable = around.movable
         self._distances = Clearances(around)
-        sampled: dict[type, Kind[Any]] = {ForceRow: self.forces, PressureRow: Pressure(around)}
+        sampled: dict[type, Kind[Any]] = {ForceRow: self.forces}
+        if around.workcell.task.allocation == "paper":
+            sampled[PressureRow] = Pressure(around)
         driven = around.workcell.task.time_law == "optimal"
         self._kinds: dict[type, Kind[Any]] = ({} if driven else sampled) | {
             Clearance: self._distances,

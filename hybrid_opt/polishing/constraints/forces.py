@@ -1,19 +1,27 @@
-"""Normal forces below their peaks: which branches have rows at which samples."""
+"""Normal forces below their peaks: which branches have rows at which samples.
+
+The paper's branches stand wherever the paper's allocation does; where pads press harder than that,
+or are about to, and where there is no closed form, stands the joint allocation's.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_opt.polishing.constraints.kind import Kind, Surroundings
-from hybrid_opt.polishing.layout import ForceRow
+from hybrid_opt.polishing.layout import HELD, ForceRow
 from hybrid_opt.polishing.placed_carry import PlacedCarry
 from hybrid_opt.polishing.targets import Target
 from symbolic.array import Array
 
 CONE_TIGHT = 0
 """Branch of the normal force that rules unless the box is accelerated across by nearly 1 g."""
+
+HARDER = 1e-6
+"""Share by which a force exceeds the paper's that is not rounding."""
 
 
 class Forces(Kind[ForceRow]):
@@ -32,13 +40,16 @@ class Forces(Kind[ForceRow]):
         self._ends = {0, 1, last - 1, last}
         self._every = set(range(0, last, grid.samples(self.near_settings.force_stride)))
         self._ties = set(range(0, last + 1, grid.samples(self.near_settings.tie_stride)))
+        self._joint = around.workcell.task.allocation == "joint" and around.cell.robust is None
+        self._facing = around.workcell.has_facing_pads
 
     def near(self, carry: PlacedCarry, target: Target) -> Iterable[ForceRow]:
         """At every few samples, at the highest and beside them, where the sample decides."""
         samples = self._every | self._ends | self._peaks(carry)
+        main = self._main(carry)
         for robot, limited in enumerate(target.limits):
             for sample in samples if limited else samples & self._ties:
-                yield ForceRow(robot, CONE_TIGHT, sample)
+                yield ForceRow(robot, main[sample], sample)
         yield from self._other_branches(carry)
 
     def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
@@ -47,21 +58,35 @@ class Forces(Kind[ForceRow]):
 
     def higher(self, carry: PlacedCarry, target: Target) -> set[ForceRow]:
         """Rows at the peaks of a candidate whose forces are higher than the program foresaw."""
+        main = self._main(carry)
         return {
-            ForceRow(robot, CONE_TIGHT, sample)
+            ForceRow(robot, main[sample], sample)
             for robot, limited in enumerate(target.limits)
             if limited
             for sample in self._peaks(carry)
         }
 
     def _values(self, carry: PlacedCarry) -> Array:
-        """(samples, 2, branches) [N]."""
-        return np.asarray(np.einsum("rbk,nk->nrb", self.around.cell.coefficients, carry.split))
+        """(samples, 2, branches) of the paper's [N]."""
+        coefficients = self.around.cell.coefficients[:, :HELD]
+        return np.asarray(np.einsum("rbk,nk->nrb", coefficients, carry.split))
+
+    def _main(self, carry: PlacedCarry) -> list[int]:
+        """Per sample the branch that has a row wherever forces matter."""
+        return [HELD if held else CONE_TIGHT for held in self._is_held(carry).tolist()]
+
+    def _is_held(self, carry: PlacedCarry) -> NDArray[np.bool_]:
+        """(samples,) whether the joint allocation's forces are, or are nearly, not the paper's."""
+        if not self._joint or not self._facing:
+            return np.full(len(carry.split), self._joint)
+        harder = carry.force > (1.0 + HARDER) * self._values(carry).max(axis=2)
+        near = carry.shift > self.near_settings.pressure_share
+        return np.asarray((harder | near).any(axis=1))
 
     def _peaks(self, carry: PlacedCarry) -> set[int]:
         """Samples at and beside local maxima of either robot's normal force."""
-        is_planned = self.around.cell.robust is None
-        force = self._values(carry).max(axis=2) if is_planned else carry.force
+        is_paper = self.around.cell.robust is None and not self._joint
+        force = self._values(carry).max(axis=2) if is_paper else carry.force
         inner = force[1:-1]
         high = (inner >= force[:-2]) & (inner >= force[2:])
         high &= inner >= self.near_settings.peak_share * inner.max(axis=0)
@@ -78,7 +103,7 @@ class Forces(Kind[ForceRow]):
         force = self._values(carry)
         share = 1.0 - self.near_settings.branch_share
         near = force >= share * force.max(axis=2, keepdims=True)
-        near[:, :, CONE_TIGHT] = False
+        near[:, :, CONE_TIGHT] = near[self._is_held(carry)] = False
         return [
             ForceRow(robot, branch, sample) for sample, robot, branch in np.argwhere(near).tolist()
         ]

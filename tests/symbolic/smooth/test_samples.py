@@ -64,7 +64,7 @@ def test_a_rounded_time_law_is_near_the_sharp_one_and_nearer_the_less_it_is_roun
 
 
 @pytest.mark.parametrize("rounding", [0.0, 0.02])
-@pytest.mark.parametrize("quantity", ["force", "pressure"])
+@pytest.mark.parametrize("quantity", ["force", "pressure", "load"])
 @pytest.mark.parametrize("time_law", ["constant", "ramped"])
 def test_derivatives_are_those_of_the_values(
     time_law: TimeLaw, quantity: Quantity, rounding: float
