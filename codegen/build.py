@@ -119,7 +119,9 @@ def build(
             source = Source.of(functions[name], lanes)
             level = (levels or {}).get(name)
             level = default_level(source.own_bytes) if level is None else level
-            futures[name] = pool.submit(compile_source, source, compiler, cache, level, rebuild)
+            futures[name] = compile_source(
+                source, compiler, cache, level, pool.submit, rebuild=rebuild
+            )
         built = [futures[name].result() for name in functions]
     reports = tuple(
         FunctionReport(
@@ -203,7 +205,8 @@ def load_or_compile(
         return next(iter(found.values()))
     signature, text = make()
     source = Source(signature, 0, text, len(text), None)
-    function, entry, _ = compile_source(source, compiler, cache, 3, rebuild=False)
+    with ThreadPoolExecutor(1) as pool:
+        function, entry, _ = compile_source(source, compiler, cache, 3, pool.submit).result()
     cache.write_record(_set_key(key, 1, compiler), {"members": {signature.name: entry.key}})
     return function
 

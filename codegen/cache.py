@@ -114,23 +114,26 @@ class Cache:
             return None
         return Entry(key, library, facts)
 
-    def store(self, key: str, make: Callable[[Path], Mapping[str, Any]]) -> Entry:
+    def store(
+        self, key: str, make: Callable[[Path], Mapping[str, Any]], suffix: str = ".so"
+    ) -> Entry:
         """Make a library and put it under this key, replacing what is there.
 
         Args:
             key: see `digest`.
             make: given the path of the library to write, in a folder of its own, it writes it and
                 returns further facts to store.
+            suffix: of the file: an object file is kept likewise.
 
         Raises:
             CodegenError: the folder is unsafe or cannot be written to.
         """
         with self._build_folder() as scratch:
-            built = scratch / "library.so"
+            built = scratch / f"library{suffix}"
             with _writing(self.folder):
                 facts = dict(make(built))
                 checksum = hashlib.sha256(built.read_bytes()).hexdigest()
-                library = self.folder / f"{key}-{checksum[:16]}.so"
+                library = self.folder / f"{key}-{checksum[:16]}{suffix}"
                 built.chmod(0o700)
                 built.replace(library)
         facts |= {"library": library.name, "sha256": checksum}
@@ -184,7 +187,7 @@ class Cache:
             for path in self.folder.iterdir():
                 if path.is_dir() and path.name.startswith("build-"):
                     shutil.rmtree(path, ignore_errors=True)
-                elif path.suffix in {".so", ".json", ".lock", ".draft"}:
+                elif path.suffix in {".so", ".o", ".json", ".lock", ".draft"}:
                     libraries += path.suffix == ".so"
                     path.unlink(missing_ok=True)
         return libraries

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,21 +12,27 @@ from codegen.cache import FORMAT, Cache, Entry, digest
 from codegen.compiled import CompiledFunction, warn_one_lane
 from codegen.compiler import FLAGS, LANE_FLAGS, Compiler
 from codegen.errors import CodegenError
+from codegen.parts import PARTED, Submit, compile_parts
 from codegen.signature import Signature
 
 if TYPE_CHECKING:
     import casadi as ca
 
+Built = tuple[CompiledFunction, Entry, bool]
+"""A function, its entry in the cache, and whether that was there already."""
+
 
 @dataclass(frozen=True)
 class Source:
-    """C to compile, and without lanes if that fails. own_bytes: what CasADi generated of it."""
+    """C to compile, for so many lanes, and without lanes if that fails. own_bytes: what CasADi
+    generated of it."""
 
     signature: Signature
     operations: int
     text: str
     own_bytes: int
     without_lanes: str | None
+    lanes: int = 1
 
     @classmethod
     def of(cls, function: ca.Function, lanes: int) -> Source:
@@ -37,33 +44,52 @@ class Source:
         text = c_source(densified, 1, generated)
         wide = text if lanes == 1 else c_source(densified, lanes, generated)
         signature, count = Signature.of(densified), operations(function)
-        return cls(signature, count, wide, len(generated), None if wide == text else text)
+        other = None if wide == text else text
+        return cls(signature, count, wide, len(generated), other, lanes)
+
+
+def source_key(source: Source, compiler: Compiler, level: int) -> str:
+    """What the cache holds the library of a source by."""
+    # Names and shapes are part of the C text, except which of two equal layouts they mean.
+    flags = () if source.without_lanes is None else LANE_FLAGS
+    names = str(source.signature.to_json())
+    return digest(
+        str(FORMAT), compiler.identity, str(level), *FLAGS, *flags, names, PARTED, source.text
+    )
 
 
 def compile_source(
-    source: Source, compiler: Compiler, cache: Cache, level: int, rebuild: bool
-) -> tuple[CompiledFunction, Entry, bool]:
-    """The loaded library, its entry, and whether the cache had it already.
+    source: Source,
+    compiler: Compiler,
+    cache: Cache,
+    level: int,
+    submit: Submit,
+    *,
+    rebuild: bool = False,
+) -> Future[Built]:
+    """Begin to compile a function: its library, its entry, and whether the cache had it already.
 
     Args:
-        level: of optimisation.
+        level: of optimisation; the parts of a text have their own, no higher ones.
+        submit: runs what it is given, beside others but not before what it was given earlier.
         rebuild: compile also what is in the cache.
 
     Raises:
-        CodegenError: it cannot be compiled, cached or loaded.
+        CodegenError: from the future, that it cannot be compiled, cached or loaded.
     """
-    signature = source.signature
-    # Names and shapes are part of the C text, except which of two equal layouts they mean.
+    signature, key = source.signature, source_key(source, compiler, level)
+    if not rebuild and (hit := load_compiled(key, cache)) is not None:
+        known: Future[Built] = Future()
+        known.set_result((*hit, True))
+        return known
     flags = () if source.without_lanes is None else LANE_FLAGS
-    names = str(signature.to_json())
-    key = digest(str(FORMAT), compiler.identity, str(level), *FLAGS, *flags, names, source.text)
+    objects = compile_parts(source.text, source.lanes, compiler, cache, level, submit)
 
     def make(library: Path) -> dict[str, Any]:
         text = library.parent / f"{signature.name}.c"
-        text.write_text(source.text)
         start = time.perf_counter()
         try:
-            compiler.compile(text, library, level, flags)
+            objects.link(text, library, level, flags)
         except CodegenError as error:
             if source.without_lanes is None:
                 raise
@@ -78,13 +104,16 @@ def compile_source(
             "level": level,
         }
 
-    if not rebuild and (hit := load_compiled(key, cache)) is not None:
-        return *hit, True
-    with cache.lock(key):
+    def built() -> Built:
         if not rebuild and (hit := load_compiled(key, cache)) is not None:
             return *hit, True
-        entry = cache.store(key, make)
-    return CompiledFunction(signature, entry.library), entry, False
+        with cache.lock(key):
+            if not rebuild and (hit := load_compiled(key, cache)) is not None:
+                return *hit, True
+            entry = cache.store(key, make)
+        return CompiledFunction(signature, entry.library), entry, False
+
+    return submit(built)
 
 
 def load_compiled(key: str, cache: Cache) -> tuple[CompiledFunction, Entry] | None:

@@ -6,11 +6,14 @@ import os
 import shlex
 import shutil
 import subprocess
+import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from codegen.errors import CodegenError
+from codegen.function import available_cores
 
 FLAGS = (
     "-std=gnu11",
@@ -28,8 +31,8 @@ FLAGS = (
 )
 
 LANE_FLAGS = (
-    # GCC 12 makes wrong code of loops over four lanes when it vectorises them (AVX-512VL); what is
-    # written in lanes gains nothing from it.
+    # Where it vectorises, GCC 12 makes wrong code of loops over four lanes (AVX-512VL), and fuses
+    # what alternates between sum and difference, against -ffp-contract. Lanes gain nothing from it.
     "-fno-tree-vectorize",
     "-fno-tree-slp-vectorize",
     "-Wno-psabi",
@@ -45,10 +48,20 @@ LARGE_SOURCE = 2_000_000
 -O0, and runs in 0.39, 0.49 and 1.6 ms. One straight line of code costs about 20 s per megabyte at
 -O3, 15 s at -O1 and 5 s at -O0, and gains nothing from -O3."""
 
+LANE_LEVEL = 2
+"""Optimisation level of what is written for lanes: -O3 compiles longer and gains nothing."""
+
+LONG_PART = 90_000
+"""Bytes of a function from which on it is compiled at a level less. The clearances of the rack (193
+kB) take gcc 12 in lanes 5.1 s at -O2 and 2.2 s at -O1, and run in 32.6 and 29.9 us per 64; one by
+one they take it 4.0 s at -O3 and 2.3 s at -O2, and run in 11.3 and 11.2 us."""
+
 NAMES = ("cc", "gcc", "clang")
 
 MOST_SECONDS = 1200.0
 """After so long a compiler counts as hung [s]; sources here take it seconds, at most minutes."""
+
+_CORES = threading.BoundedSemaphore(available_cores())
 
 _OTHER_COMPILER = "name another one in the environment variable CC"
 
@@ -74,17 +87,34 @@ class Compiler:
         """Text that changes with the compiler, its version, its target and the machine."""
         return "\n".join([*self.command, self.version, *self.machine, self.instructions])
 
-    def compile(self, source: Path, library: Path, level: int, flags: tuple[str, ...] = ()) -> None:
-        """Compile one C file into a shared library at optimisation `level` (0 to 3).
+    def compile(
+        self,
+        source: Path,
+        result: Path,
+        level: int,
+        flags: tuple[str, ...] = (),
+        objects: Sequence[Path] | None = (),
+    ) -> None:
+        """Compile one C file at optimisation `level` (0 to 3) into a shared library.
+
+        No more than one compiler per core runs at once.
 
         Args:
+            result: the file to write.
             flags: further ones.
+            objects: object files that go into the library; None to make one of the source, and no
+                library.
 
         Raises:
             CodegenError: the compiler refused the source, could not write, or was killed.
         """
-        own = [f"-O{level}", *FLAGS, *self.machine]
-        command = [*self.command, *own, *flags, "-o", str(library), str(source), "-lm"]
+        own = [f"-O{level}", *FLAGS, *self.machine, *flags]
+        last = ["-c"] if objects is None else [*map(str, objects), "-lm"]
+        command = [*self.command, *own, "-o", str(result), str(source), *last]
+        with _CORES:
+            self._run(command, source, result)
+
+    def _run(self, command: Sequence[str], source: Path, result: Path) -> None:
         # The compiler's own temporary files stay in the build folder and go away with it.
         environment = os.environ | {"TMPDIR": str(source.parent), "LC_ALL": "C"}
         try:
@@ -107,7 +137,7 @@ class Compiler:
             ) from error
         if done.returncode != 0:
             raise CodegenError(_failure(self.command[0], source, done))
-        if not library.is_file() or library.stat().st_size == 0:
+        if not result.is_file() or result.stat().st_size == 0:
             raise CodegenError(
                 f"the C compiler {self.command[0]} reported success but made no library of "
                 f"{source.name}; {_OTHER_COMPILER}"
@@ -119,6 +149,12 @@ def default_level(c_bytes: int) -> int:
     if c_bytes <= SMALL_SOURCE:
         return 3
     return 1 if c_bytes <= LARGE_SOURCE else 0
+
+
+def part_level(c_bytes: int, in_lanes: bool) -> int:
+    """Level of a function that is compiled apart (`codegen.parts`)."""
+    level = LANE_LEVEL if in_lanes else default_level(c_bytes)
+    return level if c_bytes < LONG_PART else min(level, 1 if in_lanes else 2)
 
 
 def find_compiler() -> Compiler | None:

@@ -10,21 +10,21 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from codegen.cache import FORMAT, Cache, digest, source_digest
 from codegen.compiled import warn_one_lane
-from codegen.compiler import FLAGS, LANE_FLAGS, find_compiler
+from codegen.compiler import FLAGS, LANE_FLAGS, LANE_LEVEL, find_compiler
 from codegen.errors import CodegenError
+from codegen.function import available_cores
+from codegen.parts import compile_parts
 from codegen.runtime import runtime
 
 if TYPE_CHECKING:
     import casadi as ca
-
-LEVEL = 2
-"""Optimisation level of programs: -O3 compiles longer and gains nothing."""
 
 
 def load_or_build_program(
@@ -90,17 +90,18 @@ def _build(
         cache.write_record(key, {"in_lanes": False})
         return None
 
-    def write(library: Path) -> dict[str, Any]:
-        source = library.parent / f"{name}.c"
-        source.write_text(text)
-        compiler.compile(source, library, LEVEL, LANE_FLAGS)
-        return {"in_lanes": True}
+    with ThreadPoolExecutor(available_cores()) as pool:
+        objects = compile_parts(text, lanes, compiler, cache, LANE_LEVEL, pool.submit)
 
-    try:
-        loaded = _load(cache.store(key, write).library)
-    except CodegenError as error:
-        warn_one_lane(name, str(error))
-        return None
+        def write(library: Path) -> dict[str, Any]:
+            objects.link(library.parent / f"{name}.c", library, LANE_LEVEL, LANE_FLAGS)
+            return {"in_lanes": True}
+
+        try:
+            loaded = _load(cache.store(key, write).library)
+        except CodegenError as error:
+            warn_one_lane(name, str(error))
+            return None
     if loaded is None:
         cache.write_record(key, {"in_lanes": False})
     return loaded

@@ -10,7 +10,6 @@ import casadi as ca
 
 from codegen.errors import CodegenError
 from codegen.lanes import lane_text
-from codegen.pieces import in_pieces
 from codegen.runtime import runtime
 from codegen.signature import Signature
 
@@ -53,14 +52,13 @@ def c_source(function: ca.Function, lanes: int = 1, generated: str = "") -> str:
     include = "#include <math.h>\n"
     generated, signature = generated or generated_c([function]), Signature.of(function)
     in_lanes = None if lanes == 1 else lane_text(generated, "lanes")
-    generated = in_pieces(generated)
     before, after = [include, runtime("arithmetic.h")], [_filled(runtime("driver.c"), signature)]
     if in_lanes is not None:
         width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
         before += [runtime("one_lane.h"), width, runtime("lanes.h")]
         lane_driver = _filled(runtime("lane_driver.c"), signature)
         after += [
-            "\n#if DUAL_ARM_LANES > 1\n" + in_pieces(in_lanes.text) + "#endif\n\n",
+            "\n#if DUAL_ARM_LANES > 1\n" + in_lanes.text + "#endif\n\n",
             lane_driver.replace("@LANE_FUNCTION@", in_lanes.entry),
         ]
     # Our arithmetic comes after the library's declarations, which it shadows.

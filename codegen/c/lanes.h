@@ -17,11 +17,7 @@
 
 #if DUAL_ARM_LANES > 1
 
-#if defined(__SSE2__)
-#include <immintrin.h>
-#elif defined(__aarch64__)
-#include <arm_neon.h>
-#endif
+#include "intrinsics.h"
 
 typedef double lanes_real __attribute__((vector_size(8 * DUAL_ARM_LANES)));
 typedef long long lanes_mask __attribute__((vector_size(8 * DUAL_ARM_LANES)));
