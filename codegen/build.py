@@ -6,17 +6,22 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from codegen.cache import FORMAT, Cache, digest, source_digest
 from codegen.compilation import Source, compile_source, load_compiled
-from codegen.compiler import Compiler, default_level, find_compiler
+from codegen.compiler import Compiler, find_compiler
 from codegen.function import NumericFunction, available_cores
 from codegen.interpreted import InterpretedFunction, warn_interpreted
 from codegen.signature import Signature
 
 if TYPE_CHECKING:
     import casadi as ca
+
+_MAKING = Lock()
+"""Sets that are built side by side are made one after the other, so that compilers are busy with
+the first while the second is made."""
 
 
 @dataclass(frozen=True)
@@ -114,14 +119,14 @@ def build(
     cache = cache or Cache()
     with ThreadPoolExecutor(jobs or available_cores()) as pool:
         futures = {}
-        # The longest first: none is left to run alone in the end.
-        for name in sorted(functions, key=lambda name: -operations(functions[name])):
-            source = Source.of(functions[name], lanes)
-            level = (levels or {}).get(name)
-            level = default_level(source.own_bytes) if level is None else level
-            futures[name] = compile_source(
-                source, compiler, cache, level, pool.submit, rebuild=rebuild
-            )
+        with _MAKING:
+            # The longest first: none is left to run alone in the end.
+            for name in sorted(functions, key=lambda name: -operations(functions[name])):
+                source = Source.of(functions[name], lanes)
+                level = (levels or {}).get(name)
+                futures[name] = compile_source(
+                    source, compiler, cache, level, pool.submit, rebuild=rebuild
+                )
         built = [futures[name].result() for name in functions]
     reports = tuple(
         FunctionReport(
@@ -175,7 +180,9 @@ def load_or_build(
     with cache.lock(_set_key(key, lanes, compiler)):
         found = _load_set(key, lanes, compiler, cache)
         if found is None:
-            found = build_set(key, make(), cache, levels=levels, lanes=lanes).functions
+            with _MAKING:
+                functions = make()
+            found = build_set(key, functions, cache, levels=levels, lanes=lanes).functions
         return found
 
 
@@ -204,7 +211,7 @@ def load_or_compile(
     if found is not None:
         return next(iter(found.values()))
     signature, text = make()
-    source = Source(signature, 0, text, len(text), None)
+    source = Source(signature, 0, text, None)
     with ThreadPoolExecutor(1) as pool:
         function, entry, _ = compile_source(source, compiler, cache, 3, pool.submit).result()
     cache.write_record(_set_key(key, 1, compiler), {"members": {signature.name: entry.key}})

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from codegen.cache import FORMAT, Cache, Entry, digest
 from codegen.compiled import CompiledFunction, warn_one_lane
-from codegen.compiler import FLAGS, LANE_FLAGS, Compiler
+from codegen.compiler import FLAGS, LANE_FLAGS, Compiler, default_level
 from codegen.errors import CodegenError
-from codegen.parts import PARTED, Submit, compile_parts
+from codegen.parts import Submit, compile_parts, in_parts
 from codegen.signature import Signature
 
 if TYPE_CHECKING:
@@ -24,13 +24,11 @@ Built = tuple[CompiledFunction, Entry, bool]
 
 @dataclass(frozen=True)
 class Source:
-    """C to compile, for so many lanes, and without lanes if that fails. own_bytes: what CasADi
-    generated of it."""
+    """C to compile, for so many lanes, and without lanes if that fails."""
 
     signature: Signature
     operations: int
     text: str
-    own_bytes: int
     without_lanes: str | None
     lanes: int = 1
 
@@ -45,24 +43,14 @@ class Source:
         wide = text if lanes == 1 else c_source(densified, lanes, generated)
         signature, count = Signature.of(densified), operations(function)
         other = None if wide == text else text
-        return cls(signature, count, wide, len(generated), other, lanes)
-
-
-def source_key(source: Source, compiler: Compiler, level: int) -> str:
-    """What the cache holds the library of a source by."""
-    # Names and shapes are part of the C text, except which of two equal layouts they mean.
-    flags = () if source.without_lanes is None else LANE_FLAGS
-    names = str(source.signature.to_json())
-    return digest(
-        str(FORMAT), compiler.identity, str(level), *FLAGS, *flags, names, PARTED, source.text
-    )
+        return cls(signature, count, wide, other, lanes)
 
 
 def compile_source(
     source: Source,
     compiler: Compiler,
     cache: Cache,
-    level: int,
+    level: int | None,
     submit: Submit,
     *,
     rebuild: bool = False,
@@ -70,20 +58,27 @@ def compile_source(
     """Begin to compile a function: its library, its entry, and whether the cache had it already.
 
     Args:
-        level: of optimisation; the parts of a text have their own, no higher ones.
+        level: of optimisation; None for one by the size of the text and of its parts each.
         submit: runs what it is given, beside others but not before what it was given earlier.
         rebuild: compile also what is in the cache.
 
     Raises:
         CodegenError: from the future, that it cannot be compiled, cached or loaded.
     """
-    signature, key = source.signature, source_key(source, compiler, level)
+    signature = source.signature
+    flags = () if source.without_lanes is None else LANE_FLAGS
+    rest, parts = in_parts(source.text, source.lanes)
+    most = 3 if level is None else level
+    parts = tuple(replace(part, level=min(part.level, most)) for part in parts)
+    level = default_level(len(rest)) if level is None else level
+    # Names and shapes are part of the C text, except which of two equal layouts they mean.
+    names = str((signature.to_json(), [(part.name, part.level) for part in parts]))
+    key = digest(str(FORMAT), compiler.identity, str(level), *FLAGS, *flags, names, rest)
     if not rebuild and (hit := load_compiled(key, cache)) is not None:
         known: Future[Built] = Future()
         known.set_result((*hit, True))
         return known
-    flags = () if source.without_lanes is None else LANE_FLAGS
-    objects = compile_parts(source.text, source.lanes, compiler, cache, level, submit)
+    objects = compile_parts(rest, parts, compiler, cache, submit)
 
     def make(library: Path) -> dict[str, Any]:
         text = library.parent / f"{signature.name}.c"

@@ -9,7 +9,7 @@ side by side, and those that are written for lanes at a level of their own.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
@@ -20,9 +20,6 @@ from codegen.cache import FORMAT, Cache, digest
 from codegen.compiler import FLAGS, LANE_FLAGS, Compiler, part_level
 from codegen.pieces import in_pieces
 from codegen.runtime import runtime
-
-PARTED = "1"
-"""Part of every library's key; changes with how texts are parted."""
 
 LEAST_BYTES = 8000
 """Bytes of a function from which on it is compiled apart: a compiler's start costs 0.03 s, as much
@@ -62,7 +59,7 @@ class Part:
     Attributes:
         name: of the function, by the content of the file.
         text: the file.
-        level: optimisation level that suits it.
+        level: optimisation level.
     """
 
     name: str
@@ -138,30 +135,33 @@ class Objects:
 
 
 def compile_parts(
-    text: str, lanes: int, compiler: Compiler, cache: Cache, level: int, submit: Submit
+    rest: str,
+    parts: Sequence[Part],
+    compiler: Compiler,
+    cache: Cache,
+    submit: Submit,
 ) -> Objects:
     """Begin to compile the parts of a text.
 
     Args:
-        lanes: of the text; 0 for what suits the machine.
-        level: of optimisation, which a part does not exceed.
+        rest, parts: as `in_parts` gives them.
         submit: see `codegen.compilation.compile_source`.
     """
-    rest, parts = in_parts(text, lanes)
     longest_first = sorted(parts, key=lambda part: -len(part.text))
-    futures = [submit(partial(_object, part, compiler, cache, level)) for part in longest_first]
+    futures = [submit(partial(_object, part, compiler, cache)) for part in longest_first]
     return Objects(rest, tuple(futures), compiler)
 
 
-def _object(part: Part, compiler: Compiler, cache: Cache, most: int) -> Path:
+def _object(part: Part, compiler: Compiler, cache: Cache) -> Path:
     """A part's object file, from the cache where it was compiled before."""
-    level = min(part.level, most)
-    key = digest("part", str(FORMAT), compiler.identity, str(level), *FLAGS, *LANE_FLAGS, part.text)
+    key = digest(
+        "part", str(FORMAT), compiler.identity, str(part.level), *FLAGS, *LANE_FLAGS, part.text
+    )
 
     def make(result: Path) -> dict[str, Any]:
         source = result.with_name(f"{part.name}.c")
         source.write_text(part.text)
-        compiler.compile(source, result, level, LANE_FLAGS, None)
+        compiler.compile(source, result, part.level, LANE_FLAGS, None)
         return {}
 
     found = cache.find(key)

@@ -20,7 +20,7 @@ from codegen.compiled import warn_one_lane
 from codegen.compiler import FLAGS, LANE_FLAGS, LANE_LEVEL, find_compiler
 from codegen.errors import CodegenError
 from codegen.function import available_cores
-from codegen.parts import compile_parts
+from codegen.parts import compile_parts, in_parts
 from codegen.runtime import runtime
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def _build(
         return None
 
     with ThreadPoolExecutor(available_cores()) as pool:
-        objects = compile_parts(text, lanes, compiler, cache, LANE_LEVEL, pool.submit)
+        objects = compile_parts(*in_parts(text, lanes), compiler, cache, pool.submit)
 
         def write(library: Path) -> dict[str, Any]:
             objects.link(library.parent / f"{name}.c", library, LANE_LEVEL, LANE_FLAGS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -39,6 +40,12 @@ def _parser() -> argparse.ArgumentParser:
         "and first derivatives; exit code 1 where they differ",
     )
     parser.add_argument(
+        "--study",
+        action="store_true",
+        help="build everything that a study of the workcell compiles beforehand, its drivable "
+        "experiment included, and say how long that took",
+    )
+    parser.add_argument(
         "--samples", type=int, default=20, help="random inputs per function (default: 20)"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the random inputs (default: 0)")
@@ -58,7 +65,15 @@ def _run(options: argparse.Namespace) -> int:
     removed = cache.clean() if options.clean else None
     built: Build | None = None
     comparisons: list[Agreement] = []
-    if options.workcell is not None:
+    seconds: float | None = None
+    if options.study and options.workcell is not None:
+        from hybrid_opt.building import build_study
+        from hybrid_opt.cell import Cell
+
+        begin = time.perf_counter()
+        build_study(Cell.load(options.workcell))
+        seconds = time.perf_counter() - begin
+    elif options.workcell is not None:
         from hybrid_opt.compiled_cell import EVALUATOR_LANES, EVALUATORS, CompiledCell
         from symbolic.functions.cell import cell_functions
         from symbolic.workcell.file import load
@@ -77,20 +92,28 @@ def _run(options: argparse.Namespace) -> int:
                 for name, function in made.items()
             ]
     if options.json:
-        _print_json(cache, removed, built, comparisons)
+        _print_json(cache, removed, built, comparisons, seconds)
     else:
         _print_tables(cache, removed, built, comparisons)
+        if seconds is not None:
+            print(f"what a study needs is in {cache.folder}, after {seconds:.1f} s")
     return 0 if all(comparison.agrees for comparison in comparisons) else DISAGREES
 
 
 def _print_json(
-    cache: Cache, removed: int | None, built: Build | None, comparisons: Sequence[Agreement]
+    cache: Cache,
+    removed: int | None,
+    built: Build | None,
+    comparisons: Sequence[Agreement],
+    seconds: float | None,
 ) -> None:
     result: dict[str, object] = {"cache": str(cache.folder)}
     if removed is not None:
         result["removed"] = removed
     if built is not None:
         result["functions"] = [asdict(report) for report in built.reports]
+    if seconds is not None:
+        result["seconds"] = seconds
     if comparisons:
         result["check"] = [
             asdict(comparison) | {"agrees": comparison.agrees} for comparison in comparisons

@@ -1,0 +1,56 @@
+"""All that a study of a cell compiles, built at once on all cores, before any of it is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+from hybrid_opt.cell import Cell
+from hybrid_opt.job.collisions import JobCollisions
+from hybrid_opt.polishing import compiled_interior, compiled_rows
+from hybrid_opt.polishing.drivable import compiled_interior as drivable_interior
+from hybrid_opt.robust.force import robust_model
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.path_timer import PATH_INTERVALS
+
+
+def build_study(cell: Cell, polish: bool = True, drivable: bool = True) -> None:
+    """Load or build the functions of a study, all compilers side by side.
+
+    What a polish compiles when its solves first ask for it, rows of arms' clearances, is not among
+    them.
+
+    Args:
+        polish: whether fronts are polished.
+        drivable: whether carries are also searched for as robots drive them.
+
+    Raises:
+        DualArmError: a model or its code cannot be built.
+    """
+    cells = [cell, cell.drivable()] if drivable and not _driven(cell) else [cell]
+    makers = [make for each in cells for make in _makers(each, polish)]
+    # Each waits for its compilers most of the time; expressions are made by one after the other.
+    with ThreadPoolExecutor(len(makers)) as pool:
+        futures = [pool.submit(make) for make in makers]
+    for future in futures:
+        future.result()
+
+
+def _driven(cell: Cell) -> bool:
+    return cell.workcell.task.time_law == "optimal"
+
+
+def _makers(cell: Cell, polish: bool) -> Iterator[Callable[[], object]]:
+    compiled, workcell, cache = cell.compiled, cell.workcell, cell.compiled.cache
+    yield lambda: cell.evaluator
+    if polish and workcell.has_facing_pads:
+        yield lambda: cell.polish_functions
+    if _driven(cell):
+        yield lambda: cell.path_timer
+        yield lambda: TimingModel(compiled, PATH_INTERVALS)
+    yield lambda: cell.timing_model
+    yield lambda: JobCollisions(compiled)
+    yield lambda: robust_model(workcell)
+    if polish and workcell.has_facing_pads:
+        yield lambda: drivable_interior.interior_method(cache)
+        yield lambda: (compiled_interior.dense_method(cache), compiled_rows.row_binder(cache))
