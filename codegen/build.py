@@ -211,7 +211,7 @@ def load_or_compile(
     if found is not None:
         return next(iter(found.values()))
     signature, text = make()
-    source = Source(signature, 0, text, None)
+    source = Source(signature, 0, text, len(text), None)
     with ThreadPoolExecutor(1) as pool:
         function, entry, _ = compile_source(source, compiler, cache, 3, pool.submit).result()
     cache.write_record(_set_key(key, 1, compiler), {"members": {signature.name: entry.key}})

@@ -24,11 +24,13 @@ Built = tuple[CompiledFunction, Entry, bool]
 
 @dataclass(frozen=True)
 class Source:
-    """C to compile, for so many lanes, and without lanes if that fails."""
+    """C to compile, for so many lanes, and without lanes if that fails. own_bytes: what CasADi
+    generated of it."""
 
     signature: Signature
     operations: int
     text: str
+    own_bytes: int
     without_lanes: str | None
     lanes: int = 1
 
@@ -43,7 +45,7 @@ class Source:
         wide = text if lanes == 1 else c_source(densified, lanes, generated)
         signature, count = Signature.of(densified), operations(function)
         other = None if wide == text else text
-        return cls(signature, count, wide, other, lanes)
+        return cls(signature, count, wide, len(generated), other, lanes)
 
 
 def compile_source(
@@ -58,7 +60,7 @@ def compile_source(
     """Begin to compile a function: its library, its entry, and whether the cache had it already.
 
     Args:
-        level: of optimisation; None for one by the size of the text and of its parts each.
+        level: of optimisation; None for one by the size of the text, and of each of its parts.
         submit: runs what it is given, beside others but not before what it was given earlier.
         rebuild: compile also what is in the cache.
 
@@ -70,7 +72,7 @@ def compile_source(
     rest, parts = in_parts(source.text, source.lanes)
     most = 3 if level is None else level
     parts = tuple(replace(part, level=min(part.level, most)) for part in parts)
-    level = default_level(len(rest)) if level is None else level
+    level = default_level(source.own_bytes) if level is None else level
     # Names and shapes are part of the C text, except which of two equal layouts they mean.
     names = str((signature.to_json(), [(part.name, part.level) for part in parts]))
     key = digest(str(FORMAT), compiler.identity, str(level), *FLAGS, *flags, names, rest)

@@ -18,7 +18,7 @@ from typing import Any, Protocol, TypeVar
 
 from codegen.cache import FORMAT, Cache, digest
 from codegen.compiler import FLAGS, LANE_FLAGS, Compiler, part_level
-from codegen.pieces import in_pieces
+from codegen.pieces import in_pieces, is_long
 from codegen.runtime import runtime
 
 LEAST_BYTES = 8000
@@ -94,7 +94,11 @@ def in_parts(text: str, lanes: int) -> tuple[str, tuple[Part, ...]]:
         after = "#endif\n" if kind == "lanes" else ""
         name = f"dual_arm_{digest(before[kind], content)[:32]}"
         whole = f"{before[kind]}#define PART {name}\n{content}{after}"
-        parts[name] = Part(name, whole, part_level(len(body), kind == "lanes"))
+        level = part_level(len(body), kind == "lanes")
+        # What is long and has lanes is evaluated in batches; one by one it only tells whether lanes
+        # are right.
+        hardly_used = kind == "casadi" and "dual_arm_run_lanes" in text and is_long(body)
+        parts[name] = Part(name, whole, 0 if hardly_used else level)
         names[found["name"]] = name
         return f"int PART_{found['name']}{found['rest'].split(' {', 1)[0]};\n"
 

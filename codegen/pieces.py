@@ -30,15 +30,20 @@ _FUNCTION = re.compile(
 _VARIABLE = re.compile(r"\ba\d+\b")
 
 
+def is_long(body: str) -> bool:
+    """Whether a function's lines are so many that it is cut."""
+    return body.count("\n") >= LONG
+
+
 def in_pieces(text: str) -> str:
     """C text of CasADi functions, also of `codegen.lanes`, the long straight ones in pieces."""
     return _FUNCTION.sub(_cut, text)
 
 
 def _cut(found: re.Match[str]) -> str:
-    statements = found["body"].splitlines()
-    if len(statements) < LONG:
+    if not is_long(found["body"]):
         return found[0]
+    statements = found["body"].splitlines()
     name, real = found["name"], found["real"]
     pieces = [statements[at : at + PIECE] for at in range(0, len(statements), PIECE)]
     used = [_used(piece) for piece in pieces]

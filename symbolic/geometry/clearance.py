@@ -9,6 +9,9 @@ Positive means surely free by that distance; anything else means nothing.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import casadi as ca
 
 from symbolic.geometry.bodies import BOX, WORLD, Frame
@@ -82,6 +85,34 @@ def screening_functions(
         ),
         "motion": motion_function(geometry, joint_placements),
     }
+
+
+def with_more_pairs(
+    known: Mapping[str, ca.Function],
+    geometry: CellGeometry,
+    more: CellGeometry,
+    joint_placements: tuple[ca.Function, ca.Function],
+) -> dict[str, ca.Function]:
+    """`screening_functions` of a cell in which further pairs are active, put together from those
+    that are known, so that these are compiled once.
+
+    Args:
+        known: the functions of `geometry`.
+        more: the same bodies; its active pairs are those of `geometry`, then others.
+    """
+    count = len(geometry.active)
+    assert more.active[:count] == geometry.active, "further pairs come last"
+    others = screening_functions(replace(more, active=more.active[count:]), joint_placements)
+    found = dict(known)
+    for name in ("clearance", "motion"):
+        function = known[name]
+        given = [
+            ca.MX.sym(function.name_in(i), *function.size_in(i)) for i in range(function.n_in())
+        ]
+        both = zip(function.call(given), others[name].call(given), strict=True)
+        results = [ca.vertcat(*values) for values in both]
+        found[name] = ca.Function(name, given, results, function.name_in(), function.name_out())
+    return found
 
 
 def _piece_pose(R: ca.SX, p: ca.SX, piece: Piece) -> tuple[ca.SX, ca.SX]:
