@@ -4,36 +4,54 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
 
+from codegen.cache import Cache, source_digest
+from codegen.compiler import find_compiler
+from codegen.errors import CodegenError
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.polishing import compiled_interior, compiled_rows
 from hybrid_opt.polishing.drivable import compiled_interior as drivable_interior
+from hybrid_opt.polishing.drivable.point import is_polishable
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PATH_INTERVALS
+from symbolic.errors import DualArmError
 
 
 def build_study(cell: Cell, polish: bool = True, drivable: bool = True) -> None:
     """Load or build the functions of a study, all compilers side by side.
 
     What a polish compiles when its solves first ask for it, rows of arms' clearances, is not among
-    them.
+    them. Where all was built before, or there is no compiler, nothing is done; what cannot be built
+    is left to who asks for it.
 
     Args:
+        cell: read from a file.
         polish: whether fronts are polished.
         drivable: whether carries are also searched for as robots drive them.
-
-    Raises:
-        DualArmError: a model or its code cannot be built.
     """
+    compiler, cache = find_compiler(), cell.compiled.cache or Cache()
+    if compiler is None or not cell.compiled.is_identified:
+        return
+    what = (str(cell.force_kind), str(polish), str(drivable), compiler.identity)
+    sources = source_digest("codegen", "hybrid_opt")
+    key = cell.compiled.key("study", *what, version("casadi"), sources)
+    if cache.read_record(key) is not None:
+        return
     cells = [cell, cell.drivable()] if drivable and not _driven(cell) else [cell]
     makers = [make for each in cells for make in _makers(each, polish)]
     # Each waits for its compilers most of the time; expressions are made by one after the other.
     with ThreadPoolExecutor(len(makers)) as pool:
         futures = [pool.submit(make) for make in makers]
-    for future in futures:
-        future.result()
+    failures = [failure for future in futures if (failure := future.exception()) is not None]
+    for failure in failures:
+        # What a cell cannot have is told by who needs it.
+        if not isinstance(failure, DualArmError):
+            raise failure
+    if not any(isinstance(failure, CodegenError) for failure in failures):
+        cache.write_record(key, {"built": True})
 
 
 def _driven(cell: Cell) -> bool:
@@ -42,8 +60,11 @@ def _driven(cell: Cell) -> bool:
 
 def _makers(cell: Cell, polish: bool) -> Iterator[Callable[[], object]]:
     compiled, workcell, cache = cell.compiled, cell.workcell, cell.compiled.cache
+    polished = polish and workcell.has_facing_pads
+    if _driven(cell):
+        polished = polished and is_polishable(workcell.task)
     yield lambda: cell.evaluator
-    if polish and workcell.has_facing_pads:
+    if polished:
         yield lambda: cell.polish_functions
     if _driven(cell):
         yield lambda: cell.path_timer
@@ -51,6 +72,6 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Callable[[], object]]:
     yield lambda: cell.timing_model
     yield lambda: JobCollisions(compiled)
     yield lambda: robust_model(workcell)
-    if polish and workcell.has_facing_pads:
+    if polished:
         yield lambda: drivable_interior.interior_method(cache)
         yield lambda: (compiled_interior.dense_method(cache), compiled_rows.row_binder(cache))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from hybrid_opt.building import build_study
 from hybrid_opt.campaign import (
     CampaignFolder,
     CampaignSettings,
@@ -21,6 +22,7 @@ from hybrid_opt.campaign.layout import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.campaign.simulated import read_simulations
+from hybrid_opt.cell import Cell
 from hybrid_opt.polishing.drivable.point import is_polishable
 from hybrid_opt.polishing.front import knows_forces
 from hybrid_opt.polishing.settings import PolishSettings
@@ -123,6 +125,12 @@ def run_study(
     if polish is not None and not is_polishable(cell.task):
         progress.note("the drivable carries of this cell cannot be polished: search alone")
         study = replace(study, drivable_polish=None, polish=None if alone else study.polish)
+    progress.note("compiling what is not compiled yet")
+    build_study(
+        Cell(cell, settings.objectives),
+        polish=study.polish is not None or study.drivable_polish is not None,
+        drivable=study.drivable and not alone,
+    )
     with open_folder(settings, execution, cell) as folder:
         told = store_branches(folder.root, competition)
         run_stages(folder, stages(study, alone), progress)
