@@ -25,6 +25,9 @@ LEAST_BYTES = 8000
 """Bytes of a function from which on it is compiled apart: a compiler's start costs 0.03 s, as much
 as 2000 bytes."""
 
+LEAST_ENTRY = 50_000
+"""The same of a text's own function, which others hardly share."""
+
 _FUNCTION = re.compile(
     r"^static int (?P<name>\w+_f\d+)(?P<rest>\(const (?P<real>casadi|lanes)_real\*\* arg, [^)]*\) "
     r"\{\n(?P<body>(?:  [^\n]*\n)*)\}\n)",
@@ -87,7 +90,8 @@ def in_parts(text: str, lanes: int) -> tuple[str, tuple[Part, ...]]:
     def take(found: re.Match[str]) -> str:
         kind, body = found["real"], found["body"]
         words = _OWN[kind]
-        if len(body) < LEAST_BYTES or not all(words.match(w) for w in set(_WORD.findall(body))):
+        least = LEAST_ENTRY if found["name"].endswith("_f0") else LEAST_BYTES
+        if len(body) < least or not all(words.match(w) for w in set(_WORD.findall(body))):
             return found[0]
         content = in_pieces(f"static int part_f0{found['rest']}")
         content = content.replace("static int part_f0(", "int PART(")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -30,6 +31,12 @@ class CellBodies:
     workcell: Workcell
     robots: tuple[RobotModel, RobotModel]
     geometry: CellGeometry
+
+    @cached_property
+    def screening(self) -> dict[str, ca.Function]:
+        """The functions of `symbolic.geometry.clearance.screening_functions`."""
+        placements = (self.robots[0].joint_placements, self.robots[1].joint_placements)
+        return screening_functions(self.geometry, placements)
 
 
 @dataclass(frozen=True)
@@ -72,9 +79,7 @@ def build_cell_model(workcell: Workcell) -> CellModel:
     """
     bodies = build_cell_bodies(workcell)
     robots, geometry = bodies.robots, bodies.geometry
-    clearance = screening_functions(
-        geometry, (robots[0].joint_placements, robots[1].joint_placements)
-    )["clearance"]
+    clearance = bodies.screening["clearance"]
     branches = (
         start_branches(workcell, 0, robots[0], _own_clearance(geometry, clearance, 0)),
         start_branches(workcell, 1, robots[1], _own_clearance(geometry, clearance, 1)),
@@ -97,7 +102,9 @@ def build_cell_model(workcell: Workcell) -> CellModel:
     start = [
         np.array(found[max(workcell.start_branch[i], 0)].q) for i, found in enumerate(branches)
     ]
-    return CellModel(workcell, robots, geometry, branches, (start[0], start[1]))
+    model = CellModel(workcell, robots, geometry, branches, (start[0], start[1]))
+    vars(model)["screening"] = bodies.screening  # of the same bodies: not made again
+    return model
 
 
 def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:

@@ -70,11 +70,10 @@ class JobCollisions:
 
         def make(model: CellModel) -> Mapping[str, ca.Function]:
             # Not imported at the top: a warm start needs no CasADi.
-            from symbolic.geometry.clearance import screening_functions, with_more_pairs
+            from symbolic.geometry.clearance import with_more_pairs
 
             placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
-            held = screening_functions(model.geometry, placements)
-            return with_more_pairs(held, model.geometry, self.geometry, placements)
+            return with_more_pairs(model.screening, model.geometry, self.geometry, placements)
 
         self._functions = compiled.functions("job", make, lanes=0)
 

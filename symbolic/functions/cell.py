@@ -6,7 +6,6 @@ import casadi as ca
 
 from symbolic.cell_model import CellModel
 from symbolic.functions.candidate import candidate_function, sample_functions
-from symbolic.geometry.clearance import screening_functions
 from symbolic.robot.arm import posture_function
 
 
@@ -19,12 +18,11 @@ def cell_functions(model: CellModel) -> dict[str, ca.Function]:
     clearance, piece_poses, motion: collision bounds, placements and bounds of the motion
     (`symbolic.geometry.clearance.screening_functions`).
     """
-    placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
     return {
         "candidate": candidate_function(model),
         **{f"inverse_dynamics_{i + 1}": model.robots[i].inverse_dynamics for i in (0, 1)},
         "posture": posture_function(model.workcell.robots, model.robots, model.workcell.contacts),
-        **screening_functions(model.geometry, placements),
+        **model.screening,
     }
 
 
@@ -35,8 +33,5 @@ def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
     `symbolic.functions.candidate.sample_functions`.
     clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
     """
-    placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
-    screening = screening_functions(model.geometry, placements)
-    return sample_functions(model) | {
-        name: screening[name] for name in ("clearance", "piece_poses")
-    }
+    screening = {name: model.screening[name] for name in ("clearance", "piece_poses")}
+    return sample_functions(model) | screening
