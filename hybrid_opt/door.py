@@ -14,7 +14,8 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from hybrid_opt.polishing.polisher import polisher_for
-from hybrid_opt.polishing.settings import PolishSettings, usual_settings
+from hybrid_opt.polishing.presets import usual_settings
+from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk

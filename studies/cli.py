@@ -15,7 +15,8 @@ from hybrid_opt.campaign.execution import ExecutorName
 from hybrid_opt.campaign.settings import FirstGeneration
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.metaheuristics.problem import ConstraintHandling
-from hybrid_opt.polishing.settings import DRIVABLE_ATTEMPTS, PolishSettings, quick_settings
+from hybrid_opt.polishing.presets import DRIVABLE_ATTEMPTS, quick_settings
+from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
 from symbolic.errors import SettingsError
 

@@ -119,7 +119,8 @@ class PolishEffort:
         seconds, median_attempt_seconds: spent in total and per attempt.
         equivalent_evaluations: candidate evaluations that take as long.
         widest_gap: share of the front's length between the neighbours that are farthest apart.
-        worst_stationarity, worst_feasibility, median_stationarity: residuals of accepted points.
+        worst_stationarity, worst_feasibility, median_stationarity: residuals of the points that a
+            solve made and that stand on the front in the end.
     """
 
     attempts: Count

@@ -14,8 +14,9 @@ def polish_document(front: PolishedFront) -> PolishDocument:
     """A polished front as it is stored."""
     # Others were judged as they are, without a solver.
     solved = [o for o in front.outcomes if o.rounds or o.status == "failed"]
-    # Probes are cut short on purpose.
-    accepted = [o for o in solved if o.status == "accepted" and o.aim != "probe"]
+    # What was dominated later, probes most of all, is no result.
+    standing = {x.tobytes() for x in front.x}
+    accepted = [o for o in solved if o.status == "accepted" and o.x.tobytes() in standing]
     points = zip(front.objectives, front.x, front.parent, front.polished, strict=True)
     return PolishDocument(
         front=tuple(

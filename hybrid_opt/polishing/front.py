@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.objectives import FORCE_PAIRS, ROBUST_OBJECTIVES
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost
@@ -22,7 +23,7 @@ from hybrid_opt.polishing.filling import Edge, crept, filling
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.kick import kicked
 from hybrid_opt.polishing.mirror import mirror_of
-from hybrid_opt.polishing.plan import Attempt, PlanState, aimed, points
+from hybrid_opt.polishing.plan import Attempt, PlanState, aimed, finishing, points
 from hybrid_opt.polishing.point import PolishSolver, Solution, SolveStart
 from hybrid_opt.polishing.probing import Start, halve, random_starts
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
@@ -95,12 +96,17 @@ class ForceRun(PolishRun[Attempt]):
         self._solver, self._mirror = polisher.solver, mirror_of(polisher.evaluator.workcell)
         self._tried: set[tuple[int | None, bytes]] = set()
         self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
-        self._unproven: list[int] = []
+        self._unproven = set[bytes]()
+        self._probed = set[bytes]()
         self._ahead = 0
 
     def _solution(self, attempt: Attempt) -> Solution:
         how = attempt.wide, attempt.near, attempt.brief
-        return self._solver.solve(SolveStart(attempt.x, attempt.target, attempt.radius, *how))
+        found = self._solver.solve(SolveStart(attempt.x, attempt.target, attempt.radius, *how))
+        # Ends and middles have a finer scale of their own.
+        unit = float((attempt.target.span / self._archive.span()).max())
+        found.residuals = found.residuals.scaled(unit)
+        return found
 
     def all(self, rng: np.random.Generator) -> None:
         """The front's points, then probes far from it, then ends and middle in turns while attempts
@@ -108,13 +114,19 @@ class ForceRun(PolishRun[Attempt]):
         with points on chords in the end."""
         self._do(points(self._archive, self._settings))
         self._ahead = self._left()
-        for objective in (0, 1, None) if self._mirror is None else (0, None):
+        aims = (0, 1, None) if self._mirror is None else (0, None)
+        for objective in aims:
             self._probe(objective, rng)
         while self._left() > 0:
             self._turn((0, 1), rng)
             if self._stalls[None] < self._settings.front.middle_stalls:
                 self._turn((None,), rng)
+        for objective in aims:
+            self._most += 1
+            self._do([finishing(self._archive, objective, self._settings)])
+        probed = self._without_probes()
         self._fill()
+        self._take_back(probed)
         self._certify_unproven()
 
     def _probe(self, objective: int | None, rng: np.random.Generator) -> None:
@@ -137,6 +149,23 @@ class ForceRun(PolishRun[Attempt]):
             return Start(outcome.x, outcome.objectives, spent=outcome.status != "accepted")
 
         halve(pool, objective, solve)
+
+    def _without_probes(self) -> list[tuple[Array, Array]]:
+        """Take out what probes reached, but for the ends and the middle: cut short on purpose, they
+        would stand where a gap is to be filled."""
+        archive = self._archive
+        kept = {archive.best(objective)[0] for objective in (0, 1, None)}
+        probed = [k for k, x in enumerate(archive.x) if x.tobytes() in self._probed]
+        left = [k for k in probed if k not in kept]
+        found = [(archive.x[k], archive.objectives[k]) for k in left]
+        archive.drop(left)
+        return found
+
+    def _take_back(self, probed: list[tuple[Array, Array]]) -> None:
+        """What stands beside the filled front is not given up."""
+        for x, objectives in probed:
+            if not self._archive.dominates(objectives):
+                self._archive.add(x, objectives)
 
     def _fill(self) -> None:
         """Attempts between the ends, until the front is even or no side of a gap is left; then
@@ -164,7 +193,7 @@ class ForceRun(PolishRun[Attempt]):
             found = between(self._evaluator, archive, gap, fill)
             if found is not None:
                 archive.add(*found)
-                self._unproven.append(len(archive.x) - 1)
+                self._unproven.add(found[0].tobytes())
                 self._take_image(found[0])
 
     def _reflected(self, edge: Edge) -> Edge:
@@ -182,7 +211,16 @@ class ForceRun(PolishRun[Attempt]):
     def _take(self, attempt: Attempt, outcome: PolishOutcome) -> None:
         super()._take(attempt, outcome)
         if outcome.status == "accepted":
+            if attempt.brief:
+                self._unproven.add(outcome.x.tobytes())
+                self._probed |= {outcome.x.tobytes(), self._reflected_bytes(outcome.x.tobytes())}
             self._take_image(outcome.x)
+
+    def _evaluated(self, attempt: Attempt, x: Array) -> Evaluations:
+        """Most of what probes reach is dominated soon: what then stands is certified in the end."""
+        if attempt.brief:
+            return self._evaluator.evaluate(x)
+        return super()._evaluated(attempt, x)
 
     def _take_image(self, x: Array) -> None:
         if (image := self._image(x)) is None:
@@ -190,11 +228,12 @@ class ForceRun(PolishRun[Attempt]):
         found = self._evaluator.evaluate(image)
         if found.feasible[0] and not self._archive.dominates(found.objectives[0]):
             self._archive.add(image, found.objectives[0])
-            self._unproven.append(len(self._archive.x) - 1)
+            self._unproven.add(image.tobytes())
 
     def _certify_unproven(self) -> None:
         """Leave out what no solve made and is not proven free of collisions between the samples."""
-        standing = [k for k in self._archive.rows() if k in self._unproven]
+        rows, known = self._archive.rows(), self._unproven
+        standing = [k for k in rows if self._archive.x[k].tobytes() in known]
         if standing:
             x = np.array([self._archive.x[k] for k in standing])
             proven = self._evaluator.certified(self._evaluator.evaluate(x)).feasible

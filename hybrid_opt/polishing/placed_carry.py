@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,6 +20,9 @@ from symbolic.smooth.reach import Reach
 from symbolic.workcell.decision import POSE_SIZE, extended_waypoints, place_redundant
 
 _Found = TypeVar("_Found")
+
+SHARPENED_BELOW = 0.1
+"""Bounds of the payload's distances that are lower are raised by the gaps across its edges [m]."""
 
 DIPS_BELOW = 0.1
 """Pairs that stay farther apart than this are not looked at between places [m]."""
@@ -60,6 +63,7 @@ class PlacedCarry:
     peak: Array
     shift: Array
     _distances: Distances = field(repr=False)
+    _gaps: Callable[[int], Array] = field(repr=False)
     _known: dict[object, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -71,6 +75,10 @@ class PlacedCarry:
     def clearance(self) -> Array:
         """(reached, n_pairs) lower bounds of every active pair's distance [m]."""
         return self._distances.bounds
+
+    def gaps(self, pair: int) -> Array:
+        """(reached, DIRECTIONS) gaps of a pair that `symbolic.smooth.passage` separates [m]."""
+        return self._gaps(pair)
 
     @property
     def lowered(self) -> Array:
@@ -227,6 +235,7 @@ class CarryReader:
         force = found["normal_force"]
         minimised = force if self._robust is None else self._robust.forces(found)
         held = pose[:reached], q_1[:reached], q_2[:reached]
+        gaps = lru_cache(maxsize=None)(partial(self._rows.gaps, pose=held[0]))
         return PlacedCarry(
             pose=pose,
             rate=rate,
@@ -239,11 +248,12 @@ class CarryReader:
             peak=minimised.max(axis=0) / task.reference_force,
             shift=found["pressure_shift"] / self._radii,
             _distances=Distances(
-                lambda: evaluator.checker.bounds(*held),
+                lambda: self._sharpened(evaluator.checker.bounds(*held), gaps),
                 lambda rows, raised, wanted: evaluator.checker.measure(
                     held[0][rows], held[1][rows], held[2][rows], raised, wanted
                 ),
             ),
+            _gaps=gaps,
         )
 
     def _split(self, found: Mapping[str, Array]) -> Array:
@@ -255,3 +265,10 @@ class CarryReader:
         whole = found["contact_force"][:, :3] + found["contact_force"][:, 3:]
         square = (whole**2).sum(axis=1) - along**2
         return np.column_stack([along, np.sqrt(np.maximum(square, 0.0))])
+
+    def _sharpened(self, bounds: Array, gaps: Callable[[int], Array]) -> Array:
+        """Bounds (n, n_pairs), those of the payload from a box raised to the largest gap."""
+        near = bounds.min(axis=0, initial=np.inf) < SHARPENED_BELOW
+        for pair in self._rows.separable.intersection(np.flatnonzero(near).tolist()):
+            np.maximum(bounds[:, pair], gaps(pair).max(axis=1), out=bounds[:, pair])
+        return bounds

@@ -117,3 +117,12 @@ def aimed(
         return Attempt("balance", -1, archive.x[k], start, balance(start, span), radius)
     target = extreme(start, span, objective)
     return Attempt("extreme", -1, archive.x[k], start, target, radius, wide=away)
+
+
+def finishing(archive: GrowingFront, objective: int | None, settings: PolishSettings) -> Attempt:
+    """An attempt from the best point at an end, or at the balanced middle, to the last digits."""
+    k, span = archive.best(objective)[0], archive.span()
+    x, start, radius = archive.x[k], archive.objectives[k], settings.fill.radius
+    if objective is None:
+        return Attempt("balance", -1, x, start, balance(start, span), radius, near=True)
+    return Attempt("extreme", -1, x, start, extreme(start, span, objective), radius, near=True)

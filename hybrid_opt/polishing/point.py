@@ -66,7 +66,7 @@ class Solution:
         message: the solver's status in the last round.
         converged: whether the last step ended inside the box at an optimum, by the solver's word.
         usable: whether the solver returned numbers in any round.
-        residuals: of the round that gave x, or of the last one where nothing was gained.
+        residuals: at x, in the program of the last round.
         iterations, rounds: in total.
         rows: constraints at places of the path in the round of the residuals.
     """
@@ -118,7 +118,7 @@ class PolishSolver:
             settings,
             rounds=near.rounds,
             max_iterations=near.iterations,
-            solve=replace(settings.solve, barrier=near.barrier),
+            solve=replace(settings.solve, barrier=near.barrier, tolerance=near.tolerance),
         )
         self._solve = ipopt if settings.solve.solver == "ipopt" else dense_method(cache)
         self._active = ActiveSet(Surroundings(evaluator, self._cell, settings))
@@ -127,11 +127,13 @@ class PolishSolver:
     def solve(self, start: SolveStart) -> Solution:
         """Improve towards the target."""
         x = np.clip(start.x, self._cell.task.lower, self._cell.task.upper)
-        best = _Best(x, self._reader.read(x), Learned(self._active, self._settings.stricter))
+        best = _Best(x, self._reader.read(x), self._nothing_learned())
         region = TrustRegion(self._settings.trust, start.radius)
         solution, settings = Solution(x), self._settings_for(start)
+        first = level(start.target, best.carry.peak)
         while solution.rounds < settings.rounds and not region.is_spent:
-            required = best.learned.required(best.carry, start.target, lenient=solution.rounds == 0)
+            at, lenient = (best.x, region.radius), solution.rounds == 0
+            required = best.learned.required(best.carry, start.target, at, lenient)
             program = SmoothProgram(
                 self._cell, required, start.target, best.carry, best.x, region.radius
             )
@@ -144,31 +146,34 @@ class PolishSolver:
             step, carry = self._cell.unit.step(best.x, x), self._reader.read(x)
             violated = self._active.violated(carry, best.carry, required)
             if violated or not carry.is_followed:
-                learned = best.learned.refuse(carry, best.carry, violated, required)
+                learned = best.learned.refuse(carry, best.carry, x, violated, required)
                 region.refused(learned and carry.is_followed)
                 if (part := self._part(best, x, required, start.target)) is not None:
                     self._move(best, *part)
-                    solution.x = best.x
-                    solution.residuals = program.residuals_at(best.x, best.carry, answer)
             elif level(start.target, carry.peak) >= level(start.target, best.carry.peak):
                 higher = self._active.forces.higher(carry, start.target) - required.keys()
-                best.learned.ask(higher)
+                best.learned.ask(higher, x)
                 if answer.converged and not higher and not region.holds(step):
                     solution.converged = True
-                    solution.residuals = program.residuals_at(best.x, best.carry, answer)
+                    worst = level(start.target, best.carry.peak) + settings.solve.settling
+                    if level(start.target, carry.peak) < min(first, worst):
+                        self._move(best, x, carry)
                     break
                 if not higher:
                     region.barren(step)
             else:
                 self._move(best, x, carry)
-                solution.x, solution.residuals = x, answer.residuals
                 solution.converged = answer.converged and not region.holds(step)
                 region.taken(step)
                 if solution.converged:
                     break
-            if not np.isfinite(solution.residuals.stationarity):
-                solution.residuals = answer.residuals
+        solution.x = best.x
+        if solution.usable:
+            solution.residuals = program.residuals_at(best.x, best.carry)
         return solution
+
+    def _nothing_learned(self) -> Learned:
+        return Learned(self._active, self._settings.stricter, self._cell.unit.half)
 
     def _settings_for(self, start: SolveStart) -> PolishSettings:
         if start.near:

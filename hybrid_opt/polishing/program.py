@@ -24,13 +24,14 @@ import numpy as np
 
 from hybrid_opt.polishing.compiled_rows import RowParts
 from hybrid_opt.polishing.force_values import ForceValues
+from hybrid_opt.polishing.inequalities import Inequalities
+from hybrid_opt.polishing.interior_steps import estimated
 from hybrid_opt.polishing.layout import HELD, Layout, PlaceRow, Row
 from hybrid_opt.polishing.place_values import Places, PlaceValues
 from hybrid_opt.polishing.placed_carry import PlacedCarry
 from hybrid_opt.polishing.residuals import Residuals, residuals
 from hybrid_opt.polishing.sample_values import SampleValues
 from hybrid_opt.polishing.smooth_cell import SmoothCell
-from hybrid_opt.polishing.solvers import Answer
 from hybrid_opt.polishing.targets import Target, needed_level
 from symbolic.array import Array
 
@@ -100,6 +101,8 @@ class SmoothProgram:
         self.start = np.concatenate([xi, phi, [needed_level(target, phi) + SLACK]])
         self.low, self.high = np.full((2, layout.n_variables), LEVEL_BOUND)
         self.low *= -1.0
+        self.low[layout.decision], self.high[layout.decision] = low, high
+        self._own_bounds = self.low.copy(), self.high.copy()
         self.low[layout.decision] = np.maximum(low, xi - radius)
         self.high[layout.decision] = np.minimum(high, xi + radius)
         self.below = np.full(layout.n_rows, -np.inf)
@@ -283,13 +286,20 @@ class SmoothProgram:
             total += self._places.second(multipliers[layout.places] / self._scale)
         return total
 
-    def residuals_at(self, x: Array, carry: PlacedCarry, answer: Answer) -> Residuals:
-        """Residuals at a candidate that is not the answer itself, with the answer's multipliers."""
-        z, target = answer.z.copy(), self._target
-        z[self.layout.decision] = self._cell.unit.scaled(x)
+    def residuals_at(self, x: Array, carry: PlacedCarry) -> Residuals:
+        """Residuals at a candidate x, with the multipliers that satisfy the conditions best there.
+        Only the variables' own bounds count: those of the box of trust would take up what is left
+        to be won."""
+        layout, target = self.layout, self._target
+        z = np.empty(layout.n_variables)
+        z[layout.decision] = self._cell.unit.scaled(x)
         phi = (carry.peak - target.anchor) / target.span
-        z[self.layout.peaks], z[self.layout.level] = phi, needed_level(target, phi)
-        return residuals(self, z, *answer.multipliers)
+        z[layout.peaks], z[layout.level] = phi, needed_level(target, phi)
+        low, high = self._own_bounds
+        rows = Inequalities(self)
+        slacks = np.abs(rows.values(z)), np.abs(z - low), np.abs(high - z)
+        lam_z, y = estimated(self.cost, rows.slopes(z), slacks)
+        return residuals(self, z, lam_z, rows.multipliers(y), self._own_bounds)
 
     def candidate(self, z: Array) -> Array:
         """(n_var,) the decision vector at z, within its bounds and the box of trust."""

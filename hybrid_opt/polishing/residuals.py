@@ -39,20 +39,34 @@ class Residuals:
     feasibility: float
     complementarity: float
 
+    def scaled(self, unit: float) -> Residuals:
+        """With the objective in units that are so many times smaller."""
+        return Residuals(unit * self.stationarity, self.feasibility, unit * self.complementarity)
+
 
 UNKNOWN = Residuals(np.nan, np.nan, np.nan)
 """Of a solve that returned nothing."""
 
 
-def residuals(program: Constrained, z: Array, lam_z: Array, lam_g: Array) -> Residuals:
+def residuals(
+    program: Constrained,
+    z: Array,
+    lam_z: Array,
+    lam_g: Array,
+    bounds: tuple[Array, Array] | None = None,
+) -> Residuals:
     """Residuals of the optimality conditions at z with the given multipliers.
 
     In CasADi's convention: positive multipliers belong to upper bounds, negative to lower ones.
+
+    Args:
+        bounds: lower and upper (n_variables,) in place of the program's.
     """
     values, jacobian = program.constraints(z)
     lagrangian = program.cost + jacobian.T @ lam_g + lam_z
+    low, high = bounds or (program.low, program.high)
     sides = (
-        (z, program.low, program.high, lam_z),
+        (z, low, high, lam_z),
         (values, program.below, program.above, lam_g),
     )
     violation, product = 0.0, 0.0

@@ -11,7 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
+from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost, solve_safely
 from hybrid_opt.polishing.point import Solution
@@ -129,11 +129,15 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 
     def _recomputed(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
         """What the full evaluator and the certificate between the samples say of an answer."""
-        found = self._evaluator.certified(self._evaluator.evaluate(answer.x))
+        found = self._evaluated(attempt, answer.x)
         reason = int(found.reason[0])
         if reason != FEASIBLE:
             return "rejected", REASONS[reason], attempt.start
         return self._worth(attempt, answer, found.objectives[0])
+
+    def _evaluated(self, attempt: AnyAttempt, x: Array) -> Evaluations:
+        """What the full evaluator and the certificate between the samples say of x (n_var,)."""
+        return self._evaluator.certified(self._evaluator.evaluate(x))
 
     def _worth(
         self, attempt: AnyAttempt, answer: Solution, objectives: Array

@@ -32,6 +32,7 @@ class NearSettings:
         joint_distance: joints nearer than this to a limit get a row [rad].
         reach_share, reach_stride: where |det J| is below this share of its median along the path,
             every such stretch gets a row: it bounds the reach, beyond which nothing is defined.
+        edge, edge_stride: the same below this multiple of the least |det J|, more densely.
         lost: this far after the loss of an arm, and twice as far, there are rows, too.
         force_stride: distance of force rows: forces are smooth along the path.
         tie_stride: the same for a robot whose force only breaks ties.
@@ -54,6 +55,8 @@ class NearSettings:
     joint_distance: float = 0.05
     reach_share: float = 0.9
     reach_stride: float = 0.02
+    edge: float = 1.1
+    edge_stride: float = 0.005
     lost: float = 0.04
     force_stride: float = 0.02
     tie_stride: float = 0.06
@@ -100,6 +103,8 @@ class SolveSettings:
         feasible: violation of a scaled row at which an iterate counts as feasible.
         rounding: share of a step's duration by which the paper's time law is rounded where rotation
             takes over from translation: the least forces at the ends of a path lie in that kink.
+        settling: units of the target's scale by which an optimum that keeps all that is asked for
+            may be worse than the best candidate, which may keep less, and is taken in its place.
         patience: times the wanted number of iterations that a solve may take to become feasible:
             cut off wherever it stands, it ends in an obstacle more often than not.
     """
@@ -110,6 +115,7 @@ class SolveSettings:
     tolerance: float = 1e-6
     feasible: float = 1e-3
     rounding: float = 1e-3
+    settling: float = 5e-4
     patience: int = 3
 
 
@@ -165,7 +171,7 @@ class ProbeSettings:
 
     starts: int = 8
     middle_starts: int = 8
-    rounds: int = 3
+    rounds: int = 2
     candidates: int = 1000
 
 
@@ -184,21 +190,23 @@ class FillSettings:
         far: width beyond which a gap that no neighbour leads into is looked at from afar.
         far_radius, radius: of the first box of trust from afar and from a neighbour, in halves of
             the decision variables' ranges.
-        rounds, iterations, barrier: of a solve from a neighbour on the front, in place of
-            `PolishSettings.rounds`, `PolishSettings.max_iterations` and `SolveSettings.barrier`.
+        rounds, iterations, barrier, tolerance: of a solve from a neighbour on the front, in place
+            of `PolishSettings.rounds`, `PolishSettings.max_iterations`, `SolveSettings.barrier` and
+            `SolveSettings.tolerance`.
     """
 
-    solved: int = 50
+    solved: int = 36
     members: int = 60
     chord: int = 16
     attempts: int = 5
     stride: float = 0.2
     far: float = 0.1
     far_radius: float = 1.0
-    radius: float = 0.2
-    rounds: int = 2
-    iterations: int = 15
-    barrier: float = 1e-5
+    radius: float = 0.4
+    rounds: int = 12
+    iterations: int = 30
+    barrier: float = 1e-6
+    tolerance: float = 1e-6
 
 
 @dataclass(frozen=True)
@@ -270,7 +278,7 @@ class PolishSettings:
         near, trust, solve, front, kick, probe, fill, drivable: the parts' own.
     """
 
-    attempts: int = 8
+    attempts: int = 6
     method: Method = "pascoletti-serafini"
     max_iterations: int = 20
     rounds: int = 7
@@ -308,23 +316,3 @@ class PolishSettings:
         for name in ("max_seconds", "margin", "between", "clearance", "stricter", "tolerance"):
             if not getattr(self, name) > 0.0:
                 raise SettingsError(f"polish {name} is {getattr(self, name)!r}; it must exceed 0")
-
-
-DRIVABLE_ATTEMPTS = 10
-"""At a drivable front. With seven, replicas of the rack differ by 1.1 % at 55 N, with ten by 0.4 %
-(docs/drivable.md)."""
-
-
-def usual_settings(time_law: str) -> PolishSettings:
-    """The settings where nothing else is asked for."""
-    return PolishSettings(attempts=DRIVABLE_ATTEMPTS) if time_law == "optimal" else PolishSettings()
-
-
-def quick_settings() -> PolishSettings:
-    """Settings of a small study: a third as many points from fewer attempts, and a shorter
-    tournament, after which one replica of eight stayed in a slower basin (docs/drivable.md)."""
-    return PolishSettings(
-        attempts=2,
-        fill=FillSettings(solved=16, members=16),
-        drivable=DrivableSettings(turn=1, members=10),
-    )

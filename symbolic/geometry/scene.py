@@ -23,12 +23,12 @@ from symbolic.geometry.directions import (
 )
 from symbolic.geometry.enclosing import SphereChain
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.geometry.pieces import Capsule, Piece, bounding_box, support
+from symbolic.geometry.pieces import Capsule, Piece, bounding_box
 from symbolic.geometry.placements import clean, world_placements
 from symbolic.geometry.softness import Softness
 from symbolic.workcell.records import Box, Cylinder, Sphere
 
-BOX_NUMBERS = 30
+BOX_NUMBERS = 15
 """Length of `Scene.box_numbers`."""
 
 
@@ -94,37 +94,33 @@ class Scene:
             and isinstance(second.pieces[0].shape, Box)
         )
 
-    def separations(self, i: int, obstacle: ca.SX) -> list[ca.SX]:
-        """The gaps between the payload, body i, and a fixed box along single directions; `bound`
-        is the largest.
+    def separation(self, i: int, obstacle: ca.SX, direction: ca.SX) -> ca.SX:
+        """The gap between the payload, body i, and a fixed box along a direction.
 
         Args:
             obstacle: (BOX_NUMBERS,) of the box, see `box_numbers`; may be symbols.
+            direction: (3,) unit vector from the box towards the payload.
         """
-        A, low, high = ca.reshape(obstacle[:9], 3, 3).T, obstacle[9:12], obstacle[12:15]
-        rotation, centre = ca.reshape(obstacle[15:24], 3, 3).T, obstacle[24:27]
-        half = obstacle[27:]
-        # A key of its own, because other symbols may come next.
-        moving = self._interval(i, Axes(f"obstacle {len(self._intervals)}", A))
-        pairs = [(own, (low[k], high[k])) for k, own in enumerate(moving)]
-        own = self._own_axes(self.geometry.bodies[i].frame)
-        middle, turned = ca.mtimes(own.A, centre), ca.mtimes(own.A, rotation)
-        for k, interval in enumerate(self._interval(i, own)):
-            reach = sum(half[m] * self.soft.entry_above(turned[k, m]) for m in range(3))
-            pairs.append((interval, (middle[k] - reach, middle[k] + reach)))
-        return _gaps(pairs)
+        rotation, centre = ca.reshape(obstacle[:9], 3, 3).T, obstacle[9:12]
+        half = obstacle[12:]
+        R, p = self._placed[self.geometry.bodies[i].frame]
+        along = ca.mtimes(direction.T, R)
+        ends = [
+            ca.mtimes(along, ca.SX(clean(piece.centre)))
+            - self._reach(ca.mtimes(along, ca.SX(clean(piece.rotation))), piece)
+            for piece in self._cover(i)
+        ]
+        turned = ca.mtimes(direction.T, rotation)
+        reach = sum(half[k] * self.soft.entry_above(turned[k]) for k in range(3))
+        return self.soft.minimum_below(ends) + ca.dot(direction, p - centre) - reach
 
     def box_numbers(self, j: int) -> Array:
-        """(BOX_NUMBERS,) of the fixed box j of a `separable` pair: the axes along which it is
-        compared (3, 3), its extent along them, low (3,) and high (3,), its rotation (3, 3),
-        centre (3,) and half edges (3,)."""
+        """(BOX_NUMBERS,) of the fixed box j of a `separable` pair: its rotation (3, 3), centre (3,)
+        and half edges (3,)."""
         (piece,) = self.geometry.bodies[j].pieces
         assert isinstance(piece.shape, Box)
-        A = np.array(ca.DM(self._axes_of(piece).A))
-        high, low = support(piece, A), -support(piece, -A)
-        rotation, half = clean(piece.rotation), np.asarray(piece.shape.size) / 2.0
-        parts = (A, low, high, rotation, clean(piece.centre), half)
-        return np.concatenate([np.ravel(part) for part in parts])
+        half = np.asarray(piece.shape.size) / 2.0
+        return np.concatenate([clean(piece.rotation).ravel(), clean(piece.centre), half])
 
     def _along(self, i: int, j: int, axes: Axes) -> list[tuple[Interval, Interval]]:
         return list(zip(self._interval(i, axes), self._interval(j, axes), strict=True))

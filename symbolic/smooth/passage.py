@@ -1,11 +1,12 @@
 """How the payload passes an obstacle: along one direction, or over the edge between two.
 
-The clearance of the payload from a box is the largest gap along one of a few directions. A row
-that holds one of these gaps is smooth. Where the payload passes an edge, another direction
-separates the two after it than before, and the clearance has a kink between. Rows that held the
-larger of both gaps would tie each place of the path to its side of the edge. So the height of the
-kink is a row of its own: with the gaps g, before and after, and their rates g' along the path,
-both taken at a place near the kink,
+The clearance of the payload from a box is the largest gap along one of a few directions: the axes
+of both, and those across an edge of each (the separating axis theorem, Gottschalk, Lin and Manocha
+1996). A row that holds one of these gaps is smooth. Where the payload passes an edge, another
+direction separates the two after it than before, and the clearance has a kink between. Rows that
+held the larger of both gaps would tie each place of the path to its side of the edge. So the height
+of the kink is a row of its own: with the gaps g, before and after, and their rates g' along the
+path, both taken at a place near the kink,
 
     height = (g_after' g_before - g_before' g_after) / (g_after' - g_before'),
 
@@ -27,13 +28,69 @@ from symbolic.smooth.place import Place, PlaceConstraint
 GAPS = "gaps"
 """Name of `gap_function`."""
 
-DIRECTIONS = 12
-"""Gaps of `Scene.separations`: both ways along three axes of the obstacle and of the payload."""
+PARALLEL = 0.1
+"""Sine of the angle between two edges below which no direction across both is looked at."""
+
+APART = -1e3
+"""Gap along such a direction: it never is the largest [m]."""
+
+
+DIRECTION_NUMBERS = 12
+"""Length of `direction_numbers`."""
+
+
+def _directions() -> Array:
+    """(DIRECTIONS, DIRECTION_NUMBERS) shares of the axes that make up each, see `direction`."""
+    found = []
+    for first, axes in ((0, 1), (3, 1), (6, 3)):
+        for k in range(3):
+            for j in range(axes):
+                one = np.zeros(DIRECTION_NUMBERS)
+                one[first + k] = 1.0
+                if axes > 1:
+                    one[9 + j] = 1.0
+                back = one.copy()
+                back[first : first + 3] *= -1.0
+                found += [one, back]
+    return np.array(found)
+
+
+_SHARES = _directions()
+
+DIRECTIONS = len(_SHARES)
+"""Both ways along three axes of the obstacle and three of the payload, and across each edge of one
+and each of the other: of two boxes that are apart, one of these separates them."""
+
+
+def direction_numbers(obstacle: Array, k: int) -> Array:
+    """(DIRECTION_NUMBERS,) of direction k from an obstacle (BOX_NUMBERS,), for `direction`."""
+    along_obstacle, along_payload, edge, other = _SHARES[k].reshape(4, 3)
+    rotation = obstacle[:9].reshape(3, 3)
+    turned = rotation @ along_obstacle, rotation @ edge
+    return np.concatenate([turned[0], along_payload, turned[1], other])
+
+
+def direction(place: Place, numbers: ca.SX) -> ca.SX:
+    """(3,) not normalised: the sum of a fixed vector, one of the payload, and the product of a
+    fixed edge and one of the payload. All but one are zero.
+
+    Args:
+        numbers: (DIRECTION_NUMBERS,) these four, two in the world and two in the payload's axes.
+    """
+    fixed, own, edge, other = ca.vertsplit(numbers, 3)
+    turned = ca.mtimes(place.rotation, ca.horzcat(own, other))
+    return fixed + turned[:, 0] + ca.cross(edge, turned[:, 1])
+
+
+def gap(place: Place, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
+    """The gap along a direction, its kinks rounded [m]."""
+    n = direction(place, numbers)
+    return place.scene.separation(place.payload, obstacle, n / ca.norm_2(n))
 
 
 @dataclass(frozen=True, order=True)
 class Separation(PlaceConstraint):
-    """Gap of a separable pair along one direction of `Scene.separations` [m]."""
+    """Gap of a separable pair along one direction [m]."""
 
     pair: int
     direction: int
@@ -46,16 +103,17 @@ class Separation(PlaceConstraint):
         return "separation"
 
     def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
-        """The chosen gap."""
-        return ca.dot(ca.vertcat(*place.gaps(numbers[:BOX_NUMBERS])), numbers[BOX_NUMBERS:])
+        """The gap."""
+        return gap(place, numbers[:BOX_NUMBERS], numbers[BOX_NUMBERS:])
 
     def count(self, place: Place) -> int:
-        """Those of the obstacle and a choice."""
-        return BOX_NUMBERS + DIRECTIONS
+        """Those of the obstacle and of the direction."""
+        return BOX_NUMBERS + DIRECTION_NUMBERS
 
     def numbers(self, place: Place) -> Array:
-        """The obstacle, and which gap."""
-        return np.concatenate([place.obstacle(self.pair), _chosen(self.direction)])
+        """The obstacle, and the direction."""
+        obstacle = place.obstacle(self.pair)
+        return np.concatenate([obstacle, direction_numbers(obstacle, self.direction)])
 
 
 @dataclass(frozen=True, order=True)
@@ -76,28 +134,39 @@ class Passing(PlaceConstraint):
 
     def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
         """Where the lines of both gaps meet."""
-        gaps = ca.vertcat(*place.gaps(numbers[:BOX_NUMBERS]))
-        before = ca.dot(gaps, numbers[BOX_NUMBERS : BOX_NUMBERS + DIRECTIONS])
-        after = ca.dot(gaps, numbers[BOX_NUMBERS + DIRECTIONS :])
-        falls, rises = (ca.jtimes(gap, place.pose, place.rate) for gap in (before, after))
+        obstacle, both = (
+            numbers[:BOX_NUMBERS],
+            ca.vertsplit(numbers[BOX_NUMBERS:], DIRECTION_NUMBERS),
+        )
+        before, after = (gap(place, obstacle, one) for one in both)
+        falls, rises = (ca.jtimes(one, place.pose, place.rate) for one in (before, after))
         return (rises * before - falls * after) / (rises - falls)
 
     def count(self, place: Place) -> int:
-        """Those of the obstacle and two choices."""
-        return BOX_NUMBERS + 2 * DIRECTIONS
+        """Those of the obstacle and of both directions."""
+        return BOX_NUMBERS + 2 * DIRECTION_NUMBERS
 
     def numbers(self, place: Place) -> Array:
-        """The obstacle, and which gaps."""
-        chosen = (_chosen(self.before), _chosen(self.after))
-        return np.concatenate([place.obstacle(self.pair), *chosen])
-
-
-def _chosen(direction: int) -> Array:
-    return np.asarray(np.eye(DIRECTIONS)[direction])
+        """The obstacle, and both directions."""
+        obstacle = place.obstacle(self.pair)
+        both = [direction_numbers(obstacle, k) for k in (self.before, self.after)]
+        return np.concatenate([obstacle, *both])
 
 
 def gap_function(place: Place) -> ca.Function:
-    """pose (6,), obstacle (BOX_NUMBERS,) -> gaps (DIRECTIONS,) along single directions [m]."""
+    """pose (6,), obstacle (BOX_NUMBERS,) -> gaps (DIRECTIONS,) along single directions, with their
+    kinks [m]. The largest is positive where the payload, a box, and the obstacle are apart, and
+    never more than their distance then; but for edges that are nearly parallel."""
     obstacle = ca.SX.sym("obstacle", BOX_NUMBERS)
-    gaps = ca.cse([ca.densify(ca.vertcat(*place.gaps(obstacle)))])
+    rotation = ca.reshape(obstacle[:9], 3, 3).T
+    found = []
+    for shares in _SHARES:
+        fixed, own, edge, other = (ca.DM(part) for part in shares.reshape(4, 3))
+        turned = ca.vertcat(ca.mtimes(rotation, fixed), own, ca.mtimes(rotation, edge), other)
+        n = direction(place, turned)
+        squared = ca.sumsqr(n)
+        unit = n / ca.sqrt(ca.fmax(squared, PARALLEL**2))
+        along = place.sharp_scene.separation(place.payload, obstacle, unit)
+        found.append(ca.if_else(squared < PARALLEL**2, APART, along))
+    gaps = ca.cse([ca.densify(ca.vertcat(*found))])
     return ca.Function(GAPS, [place.pose, obstacle], gaps, ["pose", "obstacle"], ["gaps"])

@@ -18,7 +18,7 @@ from symbolic.array import Array
 from symbolic.cell_model import CellBodies
 from symbolic.geometry.bodies import PAYLOAD
 from symbolic.geometry.scene import Scene
-from symbolic.geometry.softness import Softness
+from symbolic.geometry.softness import EXACT, Softness
 from symbolic.physics.rotation import rotation_matrix
 from symbolic.smooth.keys import Order, RowKey
 
@@ -27,7 +27,7 @@ WIDTH = 2e-4
 by measured distances (`hybrid_opt.polishing.constraints`)."""
 
 
-TURN = 1e-2
+TURN = 3e-3
 """Width of the kinks where a face of a box becomes parallel to another [1]: the best carries lie
 in these kinks, and a solver that sees them sharp creeps along."""
 
@@ -49,17 +49,24 @@ class Place:
         self.q = ca.SX.sym("q_1", first), ca.SX.sym("q_2", second)
 
     @cached_property
+    def rotation(self) -> ca.SX:
+        """(3, 3) of the box in the world."""
+        return rotation_matrix(self.model.workcell.task.orientation, self.pose[3:])
+
+    @cached_property
     def scene(self) -> Scene:
         """The bodies, with the kinks of their distances rounded."""
-        placed = [self.model.robots[arm].joint_placements(self.q[arm]) for arm in (0, 1)]
-        rotation = rotation_matrix(self.model.workcell.task.orientation, self.pose[3:])
-        softness = Softness(WIDTH, TURN)
-        return Scene(self.model.geometry, rotation, self.pose[:3], (placed[0], placed[1]), softness)
+        return self._scene(Softness(WIDTH, TURN))
 
-    def gaps(self, obstacle: ca.SX) -> list[ca.SX]:
-        """The gaps between the payload and a fixed box (`Scene.box_numbers`) along single
-        directions [m]."""
-        return self.scene.separations(self.payload, obstacle)
+    @cached_property
+    def sharp_scene(self) -> Scene:
+        """The bodies as they are."""
+        return self._scene(EXACT)
+
+    def _scene(self, softness: Softness) -> Scene:
+        placed = [self.model.robots[arm].joint_placements(self.q[arm]) for arm in (0, 1)]
+        geometry = self.model.geometry
+        return Scene(geometry, self.rotation, self.pose[:3], (placed[0], placed[1]), softness)
 
     @property
     def payload(self) -> int:

@@ -147,6 +147,6 @@ def gaps_of(kind: DistanceKind, carry: PlacedCarry, pair: int) -> Gaps:
     """Of a separable pair, at the places that are reached."""
 
     def find() -> Gaps:
-        return Gaps.of(kind.rows.gaps(pair, carry.pose[: carry.reached]))
+        return Gaps.of(carry.gaps(pair))
 
     return carry.once(("gaps", pair), find)

@@ -21,8 +21,8 @@ class Pressure(Kind[PressureRow]):
         return self._beyond(carry, self.near_settings.pressure_share)
 
     def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:
-        """At the rim."""
-        return self._beyond(carry, 1.0 - self.around.settings.margin)
+        """At the rim: half of the margin is left to what the solver rounds off."""
+        return self._beyond(carry, (1.0 - self.around.settings.margin / 2.0) ** 0.5)
 
     def _beyond(self, carry: PlacedCarry, share: float) -> Iterable[PressureRow]:
         last = len(carry.shift) - 1

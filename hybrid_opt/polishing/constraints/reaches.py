@@ -21,12 +21,15 @@ class Reaches(Kind[PlaceRow]):
     lasting = True
 
     def near(self, carry: PlacedCarry, target: Target) -> Iterable[PlaceRow]:
-        """Below a share of the median along the path, every few places."""
-        stride = self.around.cell.grid.places(self.near_settings.reach_stride)
+        """Below a share of the median along the path, every few places; more densely where there is
+        little left, so that the least does not move between two rows."""
+        settings, places = self.near_settings, self.around.cell.grid.places
         for arm in (0, 1):
             measure = carry.manipulability[:, arm]
-            least = max(1.0, self.near_settings.reach_share * float(np.median(measure)))
-            for place in lowest(measure, least, stride):
+            least = max(1.0, settings.reach_share * float(np.median(measure)))
+            chosen = {*lowest(measure, least, places(settings.reach_stride))}
+            chosen |= {*lowest(measure, settings.edge, places(settings.edge_stride))}
+            for place in sorted(chosen):
                 yield PlaceRow(Reach(arm), place)
 
     def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:

@@ -100,7 +100,8 @@ def test_residuals_of_accepted_points_are_told() -> None:
 def test_with_time_a_point_becomes_stationary() -> None:
     patient = FrontPolisher(evaluator(), replace(PATIENT, fill=FillSettings(attempts=0)))
     start = initial_decision(evaluator().workcell.task)[None]
-    (outcome,) = patient.polish(start, np.random.default_rng(0)).outcomes
+    outcomes = patient.polish(start, np.random.default_rng(0)).outcomes
+    (outcome,) = [o for o in outcomes if o.aim == "point"]
     assert outcome.status == "accepted"
     assert outcome.residuals.stationarity < 1e-4
     assert outcome.residuals.feasibility < 1e-6
@@ -113,7 +114,8 @@ def test_what_it_cost_is_told_in_evaluations() -> None:
     assert result.equivalent_evaluations == pytest.approx(
         result.seconds / result.evaluation_seconds, abs=1.0
     )
-    most = SETTINGS.attempts * (1 + SETTINGS.fill.attempts)
+    ends_and_middle = 3
+    most = SETTINGS.attempts * (1 + SETTINGS.fill.attempts) + ends_and_middle
     beside_probes = sum(o.aim != "probe" for o in result.outcomes)
     assert SETTINGS.attempts < beside_probes <= most
     assert sum(o.status == "accepted" for o in result.outcomes) == result.counts["accepted"]

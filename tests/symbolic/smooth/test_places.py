@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.geometry.clearance import screening_functions
+from symbolic.geometry.coal_shapes import coal_distance
 from symbolic.physics.rotation import rotation_matrix
 from symbolic.robot.arm import flange_target, manipulability, pose_error
 from symbolic.smooth.clearance import Clearance
 from symbolic.smooth.closure import closure_functions
 from symbolic.smooth.joint_limit import JointLimit
 from symbolic.smooth.keys import ClosureKey
-from symbolic.smooth.passage import DIRECTIONS, Passing, Separation, gap_function
+from symbolic.smooth.passage import (
+    APART,
+    DIRECTIONS,
+    PARALLEL,
+    Passing,
+    Separation,
+    gap_function,
+)
 from symbolic.smooth.place import TURN, Place, PlaceConstraint, row_function
 from symbolic.smooth.reach import Reach
 from symbolic.workcell.file import load
@@ -47,8 +57,13 @@ def value_of(constraint: PlaceConstraint, *at: Array) -> float:
     return float(row_function(place(), constraint, "first")(*at, *numbers)[0])
 
 
+@cache
+def gaps_of_poses() -> ca.Function:
+    return gap_function(place())
+
+
 def gaps_at(index: int, pose: Array) -> Array:
-    return np.array(gap_function(place())(pose, place().obstacle(index))).ravel()
+    return np.array(gaps_of_poses()(pose, place().obstacle(index))).ravel()
 
 
 def pose_near_start(seed: int) -> Array:
@@ -94,40 +109,80 @@ def test_a_smooth_clearance_never_exceeds_the_sharp_bound() -> None:
             assert smooth >= bounds[index] - 0.1
 
 
-def test_the_largest_separation_is_the_sharp_bound() -> None:
+def test_the_largest_gap_is_never_less_than_the_sharp_bound() -> None:
     placements = (model().robots[0].joint_placements, model().robots[1].joint_placements)
     sharp = screening_functions(model().geometry, placements)["clearance"]
     names = model().geometry.pair_names
-    workcell = model().workcell
-    payload = workcell.payload.size
-    sizes = {b.name: b.shape.size for b in workcell.environment if isinstance(b.shape, Box)}
     assert {"top board", "pallet in front"} <= {names[index][1] for index in place().separable()}
     for seed in range(3):
         pose = pose_near_start(seed)
         bounds = np.array(sharp(pose, *joints_at(pose))).ravel()
         for index in place().separable():
             gaps = gaps_at(index, pose)
-            # Each rounded kink of a rotation's entry takes TURN of half an edge at most.
-            rounded = TURN * (payload.sum() + sizes[names[index][1]].sum()) / 2.0
-            assert bounds[index] - rounded <= gaps.max() <= bounds[index] + 1e-12
             assert len(gaps) == DIRECTIONS
-            for direction in (0, DIRECTIONS - 1):
-                value = value_of(Separation(index, direction), pose, STILL, STILL, STILL)
-                assert value == pytest.approx(gaps[direction], abs=1e-15)
+            assert bounds[index] <= gaps.max() + 1e-12
+
+
+@given(
+    st.integers(0, 10**6),
+    arrays(float, 3, elements=st.floats(-0.3, 0.3)),
+    arrays(float, 3, elements=st.floats(-1.2, 1.2)),
+)
+@settings(max_examples=100)
+def test_one_direction_separates_boxes_that_are_apart(
+    chosen: int, away: Array, turn: Array
+) -> None:
+    """Against Coal, near an edge of an obstacle: the largest gap is positive where they are apart,
+    and never more than their distance then."""
+    index = place().separable()[chosen % len(place().separable())]
+    obstacle = model().geometry.bodies[model().geometry.active[index].second].pieces[0]
+    assert isinstance(obstacle.shape, Box)
+    half = np.asarray(obstacle.shape.size) / 2.0
+    edge = half * np.where(np.arange(3) == chosen % 3, 0.0, 1.0 - 2.0 * (chosen // 3 % 2))
+    pose = np.concatenate([obstacle.pose[:3, :3] @ edge + obstacle.pose[:3, 3] + away, turn])
+    rotation = rotation_matrix(model().workcell.task.orientation, turn)
+    payload = model().geometry.bodies[place().payload].pieces[0]
+    placed = np.eye(4)
+    placed[:3, :3], placed[:3, 3] = np.array(ca.DM(rotation)), pose[:3]
+    edges = np.array(ca.DM(rotation)), obstacle.pose[:3, :3]
+    assume(np.abs(edges[1].T @ edges[0]).max() < (1.0 - PARALLEL**2) ** 0.5 - 1e-6)
+    distance = coal_distance((replace(payload, pose=placed @ payload.pose),), (obstacle,))
+    assume(abs(distance) > 1e-6)
+    largest = gaps_at(index, pose).max()
+    assert (largest > 0.0) == (distance > 0.0)
+    assert largest <= max(distance, 0.0) + 1e-5
+
+
+def test_a_row_of_a_gap_falls_short_of_it_by_what_its_kinks_are_rounded() -> None:
+    workcell = model().workcell
+    sizes = {b.name: b.shape.size for b in workcell.environment if isinstance(b.shape, Box)}
+    pose = pose_near_start(1)
+    for index in place().separable():
+        size = sizes[model().geometry.pair_names[index][1]]
+        # Each rounded kink of a rotation's entry takes TURN of half an edge at most.
+        rounded = TURN * (workcell.payload.size.sum() + size.sum()) / 2.0
+        gaps = gaps_at(index, pose)
+        assert (gaps > APART).sum() >= 12
+        for direction in np.flatnonzero(gaps > APART).tolist():
+            value = value_of(Separation(index, direction), pose, STILL, STILL, STILL)
+            assert gaps[direction] - rounded <= value <= gaps[direction] + 1e-12
 
 
 def test_a_passing_row_is_the_height_at_which_the_gaps_meet() -> None:
     index = next(k for k in place().separable() if model().geometry.pair_names[k][1] == "top board")
     pose = np.array([-0.34, 0.01, 0.86, 0.01, 0.05, 0.02])
     rate = np.array([-2e-3, 1e-4, 2e-3, 1e-4, -2e-4, 1e-4])
+    apart = np.flatnonzero(gaps_at(index, pose) > APART)
 
     def along(steps: float) -> Array:
-        return gaps_at(index, pose + steps * rate)
+        at = pose + steps * rate, STILL, STILL, STILL
+        return np.array([value_of(Separation(index, int(k)), *at) for k in apart])
 
     slopes = (along(1e-4) - along(-1e-4)) / 2e-4
     before, after = int(np.argmin(slopes)), int(np.argmax(slopes))
     meeting = (along(0.0)[before] - along(0.0)[after]) / (slopes[after] - slopes[before])
-    height = value_of(Passing(index, before, after), pose, rate, STILL, STILL)
+    row = Passing(index, int(apart[before]), int(apart[after]))
+    height = value_of(row, pose, rate, STILL, STILL)
     assert height == pytest.approx(along(0.0)[before] + meeting * slopes[before], abs=1e-7)
 
 

@@ -68,7 +68,7 @@ def test_most_points_end_stationary() -> None:
 def test_a_point_goes_on_while_that_brings_much(worth: float, goes_on: bool) -> None:
     driven = DrivableSettings(rounds=2, worth=worth, turn=1, most_rounds=5)
     solver = DrivableSolver(evaluator(), functions(), PolishSettings(drivable=driven))
-    climb = Climb(solver, start(52.0), Goal("duration", 52.0), RADIUS)
+    climb = Climb(solver, start(53.0), Goal("duration", 53.0), RADIUS)
     climb.finish()
     assert 3 <= climb.solution.rounds <= 6 if goes_on else climb.solution.rounds == 2
 
