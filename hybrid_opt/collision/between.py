@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.collision.intervals import End, Intervals, alternating, alternating_ends, joined
+from hybrid_opt.collision.pair_values import Separations
 from symbolic.array import Array
 
 Status = Literal["free", "collision", "undecided"]
@@ -71,50 +73,6 @@ class MotionVerdict:
     unsafe: NDArray[np.bool_]
     intervals: int
     added: int
-
-
-@dataclass(frozen=True)
-class _End:
-    """One end of m intervals.
-
-    Attributes:
-        configuration: (m, 6 + all joints) pose, q_1, q_2.
-        clearance: (m, n_pairs), raised in place where FCL measured [m].
-        measured: (m, n_pairs) where it did.
-    """
-
-    configuration: Array
-    clearance: Array
-    measured: NDArray[np.bool_]
-
-    def __getitem__(self, rows: NDArray[np.bool_]) -> _End:
-        return _End(self.configuration[rows], self.clearance[rows], self.measured[rows])
-
-
-@dataclass(frozen=True)
-class _Intervals:
-    """Work list: intervals of equal width, both ends, and the pairs not yet cleared."""
-
-    index: NDArray[np.intp]
-    start: Array
-    width: float
-    a: _End
-    b: _End
-    chord: Array
-    bend: Array
-    pending: NDArray[np.bool_]
-
-    def __getitem__(self, rows: NDArray[np.bool_]) -> _Intervals:
-        return _Intervals(
-            self.index[rows],
-            self.start[rows],
-            self.width,
-            self.a[rows],
-            self.b[rows],
-            self.chord[rows],
-            self.bend[rows],
-            self.pending[rows],
-        )
 
 
 def check_between(
@@ -169,7 +127,7 @@ class _Sweep:
     Attributes:
         owner: (n_intervals,) motion that an interval belongs to.
         first: (n_motions,) its first interval.
-        required: (n_intervals, n_pairs) clearance to be kept [m].
+        required: (n_motions, n_pairs) clearance to be kept [m].
     """
 
     def __init__(self, checker: CollisionChecker, sampled: SampledMotions) -> None:
@@ -178,26 +136,20 @@ class _Sweep:
         intervals = np.asarray(sampled.lengths) - 1
         self.owner = np.repeat(np.arange(len(intervals)), intervals)
         self.first = np.cumsum(intervals) - intervals
-        self.required = checker.geometry.tolerance + sampled.margin[self.owner][:, None]
+        self.required = checker.geometry.tolerance + sampled.margin[:, None]
+        self._separations: Separations = {}
 
     def run(self, depth: int) -> list[MotionVerdict]:
-        configuration, clearance = self.sampled.configuration, self.sampled.clearance
         n, n_motions = len(self.owner), len(self.sampled.lengths)
         unsafe, left = np.zeros(n, dtype=bool), list[PassingTouch]()
         beyond = np.full(n_motions, n)  # a motion's earliest interval with a collision so far
         hits: list[PassingTouch] = []
-        examined, added = np.zeros(n_motions, dtype=int), np.zeros(n_motions, dtype=int)
-        ends = _End(configuration, clearance.copy(), np.zeros(clearance.shape, dtype=bool))
-        lasts = np.cumsum(self.sampled.lengths) - 1
-        starts = np.ones(len(configuration), dtype=bool)
-        starts[lasts] = False
-        stops = np.ones(len(configuration), dtype=bool)
-        stops[np.append(0, lasts[:-1] + 1)] = False
-        pending = np.ones((n, clearance.shape[1]), dtype=bool)
-        work = self._intervals(np.arange(n), np.zeros(n), 1.0, ends[starts], ends[stops], pending)
+        examined, added = np.bincount(self.owner, minlength=n_motions), np.zeros(n_motions, int)
+        work = self._first_intervals()
         for level in range(depth + 1):
-            examined += self._per_motion(work)
-            work = self._uncleared(work)
+            if level > 0:
+                examined += self._per_motion(work)
+                work = self._uncleared(work)
             for end, fraction in ((work.a, 0.0), (work.b, 1.0)):
                 hit = self._measure(work, end, level == depth)
                 for row in np.flatnonzero(hit >= 0).tolist():
@@ -222,7 +174,7 @@ class _Sweep:
             for k in range(n_motions)
         ]
 
-    def _per_motion(self, work: _Intervals) -> NDArray[np.intp]:
+    def _per_motion(self, work: Intervals) -> NDArray[np.intp]:
         """(n_motions,) intervals of each in the work list."""
         return np.bincount(self.owner[work.index], minlength=len(self.sampled.lengths))
 
@@ -251,80 +203,99 @@ class _Sweep:
         earliest = next(iter(hits or left), None)
         return MotionVerdict(status, earliest, unsafe[self.owner == motion], examined, added)
 
+    def _first_intervals(self) -> Intervals:
+        """The intervals between the samples that the motion bound does not clear, found motion by
+        motion: nearly all are cleared, and arrays over all of them would not stay cached."""
+        found = []
+        for motion, count in enumerate(self.sampled.lengths):
+            first = int(self.first[motion]) + motion
+            configuration = self.sampled.configuration[first : first + count]
+            clearance = self.sampled.clearance[first : first + count]
+            measured = np.zeros(clearance.shape, dtype=bool)
+            a, b = (
+                End(configuration[part], clearance[part], measured[part])
+                for part in (slice(None, -1), slice(1, None))
+            )
+            index = int(self.first[motion]) + np.arange(count - 1)
+            pending = np.ones((count - 1, clearance.shape[1]), dtype=bool)
+            every = self._intervals(index, np.zeros(count - 1), 1.0, a, b, pending)
+            found.append(self._uncleared(every))
+        return joined(found)
+
     def _intervals(
         self,
         index: NDArray[np.intp],
         start: Array,
         width: float,
-        a: _End,
-        b: _End,
+        a: End,
+        b: End,
         pending: NDArray[np.bool_],
-    ) -> _Intervals:
+    ) -> Intervals:
         motion = self.checker.motion(
             self.checker.split(a.configuration), self.checker.split(b.configuration)
         )
-        return _Intervals(index, start, width, a, b, motion.chord, motion.bend, pending)
+        return Intervals(index, start, width, a, b, motion.chord, motion.bend, pending)
 
-    def _uncleared(self, work: _Intervals) -> _Intervals:
+    def _uncleared(self, work: Intervals) -> Intervals:
         """The intervals with pairs that the motion bound does not clear."""
         c_a, c_b = work.a.clearance, work.b.clearance
-        halfway = (c_a + c_b - work.chord) / 2.0
-        one_sided = np.fmax(c_a, c_b) - work.chord
-        kept = np.fmax(halfway, one_sided) - work.bend / 8.0
-        pending: NDArray[np.bool_] = work.pending & ~(kept > self.required[work.index])
+        halfway = c_a + c_b
+        halfway -= work.chord
+        halfway /= 2.0
+        kept = np.fmax(c_a, c_b)
+        kept -= work.chord
+        np.fmax(halfway, kept, out=kept)
+        kept -= work.bend / 8.0
+        pending: NDArray[np.bool_] = work.pending & ~(kept > self._required(work))
         left: NDArray[np.bool_] = np.any(pending, axis=1)
         return replace(work, pending=pending)[left]
 
-    def _given_up(self, work: _Intervals, level: int, depth: int) -> NDArray[np.bool_]:
+    def _required(self, work: Intervals) -> Array:
+        """Clearance to be kept in the intervals, (m, n_pairs), or (1, n_pairs) for all [m]."""
+        owners = self.owner[work.index]
+        if len(owners) and owners[0] == owners[-1] and (owners == owners[0]).all():
+            return self.required[owners[:1]]
+        return self.required[owners]
+
+    def _given_up(self, work: Intervals, level: int, depth: int) -> NDArray[np.bool_]:
         """(m,) intervals that stay undecided: those with an end from which no shorter one could be
         proven either, at the last level all."""
         hopeless = np.full(len(work.index), level == depth)
         if HOPELESS_DEPTH <= level < depth:
-            required = self.required[work.index]
+            required = self.required[self.owner[work.index]]
             for end in (work.a, work.b):
                 asked = work.pending & end.measured & ~(end.clearance > required)
                 hopeless |= self.checker.too_near(end.configuration, asked, required).any(axis=1)
         return hopeless
 
-    def _measure(self, work: _Intervals, end: _End, last: bool) -> NDArray[np.intp]:
+    def _measure(self, work: Intervals, end: End, last: bool) -> NDArray[np.intp]:
         """Raise bounds to a proven distance where halving alone would take too long.
 
         Returns (m,) the first colliding pair of each configuration, or -1.
         """
-        beyond = end.clearance - self.required[work.index]
+        beyond = end.clearance - self._required(work)
         hopeless = ~(beyond > HALVING_WINS * work.chord)
         wanted = work.pending & (hopeless | last) & ~end.measured
         end.measured[wanted] = True
-        return self.checker.measure(*self.checker.split(end.configuration), end.clearance, wanted)
+        return self.checker.measure(
+            *self.checker.split(end.configuration), end.clearance, wanted, self._separations
+        )
 
-    def _halves(self, work: _Intervals) -> _Intervals:
+    def _halves(self, work: Intervals) -> Intervals:
         """Both halves of every interval, the earlier first."""
         middle = (work.a.configuration + work.b.configuration) / 2.0
         clearance = self.checker.bounds(*self.checker.split(middle))
-        new = _End(middle, clearance, np.zeros(clearance.shape, dtype=bool))
+        new = End(middle, clearance, np.zeros(clearance.shape, dtype=bool))
         return self._intervals(
             np.repeat(work.index, 2),
-            _alternating(work.start, work.start + work.width / 2.0),
+            alternating(work.start, work.start + work.width / 2.0),
             work.width / 2.0,
-            _alternating_ends(work.a, new),
-            _alternating_ends(new, work.b),
+            alternating_ends(work.a, new),
+            alternating_ends(new, work.b),
             np.repeat(work.pending, 2, axis=0),
         )
 
-    def _touch(self, work: _Intervals, row: int, pair: int, fraction: float) -> PassingTouch:
+    def _touch(self, work: Intervals, row: int, pair: int, fraction: float) -> PassingTouch:
         first, second = self.checker.geometry.pair_names[pair]
         place = float(work.start[row]) + work.width * fraction
         return PassingTouch(int(work.index[row]), place, first, second)
-
-
-def _alternating(first: Array, second: Array) -> Array:
-    """Rows of two arrays in turn."""
-    return np.stack([first, second], axis=1).reshape(-1, *first.shape[1:])
-
-
-def _alternating_ends(first: _End, second: _End) -> _End:
-    return _End(
-        _alternating(first.configuration, second.configuration),
-        _alternating(first.clearance, second.clearance),
-        np.stack([first.measured, second.measured], axis=1).reshape(-1, first.measured.shape[1]),
-    )

@@ -32,6 +32,9 @@ STRAIGHTNESS = 1e-4
 MOST_ROUNDS = 14
 """Halvings of the grid after which a path counts as not smooth."""
 
+CACHED_ROWS = 128
+"""Configurations whose pairs are looked at together."""
+
 
 @dataclass(frozen=True, repr=False)
 class Certificate:
@@ -115,7 +118,8 @@ def certify_all(
         found[path] = _failed_on_grid(checker, grid, path, clearance)
     left = [path for path, certificate in enumerate(found) if certificate is None]
     if left:
-        rows = np.isin(grid.owner, left)
+        every = len(left) == len(parameters)
+        rows = slice(None) if every else np.isin(grid.owner, left)
         lengths = np.bincount(grid.owner, minlength=len(parameters))[left]
         margin = 2.0 * grid.deviation[left]
         motions = SampledMotions(
@@ -177,12 +181,12 @@ def _straight_grid(
         between = (work.u_a + work.u_b) / 2.0
         middle = configurations(work.owner, between)
         straight = (work.a + work.b) / 2.0
-        chords = checker.motion(checker.split(middle), checker.split(straight)).chord
-        off = np.max(chords, axis=1, initial=0.0)
+        off = _farthest(checker, middle, straight)
         bent, lost = off > straightness, ~np.isfinite(middle).all(axis=1)
         straight_enough = off <= straightness  # not where an end is lost: nothing is known of it
         np.maximum.at(deviation, work.owner[straight_enough], off[straight_enough])
-        places.append(tuple(array[bent | lost] for array in (work.owner, between, middle)))
+        new = bent | lost
+        places.append((work.owner[new], between[new], middle[new]))
         if not bent.any():
             break
         work, between, middle = work[bent], between[bent], middle[bent]
@@ -204,11 +208,23 @@ def _straight_grid(
     return _Grid(owner[order], u[order], placed[order], deviation)
 
 
+def _farthest(checker: CollisionChecker, configuration: Array, other: Array) -> Array:
+    """(n,) largest chord of all pairs between two configurations (n, 6 + all joints) [m], some rows
+    at a time: the chords of all would not stay cached."""
+    off = np.empty(len(configuration))
+    for start in range(0, len(off), CACHED_ROWS):
+        some = slice(start, start + CACHED_ROWS)
+        ends = checker.split(configuration[some]), checker.split(other[some])
+        off[some] = np.max(checker.motion(*ends).chord, axis=1, initial=0.0)
+    return off
+
+
 def _failed_on_grid(
     checker: CollisionChecker, grid: _Grid, path: int, clearance: Array
 ) -> Certificate | None:
     """The certificate of a path that is lost or collides at a grid point."""
-    rows = grid.owner == path
+    # In order of their owners: a slice, of which nothing is copied.
+    rows = slice(*np.searchsorted(grid.owner, [path, path + 1]).tolist())
     u, placed = grid.u[rows], grid.configuration[rows]
     deviation = float(grid.deviation[path])
     lost = ~np.isfinite(placed).all(axis=1)

@@ -8,13 +8,13 @@ than FCL's own resolution, so near the tolerance FCL alone decides, screened or 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
+from hybrid_opt.collision.pair_values import MotionBounds, Separations, by_sample
 from hybrid_opt.collision.verdict import Touch, Verdict, sample_durations
 from symbolic.array import Array
 from symbolic.geometry.bodies import PAYLOAD
@@ -22,15 +22,6 @@ from symbolic.geometry.pairs import CellGeometry
 
 RESTING_TOLERANCE = 1e-3
 """How deep the payload may sink into a body that it is allowed to rest on [m]."""
-
-
-@dataclass(frozen=True)
-class MotionBounds:
-    """Chord and bend (n, n_pairs) [m] of every pair between configurations, see
-    `symbolic.geometry.motion_bounds`."""
-
-    chord: Array
-    bend: Array
 
 
 class CollisionChecker:
@@ -70,10 +61,9 @@ class CollisionChecker:
     def split(self, configuration: Array) -> tuple[Array, Array, Array]:
         """Box poses (n, 6) and both arms' joints (n, joints) from configurations (n, 6 + all
         joints), each contiguous."""
-        ends = np.cumsum([6, self.geometry.arms[0].joints])
-        first, second, third = (
-            np.ascontiguousarray(part) for part in np.split(configuration, ends, axis=1)
-        )
+        at = 6 + self.geometry.arms[0].joints
+        parts = (configuration[:, :6], configuration[:, 6:at], configuration[:, at:])
+        first, second, third = map(np.ascontiguousarray, parts)
         return first, second, third
 
     def bounds(self, pose: Array, q_1: Array, q_2: Array) -> Array:
@@ -111,7 +101,7 @@ class CollisionChecker:
         calls = self.judge.calls
         # `not >` keeps a NaN bound open.
         unsure = ~(clearance > self.free_beyond) if screened else np.full(clearance.shape, True)
-        suspects = _by_sample(clearance, unsure)
+        suspects = by_sample(clearance, unsure)
         first: tuple[int, int] | None = None
         if suspects:
             rows = list(suspects)
@@ -191,6 +181,7 @@ class CollisionChecker:
         q_2: Array,
         clearance: Array,
         wanted: NDArray[np.bool_],
+        known: Separations | None = None,
     ) -> NDArray[np.intp]:
         """Raise the bounds (n, n_pairs) of wanted pairs, in place, to a proven distance [m].
 
@@ -198,30 +189,45 @@ class CollisionChecker:
         may rest on a body, the distance of the payload smaller by the resting tolerance counts, and
         the pair's own tolerance beside it: it may come nearer than that.
 
+        Args:
+            known: what was measured before, to be looked up and added to: a place where two
+                intervals meet is an end of both.
+
         Returns:
             (n,) the first wanted pair of each sample that collides, or -1.
         """
         hits = np.full(len(pose), -1)
-        rows = np.flatnonzero(wanted.any(axis=1))
-        if not len(rows):
-            return hits
-        self._place(pose[rows], q_1[rows], q_2[rows])
+        known = {} if known is None else known
         queries: dict[int, list[int]] = {}
         for k, pair in np.argwhere(wanted).tolist():
             queries.setdefault(k, []).append(pair)
-        for local, (k, pairs) in enumerate(queries.items()):
+        places = {k: np.hstack([pose[k], q_1[k], q_2[k]]).tobytes() for k in queries}
+        new = [k for k, pairs in queries.items() if any((places[k], p) not in known for p in pairs)]
+        if new:
+            self._place(pose[new], q_1[new], q_2[new])
+        at = {k: local for local, k in enumerate(new)}
+        for k, pairs in queries.items():
             resting_pairs = self._resting_pairs(pose[k, :3])
             for pair in pairs:
-                resting = pair in resting_pairs
-                i, j = self._pairs[pair]
-                first = self.judge.shrunk_payload if resting else i
-                nearer = float(self.geometry.tolerance[pair]) if resting else 0.0
-                apart = self.judge.separation(local, first, j) + nearer
-                if apart <= self.free_beyond[pair] and self._judge_pair(local, pair, resting):
+                name = places[k], pair
+                if name not in known:
+                    known[name] = self._separation(at[k], pair, pair in resting_pairs)
+                apart = known[name]
+                if apart is None:
                     hits[k] = pair
                     break
                 clearance[k, pair] = np.fmax(clearance[k, pair], apart)
         return hits
+
+    def _separation(self, local: int, pair: int, resting: bool) -> float | None:
+        """A distance that a pair surely keeps, or None where it collides."""
+        i, j = self._pairs[pair]
+        first = self.judge.shrunk_payload if resting else i
+        nearer = float(self.geometry.tolerance[pair]) if resting else 0.0
+        apart = self.judge.separation(local, first, j) + nearer
+        if apart <= self.free_beyond[pair] and self._judge_pair(local, pair, resting):
+            return None
+        return apart
 
     def too_near(
         self, configuration: Array, wanted: NDArray[np.bool_], required: Array
@@ -315,15 +321,3 @@ class CollisionChecker:
                 if self.judge.distance(0, *self._pairs[pair]) <= reach:
                     found.append((pair, waypoint.lower[:3], allowed.departure))
         return found
-
-
-def _by_sample(bounds: Array, unsure: NDArray[np.bool_]) -> dict[int, list[int]]:
-    """The pairs of each sample that has open ones: least bound first, ties in order."""
-    # Flat indices: much faster to find than those of two axes.
-    open_pairs = np.flatnonzero(unsure)
-    samples, pairs = np.divmod(open_pairs, unsure.shape[1])
-    order = np.lexsort((bounds.ravel()[open_pairs], samples))
-    found: dict[int, list[int]] = {}
-    for sample, pair in zip(samples[order].tolist(), pairs[order].tolist(), strict=True):
-        found.setdefault(sample, []).append(pair)
-    return found

@@ -18,7 +18,7 @@ from hybrid_opt.collision.certify import Certificate, certify_all
 from hybrid_opt.collision.checker import CollisionChecker
 from symbolic.array import Array
 from symbolic.errors import DualArmError
-from symbolic.physics.path import path_basis
+from symbolic.physics.path import path_position
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.workcell.decision import POSE_SIZE, place_redundant
 from symbolic.workcell.records import Task
@@ -60,7 +60,7 @@ def configurations(
         owner: (n,) index of the path of each place.
         u: (n,) its path parameter.
     """
-    basis = path_basis(len(paths[0].waypoints), u).position
+    basis = path_position(len(paths[0].waypoints), u)
     waypoints = np.array([path.waypoints for path in paths])
     # Summed one by one: the same bits for any number of places.
     extended = basis[:, :1] * waypoints[owner, 0]

@@ -52,6 +52,13 @@ def path_basis(n_waypoints: int, parameter: Array) -> PathBasis:
     return _read_only(parameter, *(spline(parameter) for spline in _natural_splines(n_waypoints)))
 
 
+def path_position(n_waypoints: int, parameter: Array) -> Array:
+    """`PathBasis.position` alone."""
+    if n_waypoints == 2:
+        return path_basis(n_waypoints, parameter).position
+    return np.ascontiguousarray(_natural_splines(n_waypoints)[0](parameter), dtype=float)
+
+
 @cache
 def _natural_splines(n_waypoints: int) -> tuple[Callable[[Array], Array], ...]:
     """The natural quintic splines of unit waypoints, and their first and second derivatives."""
