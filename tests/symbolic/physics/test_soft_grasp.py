@@ -95,6 +95,23 @@ def test_forces_tend_to_those_of_least_effort() -> None:
         assert narrow < 0.2 * wide
 
 
+@pytest.mark.parametrize("kinds", KINDS)
+def test_gradients_tend_to_those_of_least_effort(kinds: tuple[str, ...]) -> None:
+    """Against differences of clarabel's forces, at loads away from kinks."""
+    cell, rng = grasp_of(kinds), np.random.default_rng(6)
+    first, _ = soft(kinds, 1e-7)
+
+    def least(load: Array) -> Array:
+        return np.bincount(cell.pad_robots, least_wrenches(cell.pads, load)[:, 2], 2)
+
+    for _ in range(3):
+        load = random_load(rng)
+        slope, step = values(first, load)[1], 1e-3 * float(np.linalg.norm(load))
+        pairs = [(least(load + step * d), least(load - step * d)) for d in np.eye(6)]
+        found = np.column_stack([(a - b) / (2.0 * step) for a, b in pairs])
+        np.testing.assert_allclose(slope, found, atol=1e-3 * np.abs(slope).max())
+
+
 @pytest.mark.parametrize("weight", [1e-5, 1e-3])
 @pytest.mark.parametrize("kinds", KINDS)
 def test_derivatives_are_those_of_differences(kinds: tuple[str, ...], weight: float) -> None:
