@@ -102,7 +102,8 @@ def test_gradients_tend_to_those_of_least_effort(kinds: tuple[str, ...]) -> None
     first, _ = soft(kinds, 1e-7)
 
     def least(load: Array) -> Array:
-        return np.bincount(cell.pad_robots, least_wrenches(cell.pads, load)[:, 2], 2)
+        wrenches = least_wrenches(cell.pads, load)
+        return np.bincount(cell.pad_robots, wrenches[:, 2], 2).astype(float)
 
     for _ in range(3):
         load = random_load(rng)
