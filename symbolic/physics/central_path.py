@@ -14,13 +14,20 @@ one expression and compiles. The wrench of the last contact is what the others l
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import accumulate
 from typing import Protocol
 
 import casadi as ca
+import numpy as np
 
+from symbolic.array import Array
 from symbolic.physics.closure import WRENCH_SIZE
-from symbolic.physics.elimination import Elimination
+from symbolic.physics.patch_equations import (
+    Equations,
+    degree_of,
+    efforts,
+    ends_of,
+    iterate_and_cell,
+)
 from symbolic.physics.patches import Patch, Step, least
 
 FINAL_WEIGHT = 1e-8
@@ -40,7 +47,14 @@ STEP_SHARE, LAST_SHARE, APPROACH = 0.97, 0.999, 100.0
 left may be this many times the weight, over the effort."""
 
 START_WEIGHT = 0.5
-"""Weight of a start, over the effort there per degree."""
+"""Weight of a start whose multipliers are not known, over the effort there per degree."""
+
+NEWTON_STEPS, NEWTON_CHANGE = 100, 1e-9
+"""Newton steps to a point on the central path, at most, and the change, over the iterate, that
+counts as none."""
+
+BLOCK = 10
+"""Steps that are passed over at once where nothing goes on: each costs a copy of the iterate."""
 
 PROGRAMS = 16
 """How many programs' functions are kept."""
@@ -66,8 +80,9 @@ class Program(Protocol):
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """What is minimised: a sum over the contacts, each convex and at most quadratic."""
 
-    def start(self, cell: list[ca.SX]) -> list[ca.SX]:
-        """States of all patches, well within their cones, that balance the load."""
+    def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
+        """States of all patches, well within their cones, that balance the load, and the weight to
+        begin with, over the effort there per degree."""
 
     def __hash__(self) -> int:
         """Functions are kept by program."""
@@ -113,26 +128,31 @@ def centred(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function
 def _repeated(
     program: Program, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
 ) -> ca.MX:
-    """The iterate after so many steps at most, as long as they go on."""
-    held = [ca.MX.sym("iterate", _ends(program)[-1]), ca.MX.sym("goes_on")]
-    unused = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
-    keep = ca.Function("keep", [*held, *unused], held)
-    choice = ca.Function.if_else(f"{step.name()}_or_not", step, keep)
-    goes_on = ca.MX(1.0)
-    for _ in range(most):
-        iterate, goes_on = choice(goes_on, iterate, goes_on, *cell)
-    return iterate
+    """The iterate after so many steps at most, whole blocks of them, as long as they go on."""
+    held = [ca.MX.sym("iterate", ends_of(program)[-1]), ca.MX.sym("goes_on")]
+    inputs = [*held, *[ca.MX.sym(name, size) for name, size in program.cell_sizes]]
+    keep = ca.Function("keep", inputs, held)
+
+    def after(count: int, one: ca.Function, state: list[ca.MX], cell: list[ca.MX]) -> list[ca.MX]:
+        choice = ca.Function.if_else(f"{one.name()}_or_not", one, keep)
+        for _ in range(count):
+            state = choice(state[1], *state, *cell)
+        return state
+
+    name = f"{step.name()}s"
+    block = ca.Function(name, inputs, after(BLOCK, step, held, inputs[2:]))
+    return after(most // BLOCK, block, [iterate, ca.MX(1.0)], cell)[0]
 
 
 @lru_cache(PROGRAMS)
 def _step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """An iterate, a flag that does not matter and the cell to the next one and whether to go on."""
-    iterate, cell = _symbols(program)
-    owns = zip(program.patches, ca.vertsplit(iterate, _ends(program)), strict=True)
+    iterate, cell = iterate_and_cell(program)
+    owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
     local = [patch.local(own) for patch, own in owns]
-    degree = sum(patch.degree for patch in program.patches)
+    degree = degree_of(program)
     weight = sum(own.gap for own in local) / degree
-    equations = _Equations(program, cell, [(own.wrench, own.stiffness) for own in local])
+    equations = Equations(program, cell, [(own.wrench, own.stiffness) for own in local])
 
     def steps(aimed: ca.SX, corrections: list[ca.SX]) -> list[Step]:
         pairs = zip(local, corrections, strict=True)
@@ -161,14 +181,14 @@ def _step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
 def _barrier_step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """As `_step`, to the one whose state is of the final weight, by Newton's step of the barriers
     alone; where it has arrived there, its derivatives by the cell are those of the central path."""
-    iterate, cell = _symbols(program)
-    owns = ca.vertsplit(iterate, _ends(program))
+    iterate, cell = iterate_and_cell(program)
+    owns = ca.vertsplit(iterate, ends_of(program))
     wrenches = [own[:WRENCH_SIZE] for own in owns]
-    weight = final_weight * _efforts(program, wrenches, cell)[0]
+    weight = final_weight * efforts(program, wrenches, cell)[0]
     patches = zip(program.patches, owns, strict=True)
     barriers = [patch.barrier(own, weight) for patch, own in patches]
     stiff = [own.stiffness for own in barriers]
-    equations = _Equations(program, cell, list(zip(wrenches, stiff, strict=True)))
+    equations = Equations(program, cell, list(zip(wrenches, stiff, strict=True)))
     changes = equations.changes([own.pull for own in barriers])
     downhill = equations.downhill([own.pull for own in barriers], changes)
     steps = [own.step(change) for own, change in zip(barriers, changes, strict=True)]
@@ -183,88 +203,65 @@ def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
     return ca.fmin(1.0, share / ca.fmax(-least(lowest), share))
 
 
-class _Equations:
-    """Newton's equations of a program, for the wrenches.
-
-    Attributes:
-        effort: at the iterate.
-    """
-
-    def __init__(
-        self, program: Program, cell: list[ca.SX], local: list[tuple[ca.SX, ca.SX]]
-    ) -> None:
-        """Factors.
-
-        Args:
-            local: of each patch its wrench (6,) and stiffness (6, 6).
-        """
-        wrenches = [wrench for wrench, _ in local]
-        self.effort, self._slopes, curvatures = _efforts(program, wrenches, cell)
-        stiff = [curve + own for curve, (_, own) in zip(curvatures, local, strict=True)]
-        symbols = _wrench_symbols(len(local) - 1)
-        passed = ca.vertcat(*symbols)
-        self._change = ca.jacobian(program.left(symbols, cell), passed)
-        self._missing = program.left(wrenches[:-1], cell) - wrenches[-1]
-        self._last = stiff[-1]
-        whole = ca.diagcat(*stiff[:-1]) + ca.mtimes([self._change.T, self._last, self._change])
-        size = range(whole.shape[0])
-        self._system = Elimination([[whole[i, j] for j in size] for i in size], len(size))
-
-    def downhill(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
-        """How fast effort and barriers fall along changes: the decrement's square, times the
-        weight."""
-        terms = zip(pulls, self._slopes, changes, strict=True)
-        return sum(ca.dot(pull - slope, change) for pull, slope, change in terms)
-
-    def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
-        """(6,) of every wrench, where the patches' multipliers pull so (6,)."""
-        right = [pull - slope for pull, slope in zip(pulls, self._slopes, strict=True)]
-        on_last = right[-1] - ca.mtimes(self._last, self._missing)
-        pulled = ca.vertcat(*right[:-1]) + ca.mtimes(self._change.T, on_last)
-        reduced = self._system.reduced(ca.vertsplit(pulled))
-        free = ca.vertcat(*self._system.first(reduced, []))
-        return [*ca.vertsplit(free, WRENCH_SIZE), self._missing + ca.mtimes(self._change, free)]
-
-
-def _efforts(
-    program: Program, wrenches: list[ca.SX], cell: list[ca.SX]
-) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
-    """The effort at wrenches, its slopes (6,) and curvatures (6, 6) by each of them."""
-    symbols = _wrench_symbols(len(wrenches))
-    effort = program.effort(symbols, cell)
-    slopes = [ca.gradient(effort, w) for w in symbols]
-    curvatures = [ca.hessian(effort, w)[0] for w in symbols]
-    passed = ca.Function("effort", [*symbols, *cell], [effort, *slopes, *curvatures])
-    found, k = passed.call([*wrenches, *cell]), len(wrenches)
-    return found[0], list(found[1 : k + 1]), list(found[k + 1 :])
-
-
 @lru_cache(PROGRAMS)
 def _start(program: Program) -> ca.Function:
     """The program's start, as an iterate on the central path of a problem like it."""
     cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
-    states = program.start(cell)
-    degree = sum(patch.degree for patch in program.patches)
+    states, share = program.start(cell)
+    return ca.Function("start", cell, ca.cse([_centred_at(program, states, share, cell)]))
+
+
+def _centred_at(
+    program: Program, states: list[ca.SX], share: ca.SX | float, cell: list[ca.SX]
+) -> ca.SX:
+    """The iterate whose X S is a weight, given over the effort per degree."""
     effort = program.effort([own[:WRENCH_SIZE] for own in states], cell)
-    weight = effort * (START_WEIGHT / degree)
+    weight = effort * (share / degree_of(program))
     pairs = zip(program.patches, states, strict=True)
-    iterate = ca.vertcat(*[patch.centred(own, weight) for patch, own in pairs])
-    return ca.Function("start", cell, ca.cse([iterate]))
+    return ca.vertcat(*[patch.centred(own, weight) for patch, own in pairs])
+
+
+def central_point(
+    program: Program, states: list[Array], cell: list[Array], share: float
+) -> tuple[Array, Array]:
+    """An iterate (n,) on the central path, and its slope (n, m) by the program's first input (m,).
+
+    Args:
+        states: of all patches, within their cones, that balance the load.
+        cell: the inputs.
+        share: the weight, over the effort there per degree.
+    """
+    newton = _newton_step(program, share)
+    start = _centred_at(program, [ca.SX(ca.DM(s)) for s in states], START_WEIGHT, cell)
+    iterate = np.array(ca.evalf(start)).ravel()
+    for _ in range(NEWTON_STEPS):
+        change, length = (np.array(value).ravel() for value in newton(iterate, *cell))
+        iterate = iterate + length * change
+        if np.linalg.norm(change) < NEWTON_CHANGE * np.linalg.norm(iterate):
+            break
+    load, *others = cell
+    # At one place the step is affine in what is to be balanced.
+    along = [np.array(newton(iterate, load + e, *others)[0]).ravel() for e in np.eye(len(load))]
+    return iterate, np.stack(along, axis=1) - np.array(newton(iterate, *cell)[0])
+
+
+def _newton_step(program: Program, share: float) -> ca.Function:
+    """An iterate and the cell to the whole step to a weight, over the effort per degree, and how
+    much of it can be gone."""
+    iterate, cell = iterate_and_cell(program)
+    owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
+    local = [patch.local(own) for patch, own in owns]
+    equations = Equations(program, cell, [(own.wrench, own.stiffness) for own in local])
+    weight = equations.effort * (share / degree_of(program))
+    pairs = zip(program.patches, local, strict=True)
+    aims = [own.aim(weight, ca.SX.zeros(patch.correction_size)) for patch, own in pairs]
+    changes = equations.changes([aim.pull for aim in aims])
+    steps = [aim.step(change) for aim, change in zip(aims, changes, strict=True)]
+    length = _length([step.lowest for step in steps], STEP_SHARE)
+    return ca.Function(
+        "newton_step", [iterate, *cell], [ca.vertcat(*[step.change for step in steps]), length]
+    )
 
 
 def _wrenches(program: Program, iterate: ca.MX) -> ca.MX:
-    return ca.vertcat(*[own[:WRENCH_SIZE] for own in ca.vertsplit(iterate, _ends(program))])
-
-
-def _symbols(program: Program) -> tuple[ca.SX, list[ca.SX]]:
-    """An iterate and the cell."""
-    cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
-    return ca.SX.sym("iterate", _ends(program)[-1]), cell
-
-
-def _wrench_symbols(count: int) -> list[ca.SX]:
-    return [ca.SX.sym(f"w_{i}", WRENCH_SIZE) for i in range(count)]
-
-
-def _ends(program: Program) -> list[int]:
-    return [0, *accumulate(patch.iterate_size for patch in program.patches)]
+    return ca.vertcat(*[own[:WRENCH_SIZE] for own in ca.vertsplit(iterate, ends_of(program))])

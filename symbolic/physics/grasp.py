@@ -8,6 +8,7 @@ for pads that face one another. The method starts from an internal squeeze
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -15,7 +16,12 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.expression import reciprocal
-from symbolic.physics.central_path import differentiable_least_effort, least_effort
+from symbolic.physics.central_path import (
+    START_WEIGHT,
+    central_point,
+    differentiable_least_effort,
+    least_effort,
+)
 from symbolic.physics.closure import (
     WRENCH_SIZE,
     closing_squeeze,
@@ -23,8 +29,10 @@ from symbolic.physics.closure import (
     state_to_box,
     tangential,
 )
+from symbolic.physics.contact_forces import GRAVITY
 from symbolic.physics.patches import Patch, least
 from symbolic.physics.rectangular_patch import RectangularPatch
+from symbolic.physics.rotation import rotation_matrix
 from symbolic.physics.round_patch import RoundPatch
 from symbolic.workcell.records import Contact, Workcell
 
@@ -43,6 +51,15 @@ START_SHARE = 0.97
 BEYOND = 1e12
 """Normal force over the load's scale that says that friction does not close the grasp."""
 
+REST_WEIGHT = 0.02
+"""Weight, over the effort per degree, of the central path's place that is known at rest."""
+
+REST_SHARE = 0.95
+"""Of the way from there to the cones' boundary that the slope by the load is followed."""
+
+ALIKE = 0.1
+"""Squeeze, over the scale, up to which a load counts as like that at rest."""
+
 MOMENT_ARM = 0.1
 """Of moments in the load's scale [m]: about half a payload, so that they count like forces."""
 
@@ -57,6 +74,7 @@ class Grasp:
     Attributes:
         robots: per pad the index of its robot.
         patches, cell_sizes: see `symbolic.physics.central_path.Program`.
+        nominal: the cell's own numbers for the inputs after the load.
     """
 
     def __init__(self, workcell: Workcell) -> None:
@@ -75,6 +93,8 @@ class Grasp:
         self.robots = workcell.pad_robots
         self.patches = tuple(_patch(pad) for pad in pads)
         self.cell_sizes: tuple[tuple[str, int], ...] = (("load", LOAD_SIZE), ("friction", 2))
+        self.nominal: tuple[list[float], ...] = ([c.friction for c in workcell.contacts],)
+        self._load_at_rest = _load_at_rest(workcell)
         self._pads = pads
         self._squeeze = squeeze.states
         # The least states that balance a load, whether they lie within the cones or not.
@@ -104,13 +124,45 @@ class Grasp:
             total += wrench[0] ** 2 + friction[robot] ** 2 * ca.sumsqr(wrench[1:3])
         return 0.5 * total
 
-    def start(self, cell: list[ca.SX]) -> list[ca.SX]:
-        """The least states that balance the load, and as much of the squeeze as takes them into
-        the cones."""
-        asked, given = self.asked(*cell), self.squeezed(*cell[1:])
+    def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
+        """For loads like that at rest what to first order lies on their central path, else the
+        least states that balance them; and as much of the squeeze as takes that into the cones."""
+        load, *sizes = cell
+        given, rest = self.squeezed(*sizes), ca.DM(self._load_at_rest)
+        states, slopes = self._at_rest
+        times = ca.fmax(ca.dot(rest, load) / ca.sumsqr(rest), 0.0)
+        near = self._at([times * ca.DM(state) for state in states], *sizes)
+        moves = self._at([ca.mtimes(ca.DM(by), load - times * rest) for by in slopes], *sizes)
+        inside = [p.slack(state) for p, state in zip(self.patches, near, strict=True)]
+        taken = [p.lowest(s, move) for p, s, move in zip(self.patches, near, moves, strict=True)]
+        stays = ca.logic_and(least(inside) > 0.0, least(taken) > -REST_SHARE)
+        part = [move + REST_SHARE * s for s, move in zip(near, moves, strict=True)]
+        press = ca.if_else(stays, START_FLOOR, self._pressed(given, part))
+        asked, alike = self.asked(*cell), press < ALIKE
+        press = ca.if_else(alike, press, self._pressed(given, asked))
+        pairs = zip(near, moves, asked, strict=True)
+        chosen = [ca.if_else(alike, s + move, a) for s, move, a in pairs]
+        share = ca.if_else(alike, REST_WEIGHT + press, START_WEIGHT)
+        return [c + press * s for c, s in zip(chosen, given, strict=True)], share
+
+    def _pressed(self, given: list[ca.SX], asked: list[ca.SX]) -> ca.SX:
+        """How much of the squeeze takes states into the cones."""
         shares = [p.lowest(s, a) for p, s, a in zip(self.patches, given, asked, strict=True)]
-        pressed = ca.fmax(-least(shares), 0.0) / START_SHARE + START_FLOOR
-        return [a + pressed * s for a, s in zip(asked, given, strict=True)]
+        return ca.fmax(-least(shares), 0.0) / START_SHARE + START_FLOOR
+
+    @cached_property
+    def _at_rest(self) -> tuple[list[Array], list[Array]]:
+        """States (n,) on the central path under `_load_at_rest`, and their slopes (n, 6) by it."""
+        inputs = [self._load_at_rest, *[np.array(value) for value in self.nominal]]
+        cell = [ca.SX(ca.DM(value)) for value in inputs]
+        asked, given = self.asked(*cell), self.squeezed(*cell[1:])
+        press = self._pressed(given, asked)
+        pairs = zip(asked, given, strict=True)
+        states = [np.array(ca.evalf(a + press * s)).ravel() for a, s in pairs]
+        iterate, slope = central_point(self, states, inputs, REST_WEIGHT)
+        starts = np.cumsum([0, *[patch.iterate_size for patch in self.patches]])
+        places = [slice(at, at + len(own)) for at, own in zip(starts, states, strict=False)]
+        return [iterate[at] for at in places], [slope[at] for at in places]
 
     def asked(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
         """The least states that balance a load (6,), whether they lie within the cones or not."""
@@ -137,7 +189,7 @@ class Grasp:
         mu, r = friction[robot], reach[robot] * self._pads[i].patch_radius
         return ca.vertcat(1.0, mu, mu, r, r, mu * r)
 
-    def _at(self, states: list[ca.SX], friction: ca.SX, reach: ca.SX) -> list[ca.SX]:
+    def _at(self, states: list[ca.SX], friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
         """States at the nominal friction and size with what they carry, at others: each corner's
         force is shared among those of the other size."""
         moved = []
@@ -180,6 +232,16 @@ def _in_newtons(grasp: Grasp) -> ca.Function:
     return ca.Function(
         "in_newtons", [found, size, friction], [size * ca.if_else(closes, units * found, beyond)]
     )
+
+
+def _load_at_rest(workcell: Workcell) -> Array:
+    """(6,) of the payload as it stands at the start, as a direction that is scaled like loads."""
+    task = workcell.task
+    turn = ca.evalf(rotation_matrix(task.orientation, ca.SX(ca.DM(task.waypoints[0].lower[3:]))))
+    force = -np.array(turn).T @ np.array(GRAVITY)
+    moment = np.cross(workcell.payload.centre_of_mass, force)
+    load = np.concatenate([force, moment])
+    return np.asarray(load / np.hypot(np.linalg.norm(force), np.linalg.norm(moment) / MOMENT_ARM))
 
 
 def _patch(contact: Contact) -> Patch:

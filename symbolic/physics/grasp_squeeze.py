@@ -47,6 +47,7 @@ class GraspSqueeze(Grasp):
         super().__init__(cell)
         self.commanded = commanded
         self.cell_sizes = (("load", LOAD_SIZE), ("friction", 2), ("reach", 2))
+        self.nominal = (*self.nominal, [1.0, 1.0])
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """See `symbolic.physics.central_path.Program`."""

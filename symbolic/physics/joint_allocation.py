@@ -20,7 +20,11 @@ from typing import Literal
 import casadi as ca
 
 from symbolic.expression import Expression, reciprocal
-from symbolic.physics.central_path import differentiable_least_effort, least_effort
+from symbolic.physics.central_path import (
+    START_WEIGHT,
+    differentiable_least_effort,
+    least_effort,
+)
 from symbolic.physics.closure import WRENCH_SIZE
 from symbolic.physics.patch_cone import cross_2, patch_slack
 from symbolic.physics.patches import Patch
@@ -154,7 +158,7 @@ class OppositePads:
         forces = [ca.vertcat(w[0], mu[i] * w[1:3]) for i, w in enumerate(wrenches)]
         return ca.sumsqr(ca.vertcat(*forces)) / 2.0
 
-    def start(self, cell: list[ca.SX]) -> list[ca.SX]:
+    def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
         """Wrenches within both cones, pressed as hard as what else they carry asks."""
         balance, friction, radius = cell
         # Tangential forces that leave little moment to be carried: least squares, scaled.
@@ -169,7 +173,7 @@ class OppositePads:
         # The squeeze itself tilts the box where the pads do not face one another.
         overlap = 1.0 - _length(balance[6:8]) / ca.sum1(radius)
         pressed = LOWEST * ca.fmax(*asked) / (START_SHARE * overlap) + START_FLOOR
-        return _shared(cell, tangent, pressed + lighter)
+        return _shared(cell, tangent, pressed + lighter), ca.SX(START_WEIGHT)
 
 
 def even_slack(balance: ca.SX, friction: ca.SX, radius: ca.SX, n_1: ca.SX) -> ca.SX:

@@ -15,7 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.grasp import Grasp, grasp_wrenches
+from symbolic.physics.central_path import START_WEIGHT
+from symbolic.physics.closure import state_to_box
+from symbolic.physics.grasp import REST_WEIGHT, Grasp, grasp_wrenches
 from symbolic.workcell.records import Contact, Workcell
 from tests.symbolic.cells import hand_cell
 from tests.symbolic.physics.grasp_oracle import (
@@ -219,3 +221,30 @@ def test_friction_that_closes_nothing_asks_for_forces_beyond_any_limit() -> None
     load = np.array([1.0, 2.0, 30.0, 0.0, 0.0, 0.0])
     assert np.array(function(load, [0.3, 0.3]))[0] > 1e9
     assert np.array(function(load, [1.4, 1.4]))[0] < 1e4
+
+
+@pytest.mark.parametrize("kinds", KINDS)
+def test_starts_balance_the_load_within_the_cones_and_at_rest_near_the_least_effort(
+    kinds: tuple[str, ...],
+) -> None:
+    rng = np.random.default_rng(3)
+    cell = random_grasp(rng, hand_cell(), kinds)
+    upright = np.array([0.0, 0.0, 1.0])
+    at_rest = np.concatenate([upright, np.cross(cell.payload.centre_of_mass, upright)])
+    grasp = Grasp(cell)
+    load, friction = ca.SX.sym("load", 6), ca.SX.sym("friction", 2)
+    states, weight = grasp.start([load, friction])
+    outputs = [patch.slack(state) for patch, state in zip(grasp.patches, states, strict=True)]
+    outputs += [weight, grasp.effort([state[:6] for state in states], [load, friction])]
+    start = ca.Function("start", [load, friction], [ca.vertcat(*outputs), *states])
+    maps = [state_to_box(pad) for pad in cell.pads]
+    disturbed = [0.05 * rng.normal(size=6) * [1, 1, 1, 0.1, 0.1, 0.1] for _ in range(8)]
+    for asked in [at_rest, -at_rest, *[sign * at_rest + d for d in disturbed for sign in (1, -1)]]:
+        found, *held = (np.array(v).ravel() for v in start(asked, friction_of(cell)))
+        assert found[:-2].min() > 0.0
+        balance = sum(A @ state for A, state in zip(maps, held, strict=True))
+        np.testing.assert_allclose(balance, asked, atol=1e-9)
+        if asked is at_rest:
+            least = effort(least_wrenches(cell.pads, asked)) / 2.0
+            assert least < found[-1] < least * (1.0 + 1.5 * REST_WEIGHT)
+            assert found[-2] < START_WEIGHT
