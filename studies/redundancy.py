@@ -23,6 +23,7 @@ from hybrid_opt.evaluate.locked import LockedEvaluator
 from hybrid_opt.indicators.metrics import front_rows, hypervolume
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from studies.program import add_verbose, carried_out, run_program
+from studies.text_table import counted
 from symbolic.errors import SettingsError
 from symbolic.workcell.file import load
 from symbolic.workcell.records import Task
@@ -96,7 +97,7 @@ def as_text(found: Sequence[Replica]) -> str:
         best = max(one.locked)
         lines.append(f"{k:7d} {one.free:8.4f} {best:10.4f} {some:8d} of {len(one.locked)}  {at}")
     better = sum(one.free > max(one.locked) for one in found)
-    lines.append(f"free beats the best lock in {better} of {len(found)} replicas")
+    lines.append(f"free beats the best lock in {better} of {counted(len(found), 'replica')}")
     return "\n".join(lines)
 
 

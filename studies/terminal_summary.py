@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from hybrid_opt.campaign.recommended import StoredRecommendation
 from hybrid_opt.campaign.summary import AlgorithmFigures, Bounds, CampaignSummary, StoredTest
-from studies.text_table import number, text_table
+from studies.text_table import counted, number, text_table
 
 TITLES = {
     "nsga2": "NSGA-II",
@@ -74,7 +74,7 @@ def terminal_summary(
     settings = summary.settings
     parts = [
         recommendation,
-        f"{summary.workcell.name}: {settings.replicas} replicas of "
+        f"{summary.workcell.name}: {counted(settings.replicas, 'replica')} of "
         f"{settings.evaluations} evaluations, seed {settings.seed}",
         _table_1(summary.algorithms),
         _reasons(summary.algorithms),

@@ -118,7 +118,14 @@ class RobustPath:
 
     def beyond(self, points: PathPoints, level: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """The points where a force of either robot is above a level (n,) [N], their forces and
-        slopes as of `at`.
+        slopes as of `at`."""
+        rows, ruling = self.ruling_beyond(points, level)
+        return rows, ruling.force, self.slopes(points.at(rows), ruling)
+
+    def ruling_beyond(
+        self, points: PathPoints, level: Array
+    ) -> tuple[NDArray[np.intp], RulingCases]:
+        """The same points and the cases that decide there: slopes take as long as forces.
 
         Most cases are seen to need less by a pressure that shares everything evenly.
         """
@@ -139,7 +146,7 @@ class RobustPath:
         known[:, :, self.leader] = np.where(
             missing, HELD, known[:, :, follower] + sign * difference[:, rows]
         )
-        return (rows, *self._ruled(points.at(rows), known, sign * difference[:, rows]))
+        return rows, ruling_cases(known, self._set, self.leader, sign * difference[:, rows])
 
     def most_demanding(self, points: PathPoints, count: int) -> tuple[Array, Array]:
         """Forces of the cases that ask for most: where they rule in turn, each has its own slope.
@@ -177,10 +184,8 @@ class RobustPath:
             found[case, row] = self._squeeze.batch(*motion, self._cases[case])["normal_force"]
         return found
 
-    def _ruled(
-        self, points: PathPoints, least: Array, difference: Array | None = None
-    ) -> tuple[Array, Array]:
-        ruling = ruling_cases(least, self._set, self.leader, difference)
+    def _ruled(self, points: PathPoints, least: Array) -> tuple[Array, Array]:
+        ruling = ruling_cases(least, self._set, self.leader)
         return ruling.force, self.slopes(points, ruling)
 
     def slopes(self, points: PathPoints, ruling: RulingCases) -> Array:

@@ -30,6 +30,11 @@ class RulingCases:
     felt: NDArray[np.intp]
     share: Array
 
+    def at(self, rows: NDArray[np.intp]) -> RulingCases:
+        """At some of the samples."""
+        cases = self.commanded[rows], self.felt[rows]
+        return RulingCases(self.leader, self.force[rows], *cases, self.share[rows])
+
     def slopes(self, commanded: Array, felt: Array) -> Array:
         """(n, 2, m) derivatives of `force` from those of both robots' forces (n, 2, m) in the cases
         `commanded` and `felt`."""

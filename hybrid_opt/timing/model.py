@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     import casadi as ca
 
     from hybrid_opt.evaluate.drive import Driver
+    from hybrid_opt.timing.path_timer import PathTiming
 
 _BOX = (
     "pose",
@@ -193,6 +194,15 @@ class TimingModel:
         """The limits of drivable carries whose force limit this is [N], one of robust forces where
         the model limits these."""
         return TimingLimits(force=force, robust=self._robust)
+
+    def search_timing(self, x: Array) -> PathTiming:
+        """How a search drives a drivable carry x (n_var,) within its own force limit.
+
+        Raises:
+            SettingsError: x does not fit the workcell.
+        """
+        (found,) = self._driver.timings(self._checked(x)[None])
+        return found
 
     def search_carry(self, x: Array) -> Carry:
         """The carry under the task's own time law, see `hybrid_opt.evaluate.time_law`."""

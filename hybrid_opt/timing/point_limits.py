@@ -74,25 +74,31 @@ class PointLimits:
             )
         ]
         still = np.zeros(len(self._index))
-        return rows_of.join([*cuts, *self._force_cut(still, still)])
+        force = self._force_cut(still, still, self._robust(still, still))
+        return rows_of.join([*cuts, *force])
 
     @property
     def _convex_force(self) -> float | None:
         """The force limit where the normal forces are convex, in closed form."""
         return self._limits.force if self._model.workcell.has_facing_pads else None
 
-    def _force_cut(self, a: Array, w: Array) -> list[PointRows]:
+    def _force_cut(self, a: Array, w: Array, robust: tuple[Array, Array] | None) -> list[PointRows]:
+        """robust: see `_robust`."""
         if self._convex_force is None:
             return []
         tangent = rows_of.tangent_direction(self.points, self._model.workcell, a, w)
         force = self._convex_force
         cuts = [rows_of.force_rows(self.points, self._model.workcell, force, tangent)]
-        if self._limits.robust:
-            value, slope = self._robust(a, w)
+        if robust is not None:
+            value, slope = robust
             cuts.append(rows_of.tangent_rows(value / force, slope / force, np.stack([a, w], 1)))
         return cuts
 
-    def _robust(self, a: Array, w: Array) -> tuple[Array, Array]:
+    def _robust(self, a: Array, w: Array) -> tuple[Array, Array] | None:
+        """Robust forces (n, 2) and their slopes (n, 2, 2) by (u'', u'^2), where these are limited
+        and convex."""
+        if not self._limits.robust or self._convex_force is None:
+            return None
         p = self.points
         path = (p.pose[:, :6], p.pose_first[:, :6], p.pose_second[:, :6])
         force, slope = robust_path(self._model.workcell).at(PathPoints(*path, a, w))
@@ -116,13 +122,14 @@ class PointLimits:
                 cuts.append(rows_of.norm_rows(first, second, limit, direction[:, None, :]))
         if self._convex_force is not None:
             largest = float(self._model.drive(p, np.sqrt(w), a)["normal_force"].max())
-            if self._limits.robust:
-                largest = max(largest, float(self._robust(a, w)[0].max()))
+            robust = self._robust(a, w)
+            if robust is not None:
+                largest = max(largest, float(robust[0].max()))
             excess = largest / self._convex_force - 1.0
             worst_excess = max(worst_excess, excess)
             # What the force limit leaves for the motion is small, so the whole of it counts.
             if excess > POINT_TOLERANCE * FORCE_SHARPNESS:
-                cuts += self._force_cut(a, w)
+                cuts += self._force_cut(a, w, robust)
                 worst_excess = max(worst_excess, 2.0 * POINT_TOLERANCE)
         return cuts, worst_excess
 

@@ -141,7 +141,8 @@ class RobustPasses:
         a = (rise * self._intervals / 2.0).reshape(-1)
         path, sample = np.repeat(chosen, per), np.tile(self._sample, m)
         points, limit = self._points(state, path, sample, a, w), state.limit[path]
-        rows, force, slope = self._forces.beyond(points, NEAR * limit)
+        rows, ruling = self._forces.ruling_beyond(points, NEAR * limit)
+        force = ruling.force
         exceeded = np.zeros(len(state.limit), dtype=bool)
         exceeded[path[rows][force.max(axis=1) > (1.0 + TOLERANCE) * limit[rows]]] = True
         state.peak[chosen] = 0.0
@@ -152,7 +153,8 @@ class RobustPasses:
         keep = np.flatnonzero(exceeded[path[rows]])
         z = np.stack([a[rows], w[rows]], axis=1)[keep]
         place = (path[rows][keep], sample[rows][keep])
-        self._add(state, place, z, force[keep], slope[keep][:, :, BY_TIMING])
+        slope = self._forces.slopes(points.at(rows[keep]), ruling.at(keep))
+        self._add(state, place, z, force[keep], slope[:, :, BY_TIMING])
         return exceeded[chosen]
 
     def _add(

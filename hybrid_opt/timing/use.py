@@ -26,6 +26,9 @@ RECOMPUTED_TOLERANCE = TIMING_TOLERANCE
 NEAR = 0.98
 """Share of a limit of robust forces from which on they are told exactly."""
 
+SPREAD = 20
+"""Samples per one whose robust force is told, where the largest is looked for."""
+
 AT_A_TIME = 2000
 """Samples of a carry whose cases are held in memory together."""
 
@@ -80,20 +83,33 @@ def limited_force(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Arr
 
 
 def _near_limit(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array:
-    """As `limited_force`; robust ones that are below `NEAR` of the limit may be told as the planned
-    ones, where a larger one is there: to see that takes a thirtieth of the time."""
+    """As `limited_force`; robust ones that are below `NEAR` of the limit, and below the largest of
+    the carry, may be told as the planned ones: to see that takes a fraction of the time."""
     if not limits.robust or limits.force is None or not workcell.has_facing_pads:
         return limited_force(carry, workcell, limits)
     n = len(carry)
     points = PathPoints(carry.pose, carry.rate, carry.second_rate, np.zeros(n), np.ones(n))
     found = carry.normal_force.copy()
-    known = False
-    for part in np.array_split(np.arange(n), -(-n // AT_A_TIME)):
-        level = np.full(len(part), NEAR * limits.force)
-        rows, force, _ = robust_path(workcell).beyond(points.at(part), level)
-        found[part[rows]] = np.maximum(found[part[rows]], force)
-        known = known or len(rows) > 0
-    return found if known else limited_force(carry, workcell, limits)
+    if _tell_above(NEAR * limits.force, points, workcell, found):
+        return found
+    # Nearly the largest one is among a few; only what exceeds that can be larger.
+    _tell_above(0.0, points, workcell, found, every=SPREAD)
+    _tell_above(float(found.max()), points, workcell, found)
+    return found
+
+
+def _tell_above(
+    level: float, points: PathPoints, workcell: Workcell, found: Array, every: int = 1
+) -> bool:
+    """Write the robust forces above a level [N], of every so manieth point, into forces (n, 2);
+    whether there are any."""
+    known, rows = False, np.arange(0, len(points), every)
+    for part in np.array_split(rows, -(-len(rows) // AT_A_TIME)):
+        least = np.full(len(part), level)
+        above, ruling = robust_path(workcell).ruling_beyond(points.at(part), least)
+        found[part[above]] = np.maximum(found[part[above]], ruling.force)
+        known = known or len(above) > 0
+    return known
 
 
 def limits_pressure(workcell: Workcell, limits: TimingLimits) -> bool:

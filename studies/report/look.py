@@ -11,6 +11,7 @@ from studies.report.animation import Film, write_animation
 from studies.report.data import gather_carries
 from studies.report.generate import TABLES
 from studies.report.live import LiveView
+from studies.text_table import counted
 
 BEGIN = "<!-- measured: begin -->"
 END = "<!-- measured: end -->"
@@ -45,7 +46,7 @@ def insert_tables(root: Path, document: Path) -> None:
     if begin < 0 or end < begin:
         raise ReportError(f"{document}: needs the lines {BEGIN} and {END}")
     head = (
-        f"{summary.workcell.name}: {settings.replicas} replicas of "
+        f"{summary.workcell.name}: {counted(settings.replicas, 'replica')} of "
         f"{settings.evaluations} evaluations, seed {settings.seed}; Python "
         f"{machine['python']}, CasADi {machine['casadi']}, Pinocchio {machine['pin']}, pymoo "
         f"{machine['pymoo']}."

@@ -21,6 +21,7 @@ from studies.errors import ReportError
 from studies.recommendation_text import recommendation_text
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
+from studies.text_table import counted
 
 
 def render_page(
@@ -99,8 +100,9 @@ def _lead(data: ReportData) -> str:
     chosen = f" {branches[0].upper()}{branches[1:]}." if branches else ""
     return (
         f"Two arms carry a box of {payload.mass:g} kg along {len(task.waypoints)} poses, "
-        f"{len(task.free_indices)} of them free. {names}: {settings.replicas} replicas of "
-        f"{settings.evaluations} evaluations each, seed {settings.seed}.{chosen}"
+        f"{len(task.free_indices)} of them free. {names}: "
+        f"{counted(settings.replicas, 'replica')} of {settings.evaluations} evaluations each, "
+        f"seed {settings.seed}.{chosen}"
     )
 
 

@@ -18,7 +18,7 @@ from hybrid_opt.display.scene import packed
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.store.trajectory_figures import trajectory_figures
-from hybrid_opt.timing import time_path
+from hybrid_opt.timing import drivable_timing, time_path
 from hybrid_opt.timing.jerk import drive_with_jerk
 from hybrid_opt.work.job import Emit
 from studies.report.jobs import DrawnJob, JobRequest, drawn
@@ -82,6 +82,8 @@ def _loaded(objectives: tuple[str, ...], workcell: Workcell) -> tuple[ho.Cell, J
     cell = ho.Cell(workcell, objectives)
     # The cell's files are there only now: what is loaded when it is first needed is needed now.
     cell.carry(cell.initial)
+    if workcell.task.time_law == "optimal":
+        cell.timing_model.search_timing(cell.initial)
     return cell, JobModel(cell.compiled, cell.timing_model)
 
 
@@ -148,7 +150,7 @@ class PageCarries:
         judged = cell.carry(shown.x)
         assert judged.judgement is not None, "carries of a cell are judged"
         request = JobRequest(shown.label, shown.x[: self._n_var], _limits(cell, shown.x))
-        timing = time_path(self._jobs.timing, request.x, request.limits)
+        timing = self._timed(cell, shown.x, request)
         driven = timing.carry
         motions = [] if driven is None else [self._motion(DRIVEN, driven)]
         if shown.jerk:
@@ -180,6 +182,11 @@ class PageCarries:
         elif timing.ok:
             _with_job(found, drawn(self._jobs, request, timing))
         return found
+
+    def _timed(self, cell: ho.Cell, x: Array, request: JobRequest) -> ho.Timing:
+        if cell.workcell.task.time_law == "optimal":
+            return drivable_timing(cell.timing_model, x)
+        return time_path(self._jobs.timing, request.x, request.limits)
 
     def _within_jerk(self, cell: ho.Cell, x: Array) -> list[dict[str, Any]]:
         """The carry within the cell's limits on jerk, where it has any."""

@@ -19,6 +19,7 @@ from studies.report.style import (
     new_figure,
     series,
 )
+from studies.text_table import counted
 from symbolic.array import Array
 
 
@@ -104,7 +105,7 @@ def _draw_replicas(
             color=look.colour,
             linestyle="-",
             linewidth=0.9,
-            label=f"{row.label}: {row.replicas} replicas",
+            label=f"{row.label}: {counted(row.replicas, 'replica')}",
         )
         axes.fill_between(force, least, largest, color=look.colour, alpha=0.2, linewidth=0.0)
         drawn.append(np.stack([force, median], axis=1)[np.isfinite(median)])

@@ -13,6 +13,7 @@ from hybrid_opt.indicators.attainment import attainment_surfaces
 from hybrid_opt.indicators.metrics import front_of
 from studies.report.records import AlgorithmRuns, ReportData
 from studies.report.style import FULL_WIDTH, new_figure, panel_label, series
+from studies.text_table import counted
 from symbolic.array import Array
 
 QUARTILES = (25.0, 75.0)
@@ -98,7 +99,7 @@ def attainment(data: ReportData) -> Figure:
                 )
         _static_point(axes, data)
         _label_objectives(axes, data)
-        panel_label(axes, letter, f"{text}, {max(len(f) for f in group)} replicas")
+        panel_label(axes, letter, f"{text}, {counted(max(len(f) for f in group), 'replica')}")
         _zoom(axes, [points for found in group for points in found], data.static)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)

@@ -21,6 +21,7 @@ from studies.report.tables_drive import (
 from studies.report.tables_job import phases
 from studies.simulation_text import HEADINGS, MEANING, simulation_rows
 from studies.terminal_summary import PAPER
+from studies.text_table import counted
 
 
 def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
@@ -79,7 +80,7 @@ def quality(data: ReportData, with_paper: bool) -> Table:
         "Table 1. Quality of the search.",
         ("algorithm", *(heading for _, heading, _, _ in _QUALITY)),
         tuple(rows),
-        f"Mean ± standard deviation of {settings.replicas} replicas of "
+        f"Mean ± standard deviation of {counted(settings.replicas, 'replica')} of "
         f"{settings.evaluations} evaluations. Hypervolume: reference 1.1 in every objective. "
         "IGD: mean distance to the non-dominated union of the campaign. Spacing: Schott's."
         + (" The paper's rows hold what its text states." if with_paper else ""),

@@ -18,8 +18,10 @@ from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.problem import CarryProblem
+from hybrid_opt.polishing.drivable.certified import AGREEMENT
 from hybrid_opt.robust.force import robust_model
-from hybrid_opt.timing import PathTimer, TimingLimits, time_path
+from hybrid_opt.timing import PathTimer, TimingLimits, drivable_timing, time_path
+from hybrid_opt.timing.path_timer import PATH_INTERVALS
 from symbolic.array import Array
 from symbolic.functions.candidate import candidate_function
 from symbolic.geometry.clearance import screening_functions
@@ -169,3 +171,26 @@ def test_less_force_violates_more_and_costs_more() -> None:
     x[:, -1] = np.linspace(20.0, 45.0, 5)
     found = evaluator().evaluate(x)
     assert (np.diff(found.penalised[:, 0]) < 0.0).all()
+
+
+def test_a_drivable_carry_is_timed_as_the_search_found_it() -> None:
+    """On a grid twice as fine, and within the force limit between its points, too."""
+    model = timing_of(drivable_cell(), 2 * PATH_INTERVALS)
+    driver = evaluator().driver
+    assert driver is not None
+    for x in candidates(3):
+        timing, (found,) = drivable_timing(model, x), driver.timings(x[None])
+        assert timing.ok
+        assert timing.carry is not None
+        assert timing.duration == pytest.approx(found.duration, rel=1e-9)
+        assert timing.carry.normal_force.max() <= 1.005 * x[-1]
+        assert timing.iterations == 0, "time_path was asked"
+        other = time_path(model, x, TimingLimits(force=float(x[-1])))
+        assert timing.duration == pytest.approx(other.duration, rel=AGREEMENT)
+
+
+def test_what_the_search_cannot_drive_is_told_by_time_path() -> None:
+    model = timing_of(drivable_cell(), 2 * PATH_INTERVALS)
+    x = np.append(candidates(1)[0][:-1], 0.9 * STATIC)
+    assert drivable_timing(model, x).status is time_path(model, x, model.drive_limits(x[-1])).status
+    assert not drivable_timing(model, x).ok

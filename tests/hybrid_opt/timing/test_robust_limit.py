@@ -55,7 +55,7 @@ def test_robust_forces_need_a_limit() -> None:
         TimingLimits(robust=True)
 
 
-@pytest.mark.parametrize("share", [0.9, 1.0, 1.1])
+@pytest.mark.parametrize("share", [0.9, 1.0, 1.1, 1.5])
 def test_the_use_of_the_limit_is_that_of_all_cases(share: float) -> None:
     """Cases far below the limit are left out, where others are near it."""
     model = unsure()
