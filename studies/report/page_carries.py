@@ -82,7 +82,7 @@ def _loaded(objectives: tuple[str, ...], workcell: Workcell) -> tuple[ho.Cell, J
     cell = ho.Cell(workcell, objectives)
     # The cell's files are there only now: what is loaded when it is first needed is needed now.
     cell.carry(cell.initial)
-    if workcell.task.time_law == "optimal":
+    if workcell.task.time_law == "optimal" and cell.force_kind.robust:
         cell.timing_model.search_timing(cell.initial)
     return cell, JobModel(cell.compiled, cell.timing_model)
 
@@ -150,7 +150,7 @@ class PageCarries:
         judged = cell.carry(shown.x)
         assert judged.judgement is not None, "carries of a cell are judged"
         request = JobRequest(shown.label, shown.x[: self._n_var], _limits(cell, shown.x))
-        timing = self._timed(cell, shown.x, request)
+        timing = self._timed(cell, shown, request)
         driven = timing.carry
         motions = [] if driven is None else [self._motion(DRIVEN, driven)]
         if shown.jerk:
@@ -183,9 +183,11 @@ class PageCarries:
             _with_job(found, drawn(self._jobs, request, timing))
         return found
 
-    def _timed(self, cell: ho.Cell, x: Array, request: JobRequest) -> ho.Timing:
-        if cell.workcell.task.time_law == "optimal":
-            return drivable_timing(cell.timing_model, x)
+    def _timed(self, cell: ho.Cell, shown: Shown, request: JobRequest) -> ho.Timing:
+        """As robots drive it: as an export times it, but for the points of time against robust
+        force, for which that takes long: as the search found them."""
+        if request.limits.robust and not shown.jerk:
+            return drivable_timing(cell.timing_model, shown.x)
         return time_path(self._jobs.timing, request.x, request.limits)
 
     def _within_jerk(self, cell: ho.Cell, x: Array) -> list[dict[str, Any]]:

@@ -14,6 +14,7 @@ from hybrid_opt.campaign.layout import POLISH, polished_folder
 from hybrid_opt.campaign.recommended import StoredRecommendation
 from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.recommending.force_table import level_force
@@ -183,3 +184,14 @@ def test_the_report_shows_robust_forces(data: ReportData) -> None:
     (group,) = (each for each in view["groups"] if each["label"] == "Recommended")
     assert group["x"][0] == pytest.approx(choice.force_limit, rel=5e-3)
     assert group["y"][0] == pytest.approx(choice.duration, rel=1e-3)
+    # Points of the fronts are driven as the search found them.
+    assert data.drivable is not None
+    entry = data.drivable.fronts[0].front
+    (shown,) = (each for each in view["groups"] if each["label"] == entry.label)
+    cell = Cell(data.drivable.workcell, data.objectives)
+    for k in (0, len(entry.x) - 1):
+        point = page["trajectories"][shown["members"][k]]
+        assert point["motions"][0]["duration"] == pytest.approx(
+            cell.carry(entry.x[k]).duration, rel=1e-4
+        )
+        assert point["force"] <= 1.005 * entry.x[k][-1]
