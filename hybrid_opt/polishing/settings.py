@@ -195,8 +195,8 @@ class FillSettings:
             `SolveSettings.tolerance`.
     """
 
-    solved: int = 36
-    members: int = 60
+    solved: int = 32
+    members: int = 56
     chord: int = 16
     attempts: int = 5
     stride: float = 0.2
@@ -205,7 +205,7 @@ class FillSettings:
     radius: float = 0.4
     rounds: int = 12
     iterations: int = 30
-    barrier: float = 1e-6
+    barrier: float = 1e-5
     tolerance: float = 1e-6
 
 
