@@ -40,7 +40,8 @@ def build_study(cell: Cell, polish: bool = True, drivable: bool = True) -> None:
     key = cell.compiled.key("study", *what, version("casadi"), sources)
     if cache.read_record(key) is not None:
         return
-    cells = [cell, cell.drivable()] if drivable and not _driven(cell) else [cell]
+    # What drives has the longest functions.
+    cells = [cell.drivable(), cell] if drivable and not _driven(cell) else [cell]
     makers = [make for each in cells for make in _makers(each, polish)]
     # Each waits for its compilers most of the time; expressions are made by one after the other.
     with ThreadPoolExecutor(len(makers)) as pool:
