@@ -121,8 +121,8 @@ class Judge:
         if length < SMALLEST_SIZE:
             return 0.0
         u = between / length
-        near = u @ a.getTranslation() + reach(shape_a, (u @ a.getRotation())[None])[0]
-        far = u @ b.getTranslation() - reach(shape_b, (-u @ b.getRotation())[None])[0]
+        near = u @ a.getTranslation() + _reach(shape_a, u @ a.getRotation())
+        far = u @ b.getTranslation() - _reach(shape_b, -u @ b.getRotation())
         return max(0.0, float(far - near))
 
     def _placed(self, sample: int, index: int) -> list[fcl.CollisionObject]:
@@ -134,6 +134,15 @@ class Judge:
                 item.setTranslation(self._positions[sample, k])
             self.updates += len(body.objects)
         return body.objects
+
+
+def _reach(shape: ConvexShape, u: Array) -> float:
+    """`symbolic.geometry.pieces.reach` along one direction (3,); most shapes are boxes, and asked
+    for thousands of times."""
+    if isinstance(shape, Box):
+        (x, y, z), (a, b, c) = u.tolist(), shape.size.tolist()
+        return float(abs(x) * a + abs(y) * b + abs(z) * c) / 2.0
+    return float(reach(shape, u[None])[0])
 
 
 class _Objects:
