@@ -25,7 +25,7 @@ from hybrid_opt.polishing.inequalities import Inequalities
 from hybrid_opt.polishing.interior_steps import direction, estimated, kept, largest, until
 from hybrid_opt.polishing.residuals import UNKNOWN, residuals
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.polishing.solvers import Answer, Program
+from hybrid_opt.polishing.solvers import Answer, Conditions, Program
 from symbolic.array import Array
 
 PUSH = 1e-4
@@ -145,20 +145,24 @@ class DenseSolver:
                 message = "Step_Too_Short"
                 break
         z = np.clip(now.z, self._program.low, self._program.high)
-        lam_z, y = estimated(
-            self._program.cost, now.A, (now.h, now.z - self._low, self._high - now.z)
-        )
-        multipliers = lam_z, self._rows.multipliers(y)
         usable = bool(np.isfinite(z).all())
         return Answer(
             z=z,
             message=message if usable else "Not_Finite",
             converged=usable and message == "Solve_Succeeded",
             usable=usable,
-            multipliers=multipliers,
-            residuals=residuals(self._program, z, *multipliers) if usable else UNKNOWN,
             iterations=iterations,
+            conditions=lambda: self._conditions(now, z),
         )
+
+    def _conditions(self, now: State, z: Array) -> Conditions:
+        """Multipliers that satisfy the conditions best where the solve ended, and residuals."""
+        lam_z, y = estimated(
+            self._program.cost, now.A, (now.h, now.z - self._low, self._high - now.z)
+        )
+        multipliers = lam_z, self._rows.multipliers(y)
+        usable = bool(np.isfinite(z).all())
+        return multipliers, residuals(self._program, z, *multipliers) if usable else UNKNOWN
 
     def _start(self) -> State:
         push = PUSH * self._width

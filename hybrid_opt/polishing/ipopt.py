@@ -189,7 +189,7 @@ def ipopt(program: Program, settings: PolishSettings) -> Answer:
         message = str(error).strip().splitlines()[-1]
         nowhere = np.full(len(program.start), np.nan)
         none = np.zeros(len(program.start)), np.zeros(len(program.below))
-        return Answer(nowhere, message, False, False, none, UNKNOWN, 0)
+        return Answer(nowhere, message, False, False, 0, lambda: (none, UNKNOWN))
     statistics = solver.stats()
     z, lam_z, lam_g = (found[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
     usable = bool(np.isfinite(z).all())
@@ -198,7 +198,9 @@ def ipopt(program: Program, settings: PolishSettings) -> Answer:
         message=str(statistics["return_status"]),
         converged=statistics["return_status"] == "Solve_Succeeded",
         usable=usable,
-        multipliers=(lam_z, lam_g),
-        residuals=residuals(program, z, lam_z, lam_g) if usable else UNKNOWN,
         iterations=int(statistics["iter_count"]),
+        conditions=lambda: (
+            (lam_z, lam_g),
+            residuals(program, z, lam_z, lam_g) if usable else UNKNOWN,
+        ),
     )

@@ -195,7 +195,7 @@ class FillSettings:
             `SolveSettings.tolerance`.
     """
 
-    solved: int = 32
+    solved: int = 30
     members: int = 56
     chord: int = 16
     attempts: int = 5

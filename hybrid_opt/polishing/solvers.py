@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 from hybrid_opt.polishing.residuals import Residuals
@@ -35,6 +37,10 @@ class Program(Protocol):
         """(n_variables, n_variables) second derivatives of multipliers . constraints at z."""
 
 
+Conditions = tuple[tuple[Array, Array], Residuals]
+"""Multipliers and residuals."""
+
+
 @dataclass(frozen=True)
 class Answer:
     """What a solver returned.
@@ -44,16 +50,28 @@ class Answer:
         message: its status.
         converged: whether it claims an optimum.
         usable: whether z is finite.
-        multipliers: of the variables' bounds (n_variables,) and of the rows (n_rows,), in CasADi's
-            convention.
-        residuals: recomputed here.
         iterations: its own.
+        conditions: tells the multipliers and the residuals, when somebody asks for them.
     """
 
     z: Array
     message: str
     converged: bool
     usable: bool
-    multipliers: tuple[Array, Array]
-    residuals: Residuals
     iterations: int
+    conditions: Callable[[], Conditions] = field(repr=False)
+
+    @cached_property
+    def _told(self) -> Conditions:
+        return self.conditions()
+
+    @property
+    def multipliers(self) -> tuple[Array, Array]:
+        """Of the variables' bounds (n_variables,) and of the rows (n_rows,), in CasADi's
+        convention."""
+        return self._told[0]
+
+    @property
+    def residuals(self) -> Residuals:
+        """Recomputed from the program."""
+        return self._told[1]
