@@ -19,7 +19,7 @@ from hybrid_opt.evaluate.objectives import FORCE_PAIRS, ROBUST_OBJECTIVES
 from hybrid_opt.polishing.archive import GrowingFront
 from hybrid_opt.polishing.attempt import Lost
 from hybrid_opt.polishing.chords import Chord, between, chord_of, widest
-from hybrid_opt.polishing.filling import Edge, crept, filling
+from hybrid_opt.polishing.filling import Edge, crept, filling, gaps
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.kick import kicked
 from hybrid_opt.polishing.mirror import mirror_of
@@ -162,10 +162,19 @@ class ForceRun(PolishRun[Attempt]):
         return found
 
     def _take_back(self, probed: list[tuple[Array, Array]]) -> None:
-        """What stands beside the filled front is not given up."""
+        """What lies in gaps that stayed far too wide is not given up, nor what a front lacks."""
         for x, objectives in probed:
-            if not self._archive.dominates(objectives):
+            is_short = len(self._archive.rows()) < self._settings.fill.members
+            if not self._archive.dominates(objectives) and (is_short or self._is_far(objectives)):
                 self._archive.add(x, objectives)
+
+    def _is_far(self, objectives: Array) -> bool:
+        """Whether a point lies beyond the ends of the front, or in a gap that is far too wide."""
+        f = [self._archive.objectives[k][0] for k in self._archive.rows()]
+        place = int(np.searchsorted(f, objectives[0]))
+        if place in (0, len(f)):
+            return True
+        return gaps(self._archive)[place - 1].width > self._settings.fill.far
 
     def _fill(self) -> None:
         """Attempts between the ends, until the front is even or no side of a gap is left; then

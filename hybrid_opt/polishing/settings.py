@@ -171,7 +171,7 @@ class ProbeSettings:
 
     starts: int = 8
     middle_starts: int = 8
-    rounds: int = 2
+    rounds: int = 3
     candidates: int = 1000
 
 
@@ -195,7 +195,7 @@ class FillSettings:
             `SolveSettings.tolerance`.
     """
 
-    solved: int = 30
+    solved: int = 34
     members: int = 56
     chord: int = 16
     attempts: int = 5
