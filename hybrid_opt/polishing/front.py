@@ -128,6 +128,10 @@ class ForceRun(PolishRun[Attempt]):
         self._fill()
         self._take_back(probed)
         self._certify_unproven()
+        if self._is_short:
+            # Some were not proven.
+            self._fill_by_chords()
+            self._certify_unproven()
 
     def _probe(self, objective: int | None, rng: np.random.Generator) -> None:
         """Short solves from random feasible candidates and from the front's best point, then again
@@ -164,9 +168,14 @@ class ForceRun(PolishRun[Attempt]):
     def _take_back(self, probed: list[tuple[Array, Array]]) -> None:
         """What lies in gaps that stayed far too wide is not given up, nor what a front lacks."""
         for x, objectives in probed:
-            is_short = len(self._archive.rows()) < self._settings.fill.members
-            if not self._archive.dominates(objectives) and (is_short or self._is_far(objectives)):
+            wanted = self._is_short or self._is_far(objectives)
+            if wanted and not self._archive.dominates(objectives):
                 self._archive.add(x, objectives)
+
+    @property
+    def _is_short(self) -> bool:
+        """Whether the front has fewer points than it is to have."""
+        return len(self._archive.rows()) < self._settings.fill.members
 
     def _is_far(self, objectives: Array) -> bool:
         """Whether a point lies beyond the ends of the front, or in a gap that is far too wide."""
@@ -195,7 +204,7 @@ class ForceRun(PolishRun[Attempt]):
 
     def _fill_by_chords(self) -> None:
         archive, fill, tried = self._archive, self._settings.fill, set[Chord]()
-        while len(archive.rows()) < fill.members and (gap := widest(archive, tried)) is not None:
+        while self._is_short and (gap := widest(archive, tried)) is not None:
             first, second = chord_of(archive, gap)
             image = self._reflected_bytes(second), self._reflected_bytes(first)
             tried |= {(first, second), image}

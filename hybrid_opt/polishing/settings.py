@@ -171,7 +171,7 @@ class ProbeSettings:
 
     starts: int = 8
     middle_starts: int = 8
-    rounds: int = 3
+    rounds: int = 2
     candidates: int = 1000
 
 
@@ -195,7 +195,7 @@ class FillSettings:
             `SolveSettings.tolerance`.
     """
 
-    solved: int = 34
+    solved: int = 32
     members: int = 56
     chord: int = 16
     attempts: int = 5
@@ -278,7 +278,7 @@ class PolishSettings:
         near, trust, solve, front, kick, probe, fill, drivable: the parts' own.
     """
 
-    attempts: int = 6
+    attempts: int = 8
     method: Method = "pascoletti-serafini"
     max_iterations: int = 20
     rounds: int = 7
