@@ -9,6 +9,7 @@ the full evaluator and certified between the samples before it is believed.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -38,6 +39,10 @@ def knows_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
     """Whether the pads' forces are known: planned ones of any pads, robust ones of two round pads
     that face one another."""
     return workcell.has_facing_pads or tuple(objectives) != ROBUST_OBJECTIVES
+
+
+ENOUGH = 0.9
+"""Share of the points that a front is to have with which it is left."""
 
 
 class FrontPolisher(Polisher):
@@ -125,12 +130,12 @@ class ForceRun(PolishRun[Attempt]):
             self._most += 1
             self._do([finishing(self._archive, objective, self._settings)])
         probed = self._without_probes()
-        self._fill()
+        self._fill(self._settings.fill.solved)
         self._take_back(probed)
         self._certify_unproven()
-        if self._is_short:
-            # Some were not proven.
-            self._fill_by_chords()
+        if len(self._archive.rows()) < ENOUGH * self._settings.fill.members:
+            # Chords lead nowhere, or where nothing is proven.
+            self._fill(self._settings.fill.members)
             self._certify_unproven()
 
     def _probe(self, objective: int | None, rng: np.random.Generator) -> None:
@@ -185,13 +190,13 @@ class ForceRun(PolishRun[Attempt]):
             return True
         return gaps(self._archive)[place - 1].width > self._settings.fill.far
 
-    def _fill(self) -> None:
-        """Attempts between the ends, until the front is even or no side of a gap is left; then
-        points on chords between neighbours."""
+    def _fill(self, solved: int) -> None:
+        """Attempts between the ends, until the front has so many points or no side of a gap is
+        left; then points on chords between neighbours."""
         tried: set[Edge] = set()
         self._most += self._settings.fill.attempts * self._settings.attempts
         while self._left() > 0:
-            found = filling(self._archive, tried, self._settings.fill)
+            found = filling(self._archive, tried, replace(self._settings.fill, solved=solved))
             if found is None:
                 break
             tried |= {found.edge, self._reflected(found.edge)}

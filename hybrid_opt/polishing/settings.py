@@ -170,7 +170,7 @@ class ProbeSettings:
     """
 
     starts: int = 8
-    middle_starts: int = 8
+    middle_starts: int = 10
     rounds: int = 2
     candidates: int = 1000
 
