@@ -184,7 +184,8 @@ class FillSettings:
         members: points that the front is to have; beyond those, the rest lies on chords between
             neighbours, see `hybrid_opt.polishing.chords`.
         chord: points that are evaluated on each.
-        attempts: at most, for each of `PolishSettings.attempts`.
+        attempts: at most, for each of `PolishSettings.attempts`; twice as many where the front
+            stays short.
         stride: from the neighbour that an attempt starts from, along both objectives, at most, in
             units of the front's extent.
         far: width beyond which a gap that no neighbour leads into is looked at from afar.

@@ -115,7 +115,7 @@ def test_what_it_cost_is_told_in_evaluations() -> None:
         result.seconds / result.evaluation_seconds, abs=1.0
     )
     ends_and_middle = 3
-    most = SETTINGS.attempts * (1 + SETTINGS.fill.attempts) + ends_and_middle
+    most = SETTINGS.attempts * (1 + 2 * SETTINGS.fill.attempts) + ends_and_middle
     beside_probes = sum(o.aim != "probe" for o in result.outcomes)
     assert SETTINGS.attempts < beside_probes <= most
     assert sum(o.status == "accepted" for o in result.outcomes) == result.counts["accepted"]
