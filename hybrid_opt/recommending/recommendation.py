@@ -176,11 +176,25 @@ def _driven(cell: Cell, x: Array, wanted: Iterable[Choice]) -> tuple[Choice, Tim
 
 
 def _commanded(carry: Carry) -> tuple[Commanded, tuple[str, ...]]:
-    """What to press with, and a warning where the cell's own set cannot be held."""
+    """What to press with, and what speaks against it."""
+    doubts = []
     try:
-        return commanded(carry), ()
+        found = commanded(carry)
     except SettingsError as error:
-        return commanded(carry, SqueezeSettings(FACTOR)), (f"no robust forces: {error}",)
+        found = commanded(carry, SqueezeSettings(FACTOR))
+        doubts.append(f"no robust forces: {error}")
+    if not found.squeeze.even_pads:
+        doubts.append(
+            "the squeeze holds pads that choose their pressure; what pads that press evenly need "
+            "is known for two pads with opposite normals only"
+        )
+    allowed = carry.workcell.task.reference_force
+    if (found.peak > allowed).any():
+        doubts.append(
+            f"pressing with {found.peak.max():.1f} N exceeds the reference force of "
+            f"{allowed.min():.1f} N; wish for a longer carry or less force"
+        )
+    return found, tuple(doubts)
 
 
 def _warnings(beside: Iterable[Rival], timing: Timing, force: float) -> Iterator[str]:

@@ -3,6 +3,9 @@
 With N_1 - N_2 fixed by the motion, the force of one arm decides both: the leading arm keeps its
 place and feels what follows, the other is force-controlled (`hybrid_opt.robust`). What is commanded
 beyond the plan presses both pads against one another and moves nothing.
+
+The plan may assume pads that choose their pressure. What is commanded always holds pads that press
+evenly as well (`hybrid_opt.robust.even_pads`).
 """
 
 from __future__ import annotations
@@ -12,13 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
+from hybrid_opt.robust.even_pads import even_pads
 from hybrid_opt.robust.force import HeldMotion, robust_model
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.workcell.records import Uncertainty, Workcell
 
 FACTOR = 1.3
-"""Commanded over planned force where nothing says how uncertain the cell is."""
+"""Commanded over least force where nothing says how uncertain the cell is."""
 
 RESERVE = 0.10
 """Share by which robust forces are exceeded: they hold a box whose wrenches follow the plan.
@@ -38,8 +42,8 @@ class SqueezeSettings:
     """How hard to press.
 
     Attributes:
-        factor: commanded over planned squeeze; None for the robust force of the workcell's
-            uncertainty, and `FACTOR` where it has none.
+        factor: commanded squeeze over the least that holds; None for the robust force of the
+            workcell's uncertainty, and `FACTOR` where it has none.
         leader: index of the arm that keeps its place.
         smoothing: half the width of the time window of the smoothing [s].
     """
@@ -51,8 +55,8 @@ class SqueezeSettings:
     def __post_init__(self) -> None:
         if self.factor is not None and not 1.0 <= self.factor <= LARGEST_FACTOR:
             raise SettingsError(
-                f"squeeze {self.factor:g}: allowed is 1 to {LARGEST_FACTOR:g} times the planned "
-                "force"
+                f"squeeze {self.factor:g}: allowed is 1 to {LARGEST_FACTOR:g} times the least "
+                "squeeze that holds"
             )
         if self.leader not in (0, 1):
             raise SettingsError(f"leader {self.leader}: give 0 or 1, the index of an arm")
@@ -68,20 +72,24 @@ class Squeeze:
 
     Attributes:
         leader: index of the arm that keeps its place; the other is force-controlled.
-        factor: commanded over planned squeeze, None where the forces are robust ones.
+        factor: commanded squeeze over the least that holds, None where the forces are robust ones.
         uncertainty: the set that the forces hold for, None where a factor was taken.
         smoothing: half the width of the time window of the smoothing [s].
+        even_pads: whether the forces hold pads that press evenly; known for two pads with opposite
+            normals.
     """
 
     leader: int
     factor: float | None
     uncertainty: Uncertainty | None
     smoothing: float
+    even_pads: bool = True
 
     def __str__(self) -> str:
+        pads = "pads that press evenly" if self.even_pads else "pads that choose their pressure"
         if self.factor is None:
-            return f"robust forces of the cell's [uncertainty], {RESERVE:.0%} more"
-        return f"{self.factor:g} times the planned squeeze"
+            return f"holds {pads} in every case of the cell's [uncertainty]"
+        return f"{self.factor:g} times the least that holds {pads}"
 
 
 def chosen_squeeze(workcell: Workcell, settings: SqueezeSettings) -> Squeeze:
@@ -91,7 +99,8 @@ def chosen_squeeze(workcell: Workcell, settings: SqueezeSettings) -> Squeeze:
         uncertainty = workcell.uncertainty
     elif factor is None:
         factor = FACTOR
-    return Squeeze(settings.leader, factor, uncertainty, settings.smoothing)
+    even = workcell.has_opposite_pads
+    return Squeeze(settings.leader, factor, uncertainty, settings.smoothing, even)
 
 
 def extra_force(
@@ -100,7 +109,7 @@ def extra_force(
     """(n,) what both robots press with beyond the planned normal forces [N].
 
     Smooth where the planned forces are; with it neither robot ever presses less than the plan, or
-    than the robust force and its reserve, ask for.
+    than what holds pads that press evenly, or than the robust force and its reserve, ask for.
 
     Args:
         time: (n,) of the samples, not decreasing [s].
@@ -110,14 +119,20 @@ def extra_force(
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
     """
-    follower = least[:, 1 - squeeze.leader]
+    follower = 1 - squeeze.leader
+    planned = least[:, follower]
     if squeeze.uncertainty is not None:
         commanded, _ = robust_model(workcell).hold(motion, squeeze.uncertainty, squeeze.leader)
-        needed = np.maximum((1.0 + RESERVE) * commanded, follower)
+        needed = np.maximum((1.0 + RESERVE) * commanded, planned)
+        if squeeze.even_pads:
+            even = even_pads(workcell).hold(motion, squeeze.uncertainty, squeeze.leader)
+            needed = np.maximum(needed, even)
     else:
         assert squeeze.factor is not None, "a squeeze has a factor or a set"
-        needed = follower + (squeeze.factor - 1.0) * least.mean(axis=1)
-    return smooth_above(time, needed, squeeze.smoothing) - follower
+        if squeeze.even_pads:
+            least = np.maximum(least, even_pads(workcell).nominal(motion))
+        needed = least[:, follower] + (squeeze.factor - 1.0) * least.mean(axis=1)
+    return smooth_above(time, needed, squeeze.smoothing) - planned
 
 
 def smooth_above(time: Array, values: Array, width: float) -> Array:

@@ -15,6 +15,7 @@ import pinocchio
 
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.witness.scene import (
+    Pads,
     box_body,
     contact_points,
     mjcf_text,
@@ -48,7 +49,7 @@ class ArmSettings:
         time_step: of the physics [s].
         control_period: of the controllers, a multiple of the time step [s].
         contact_time: time constant of a contact [s].
-        rim_points: contact points on the rim of each round patch; rectangles have their corners.
+        pads, points: see `hybrid_opt.witness.scene.SimulationSettings`.
         noslip_iterations: of MuJoCo's solver against the creep of frictional contacts.
         slip: displacement in the plane of a pad that counts as slip [m].
         arrival: how far from its goal the box may end [m].
@@ -64,7 +65,8 @@ class ArmSettings:
     time_step: float = 5e-4
     control_period: float = 1e-3
     contact_time: float = 0.01
-    rim_points: int = 32
+    pads: Pads = "rim"
+    points: int = 32
     noslip_iterations: int = 30
     slip: float = 1e-3
     arrival: float = 5e-3
@@ -84,7 +86,7 @@ class ArmSettings:
         steps = self.control_period / self.time_step
         if not (steps > 0.99 and abs(steps - round(steps)) < 1e-6):
             raise SettingsError("give a control period that is a multiple of the time step")
-        if self.rim_points < 3 or self.noslip_iterations < 0:
+        if self.points < 3 or self.noslip_iterations < 0:
             raise SettingsError("give at least three contact points and no negative iterations")
         positive = (self.slip, self.arrival, self.stiffness, self.damping_ratio)
         other = (self.armature, self.force_gain, self.drift_stiffness, self.support_friction)
@@ -161,7 +163,7 @@ def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, l
     T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
     armature = settings.armature * workcell.robots[i].torque_max
     inner = f"""<site name="pad_{i + 1}" {placed(T_joint_pad)} size="0.005"/>
-      {contact_points(contact, settings.rim_points, T_joint_pad)}"""
+      {contact_points(contact, settings.pads, settings.points, T_joint_pad)}"""
     for j in reversed(range(len(geometry.axes))):
         kind = "hinge" if geometry.turning[j] else "slide"
         T = geometry.origins[j] if j else geometry.T_world_root @ geometry.origins[0]

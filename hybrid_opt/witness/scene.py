@@ -8,6 +8,7 @@ normal. Gravity does not act on carriage and pads, which are driven.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,6 +41,10 @@ PLATE_REACH, PLATE_THICKNESS = 3.0, 0.01
 """Half the side of a plate under a pad over the patch's radius, and its thickness [m]."""
 
 
+Pads = Literal["even", "rim"]
+"""Where the contact points of a pad lie."""
+
+
 @dataclass(frozen=True)
 class SimulationSettings:
     """How the witness simulates.
@@ -48,7 +53,10 @@ class SimulationSettings:
         time_step: [s].
         contact_time: time constant of a contact [s]; at least a few time steps. The stiffer, the
             more a threshold depends on the time step.
-        rim_points: contact points on the rim of each round patch; rectangles have their corners.
+        pads: 'even' for elastic pads, whose points lie evenly over their patches; 'rim' for pads
+            that press where the planner's freest pressures do: at the rim of a round patch, at the
+            corners of a rectangle.
+        points: about how many contact points a patch has.
         noslip_iterations: of MuJoCo's solver against the creep of frictional contacts.
         tilt_stiffness: of each pad about the axes in its plane, where it is driven by the planned
             moments; None for pads that keep their planned orientation, whatever they feel
@@ -59,7 +67,8 @@ class SimulationSettings:
 
     time_step: float = 2e-4
     contact_time: float = 0.01
-    rim_points: int = 32
+    pads: Pads = "rim"
+    points: int = 32
     noslip_iterations: int = 30
     tilt_stiffness: float | None = None
     settle: float = 0.15
@@ -71,7 +80,7 @@ class SimulationSettings:
                 f"time step {self.time_step:g} s with contacts of {self.contact_time:g} s: give a "
                 "contact time of at least two time steps"
             )
-        if self.rim_points < 3 or self.noslip_iterations < 0:
+        if self.points < 3 or self.noslip_iterations < 0:
             raise SettingsError("give at least three contact points and no negative iterations")
         if self.tilt_stiffness is not None and not self.tilt_stiffness > 0.0:
             raise SettingsError("give a positive stiffness of the pads' tilt, or none")
@@ -137,18 +146,18 @@ def solver_options(time_step: float, noslip_iterations: int, gravity: Array) -> 
     noslip_iterations="{noslip_iterations}" noslip_tolerance="1e-12"/>"""
 
 
-def contact_points(contact: Contact, points: int, T_body_pad: Array) -> str:
+def contact_points(contact: Contact, pads: Pads, points: int, T_body_pad: Array) -> str:
     """Spheres where a robot's patches press, touching their planes, as geoms of the body that holds
     its pads.
 
     Args:
-        points: per round patch.
+        pads, points: see `SimulationSettings`.
         T_body_pad: (4, 4) of the first pad.
     """
     T_body_box = T_body_pad @ inverse(contact.T_box_pad)
     places = []
     for pad in (contact, *contact.further):
-        around = pressed_places(pad, points)
+        around = pressed_places(pad, pads, points)
         in_pad = np.column_stack([around, np.full(len(around), -POINT_RADIUS)])
         T = T_body_pad if pad is contact else T_body_box @ pad.T_box_pad
         places.append(in_pad @ T[:3, :3].T + T[:3, 3])
@@ -159,11 +168,28 @@ def contact_points(contact: Contact, points: int, T_body_pad: Array) -> str:
     )
 
 
-def pressed_places(contact: Contact, points: int) -> Array:
-    """(n, 2) places of a patch, in its pad's plane, that press on the payload [m]: those that the
-    planner's pressures need. Evenly around a round one's rim; the corners of a rectangle, since all
-    that presses on its sides could be shared by them and twists the less."""
-    return rim(contact, points if contact.half_sides is None else 4)
+def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
+    """(n, 2) places of a patch, in its pad's plane, that press on the payload [m].
+
+    Those of the planner's freest pressures lie evenly around a round patch's rim, and at the
+    corners of a rectangle: all that presses on its sides could be shared by them and twists less.
+
+    Args:
+        pads, points: see `SimulationSettings`.
+    """
+    if pads == "rim":
+        return rim(contact, points if contact.half_sides is None else 4)
+    if contact.half_sides is None:
+        # Sunflower: equal areas, each turned on by the golden angle.
+        k = np.arange(points)
+        angle = k * np.pi * (3.0 - np.sqrt(5.0))
+        reach = contact.patch_radius * np.sqrt((k + 0.5) / points)
+        return np.column_stack([reach * np.cos(angle), reach * np.sin(angle)])
+    x, y = contact.half_sides
+    rows = max(2, round(float(np.sqrt(points * y / x))))
+    columns = max(2, round(points / rows))
+    across, along = ((2.0 * np.arange(n) + 1.0) / n - 1.0 for n in (columns, rows))
+    return np.asarray([(x * a, y * b) for a in across for b in along])
 
 
 def tilt_centre(contact: Contact) -> Array:
@@ -254,7 +280,7 @@ def _pad_text(contact: Contact, name: str, settings: SimulationSettings, slides:
     return f"""<body name="{name}" gravcomp="1" {placed(contact.T_box_pad)}>
         {joint}
         <inertial pos="0 0 0" mass="{PAD_MASS!r}" diaginertia="{mjcf_text([PAD_INERTIA] * 3)}"/>
-        {contact_points(contact, settings.rim_points, np.eye(4))}
+        {contact_points(contact, settings.pads, settings.points, np.eye(4))}
       </body>"""
 
 

@@ -111,5 +111,5 @@ def test_a_rectangles_rim_runs_through_its_corners() -> None:
     assert found.shape == (8, 2)
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [0.03, 0.015]
     np.testing.assert_allclose(found[::2], corners)
-    np.testing.assert_allclose(pressed_places(first, 8), corners)
+    np.testing.assert_allclose(pressed_places(first, "rim", 8), corners)
     np.testing.assert_allclose(found[1::2], (corners + np.roll(corners, -1, axis=0)) / 2)

@@ -13,6 +13,7 @@ pytest.importorskip("mujoco")
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.cases import nominal_case
+from hybrid_opt.robust.even_pads import even_pads
 from hybrid_opt.witness.cases import witness_of_case, workcell_of_case
 from hybrid_opt.witness.drive import PlannedMoments, drive_of
 from hybrid_opt.witness.scene import SimulationSettings
@@ -157,3 +158,30 @@ def test_without_the_simulator_it_is_told(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(WitnessError, match="pip install"):
         Witness(hand_cell())
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        (0.25, 0.0, 0.0, 0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.15, 0.0, 0.3, 0.0),
+        (0.1, 0.05, 0.1, 0.1, 0.2, 0.1),
+    ],
+)
+def test_pads_that_press_evenly_slip_below_the_soft_finger_force(path: tuple[float, ...]) -> None:
+    """Nothing of the plan but the motion and the force is known to the simulator: points all over
+    the pads share pressure, friction and torsion as they come, orientation is kept."""
+    cell = hand_cell()
+    raised = [contact.T_box_pad.copy() for contact in cell.contacts]
+    for T in raised:
+        T[2, 3] = 0.05
+    first, second = (
+        replace(contact, T_box_pad=T) for contact, T in zip(cell.contacts, raised, strict=True)
+    )
+    carry = carry_along(replace(cell, contacts=(first, second)), np.array(path), 0.5)
+    press = even_pads(carry.workcell).nominal(carry)[:, 1]
+    settings = SimulationSettings(pads="even", points=37)
+    witness = Witness(carry.workcell, settings)
+    found = witness.threshold(drive_of(carry, settings, press), 0.9, 1.1, 5)
+    assert found.factor == pytest.approx(1.0, abs=0.03)
