@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from hybrid_opt.store.export.origin import Origin
     from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
     from symbolic.errors import DualArmError
-    from symbolic.workcell.records import Workcell
+    from symbolic.records import Workcell
 
 __all__ = [
     "BundleOptions",
@@ -99,7 +99,7 @@ _HOMES = {
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",
     "Wish": "hybrid_opt.recommending.wish",
-    "Workcell": "symbolic.workcell.records",
+    "Workcell": "symbolic.records",
     "export": "hybrid_opt.store.export.formats",
     "plan_job": "hybrid_opt.job.plan",
     "polish": "hybrid_opt.door",

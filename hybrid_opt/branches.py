@@ -25,8 +25,8 @@ from hybrid_opt.indicators.metrics import REFERENCE_POINT, front_rows, hypervolu
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
-from symbolic.functions.candidate import CONSTRAINTS
-from symbolic.workcell.records import SEARCHED, TimeLaw
+from symbolic.functions import CONSTRAINTS
+from symbolic.records import SEARCHED, TimeLaw
 
 SAMPLED = 32
 """Random candidates of which a pair has to hold one, where it does not hold the hand-made

@@ -17,7 +17,7 @@ import numpy as np
 from hybrid_opt.evaluate.static_hold import payload_limit, static_hold
 from hybrid_opt.indicators.metrics import excess_above_static
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 if TYPE_CHECKING:
     from hybrid_opt.display.view import CarryView

@@ -27,11 +27,10 @@ from hybrid_opt.evaluate.objectives import (
 from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.workcell.cell_files import collect_cell, unpack_cell
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.drivable import drivable_files
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
+from symbolic.records import Workcell
+from symbolic.records.task import initial_decision
 
 if TYPE_CHECKING:
     # Not imported at run time before they are needed: a search needs none of them.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from codegen.build import build, load_or_build
 from codegen.cache import Cache, digest, source_digest
 from codegen.function import NumericFunction
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -124,10 +124,10 @@ class CompiledCell:
 
     @cached_property
     def evaluators(self) -> dict[str, NumericFunction]:
-        """Every function of `symbolic.functions.cell.cell_functions`."""
+        """Every function of `symbolic.functions.cell_functions`."""
 
         def make(model: CellModel) -> Mapping[str, ca.Function]:
-            from symbolic.functions.cell import cell_functions
+            from symbolic.functions import cell_functions
 
             return cell_functions(model)
 

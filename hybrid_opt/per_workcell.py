@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import TypeVar
 
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 KEPT = 2
 """Workcells that a function remembers."""

@@ -44,9 +44,9 @@ from studies.program import add_verbose, carried_out, run_program
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
-from symbolic.functions.candidate import candidate_function
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Task, Waypoint, Workcell
+from symbolic.functions import candidate_function
+from symbolic.read.cell import load
+from symbolic.records import Task, Waypoint, Workcell
 
 PROGRAM = "python -m studies.benchmark"
 

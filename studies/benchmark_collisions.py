@@ -22,8 +22,8 @@ from hybrid_opt.metaheuristics.settings import GeneticSettings
 from studies.benchmark_peak import candidate_operations, peak_operations
 from studies.benchmark_turns import Evaluate, interleaved, progress, summary
 from symbolic.array import Array
-from symbolic.functions.cell import cell_functions
-from symbolic.workcell.records import Workcell
+from symbolic.functions import cell_functions
+from symbolic.records import Workcell
 
 EVALUATIONS = 1000
 """Of the NSGA-II search whose candidates are timed."""

@@ -8,7 +8,7 @@ import time
 from codegen.program import load_or_build_program
 from codegen.source import operations
 from symbolic.cell_model import CellModel
-from symbolic.functions.cell import kernel_functions
+from symbolic.functions import kernel_functions
 
 ROUNDS = 2_000_000
 BEST_OF = 5

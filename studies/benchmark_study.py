@@ -23,7 +23,7 @@ from hybrid_opt.door import polish, search, time_path
 from hybrid_opt.front import Front
 from hybrid_opt.polishing.settings import PolishSettings
 from studies.benchmark_turns import progress
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 EVALUATIONS = 1000
 POLISH_ATTEMPTS = 4

@@ -17,7 +17,7 @@ from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.selection import select
 from studies.terminal_summary import title
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 POLISHED = ", polished"
 """After an algorithm's title."""

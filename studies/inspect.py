@@ -21,7 +21,7 @@ from hybrid_opt.carry import Judgement
 from studies.inspection import Branch, Inspection, Optimum, inspect
 from studies.options import seed, whole
 from studies.program import add_verbose, carried_out, run_program
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 
 _IN_THE_WAY = {
     "pairs": "Pairs that collide first",

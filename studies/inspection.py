@@ -17,9 +17,9 @@ from studies.inspection_pictures import draw, show
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, own_pairs
 from symbolic.errors import SettingsError
+from symbolic.records import Workcell
+from symbolic.records.task import straight_line
 from symbolic.robot.branches import StartBranch, initial_poses
-from symbolic.workcell.decision import straight_line
-from symbolic.workcell.records import Workcell
 
 EXPLAINED = 200
 """Most infeasible candidates that are looked at closer."""

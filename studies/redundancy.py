@@ -25,8 +25,8 @@ from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from studies.program import add_verbose, carried_out, run_program
 from studies.text_table import counted
 from symbolic.errors import SettingsError
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Task
+from symbolic.read.cell import load
+from symbolic.records import Task
 
 PROGRAM = "python -m studies.redundancy"
 

@@ -35,9 +35,9 @@ from studies.program import add_verbose, carried_out, run_program
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.cell_files import collect_cell
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell
+from symbolic.records.task import initial_decision
 
 PROGRAM = "python -m studies.reference_front"
 

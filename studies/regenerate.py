@@ -75,8 +75,8 @@ def _run(options: argparse.Namespace) -> int:
         seconds = time.perf_counter() - begin
     elif options.workcell is not None:
         from hybrid_opt.compiled_cell import EVALUATOR_LANES, EVALUATORS, CompiledCell
-        from symbolic.functions.cell import cell_functions
-        from symbolic.workcell.file import load
+        from symbolic.functions import cell_functions
+        from symbolic.read.cell import load
 
         workcell = load(options.workcell)
         cell = CompiledCell(workcell, cache)

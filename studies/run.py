@@ -43,7 +43,7 @@ def main(
     from studies.drivable import is_drivable
     from studies.report.stage import add_report_options, follow_report_options
     from studies.study import StudySettings, run_study
-    from symbolic.workcell.file import load
+    from symbolic.read.cell import load
 
     description = "Search for the least-force carries of a dual-arm workcell."
     output = f"results/{'WORKCELL' if workcell is None else workcell.stem}"

@@ -16,7 +16,7 @@ from hybrid_opt.witness.outcome import Shown, Threshold
 from hybrid_opt.witness.scene import SimulationSettings
 from hybrid_opt.witness.simulate import Witness
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 LOW, HIGH, BISECTIONS = 0.9, 1.5, 9
 """Factors between which a threshold is looked for, to about 0.1 %."""

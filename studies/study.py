@@ -38,7 +38,7 @@ from studies.summary_stage import summary_stage
 from studies.terminal_summary import terminal_summary
 from studies.timing_stage import timing_stage
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from hybrid_opt.indicators.bounds import binding_bounds
 from hybrid_opt.indicators.selection import Selected
 from hybrid_opt.indicators.statistics import corrected, rank_test, summarise
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 FIGURES = (
     "feasible",

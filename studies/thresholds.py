@@ -25,7 +25,7 @@ from studies.cli import Parser
 from studies.options import seed, whole
 from studies.program import program_of, run_program
 from symbolic.array import Array
-from symbolic.workcell.decision import initial_decision
+from symbolic.records.task import initial_decision
 
 PROGRAM = "python -m studies.thresholds"
 

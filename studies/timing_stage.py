@@ -16,8 +16,8 @@ from hybrid_opt.timing import TimingModel, timed_trajectory
 from hybrid_opt.timing.document import TimingDocument, timing_document
 from hybrid_opt.work.job import Emit, Job, answer_all
 from symbolic.array import Array
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
+from symbolic.records.task import initial_decision
 
 TIMING = "timing"
 """Folder of the timings in a results folder, laid out as that of the selected trajectories."""

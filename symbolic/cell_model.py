@@ -13,9 +13,9 @@ from symbolic.array import Array
 from symbolic.errors import WorkcellError
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.records import Workcell
 from symbolic.robot.branches import StartBranch, start_branches
 from symbolic.robot.model import RobotModel, build_robot_model
-from symbolic.workcell.records import Workcell
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import trimesh
 
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
-from tests.symbolic.workcell.samples import GOFA, RACK
+from symbolic.read.cell import load
+from symbolic.records import Workcell
+from tests.symbolic.read.samples import GOFA, RACK
 
 AWAY, GRIP, MULTIPLIER, OFFSET = 0.3, 0.4, -2.0, 0.5
 """Where the rail is out [m], the gripper's held joint [rad], and how the other finger follows."""

@@ -12,13 +12,12 @@ import numpy as np
 import pinocchio as pin
 
 from symbolic.array import Array
-from symbolic.physics.pose import inverse, pose_matrix
-from symbolic.robot.chain import held_joints
-from symbolic.robot.urdf import link_frame, moving_joints, reduced_model
-from symbolic.robot.urdf_file import read_urdf
-from symbolic.workcell.contacts import face_normal, pad_rotation
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from symbolic.read.arms import held_joints, link_frame, moving_joints, reduced_model
+from symbolic.read.cell import load
+from symbolic.read.payload import face_normal, pad_rotation
+from symbolic.read.urdf import read_urdf
+from symbolic.records import Workcell
+from symbolic.records.poses import inverse, pose_matrix
 
 SIZE = (0.30, 0.40, 0.25)
 

@@ -7,10 +7,10 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from symbolic.read.cell import load
+from symbolic.records import Workcell
 from tests.machines import MACHINES, SINGLE, machine_cell, single_cell
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 PANDA_JOINT = "panda_joint3"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.workcell.records import Robot
+from symbolic.records import Robot
 
 GOFA_URDF = Path(__file__).parent.parent / "studies" / "robots" / "gofa12.urdf"
 

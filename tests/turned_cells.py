@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.physics.pose import rotation_from_rpy
-from symbolic.workcell.file import load
-from symbolic.workcell.orientation import Orientation
-from symbolic.workcell.records import TimeLaw, Waypoint, Workcell
+from symbolic.read.cell import load
+from symbolic.records import TimeLaw, Waypoint, Workcell
+from symbolic.records.poses import Orientation, rotation_from_rpy
 from tests.symbolic.cells import fixed, free, hand_cell, with_task
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 QUARTER = np.pi / 2.0
 TURNS = [0.0, 0.7, QUARTER, 2.5, np.pi]

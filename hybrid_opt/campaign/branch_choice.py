@@ -13,8 +13,8 @@ from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.cell import Cell
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
-from symbolic.workcell.file import load
-from symbolic.workcell.records import SEARCHED, Workcell
+from symbolic.read.cell import load
+from symbolic.records import SEARCHED, Workcell
 
 _ANEW = "start the study anew"
 

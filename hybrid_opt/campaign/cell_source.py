@@ -9,8 +9,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TypeVar
 
-from symbolic.workcell.cell_files import CellFiles, cell_from_json, cell_to_json, unpack_cell
-from symbolic.workcell.records import Workcell
+from symbolic.read.cell_files import CellFiles, cell_from_json, cell_to_json, unpack_cell
+from symbolic.records import Workcell
 
 Made = TypeVar("Made")
 
@@ -20,7 +20,7 @@ class PackedCell:
     """A workcell with its files.
 
     Attributes:
-        text: JSON of `symbolic.workcell.cell_files.cell_to_json`.
+        text: JSON of `symbolic.read.cell_files.cell_to_json`.
     """
 
     text: str

@@ -13,8 +13,7 @@ from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Stage, run_stages
 from hybrid_opt.evaluate.objectives import force_kind
-from symbolic.workcell.cell_files import unpack_cell
-from symbolic.workcell.drivable import drivable_files
+from symbolic.read.cell_files import drivable_files, unpack_cell
 
 
 def drivable_settings(settings: CampaignSettings) -> CampaignSettings:

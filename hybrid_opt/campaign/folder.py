@@ -16,10 +16,10 @@ from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import locked, read_json, storing, write_json
+from symbolic.read.cell import load
+from symbolic.read.cell_files import CellFiles, collect_cell, unpack_cell
+from symbolic.records import Workcell
 from symbolic.replacing import sync_folder
-from symbolic.workcell.cell_files import CellFiles, collect_cell, unpack_cell
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
 
 
 @dataclass(frozen=True)

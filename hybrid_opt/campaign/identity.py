@@ -14,7 +14,7 @@ from typing import Any
 from codegen.cache import source_digest
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.errors import ResultsError
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 FORMAT = "dual-arm-carry campaign"
 VERSION = 1

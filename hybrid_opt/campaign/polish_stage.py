@@ -47,7 +47,7 @@ from hybrid_opt.work.job import Job, give_up
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 JUDGING_SECONDS = 540.0
 """What an attempt may take besides one solve, or the front before the first one. An idle core needs

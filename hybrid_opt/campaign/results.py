@@ -32,8 +32,8 @@ from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.store.files import read_bytes, read_json, sha256
 from hybrid_opt.store.json_records import from_json, read_record
 from symbolic.array import Array
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from symbolic.read.cell import load
+from symbolic.records import Workcell
 
 KEPT_TABLES = 64
 """Tables of candidates that are remembered by their content: a study's stages read its replicas

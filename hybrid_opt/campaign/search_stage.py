@@ -25,7 +25,7 @@ from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.store.files import read_bytes, sha256, write_atomically, write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.work.job import Executor, Job, give_up
-from symbolic.workcell.decision import initial_decision
+from symbolic.records.task import initial_decision
 
 ANEW = "--resume computes it anew"
 

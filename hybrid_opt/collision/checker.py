@@ -17,8 +17,8 @@ from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
 from hybrid_opt.collision.pair_values import MotionBounds, Separations, by_sample
 from hybrid_opt.collision.verdict import Touch, Verdict, sample_durations
 from symbolic.array import Array
-from symbolic.geometry.bodies import PAYLOAD
 from symbolic.geometry.pairs import CellGeometry
+from symbolic.records import PAYLOAD
 
 RESTING_TOLERANCE = 1e-3
 """How deep the payload may sink into a body that it is allowed to rest on [m]."""

@@ -12,10 +12,11 @@ import fcl
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.geometry.bodies import BOX, PAYLOAD, CollisionBody
+from symbolic.geometry.bodies import BOX, CollisionBody
 from symbolic.geometry.pairs import CellGeometry, pair_tolerance
-from symbolic.geometry.pieces import SMALLEST_SIZE, Capsule, ConvexShape, Hull, Piece, reach, shrunk
-from symbolic.workcell.records import Box, Cylinder, Sphere
+from symbolic.geometry.pieces import ConvexShape, Hull, Piece, reach, shrunk
+from symbolic.records import PAYLOAD, Box, Capsule, Cylinder, Sphere
+from symbolic.records.quantities import SMALLEST_SIZE
 
 FCL_RESOLUTION = 1e-5
 """What FCL resolves [m]: intersections and, downwards, distances; ten times its tolerance."""

@@ -20,7 +20,7 @@ from hybrid_opt.display.solids import Solid, cell_solids, extent_points
 from hybrid_opt.errors import DisplayError
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.workcell.orientation import Orientation
+from symbolic.records.poses import Orientation
 
 _VIEWED = 12
 """About as many samples of a carry decide where its scene is looked at from."""

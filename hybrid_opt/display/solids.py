@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from symbolic.array import Array
 from symbolic.geometry.bodies import ArmGeometry, Frame
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.geometry.pieces import Capsule, Hull, Piece
-from symbolic.physics.pose import box_placement
-from symbolic.workcell.records import Box, Cylinder, Sphere
+from symbolic.geometry.pieces import Hull, Piece
+from symbolic.records import Box, Capsule, Cylinder, Sphere
+from symbolic.records.poses import box_placement
 
 SECTIONS = 24
 """Facets around a cylinder."""

@@ -18,10 +18,10 @@ from hybrid_opt.collision.certify import Certificate, certify_all
 from hybrid_opt.collision.checker import CollisionChecker
 from symbolic.array import Array
 from symbolic.errors import DualArmError
-from symbolic.physics.path import path_position
+from symbolic.path.spline import path_position
+from symbolic.records import POSE_SIZE, Task
+from symbolic.records.task import place_redundant
 from symbolic.robot.arm import REACH_TOLERANCE
-from symbolic.workcell.decision import POSE_SIZE, place_redundant
-from symbolic.workcell.records import Task
 
 TOGETHER = 8
 """Carries certified at once: enough to spare calls, few enough for their bounds to stay cached."""

@@ -78,7 +78,7 @@ class Driver:
         """Every per-sample output of decision vectors (n, n_var), driven.
 
         Args:
-            candidate: compiled `symbolic.functions.candidate.candidate_function`.
+            candidate: compiled `symbolic.functions.candidate_function`.
             x: decision vectors.
 
         Returns:

@@ -39,10 +39,10 @@ from hybrid_opt.evaluate.time_law import carry_under_time_law
 from hybrid_opt.indicators.metrics import non_dominated
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.functions.candidate import CONSTRAINTS, SAMPLE_NAMES
+from symbolic.functions import CONSTRAINTS, SAMPLE_NAMES
 from symbolic.geometry.pairs import build_geometry
-from symbolic.workcell.decision import extended_waypoints
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
+from symbolic.records.task import extended_waypoints
 
 if TYPE_CHECKING:
     from hybrid_opt.evaluate.drive import Driver
@@ -74,7 +74,7 @@ class CandidateEvaluator:
 
         Args:
             objectives: what to minimise, by name or as one's own record.
-            functions: those of `symbolic.functions.cell`, if not to be loaded or built here.
+            functions: those of `symbolic.functions`, if not to be loaded or built here.
             driver: under the time law 'optimal', likewise.
             compiled: where functions are taken from, if others share it.
 
@@ -128,7 +128,7 @@ class CandidateEvaluator:
 
     def outputs(self, x: Array) -> dict[str, Array]:
         """Every per-sample output for decision vectors (n, n_var), see
-        `symbolic.functions.candidate`; under the time law 'optimal' also what
+        `symbolic.functions`; under the time law 'optimal' also what
         `hybrid_opt.evaluate.drive.Driver.outputs` adds."""
         x = self._checked(x)
         if self.driver is not None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybrid_opt.carry import Judgement
 from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
 from symbolic.array import Array
-from symbolic.functions.candidate import CONSTRAINTS
+from symbolic.functions import CONSTRAINTS
 
 if TYPE_CHECKING:
     pass
@@ -53,7 +53,7 @@ class Evaluations:
             `FEASIBLE`.
         position: (n,) path parameter in [0, 1] of the first violation; NaN where feasible.
         violation: (n, len(REASONS)) violation of each constraint, 0 where satisfied; the unit
-            is the constraint's (`symbolic.functions.candidate.CONSTRAINTS`), time share for
+            is the constraint's (`symbolic.functions.CONSTRAINTS`), time share for
             collision, 1 for those that follow it.
         violation_time: (n, len(REASONS)) time in violation over the duration.
     """

@@ -13,9 +13,9 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import COLLISION, REASONS, Evaluations
 from hybrid_opt.evaluate.sampled import reached_samples
 from symbolic.array import Array
-from symbolic.physics.pose import box_placement, inverse
-from symbolic.robot.urdf import arm_model, link_frame, turning_joints
-from symbolic.workcell.records import Contact, Robot
+from symbolic.read.arms import arm_model, link_frame, turning_joints
+from symbolic.records import Contact, Robot
+from symbolic.records.poses import box_placement, inverse
 
 STEPS = 60
 """Damped steps in which an arm goes as near to a pose as it can."""

@@ -1,7 +1,7 @@
 /* Candidates in lanes, from the decision vector to the verdict on every sample.
 
    Behind the cell's functions `path`, `begin`, `start`, `predict`, `sample`, `clearance` and
-   `piece_poses` in lanes (symbolic.functions.cell) and the shapes' proofs (hybrid_opt/collision/prejudge.c). The
+   `piece_poses` in lanes (symbolic.functions) and the shapes' proofs (hybrid_opt/collision/prejudge.c). The
    numbers in capitals are defined by hybrid_opt/evaluate/kernel.py. */
 
 /* A pair of one sample that neither bounds nor proofs decide. */

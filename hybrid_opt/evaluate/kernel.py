@@ -30,7 +30,7 @@ from hybrid_opt.evaluate.kernel_data import (
 )
 from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
 from symbolic.array import Array
-from symbolic.functions.candidate import (
+from symbolic.functions import (
     CONSTRAINTS,
     FORCE_CONSTRAINTS,
     force_sizes,
@@ -200,7 +200,7 @@ def load_kernel(
         return None
 
     def make() -> Mapping[str, Any]:
-        from symbolic.functions.cell import kernel_functions
+        from symbolic.functions import kernel_functions
 
         return kernel_functions(compiled.model)
 

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.collision.judge import FCL_RESOLUTION
 from symbolic.array import Array
-from symbolic.geometry.bodies import PAYLOAD
-from symbolic.geometry.pieces import Capsule, ConvexShape, Hull
-from symbolic.workcell.records import POSE_SIZE, Box, Cylinder, Sphere, Workcell
+from symbolic.geometry.pieces import ConvexShape, Hull
+from symbolic.records import PAYLOAD, POSE_SIZE, Box, Capsule, Cylinder, Sphere, Workcell
 
 PROOF_MARGIN = 5 * FCL_RESOLUTION
 """How clearly two shapes must be apart or intersect to be decided without FCL [m]."""

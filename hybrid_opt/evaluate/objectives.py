@@ -14,8 +14,8 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.decision import initial_decision, waypoints_of
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
+from symbolic.records.task import initial_decision, waypoints_of
 
 Outputs = Mapping[str, Array]
 """Batch outputs of the candidate function, each with a leading axis over candidates."""

@@ -19,7 +19,7 @@ class SampledVerdicts:
 
     Attributes:
         outputs: 'time' (n, samples) [s], 'violation' and 'violation_time' (n, constraints), and
-            what else was asked for, as `symbolic.functions.candidate.candidate_function` has them.
+            what else was asked for, as `symbolic.functions.candidate_function` has them.
         first_sample: (n,) the first sample that violates a constraint; the number of samples
             where none does.
         first_reason: (n,) the first constraint violated there, -1 where none is.

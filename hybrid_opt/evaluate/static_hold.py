@@ -9,8 +9,8 @@ import numpy as np
 
 from hybrid_opt.per_workcell import kept_per_workcell
 from symbolic.array import Array
-from symbolic.physics.payload_load import load_function
-from symbolic.workcell.records import Workcell
+from symbolic.contact.load import load_function
+from symbolic.records import Workcell
 
 
 @dataclass(frozen=True)

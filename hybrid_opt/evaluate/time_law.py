@@ -9,9 +9,9 @@ import numpy as np
 from codegen.function import NumericFunction
 from hybrid_opt.carry import ArmMotion, Carry, Judgement
 from symbolic.array import Array
-from symbolic.physics.path import sample_basis
-from symbolic.workcell.decision import waypoints_of
-from symbolic.workcell.records import Workcell
+from symbolic.path.spline import sample_basis
+from symbolic.records import Workcell
+from symbolic.records.task import waypoints_of
 
 STANDSTILL = 1e-30
 """Squared length of a path's tangent below which it counts as none [(m, rad per u)^2]."""
@@ -27,7 +27,7 @@ def carry_under_time_law(
     """The carry of one candidate from its outputs.
 
     Args:
-        functions: with both arms' `inverse_dynamics_i`, see `symbolic.functions.cell`.
+        functions: with both arms' `inverse_dynamics_i`, see `symbolic.functions`.
         x: (n_var,) decision vector.
         outputs: of the compiled candidate function for x, without an axis over candidates.
         judgement: the evaluator's verdict, where there is one.

@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.workcell.decision import variable_names
-from symbolic.workcell.records import Task
+from symbolic.records import Task
+from symbolic.records.task import variable_names
 
 ON_BOUND = 1e-3
 """Nearer to a bound than this share of the variable's range counts as on it: an interior-point

@@ -19,11 +19,16 @@ from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
 from hybrid_opt.compiled_cell import CompiledCell
 from symbolic.array import Array
-from symbolic.geometry.bodies import PAYLOAD, CollisionBody
-from symbolic.geometry.ignored import ignored_pairs
-from symbolic.geometry.pairs import ActivePair, CellGeometry, ExcludedPair, build_geometry
+from symbolic.geometry.bodies import CollisionBody
+from symbolic.geometry.pairs import (
+    ActivePair,
+    CellGeometry,
+    ExcludedPair,
+    build_geometry,
+    ignored_pairs,
+)
 from symbolic.geometry.pieces import support
-from symbolic.workcell.records import AllowedContact, Waypoint, Workcell
+from symbolic.records import PAYLOAD, AllowedContact, Waypoint, Workcell
 
 if TYPE_CHECKING:
     import casadi as ca

@@ -16,7 +16,7 @@ from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import Job, Phase
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.pose import box_rotation
+from symbolic.records.poses import box_rotation
 
 STIFFNESSES = (2e3, 1e4, 5e4, 2e5, 1e6)
 """From a soft Cartesian impedance to a stiff industrial arm [N/m]."""

@@ -9,7 +9,7 @@ from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.job.profile import rise
 from hybrid_opt.job.straight import SAMPLES, followed, lines_around
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 EVERY = 10
 """Every so many samples of a straight motion are judged."""

@@ -14,8 +14,8 @@ from hybrid_opt.robust.squeeze import Squeeze, extra_force
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.pose import box_rotation
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
+from symbolic.records.poses import box_rotation
 
 
 def held(model: TimingModel, squeeze: Squeeze, motions: Sequence[PhaseMotion]) -> list[Force]:

@@ -7,7 +7,7 @@ import numpy as np
 from hybrid_opt.job.records import Force, PhaseMotion, contact_effort
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 EXCESS = 1.005
 """Use of a limit beyond which a job is refused."""

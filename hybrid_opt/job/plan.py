@@ -42,9 +42,8 @@ from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.decision import extended_waypoints
-from symbolic.workcell.handling import Handling
-from symbolic.workcell.records import Workcell
+from symbolic.records import Handling, Workcell
+from symbolic.records.task import extended_waypoints
 
 PATH_SAMPLES = 201
 """Of the carry's joints, from which Newton's method reaches every place between."""

@@ -10,7 +10,7 @@ from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.robust.squeeze import Squeeze
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat")
 """Every phase of a job in order; without a height there is no lift or no set-down."""

@@ -15,10 +15,9 @@ from hybrid_opt.job.records import PhaseMotion
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array
-from symbolic.physics.pose import box_rotation
+from symbolic.records import Handling, Workcell
+from symbolic.records.poses import box_rotation
 from symbolic.robot.arm import REACH_TOLERANCE
-from symbolic.workcell.handling import Handling
-from symbolic.workcell.records import Workcell
 
 SAMPLES = 401
 """Samples of a phase."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.workcell.records import Task
+from symbolic.records import Task
 
 
 @dataclass(frozen=True)

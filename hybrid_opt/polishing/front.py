@@ -32,7 +32,7 @@ from hybrid_opt.polishing.run import Polisher, PolishRun
 from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 
 def knows_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:

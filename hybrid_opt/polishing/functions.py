@@ -15,6 +15,7 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.polishing.drivable.functions import DrivenFunctions, driven_functions_of
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
+from symbolic.records import Workcell
 from symbolic.smooth.closure import closure_functions
 from symbolic.smooth.held import held_functions
 from symbolic.smooth.joint_limit import JointLimit
@@ -31,7 +32,6 @@ from symbolic.smooth.passage import GAPS, Passing, Separation, gap_function
 from symbolic.smooth.place import Place, PlaceConstraint, row_function
 from symbolic.smooth.reach import Reach
 from symbolic.smooth.samples import sample_functions
-from symbolic.workcell.records import Workcell
 
 COMPILED = (
     Reach(0),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.physics.path import path_basis
-from symbolic.workcell.records import Task
+from symbolic.path.spline import path_basis
+from symbolic.records import Task
 
 PLACE_SPACING = 0.0025
 """Wanted distance of neighbouring places in the path parameter. What dips between two places is

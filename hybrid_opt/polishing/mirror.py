@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.workcell.records import Task, Workcell
+from symbolic.records import Task, Workcell
 
 SIGNS = {
     0: np.array([-1.0, 1.0, 1.0, 1.0, -1.0, -1.0]),

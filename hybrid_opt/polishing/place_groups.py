@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from codegen.function import NumericFunction, PreparedBatch
 from symbolic.array import Array
-from symbolic.workcell.decision import POSE_SIZE
+from symbolic.records import POSE_SIZE
 
 Indices = NDArray[np.intp]
 

@@ -20,9 +20,9 @@ from hybrid_opt.polishing.layout import PlaceRow
 from hybrid_opt.polishing.place_groups import ArmRows, CurvatureSums, Indices, Pull, RowGroup
 from hybrid_opt.polishing.sample_values import NEGLIGIBLE
 from symbolic.array import Array
+from symbolic.records import POSE_SIZE
 from symbolic.smooth.keys import ClosureKey, Order
 from symbolic.smooth.place import PlaceConstraint
-from symbolic.workcell.decision import POSE_SIZE
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,10 @@ from hybrid_opt.polishing.functions import RowFunctions
 from hybrid_opt.polishing.grid import Grid, dipped
 from hybrid_opt.polishing.robust_samples import RobustSamples
 from symbolic.array import Array
+from symbolic.records import POSE_SIZE
+from symbolic.records.task import extended_waypoints, place_redundant
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.smooth.reach import Reach
-from symbolic.workcell.decision import POSE_SIZE, extended_waypoints, place_redundant
 
 _Found = TypeVar("_Found")
 

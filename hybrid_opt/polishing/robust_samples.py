@@ -18,9 +18,9 @@ from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import BoxMotion, check_set, robust_model
 from hybrid_opt.robust.ruling import RulingCases, ruling_cases
 from symbolic.array import Array
-from symbolic.physics.case_squeeze import case_gradient_function
+from symbolic.contact.worst_cases import case_gradient_function
+from symbolic.records import Workcell
 from symbolic.smooth.samples import motion_function
-from symbolic.workcell.records import Workcell
 
 LEADER = 0
 """The arm that keeps its place, as in the objectives."""

@@ -19,7 +19,7 @@ from hybrid_opt.polishing.records import Aim, PolishedFront, PolishOutcome, Stat
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.work.threads import one_thread
 from symbolic.array import Array
-from symbolic.workcell.decision import initial_decision
+from symbolic.records.task import initial_decision
 
 NO_SOLUTION = Solution(np.empty(0))
 

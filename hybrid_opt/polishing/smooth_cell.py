@@ -11,9 +11,9 @@ from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.grid import Grid
 from hybrid_opt.polishing.robust_samples import RobustSamples
 from symbolic.array import Array
+from symbolic.records import POSE_SIZE, Workcell
+from symbolic.records.task import extended_waypoints
 from symbolic.smooth.samples import branch_coefficients, sample_blocks
-from symbolic.workcell.decision import POSE_SIZE, extended_waypoints
-from symbolic.workcell.records import Workcell
 
 
 class SmoothCell:

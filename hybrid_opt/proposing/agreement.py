@@ -9,8 +9,8 @@ import numpy as np
 from hybrid_opt.proposing.holding import LIMIT_MARGIN, MANIPULABILITY_MARGIN, Hold
 from hybrid_opt.proposing.kinematics import REACHED, ArmKinematics, box_to_last_joint, spun
 from symbolic.array import Array
-from symbolic.physics.pose import box_placement
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
+from symbolic.records.poses import box_placement
 
 SHARES = np.array([0.5, 0.25, 0.75, 0.0, 1.0])
 """Of the way from the first arm's value to the second's: what is tried, in this order."""

@@ -16,9 +16,9 @@ from hybrid_opt.proposing.places import Place, PlaceScorer, shared_room
 from hybrid_opt.proposing.problem import Problem
 from hybrid_opt.proposing.setup import redundancy
 from symbolic.array import Array
-from symbolic.physics.pose import box_placement, inverse, pose_matrix
-from symbolic.workcell.checks import stretched_length
-from symbolic.workcell.records import Workcell
+from symbolic.read.checks import stretched_length
+from symbolic.records import Workcell
+from symbolic.records.poses import box_placement, inverse, pose_matrix
 
 DISTANCES = (0.35, 0.45, 0.55, 0.65, 0.75)
 """Of a base from the middle of its contact's way, sideways, in the stretched arm's length."""

@@ -17,8 +17,8 @@ from hybrid_opt.proposing.holding import LIMIT_MARGIN, MANIPULABILITY_MARGIN, Ho
 from hybrid_opt.proposing.judge import PoseJudge
 from hybrid_opt.proposing.kinematics import JUMP, box_to_last_joint, spun
 from symbolic.array import Array
-from symbolic.physics.pose import box_placement, inverse
-from symbolic.workcell.records import POSE_SIZE, Workcell
+from symbolic.records import POSE_SIZE, Workcell
+from symbolic.records.poses import box_placement, inverse
 
 STEP = 0.02
 """Distance between configurations that are looked at, see `LEVERS` [m]."""
@@ -129,7 +129,7 @@ class ClosedChain:
         Args:
             workcell: with its redundant joints chosen.
             judge, holds: see the class.
-            models: of both arms (`symbolic.robot.urdf.arm_model`).
+            models: of both arms (`symbolic.read.arms.arm_model`).
         """
         self.judge = judge
         self._orientation = workcell.task.orientation

@@ -11,7 +11,7 @@ from hybrid_opt.proposing.bounds import Bounds
 from hybrid_opt.proposing.document import merged
 from hybrid_opt.proposing.problem import Problem
 from symbolic.array import Array
-from symbolic.workcell.records import POSE_SIZE, Workcell
+from symbolic.records import POSE_SIZE, Workcell
 
 UNIT = np.array([0.10, 0.10, 0.10, 0.08, 0.08, 0.08])
 """Half-widths of a pose that are scaled together [m, rad]."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.geometry.coal_shapes import coal_distance
-from symbolic.geometry.shape_reader import MeshReader, shape_pieces
-from symbolic.physics.pose import box_placement
-from symbolic.workcell.records import Workcell
+from symbolic.geometry.bodies import MeshReader, shape_pieces
+from symbolic.geometry.pairs import coal_distance
+from symbolic.records import Workcell
+from symbolic.records.poses import box_placement
 
 LIFT = 0.03
 """How far the box is lifted off what it stands on, and lowered in the end [m]."""

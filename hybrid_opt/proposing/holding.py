@@ -19,8 +19,8 @@ from hybrid_opt.proposing.kinematics import (
     spun,
 )
 from symbolic.array import Array
-from symbolic.physics.pose import box_placement
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
+from symbolic.records.poses import box_placement
 
 STARTS = 768
 """Random starts of the search for postures."""

@@ -13,9 +13,9 @@ from codegen.source import dense
 from hybrid_opt.collision.checker import CollisionChecker
 from symbolic.array import Array
 from symbolic.cell_model import own_pairs
-from symbolic.geometry.bodies import PAYLOAD
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import CellGeometry
+from symbolic.records import PAYLOAD
 from symbolic.robot.model import build_robot_model
 
 MARGINS = (0.01, 0.004, 0.0015, 0.0005, 0.0)

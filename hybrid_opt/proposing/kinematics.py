@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from symbolic.array import Array
 from symbolic.geometry.bodies import ArmGeometry, arm_geometry
-from symbolic.physics.pose import inverse, pose_matrix
-from symbolic.robot.machine import common_joints
-from symbolic.robot.urdf import arm_model
-from symbolic.workcell.records import Contact, Workcell
+from symbolic.read.arms import arm_model, common_joints
+from symbolic.records import Contact, Workcell
+from symbolic.records.poses import inverse, pose_matrix
 
 REACHED = 1e-6
 """Pose residual of a reached posture [m, rad]."""

@@ -14,8 +14,8 @@ from hybrid_opt.proposing.holding import GUIDE_POSES, GUIDES, Hold
 from hybrid_opt.proposing.judge import MARGINS, PoseJudge
 from hybrid_opt.proposing.kinematics import box_poses
 from symbolic.array import Array
-from symbolic.robot.urdf import arm_model
-from symbolic.workcell.records import POSE_SIZE, Task, Workcell
+from symbolic.read.arms import arm_model
+from symbolic.records import POSE_SIZE, Task, Workcell
 
 GUIDES_TRIED = 3
 """Guides by which pairs are ranked: straight, bowing up, and far up."""

@@ -13,12 +13,11 @@ from hybrid_opt.proposing.holding import Hold, HoldQuery, find_holds
 from hybrid_opt.proposing.kinematics import ArmKinematics, box_to_last_joint, shoulders, spun
 from hybrid_opt.proposing.problem import Problem
 from symbolic.array import Array
-from symbolic.geometry.bodies import WORLD, collision_bodies
-from symbolic.geometry.coal_shapes import coal_distance
+from symbolic.geometry.bodies import WORLD, MeshReader, collision_bodies, shape_pieces
+from symbolic.geometry.pairs import coal_distance
 from symbolic.geometry.pieces import Piece
-from symbolic.geometry.shape_reader import MeshReader, shape_pieces
-from symbolic.physics.pose import box_placement, inverse, pose_matrix, transform
-from symbolic.workcell.records import Cylinder, Workcell
+from symbolic.records import Cylinder, Workcell
+from symbolic.records.poses import box_placement, inverse, pose_matrix, transform
 
 STARTS = 192
 """Random postures by which a place is judged."""

@@ -17,7 +17,7 @@ import numpy as np
 from hybrid_opt.proposing.closed_chain import ClosedChain, Place, distance, levers, straight
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import POSE_SIZE
+from symbolic.records import POSE_SIZE
 
 RETREAT = 0.6
 """Longest straight motion out of the start, or the goal, that is tried [m]."""

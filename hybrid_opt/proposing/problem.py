@@ -17,11 +17,10 @@ from hybrid_opt.proposing.kinematics import shoulders
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError, WorkcellError
-from symbolic.physics.pose import box_placement, rotation_from_rpy
-from symbolic.robot.packages import PACKAGE_SCHEME
-from symbolic.workcell.file import load
-from symbolic.workcell.orientation import Orientation
-from symbolic.workcell.records import Workcell
+from symbolic.read.cell import load
+from symbolic.read.descriptions import PACKAGE_SCHEME
+from symbolic.records import Workcell
+from symbolic.records.poses import Orientation, box_placement, rotation_from_rpy
 
 UPRIGHT = 0.7
 """Share of the vertical from which on an edge of the box counts as upright."""

@@ -13,8 +13,8 @@ from hybrid_opt.proposing.judge import PoseJudge
 from hybrid_opt.proposing.kinematics import possible_spins, spun
 from hybrid_opt.proposing.pairing import Pair
 from symbolic.array import Array
-from symbolic.physics.pose import box_placement
-from symbolic.robot.urdf import arm_model
+from symbolic.read.arms import arm_model
+from symbolic.records.poses import box_placement
 
 POSTURES = 6
 """From which the reach that is missing is looked for with each spin."""

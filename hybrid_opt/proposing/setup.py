@@ -18,9 +18,8 @@ from hybrid_opt.proposing.problem import Problem
 from hybrid_opt.proposing.reasons import box_blocked, holds_missing, no_pair
 from symbolic.array import Array
 from symbolic.geometry.pairs import build_geometry
-from symbolic.robot.machine import common_joints
-from symbolic.robot.urdf import FOLLOWING, arm_model, turning_joints
-from symbolic.workcell.records import Workcell
+from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints
+from symbolic.records import Workcell
 
 POSTURES = 200
 """Random postures by which redundant joints are chosen."""

@@ -15,11 +15,10 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
-from symbolic.functions.candidate import motion_function
-from symbolic.functions.cell import cell_functions
+from symbolic.functions import cell_functions, motion_function
+from symbolic.records import Workcell
+from symbolic.records.task import initial_decision
 from symbolic.robot.branches import StartBranch
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.records import Workcell
 
 SAME_BRANCH = 0.02
 """Largest difference of joints, full turns apart, of the posture that a path began with and the

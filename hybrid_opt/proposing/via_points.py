@@ -10,7 +10,7 @@ import numpy as np
 from hybrid_opt.proposing.closed_chain import STEP, ClosedChain, Place, distance, straight
 from hybrid_opt.proposing.planner import same
 from symbolic.array import Array
-from symbolic.physics.path import path_basis
+from symbolic.path.spline import path_basis
 
 SHORTCUTS = 60
 """Shortcuts of a path that are tried."""

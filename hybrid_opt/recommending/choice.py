@@ -12,7 +12,7 @@ from hybrid_opt.recommending.driven_paths import DrivenPaths
 from hybrid_opt.recommending.wish import Wish
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from hybrid_opt.evaluate.static_hold import static_hold
 from hybrid_opt.recommending.driven_paths import DrivenPaths
 from hybrid_opt.robust.force import BoxMotion, robust_model
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 ABOVE_STILL = (1.02, 1.04, 1.06, 1.08, 1.12, 1.2)
 """Forces of the table over that of holding the payload level and still."""

@@ -10,7 +10,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import RobustModel, robust_model
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Uncertainty, Workcell
+from symbolic.records import Uncertainty, Workcell
 
 LEADER = 0
 """The arm that keeps its place; the other's force is commanded."""

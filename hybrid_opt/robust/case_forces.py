@@ -12,12 +12,16 @@ from codegen.build import compile_function
 from codegen.cache import Cache
 from codegen.function import NumericFunction
 from symbolic.array import Array
+from symbolic.contact.worst_cases import (
+    GraspSqueeze,
+    case_grasp_function,
+    case_grasp_slack_function,
+    case_slack_function,
+    case_squeeze_function,
+)
 from symbolic.errors import SettingsError
-from symbolic.physics.case_grasp import case_grasp_function, case_grasp_slack_function
-from symbolic.physics.case_squeeze import case_slack_function, case_squeeze_function
-from symbolic.physics.grasp_squeeze import GraspSqueeze
-from symbolic.workcell.checks import PATCH_OVERLAP, pads_beside
-from symbolic.workcell.records import Workcell
+from symbolic.read.checks import PATCH_OVERLAP, pads_beside
+from symbolic.records import Workcell
 
 
 class CaseForces:

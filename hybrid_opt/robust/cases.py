@@ -5,7 +5,7 @@ Which are worst follows from the least squeeze that a case asks for:
 - it falls with friction, whose cones grow, so that both coefficients are at their least;
 - it is proportional to the mass, which is at its largest;
 - it is a convex function of the required force and moment, and these are affine in the centre of
-  mass and in the disturbance, each for itself (`symbolic.physics.case_squeeze`), so that it is
+  mass and in the disturbance, each for itself (`symbolic.contact.worst_cases`), so that it is
   largest at vertices of both ranges;
 - a disc of radius r - e about the nominal pad lies within every disc of radius r displaced by at
   most e, so that a patch smaller by e stands for all displaced ones. This one is sufficient, not
@@ -19,8 +19,8 @@ from itertools import product
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.physics.case_grasp import least_reaches
-from symbolic.workcell.records import Uncertainty, Workcell
+from symbolic.contact.worst_cases import least_reaches
+from symbolic.records import Uncertainty, Workcell
 
 
 def nominal_case(workcell: Workcell) -> Array:

@@ -1,8 +1,8 @@
 """How hard to press so that pads hold that press evenly, for every case of a set.
 
 The other forces of this package belong to pads that may choose their pressure
-(`symbolic.physics.joint_allocation`). Real pads do not: these forces are what is commanded at least
-(`hybrid_opt.robust.squeeze`), by the soft-finger model (`symbolic.physics.soft_finger`).
+(`symbolic.contact.facing`). Real pads do not: these forces are what is commanded at least
+(`hybrid_opt.robust.squeeze`), by the soft-finger model (`symbolic.contact.soft_finger`).
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.cases import nominal_case, worst_cases
 from hybrid_opt.robust.force import HeldMotion, check_set
 from symbolic.array import Array
+from symbolic.contact.soft_finger import case_soft_function
 from symbolic.errors import SettingsError
-from symbolic.physics.soft_finger import case_soft_function
-from symbolic.workcell.records import Uncertainty, Workcell
+from symbolic.records import Uncertainty, Workcell
 
 DIRECTIONS = 8
 """Ways in which either pad is displaced; the corners lie just outside the disc of what may be."""

@@ -18,10 +18,10 @@ from hybrid_opt.robust.case_forces import CaseForces
 from hybrid_opt.robust.cases import nominal_case, random_cases, worst_cases
 from hybrid_opt.robust.ruling import ruling_cases
 from symbolic.array import Array
+from symbolic.contact.worst_cases import least_reaches
 from symbolic.errors import SettingsError
-from symbolic.physics.case_grasp import least_reaches
-from symbolic.workcell.checks import PATCH_OVERLAP, pads_beside
-from symbolic.workcell.records import Uncertainty, Workcell
+from symbolic.read.checks import PATCH_OVERLAP, pads_beside
+from symbolic.records import Uncertainty, Workcell
 
 BATCH = 100_000
 """Samples that are evaluated at once."""

@@ -19,14 +19,14 @@ from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import check_set
 from hybrid_opt.robust.ruling import RulingCases, felt_share, ruling_cases
 from symbolic.array import Array
-from symbolic.errors import SettingsError
-from symbolic.physics.case_squeeze import (
+from symbolic.contact.worst_cases import (
     case_difference_function,
     case_slack_function,
     case_slopes_function,
     case_squeeze_function,
 )
-from symbolic.workcell.records import Workcell
+from symbolic.errors import SettingsError
+from symbolic.records import Workcell
 
 BY_TIMING = slice(18, 20)
 """Where a slope's entries by u'' and u'^2 are."""

@@ -9,7 +9,7 @@ import numpy as np
 from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import BoxMotion, RobustModel, SampledCheck, allowed_factor
 from symbolic.array import Array
-from symbolic.workcell.records import Uncertainty
+from symbolic.records import Uncertainty
 
 USUAL = Uncertainty(
     friction=0.10,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.workcell.records import Uncertainty
+from symbolic.records import Uncertainty
 
 
 @dataclass(frozen=True)

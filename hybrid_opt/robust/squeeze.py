@@ -19,7 +19,7 @@ from hybrid_opt.robust.even_pads import even_pads
 from hybrid_opt.robust.force import HeldMotion, robust_model
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Uncertainty, Workcell
+from symbolic.records import Uncertainty, Workcell
 
 FACTOR = 1.3
 """Commanded over least force where nothing says how uncertain the cell is."""

@@ -25,16 +25,16 @@ from hybrid_opt.store.trajectory_figures import OBJECTIVE
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import BundleError, OutsideError
-from symbolic.replacing import replace_file
-from symbolic.workcell.cell_files import (
+from symbolic.read.cell_files import (
     CellFiles,
     cell_from_json,
     cell_to_json,
     collect_cell,
     unpack_cell,
 )
-from symbolic.workcell.problems import shown, text_problem
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
+from symbolic.records.problems import shown, text_problem
+from symbolic.replacing import replace_file
 
 FORMAT = "dual-arm-carry trajectory"
 VERSION = 1

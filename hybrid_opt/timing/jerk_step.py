@@ -12,7 +12,7 @@ from hybrid_opt.timing.records import JerkLimits, TimingLimits
 from hybrid_opt.timing.rows import squared_speed_limit
 from hybrid_opt.timing.use import limits_pressure
 from symbolic.array import Array
-from symbolic.physics.contact_forces import GRAVITY
+from symbolic.records.quantities import GRAVITY
 
 LEAST_SHARE = 0.05
 """Of its last value that a coefficient keeps at least."""
@@ -74,7 +74,7 @@ def _force_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows)
         return
     import casadi as ca
 
-    from symbolic.physics.contact_forces import normal_force_branches
+    from symbolic.contact.paper import normal_force_branches
 
     workcell, m, force = model.workcell, at.motion, limits.force
     friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)

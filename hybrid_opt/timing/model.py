@@ -17,10 +17,9 @@ from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
-from symbolic.functions.candidate import candidate_function
-from symbolic.functions.timing import timing_functions
-from symbolic.robot.urdf import arm_model
-from symbolic.workcell.records import Robot, Workcell
+from symbolic.functions import candidate_function, timing_functions
+from symbolic.read.arms import arm_model
+from symbolic.records import Robot, Workcell
 
 INTERVALS = 200
 """Pieces of constant path acceleration."""
@@ -112,7 +111,7 @@ class TimingModel:
         return PathMotion(x=x, parameter=np.linspace(0.0, 1.0, n), **values)
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
-        """`symbolic.physics.payload_load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
+        """`symbolic.contact.load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
         return self._functions["load"].batch(pose, rate, second_rate)
 
     def uncertain_load(
@@ -124,7 +123,7 @@ class TimingModel:
         )
 
     def arm_motion(self, arm: int, q: Array, pose: Array, first: Array) -> dict[str, Array]:
-        """`symbolic.physics.path_motion.ARM_OUTPUTS` of one arm (0 or 1) on a straight line.
+        """`symbolic.path_motion.ARM_OUTPUTS` of one arm (0 or 1) on a straight line.
 
         Args:
             q: (n, joints) that hold a box at the poses, redundant ones standing still [rad].
@@ -254,7 +253,7 @@ def contact_torque(workcell: Workcell, wrench_torque: Array, load: Mapping[str, 
     Args:
         workcell: the cell.
         wrench_torque: (n, all joints, 6) from wrenches to torques, both arms side by side.
-        load: outputs of `symbolic.physics.payload_load`.
+        load: outputs of `symbolic.contact.load`.
     """
     first = len(workcell.robots[0].torque_max)
     parts = (wrench_torque[:, :first], wrench_torque[:, first:])

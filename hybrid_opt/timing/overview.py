@@ -19,7 +19,7 @@ from hybrid_opt.timing.point_limits import duration_at_speed_limits
 from hybrid_opt.timing.records import JerkTiming, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 
 @dataclass(frozen=True)

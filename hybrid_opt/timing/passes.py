@@ -11,7 +11,7 @@ from codegen.function import NumericFunction
 from codegen.signature import Signature
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.records import TimingStatus
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 KINDS = (
     "joint velocity",
@@ -75,7 +75,7 @@ def passes_function(
 def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, str]:
     # Not imported at the top: a warm start needs no CasADi.
     from codegen.source import handwritten_source
-    from symbolic.physics.path_limits import limit_layout, ratio_functions
+    from symbolic.limits import limit_layout, ratio_functions
 
     layout = limit_layout(workcell)
     branches = _branches(workcell)
@@ -113,7 +113,7 @@ def _branches(workcell: Workcell) -> list[tuple[float, float]]:
     """N_2 by branch as shares of the required force's normal and tangential parts."""
     import casadi as ca
 
-    from symbolic.physics.contact_forces import normal_force_branches
+    from symbolic.contact.paper import normal_force_branches
 
     friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
     normal, tangential = (

@@ -11,7 +11,7 @@ from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_motion import PathMotion
 from hybrid_opt.timing.records import Place, Timing, TimingStatus
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 LEAST_LENGTH = 1e-9
 """A path along which box and joints move less than this does not move [m, rad]."""

@@ -19,7 +19,7 @@ _SPLINE_EVERY = 2
 class PathMotion:
     """Geometry of the path of a decision vector x (n_var,) at samples of the path parameter.
 
-    Joints of both arms stand side by side. `symbolic.physics.path_motion` describes the
+    Joints of both arms stand side by side. `symbolic.path_motion` describes the
     quantities.
     """
 

@@ -24,7 +24,7 @@ from hybrid_opt.timing.solve import time_path
 from hybrid_opt.timing.use import limited_force
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -116,7 +116,7 @@ class PathTimer:
 
         def make(model: CellModel) -> dict[str, ca.Function]:
             # Not imported at the top: a warm start needs no CasADi.
-            from symbolic.physics.path_limits import path_function, sample_limits_function
+            from symbolic.limits import path_function, sample_limits_function
 
             return {
                 "path": path_function(model, 2 * intervals + 1),
@@ -133,7 +133,7 @@ class PathTimer:
         return self._passes is not None
 
     def path_limits(self, x: Array) -> dict[str, Array]:
-        """Of waypoints (n, n_var) the outputs of `symbolic.physics.path_limits.path_function` and
+        """Of waypoints (n, n_var) the outputs of `symbolic.limits.path_function` and
         `limits`, at both ends and in the middle of every interval."""
         paths = self._path.batch(np.ascontiguousarray(x, dtype=float), threads=self._threads)
         shapes = zip(self._limits.input_names, self._limits.input_shapes, strict=True)

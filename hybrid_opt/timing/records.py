@@ -10,7 +10,7 @@ import numpy as np
 from hybrid_opt.carry import Carry
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 
 class TimingStatus(StrEnum):

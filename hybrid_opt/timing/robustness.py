@@ -17,7 +17,7 @@ from hybrid_opt.timing.model import TimingModel, contact_torque
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.use import limits_pressure
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 KILOGRAM_FORCE = 9.80665
 """[N] per kgf."""

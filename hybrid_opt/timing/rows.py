@@ -16,8 +16,9 @@ from hybrid_opt.timing.adapter import SPEED_CEILING, IntervalRows
 from hybrid_opt.timing.path_motion import PathMotion
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
-from symbolic.physics.contact_forces import GRAVITY, normal_force_branches
-from symbolic.workcell.records import Workcell
+from symbolic.contact.paper import normal_force_branches
+from symbolic.records import Workcell
+from symbolic.records.quantities import GRAVITY
 
 INTERVAL_ENDS = (0.0, 1.0)
 """Places within an interval at which limits are imposed, as a share of its length."""

@@ -11,8 +11,8 @@ from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.records import Excess, Place, TimingLimits
 from symbolic.array import Array
-from symbolic.functions.candidate import TIMING_TOLERANCE
-from symbolic.workcell.records import Workcell
+from symbolic.functions import TIMING_TOLERANCE
+from symbolic.records import Workcell
 
 JOINT_CONSTRAINTS = ("joint velocity", "joint acceleration", "joint torque")
 CONTACT_CONSTRAINTS = ("normal force", "friction", "pressure shift")

@@ -21,8 +21,8 @@ from hybrid_opt.witness.pads import Pads
 from hybrid_opt.witness.reference import Reference
 from hybrid_opt.witness.scene import quaternion
 from symbolic.array import Array
-from symbolic.physics.pose import box_rotation
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
+from symbolic.records.poses import box_rotation
 
 LOOKED_AT = 5e-3
 """Time between two looks at the box [s]."""

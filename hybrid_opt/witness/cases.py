@@ -9,7 +9,7 @@ import numpy as np
 from hybrid_opt.witness.scene import SimulationSettings
 from hybrid_opt.witness.simulate import Witness
 from symbolic.array import Array
-from symbolic.workcell.records import Contact, Workcell
+from symbolic.records import Contact, Workcell
 
 
 def witness_of_case(
@@ -18,7 +18,7 @@ def witness_of_case(
     """A witness whose box, friction and pads are those of a case.
 
     Args:
-        case: (15,), see `symbolic.physics.case_squeeze.CASE_SIZES`.
+        case: (15,), see `symbolic.contact.worst_cases.CASE_SIZES`.
 
     Raises:
         WitnessError: MuJoCo is not installed.

@@ -28,10 +28,9 @@ from hybrid_opt.witness.scene import (
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import Frame, arm_geometry, collision_bodies
-from symbolic.physics.contact_forces import GRAVITY
-from symbolic.robot.machine import common_joints
-from symbolic.robot.urdf import arm_model
-from symbolic.workcell.records import Workcell
+from symbolic.read.arms import arm_model, common_joints
+from symbolic.records import Workcell
+from symbolic.records.quantities import GRAVITY
 
 SOFTNESS = "0.7 0.7 0.001"
 """Of contacts: at 0.7 MuJoCo's regularisation lets a pad give by some hundredths of a millimetre.

@@ -13,7 +13,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.witness.scene import PAD_MASS, SimulationSettings, quaternion, tilt_centre
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.pose import box_rotation
+from symbolic.records.poses import box_rotation
 
 SAME_TIME = 1e-9
 """Samples closer than this stand for both sides of one instant [s]."""

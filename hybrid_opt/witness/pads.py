@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from hybrid_opt.witness.scene import rim
 from hybrid_opt.witness.simulate import RIM_POINTS
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 Indices = NDArray[np.int64]
 

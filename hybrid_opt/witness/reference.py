@@ -12,9 +12,9 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.timing.model import contact_torque
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.pose import inverse
+from symbolic.records import Contact, Robot, Workcell
+from symbolic.records.poses import inverse
 from symbolic.robot.model import build_robot_model
-from symbolic.workcell.records import Contact, Robot, Workcell
 
 SETTLE = 0.3
 """Time at rest before a carry begins [s]."""

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.geometry.pieces import Capsule, Hull, Piece
-from symbolic.physics.contact_forces import GRAVITY
-from symbolic.physics.pose import inverse, pose_matrix
-from symbolic.workcell.records import Box, Contact, Cylinder, Payload, Sphere, Workcell
+from symbolic.geometry.pieces import Hull, Piece
+from symbolic.records import Box, Capsule, Contact, Cylinder, Payload, Sphere, Workcell
+from symbolic.records.poses import inverse, pose_matrix
+from symbolic.records.quantities import GRAVITY
 
 CARRIAGE_MASS = 1e5
 """[kg], and [kg m^2] about every axis: what the box does to the carriage within a step is lost in

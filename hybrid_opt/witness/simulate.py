@@ -16,7 +16,7 @@ from hybrid_opt.witness.drive import Drive
 from hybrid_opt.witness.outcome import Outcome, Threshold, bisected, mujoco_module
 from hybrid_opt.witness.scene import CARRIAGE_MASS, SimulationSettings, rim, scene_text, tilt_names
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 LOOKED_AT = 1e-3
 """Time between two looks at the slip [s]."""

@@ -8,6 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from studies.plain.motion import box_rotation
 from symbolic.array import Array
+from symbolic.read.arms import held_joints, moving_joints
+from symbolic.read.urdf import read_urdf
+from symbolic.records import Contact, Robot
+from symbolic.records.poses import Orientation
 from symbolic.robot.arm import (
     BEGIN_STEPS,
     CHEAP_STEPS,
@@ -17,11 +21,6 @@ from symbolic.robot.arm import (
     REACH_TOLERANCE,
     SURE,
 )
-from symbolic.robot.chain import held_joints
-from symbolic.robot.urdf import moving_joints
-from symbolic.robot.urdf_file import read_urdf
-from symbolic.workcell.orientation import Orientation
-from symbolic.workcell.records import Contact, Robot
 
 
 def held_model(robot: Robot) -> tuple[pin.Model, list[int], Array]:

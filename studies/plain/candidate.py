@@ -1,4 +1,4 @@
-"""A whole candidate written plainly: the oracle of `symbolic.functions.candidate`.
+"""A whole candidate written plainly: the oracle of `symbolic.functions`.
 
 Numeric Pinocchio, NumPy and SciPy in Python loops; only tolerances are shared with the symbolic
 model. It iterates exactly as the symbolic model does, so both may be compared to rounding.
@@ -14,9 +14,9 @@ from studies.plain.arm import PlainArm
 from studies.plain.load import sample_load
 from studies.plain.motion import redundant_path, timed_motion
 from symbolic.array import Array
-from symbolic.functions.candidate import CONSTRAINTS, FRICTION_TOLERANCE
+from symbolic.functions import CONSTRAINTS, FRICTION_TOLERANCE
+from symbolic.records import Workcell
 from symbolic.robot.arm import REACH_TOLERANCE
-from symbolic.workcell.records import Workcell
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ from hybrid_opt.collision.checker import RESTING_TOLERANCE
 from studies.plain.arm import held_model
 from studies.plain.motion import box_rotation
 from symbolic.array import Array
-from symbolic.geometry.meshes import convex_pieces
+from symbolic.geometry.hulls import convex_pieces
 from symbolic.geometry.pairs import build_geometry
 from symbolic.geometry.pieces import ConvexShape, Hull, Piece, shrunk
-from symbolic.workcell.records import Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
+from symbolic.records import Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
 
 PAYLOAD = "payload"
 

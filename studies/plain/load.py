@@ -8,7 +8,7 @@ import numpy as np
 
 from studies.plain.motion import box_rates, box_rotation
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 

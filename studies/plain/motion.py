@@ -11,9 +11,9 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
-from symbolic.physics.time_law import STEP_TIME_FLOOR
-from symbolic.workcell.orientation import Orientation
-from symbolic.workcell.records import Task
+from symbolic.path.time_law import STEP_TIME_FLOOR
+from symbolic.records import Task
+from symbolic.records.poses import Orientation
 
 NODES = 14
 """Of Gauss's quadrature: exact to rounding up to a full turn."""

@@ -9,8 +9,8 @@ import numpy as np
 from studies.plain.candidate import PlainCandidate, PlainEvaluator
 from studies.plain.collisions import PlainCollisionChecker, PlainCollisions
 from symbolic.array import Array
-from symbolic.functions.candidate import CONSTRAINTS
-from symbolic.workcell.records import Workcell
+from symbolic.functions import CONSTRAINTS
+from symbolic.records import Workcell
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,8 @@ from studies.report.records import (
 from studies.terminal_summary import title
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
-from symbolic.workcell.cell_files import collect_cell
-from symbolic.workcell.decision import initial_decision
+from symbolic.read.cell_files import collect_cell
+from symbolic.records.task import initial_decision
 
 INITIAL_LABEL = "hand-made"
 CURVE_POINTS = 12

@@ -13,7 +13,7 @@ from studies.drivable import ReplicaFront, drivable_fronts, drivable_root
 from studies.jerk_costs import jerk_costs
 from studies.report.records import DrivableFront, DrivableReport
 from symbolic.array import Array
-from symbolic.workcell.cell_files import collect_cell
+from symbolic.read.cell_files import collect_cell
 
 
 def gather_drivable(study: CampaignResults, summary: CampaignSummary) -> DrivableReport | None:

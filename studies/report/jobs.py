@@ -17,9 +17,9 @@ from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, time_path
 from hybrid_opt.work.job import Emit
 from symbolic.array import Array
 from symbolic.errors import DualArmError
-from symbolic.physics.pose import box_rotation
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
+from symbolic.records.poses import box_rotation
+from symbolic.records.task import initial_decision
 
 RECOMMENDED_LABEL = "recommended"
 

@@ -23,7 +23,7 @@ from hybrid_opt.timing.jerk import drive_with_jerk
 from hybrid_opt.work.job import Emit
 from studies.report.jobs import DrawnJob, JobRequest, drawn
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 MAX_SAMPLES = 60
 """Samples of a trajectory on the page; its force peaks are kept besides."""

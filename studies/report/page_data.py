@@ -31,7 +31,7 @@ from studies.report.page_views import FrontView, drive_look
 from studies.report.records import DrivableReport, ReportData
 from studies.report.style import HAND_MADE, LineStyle, series
 from symbolic.array import Array
-from symbolic.workcell.cell_files import CellFiles, cell_to_json
+from symbolic.read.cell_files import CellFiles, cell_to_json
 
 MAX_CLOUD = 1500
 """Feasible candidates per algorithm in the background of the fronts."""

@@ -21,8 +21,8 @@ from studies.jerk_costs import JerkCosts
 from studies.report.jobs import DrawnJob
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.workcell.cell_files import CellFiles
-from symbolic.workcell.records import Workcell
+from symbolic.read.cell_files import CellFiles
+from symbolic.records import Workcell
 
 
 @dataclass(frozen=True)

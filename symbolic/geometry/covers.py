@@ -13,12 +13,18 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
-from symbolic.geometry.apart import relative_placement
 from symbolic.geometry.bodies import CollisionBody
-from symbolic.geometry.enclosing import SphereChain, contains, sphere_chain
-from symbolic.geometry.pairs import CellGeometry
-from symbolic.geometry.pieces import Hull, Piece, bounding_box, support
-from symbolic.workcell.records import Box
+from symbolic.geometry.pairs import CellGeometry, relative_placement
+from symbolic.geometry.pieces import (
+    Hull,
+    Piece,
+    SphereChain,
+    bounding_box,
+    contains,
+    sphere_chain,
+    support,
+)
+from symbolic.records import Box
 
 MERGE_SLACK = 0.004
 """Pieces are merged into one box that stands out from their hull by at most this [m]."""

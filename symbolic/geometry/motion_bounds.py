@@ -22,12 +22,11 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.geometry.apart import chain_radius
 from symbolic.geometry.bodies import BOX, WORLD, ArmGeometry, CollisionBody, Frame
-from symbolic.geometry.pairs import CellGeometry
+from symbolic.geometry.expressions import clean, world_placements
+from symbolic.geometry.pairs import CellGeometry, chain_radius
 from symbolic.geometry.pieces import bounding_box, farthest_from_axis, farthest_from_point
-from symbolic.geometry.placements import clean, world_placements
-from symbolic.physics.rotation import rotation_matrix
+from symbolic.path.rotation import rotation_matrix
 
 
 def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:

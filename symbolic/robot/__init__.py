@@ -1,5 +1,5 @@
-"""The arms.
+"""An arm as expressions.
 
-urdf: a robot's file read and checked. model: Pinocchio's kinematics and dynamics as CasADi
-functions, through the compiled bridge. arm: Newton's method along a path. branches: start postures.
+model: Pinocchio's kinematics and dynamics as CasADi functions, through the compiled bridge. arm:
+Newton's method along a path. branches: start postures.
 """

@@ -16,13 +16,14 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.physics.path import sample_basis, waypoint_matrix
-from symbolic.physics.pose import box_placement, inverse
-from symbolic.physics.time_law import timed_path
-from symbolic.robot.arm import TRACK_OUTPUTS, box_flange, follow_function
+from symbolic.path.spline import sample_basis, waypoint_matrix
+from symbolic.path.time_law import timed_path
+from symbolic.records import POSE_SIZE, Contact, Robot, Workcell
+from symbolic.records.cell import box_flange
+from symbolic.records.poses import box_placement, inverse
+from symbolic.records.task import extended_waypoints, initial_decision
+from symbolic.robot.arm import TRACK_OUTPUTS, follow_function
 from symbolic.robot.model import RobotModel
-from symbolic.workcell.decision import extended_waypoints, initial_decision
-from symbolic.workcell.records import POSE_SIZE, Contact, Robot, Workcell
 
 N_STARTS = 1024
 """Starts of the search; a power of two keeps the Sobol points balanced."""

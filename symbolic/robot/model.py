@@ -15,10 +15,10 @@ import pinocchio
 
 from symbolic.array import Array
 from symbolic.expression import Expression
+from symbolic.read.arms import arm_model, link_frame, turning_joints
+from symbolic.records import POSE_SIZE, Robot
+from symbolic.records.poses import Orientation
 from symbolic.robot import bridge
-from symbolic.robot.urdf import arm_model, link_frame, turning_joints
-from symbolic.workcell.orientation import Orientation
-from symbolic.workcell.records import POSE_SIZE, Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class RobotModel:
     numbers. q (n,) [rad, or m where a joint slides], v (n,) and a (n,) its time derivatives.
 
     What an arm follows is the extended pose (6 + m,): the box pose, then the values of the cell's m
-    redundant joints (`symbolic.workcell.records.RedundantJoint`). The arm's own redundant joints
+    redundant joints (`symbolic.records.RedundantJoint`). The arm's own redundant joints
     are where it says; the other six follow the box.
 
     Attributes:
@@ -135,7 +135,7 @@ def build_robot_model(
 
     Args:
         robot: the arm.
-        redundant, pose_size, orientation: see `RobotModel`; `symbolic.workcell.records.Task` gives
+        redundant, pose_size, orientation: see `RobotModel`; `symbolic.records.Task` gives
             them.
 
     Raises:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import casadi as ca
 
 from symbolic.cell_model import CellModel
-from symbolic.physics.rotation import rotation_matrix
+from symbolic.path.rotation import rotation_matrix
 from symbolic.robot.arm import flange_target, newton_step, pose_error
 from symbolic.smooth.keys import ClosureKey
 

@@ -12,13 +12,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from symbolic.cell_model import CellModel
-from symbolic.physics.path_limits import (
-    PATH_OUTPUTS,
-    limit_layout,
-    ratio_functions,
-    sample_limits_function,
-)
-from symbolic.workcell.records import POSE_SIZE, Workcell
+from symbolic.limits import PATH_OUTPUTS, limit_layout, ratio_functions, sample_limits_function
+from symbolic.records import POSE_SIZE, Workcell
 
 DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
 """Names of the functions."""

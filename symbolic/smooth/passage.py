@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.geometry.scene import BOX_NUMBERS
+from symbolic.geometry.clearance import BOX_NUMBERS
 from symbolic.smooth.place import Place, PlaceConstraint
 
 GAPS = "gaps"

@@ -16,10 +16,10 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies
-from symbolic.geometry.bodies import PAYLOAD
-from symbolic.geometry.scene import Scene
-from symbolic.geometry.softness import EXACT, Softness
-from symbolic.physics.rotation import rotation_matrix
+from symbolic.geometry.clearance import Scene
+from symbolic.geometry.expressions import EXACT, Softness
+from symbolic.path.rotation import rotation_matrix
+from symbolic.records import PAYLOAD
 from symbolic.smooth.keys import Order, RowKey
 
 WIDTH = 2e-4

@@ -8,7 +8,7 @@ from typing import ClassVar
 import casadi as ca
 
 from symbolic.cell_model import CellBodies
-from symbolic.robot.newton import following_columns, manipulability
+from symbolic.robot.arm import following_columns, manipulability
 from symbolic.smooth.place import Place, PlaceConstraint
 
 

@@ -22,14 +22,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.physics.contact_forces import allocate, normal_force_branches, split_force
-from symbolic.physics.path import PathBasis, sample_basis, waypoint_matrix
-from symbolic.physics.payload_load import resultant_force
-from symbolic.physics.pressure import pressure_shift, required_moment
-from symbolic.physics.rotation import angular_acceleration, angular_velocity, rotation_matrix
-from symbolic.physics.time_law import timed_path
+from symbolic.contact.load import resultant_force
+from symbolic.contact.paper import (
+    allocate,
+    normal_force_branches,
+    pressure_shift,
+    required_moment,
+    split_force,
+)
+from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
+from symbolic.path.spline import PathBasis, sample_basis, waypoint_matrix
+from symbolic.path.time_law import timed_path
+from symbolic.records import Task, Workcell
 from symbolic.smooth.keys import Block, Quantity, SampleKey
-from symbolic.workcell.records import Task, Workcell
 
 INPUTS = ("x", "basis", "rounding")
 """Of every function of samples."""

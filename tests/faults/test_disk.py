@@ -142,7 +142,7 @@ from pathlib import Path
 from symbolic.errors import DualArmError
 from hybrid_opt.store.files import read_json, write_json
 from codegen.cache import Cache
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 path = Path(sys.argv[1])
 # What was imported stays, also where the other user may not read the environment.
 os.setgroups([])

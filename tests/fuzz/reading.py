@@ -24,10 +24,9 @@ from hybrid_opt.store.json_records import read_record
 from hybrid_opt.store.trajectory_file import read_trajectory
 from studies.reference_front import read_reference_front
 from symbolic.errors import DualArmError
-from symbolic.geometry.meshes import read_mesh
-from symbolic.robot.srdf_file import read_srdf
-from symbolic.robot.urdf_file import read_urdf
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
+from symbolic.read.meshes import read_mesh
+from symbolic.read.urdf import read_srdf, read_urdf
 
 READERS: dict[str, Callable[[Path], Any]] = {
     "workcell": load,

@@ -15,15 +15,15 @@ import pytest
 import trimesh
 from hypothesis import strategies as st
 
-from symbolic.geometry.meshes import CollisionModelWarning, convex_pieces
+from symbolic.geometry.hulls import CollisionModelWarning, convex_pieces
 from symbolic.geometry.pairs import build_geometry
-from symbolic.robot.urdf import arm_model
-from symbolic.robot.xacro_file import XACRO_NAMESPACE
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from symbolic.read.arms import arm_model
+from symbolic.read.cell import load
+from symbolic.read.descriptions import XACRO_NAMESPACE
+from symbolic.records import Workcell
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage, xml_damage
 from tests.fuzz.promises import MANY, Checks, all_kept, kept
-from tests.symbolic.workcell.samples import GOFA, RACK, sample_data, write
+from tests.symbolic.read.samples import GOFA, RACK, sample_data, write
 
 FEW, FEW_PROCESSES = 40, 8
 SOUND = RACK.read_bytes().replace(b"../robots/gofa12.urdf", str(GOFA).encode())

@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 
 from hybrid_opt.campaign.evaluations_file import columns
-from symbolic.geometry.meshes import MOST_WORDS
 from symbolic.outside import MEBIBYTE, MESH_BYTES, MOST_VALUES, URDF_BYTES, WORKCELL_BYTES
-from symbolic.robot.urdf_elements import MOST_ATTRIBUTES
-from symbolic.robot.xacro_process import MEMORY_BYTES, MEMORY_PER_BYTE
+from symbolic.read.descriptions import MEMORY_BYTES, MEMORY_PER_BYTE
+from symbolic.read.elements import MOST_ATTRIBUTES
+from symbolic.read.meshes import MOST_WORDS
 from tests.fuzz.promises import MOST_SECONDS
 from tests.symbolic.cells import ROOT
 

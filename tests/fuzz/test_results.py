@@ -23,7 +23,7 @@ from hybrid_opt.polishing.settings import PolishSettings
 from studies.compare import compare
 from studies.report.data import gather_carries
 from studies.study import StudySettings, run_study
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
 from tests.fuzz.promises import kept
 from tests.symbolic.cells import ROOT

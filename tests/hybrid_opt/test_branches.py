@@ -15,10 +15,10 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import front_rows, hypervolume
 from symbolic.errors import SettingsError
-from symbolic.workcell.cell_files import collect_cell, unpack_cell
-from symbolic.workcell.file import load
-from symbolic.workcell.records import SEARCHED
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell, unpack_cell
+from symbolic.records import SEARCHED
+from tests.symbolic.read.samples import RACK
 
 TRANSFER = RACK.with_name("transfer.toml")
 

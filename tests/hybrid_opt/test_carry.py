@@ -11,7 +11,7 @@ import pytest
 from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import REASONS
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK
 
 

@@ -18,7 +18,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate import kernel
 from symbolic.cell_model import CellModel
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 from tests.symbolic.cells import hand_cell, hand_model, rack_cell
 
 

@@ -20,7 +20,7 @@ from hybrid_opt.store.files import sha256
 from hybrid_opt.store.trajectory_file import read_trajectory
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 from tests.hybrid_opt.campaign.fake import RACK
 
 EVALUATIONS = 120

@@ -15,7 +15,7 @@ from hybrid_opt.store.export.makers import require_axes
 from studies.plain.verdict import PlainJudge
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.decision import extended_waypoints
+from symbolic.records.task import extended_waypoints
 from tests.redundant_cells import free_pandas
 
 

@@ -13,10 +13,10 @@ import hybrid_opt as ho
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.scene import scene_data
 from hybrid_opt.display.solids import frame_placements
-from symbolic.functions.candidate import candidate_function
+from symbolic.functions import candidate_function
 from symbolic.geometry.bodies import Frame
-from symbolic.physics.pose import box_rotation
-from symbolic.workcell.decision import variable_names
+from symbolic.records.poses import box_rotation
+from symbolic.records.task import variable_names
 from tests.turned_cells import turned_transfer
 
 

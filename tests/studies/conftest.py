@@ -19,7 +19,7 @@ from studies.report.data import gather
 from studies.report.records import Front, ReportData
 from studies.study import StudySettings, run_study
 from studies.summary import front_indicators
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.symbolic.cells import ROOT
 
 TRANSFER = ROOT / "studies" / "workcells" / "transfer.toml"

@@ -15,7 +15,7 @@ from hybrid_opt.campaign.stages import run_stages
 from hybrid_opt.indicators import metrics
 from studies.compare import compare, main
 from studies.summary_stage import summary_stage
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.studies.conftest import TRANSFER
 
 

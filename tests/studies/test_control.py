@@ -17,8 +17,8 @@ from hybrid_opt.polishing.settings import PolishSettings
 from studies import control
 from studies.reference_front import ReferenceFront
 from studies.study import StudySettings, run_study
-from symbolic.workcell.file import load
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from tests.symbolic.read.samples import RACK
 
 
 @pytest.fixture(scope="module")

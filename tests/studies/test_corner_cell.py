@@ -8,8 +8,8 @@ import pytest
 from hybrid_opt.cell import Cell
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.solve import time_path
-from symbolic.physics.payload_load import load_function
-from symbolic.workcell.file import load
+from symbolic.contact.load import load_function
+from symbolic.read.cell import load
 from tests.symbolic.cells import ROOT, call
 
 CORNER = ROOT / "studies" / "workcells" / "corner.toml"

@@ -17,7 +17,7 @@ from studies.inspection import inspect
 from studies.plain.verdict import PlainJudge
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
-from symbolic.functions.candidate import candidate_function
+from symbolic.functions import candidate_function
 from tests.described_cells import SOURCES, described_cell, plain_cell
 
 

@@ -22,9 +22,9 @@ from studies.inspect import as_text, main
 from studies.inspection import Inspection, Optimum, inspect
 from studies.inspection_pictures import show
 from studies.report.pictures_meeting import meeting_place
-from symbolic.workcell.decision import straight_line
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from symbolic.read.cell import load
+from symbolic.records import Workcell
+from symbolic.records.task import straight_line
 from tests.studies.conftest import TRANSFER
 from tests.symbolic.cells import RACK
 

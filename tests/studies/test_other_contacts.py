@@ -17,10 +17,10 @@ from hybrid_opt.robust.path_force import RobustPath
 from hybrid_opt.timing import TimingLimits, TimingModel
 from hybrid_opt.timing.solve import time_path
 from studies.plain.collisions import PlainCollisionChecker
+from symbolic.contact.load import load_function
 from symbolic.errors import SettingsError
-from symbolic.physics.payload_load import load_function
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Uncertainty
+from symbolic.read.cell import load
+from symbolic.records import Uncertainty
 from tests.symbolic.cells import ROOT, call
 
 WORKCELLS = ROOT / "studies" / "workcells"

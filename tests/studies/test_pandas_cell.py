@@ -11,8 +11,8 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.locked import LockedEvaluator
 from studies.redundancy import compare, locks
 from studies.run import main
-from symbolic.workcell.file import load
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from tests.symbolic.read.samples import RACK
 
 PANDAS = RACK.with_name("pandas.toml")
 

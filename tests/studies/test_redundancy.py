@@ -10,9 +10,9 @@ import pytest
 from hybrid_opt.cell import Cell
 from studies.redundancy import as_text, compare, locks
 from symbolic.errors import SettingsError
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.redundant_cells import free_pandas
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 
 def test_locks_are_a_grid_within_the_bounds(tmp_path: Path) -> None:

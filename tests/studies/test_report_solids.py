@@ -11,7 +11,7 @@ from studies.report.reach import last_points, reach_map
 from studies.report.records import ReportData
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry, build_geometry
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.studies.conftest import TRANSFER
 
 

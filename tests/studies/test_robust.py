@@ -9,7 +9,7 @@ import pytest
 
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.robust import main
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.symbolic.cells import RACK
 
 TABLE = """

@@ -33,11 +33,10 @@ from studies.report.records import ReportData
 from studies.report.tables import report_tables
 from studies.study import StudySettings, run_study
 from symbolic.array import Array
-from symbolic.workcell.cell_files import collect_cell, unpack_cell
-from symbolic.workcell.drivable import drivable_files
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
+from symbolic.records import Workcell
+from tests.symbolic.read.samples import RACK
 
 FRICTION, MASS = 0.08, 0.05
 MORE = (1.0 + MASS) / (1.0 - FRICTION)

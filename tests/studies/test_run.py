@@ -24,9 +24,8 @@ from hybrid_opt.timing.document import read_timing
 from studies import rack, recommend, run
 from studies.cli import campaign_parser, campaign_settings
 from studies.recommendation_text import recommendation_text
-from symbolic.workcell.cell_files import collect_cell, unpack_cell
-from symbolic.workcell.drivable import drivable_files
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
 
 CELL = str(RACK.with_name("transfer.toml"))

@@ -29,7 +29,7 @@ from studies.summary import (
     replica_figures,
 )
 from studies.terminal_summary import PAPER, terminal_summary
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, RACK
 
 NAN = math.nan

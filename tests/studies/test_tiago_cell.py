@@ -9,9 +9,9 @@ import pytest
 
 from hybrid_opt.cell import Cell
 from studies.run import main
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from symbolic.records import Workcell
+from tests.symbolic.read.samples import RACK
 
 TIAGO = RACK.with_name("tiago.toml")
 

@@ -11,7 +11,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.solve import time_path
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.symbolic.cells import ROOT
 
 # Its functions are compiled for these tests alone.

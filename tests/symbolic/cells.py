@@ -18,12 +18,12 @@ from numpy.typing import ArrayLike
 from studies.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
-from symbolic.functions.candidate import candidate_function
+from symbolic.functions import candidate_function
 from symbolic.geometry.pairs import build_geometry
-from symbolic.physics.pose import pose_matrix
+from symbolic.read.cell import load
+from symbolic.records import Contact, Payload, Robot, Task, Waypoint, Workcell
+from symbolic.records.poses import pose_matrix
 from symbolic.robot.model import RobotModel, build_robot_model
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Contact, Payload, Robot, Task, Waypoint, Workcell
 
 ROOT = Path(__file__).resolve().parents[2]
 GOFA = ROOT / "studies" / "robots" / "gofa12.urdf"

@@ -13,7 +13,7 @@ from hybrid_opt.polishing.placed_carry import PlacedCarry
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.smooth_cell import SmoothCell
 from hybrid_opt.polishing.targets import Target
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 AnyRow = TypeVar("AnyRow", ForceRow, PressureRow, PlaceRow)
 

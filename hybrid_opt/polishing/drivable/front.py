@@ -34,7 +34,7 @@ from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.decision import initial_decision
+from symbolic.records.task import initial_decision
 
 FAST = 0.75
 """Where between the least and the front's largest force limit the tournament is: basins differ most

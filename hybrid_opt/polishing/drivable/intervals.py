@@ -17,11 +17,11 @@ from scipy.linalg import block_diag
 from hybrid_opt.polishing.drivable.functions import DrivenFunctions
 from hybrid_opt.polishing.drivable.robust_rows import ROBUST_ROWS, RobustForces, planned_branches
 from symbolic.array import Array
-from symbolic.physics.path import path_basis
+from symbolic.path.spline import path_basis
+from symbolic.records import Workcell
+from symbolic.records.task import extended_waypoints
 from symbolic.smooth.driven import driven_layout
 from symbolic.smooth.keys import ClosureKey
-from symbolic.workcell.decision import extended_waypoints
-from symbolic.workcell.records import Workcell
 
 
 @dataclass(frozen=True)

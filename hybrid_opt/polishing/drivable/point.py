@@ -31,7 +31,7 @@ from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.smooth_cell import SmoothCell
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Task
+from symbolic.records import Task
 
 LENGTHENED = (2.0, 4.0, 8.0)
 """Times a step that brought more than it promised."""

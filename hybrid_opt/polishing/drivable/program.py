@@ -28,7 +28,7 @@ from hybrid_opt.polishing.layout import PlaceRow
 from hybrid_opt.polishing.place_values import PlaceValues
 from hybrid_opt.polishing.residuals import Residuals
 from symbolic.array import Array
-from symbolic.workcell.decision import extended_waypoints
+from symbolic.records.task import extended_waypoints
 
 NEAR = 0.85
 """Limits used this far have a row from the start."""

@@ -11,9 +11,9 @@ import numpy as np
 
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from symbolic.array import Array
-from symbolic.physics.contact_forces import normal_force_branches
+from symbolic.contact.paper import normal_force_branches
+from symbolic.records import Workcell
 from symbolic.smooth.driven import driven_layout
-from symbolic.workcell.records import Workcell
 
 CASES = 3
 """Cases per robot and point."""

@@ -11,8 +11,7 @@ import numpy as np
 
 from hybrid_opt.polishing.drivable.timed import PathJudge
 from symbolic.array import Array
-from symbolic.workcell.decision import POSE_SIZE
-from symbolic.workcell.records import Task
+from symbolic.records import POSE_SIZE, Task
 
 SHARES = (0.8, 0.6, 0.4)
 """Of what the bounds leave, the first one with which the path can be driven. Less turned paths fall

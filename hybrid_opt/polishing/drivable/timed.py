@@ -10,7 +10,7 @@ import numpy as np
 from hybrid_opt.evaluate.drive import Driver
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from symbolic.array import Array
-from symbolic.workcell.decision import waypoints_of
+from symbolic.records.task import waypoints_of
 
 DriveAim = Literal["duration", "force"]
 """Least duration within a force limit, or least force limit within a duration."""

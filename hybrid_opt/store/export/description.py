@@ -14,13 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.job.records import robot_prefix
 from symbolic.array import Array
-from symbolic.geometry.pieces import Capsule
-from symbolic.physics.pose import pose_matrix
-from symbolic.robot.chain import held_joints
-from symbolic.robot.machine import one_machine
-from symbolic.robot.urdf import moving_joints, robot_urdf
-from symbolic.robot.urdf_file import Urdf, UrdfMesh
-from symbolic.workcell.records import Body, Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
+from symbolic.read.arms import held_joints, moving_joints, one_machine, robot_urdf
+from symbolic.read.urdf import Urdf, UrdfMesh
+from symbolic.records import Body, Box, Capsule, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
+from symbolic.records.poses import pose_matrix
 
 WORLD = "world"
 PLUGIN = "mock_components/GenericSystem"

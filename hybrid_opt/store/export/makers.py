@@ -6,8 +6,8 @@ import re
 from collections.abc import Sequence
 
 from symbolic.errors import SettingsError
-from symbolic.robot.urdf import arm_model, robot_urdf, turning_joints
-from symbolic.workcell.records import Robot, Workcell
+from symbolic.read.arms import arm_model, robot_urdf, turning_joints
+from symbolic.records import Robot, Workcell
 
 ABB = "ABB"
 UR = "UR e-series"

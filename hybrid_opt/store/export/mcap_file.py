@@ -22,8 +22,8 @@ from hybrid_opt.store.export.ros2 import (
     wrench_message,
 )
 from symbolic.array import Array
-from symbolic.physics.pose import box_placement
-from symbolic.robot.urdf import arm_model, link_frame
+from symbolic.read.arms import arm_model, link_frame
+from symbolic.records.poses import box_placement
 
 _TIME = "builtin_interfaces/Time"
 _DEFINITIONS = {

@@ -17,7 +17,7 @@ from hybrid_opt.store.export.makers import ABB, SEVEN, SIX, require_axes, requir
 from hybrid_opt.store.export.options import BundleOptions
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.pose import inverse
+from symbolic.records.poses import inverse
 
 TASKS = ("T_ROB1", "T_ROB2")
 TWO_ARMED_TASKS = ("T_ROB_L", "T_ROB_R")

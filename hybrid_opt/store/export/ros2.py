@@ -18,7 +18,7 @@ from hybrid_opt.store.export.description import description, prefixes
 from hybrid_opt.store.export.options import BundleOptions
 from hybrid_opt.store.export.ros2_programs import LAUNCH, RUN
 from symbolic.array import Array
-from symbolic.physics.pose import box_rotation
+from symbolic.records.poses import box_rotation
 
 UPDATE_RATE = 1000
 """Of the controller manager [Hz]."""

@@ -9,8 +9,8 @@ import json
 import numpy as np
 
 from hybrid_opt.job.sampling import SampledJob
-from symbolic.robot.urdf import arm_model, turning_joints
-from symbolic.workcell.decision import components
+from symbolic.read.arms import arm_model, turning_joints
+from symbolic.records.task import components
 
 JSON_FORMAT = "dual-arm-carry job"
 JSON_VERSION = 1

@@ -20,7 +20,7 @@ from hybrid_opt.store.export.makers import UR, require_axes, require_maker
 from hybrid_opt.store.export.options import BundleOptions
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.pose import inverse
+from symbolic.records.poses import inverse
 
 CYCLE = 0.002
 """Of an e-series controller [s]."""

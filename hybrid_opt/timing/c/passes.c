@@ -1,6 +1,6 @@
 /* The fastest timing of one path by a backward and a forward pass over intervals of constant u''.
 
-   docs/timing.md explains the method; `symbolic.physics.path_limits.LimitLayout` the numbers at a
+   docs/timing.md explains the method; `symbolic.limits.LimitLayout` the numbers at a
    sample. The text before this file defines INTERVALS, JOINTS, the SIZE of a sample's row, the
    offset of every block (AT_...), RATIOS, FORCE_BRANCHES, CUTS, the lines that a caller gives at every
    sample, and limit_ratios, limit_slopes of CasADi.

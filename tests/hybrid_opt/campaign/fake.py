@@ -24,7 +24,7 @@ from hybrid_opt.campaign import (
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from symbolic.array import Array
 from symbolic.errors import DualArmError
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 
 ROOT = Path(__file__).parents[3]
 RACK = ROOT / "studies/workcells/rack.toml"

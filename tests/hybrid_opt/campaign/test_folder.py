@@ -12,7 +12,7 @@ import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, open_folder
 from hybrid_opt.errors import ResultsError
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK, run_search
 
 SETTINGS = CampaignSettings(evaluations=200, replicas=2)

@@ -44,8 +44,8 @@ from hybrid_opt.polishing.records import (
 from hybrid_opt.polishing.residuals import Residuals
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from symbolic.array import Array
-from symbolic.workcell.file import load
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from tests.symbolic.read.samples import RACK
 
 SETTINGS = CampaignSettings(algorithms=("nsga2",), evaluations=200, replicas=1, seed=5)
 PROBE = ProbeSettings(starts=2, middle_starts=2)

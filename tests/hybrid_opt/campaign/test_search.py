@@ -26,7 +26,7 @@ from hybrid_opt.campaign.journal import Journal, encode_generation
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError
 from symbolic.errors import DualArmError
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import (
     RACK,
     ROOT,

@@ -18,7 +18,7 @@ from hybrid_opt.campaign import (
     run_stages,
 )
 from hybrid_opt.errors import ResultsError
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK
 
 

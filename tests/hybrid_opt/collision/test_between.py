@@ -17,8 +17,8 @@ from hybrid_opt.collision.pair_values import Separations
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import build_geometry
-from symbolic.physics.pose import pose_matrix
-from symbolic.workcell.records import Body, Box
+from symbolic.records import Body, Box
+from symbolic.records.poses import pose_matrix
 from tests.symbolic.geometry.collision_cells import Configurations, functions_of, rack
 
 BENT = np.array([0.4, -0.3, 0.5, 0.2, -0.4, 0.1])

@@ -17,10 +17,9 @@ from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
 from hybrid_opt.collision.verdict import sample_durations
-from symbolic.geometry.coal_shapes import coal_distance, coal_geometry
-from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance, coal_geometry
 from symbolic.geometry.pieces import Piece
-from symbolic.workcell.records import AllowedContact, CollisionSettings, Uncertainty, Workcell
+from symbolic.records import AllowedContact, CollisionSettings, Uncertainty, Workcell
 from tests.symbolic.geometry.collision_cells import (
     Configurations,
     functions_of,
@@ -31,7 +30,7 @@ from tests.symbolic.geometry.collision_cells import (
     true_distances,
 )
 
-pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 
 RESOLUTION = 1e-5
 """FCL's and Coal's solvers agree within this [m]."""
@@ -303,7 +302,7 @@ def test_hulls_and_their_pieces_reach_fcl_unchanged() -> None:
     import fcl
 
     from hybrid_opt.collision.judge import fcl_object
-    from symbolic.geometry.enclosing import ball
+    from symbolic.geometry.pieces import ball
 
     probe = ball(np.array([0.7, -0.6, 0.9]), 0.05)
     for body in geometry_of("ur10").bodies[:8]:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hybrid_opt.collision.checker import RESTING_TOLERANCE
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.geometry.pieces import Hull, Piece, reach, shrunk
-from symbolic.workcell.records import AllowedContact, Box, Cylinder, Mesh, Workcell
+from symbolic.records import AllowedContact, Box, Cylinder, Mesh, Workcell
 from tests.hybrid_opt.collision.test_checker import checker_of, coal_mask
 from tests.symbolic.geometry.collision_cells import (
     rack,

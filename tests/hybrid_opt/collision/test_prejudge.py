@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from hybrid_opt.collision.judge import fcl_object
 from hybrid_opt.evaluate.kernel_data import PROOF_MARGIN, shape_table
 from symbolic.array import Array
-from symbolic.geometry.pieces import Capsule, ConvexShape, Hull, Piece
-from symbolic.workcell.records import Box, Cylinder, Sphere
+from symbolic.geometry.pieces import ConvexShape, Hull, Piece
+from symbolic.records import Box, Capsule, Cylinder, Sphere
 
 APART, OPEN, INTERSECTING = 1, 0, -1
 

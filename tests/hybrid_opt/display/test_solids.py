@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from hybrid_opt.display.solids import cell_solids, joint_placements
 from symbolic.geometry.pairs import CellGeometry, build_geometry
-from symbolic.robot.urdf import arm_model
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Box
+from symbolic.read.arms import arm_model
+from symbolic.read.cell import load
+from symbolic.records import Box
 from tests.hybrid_opt.campaign.fake import RACK
 
 ANGLES = st.floats(-3.0, 3.0)

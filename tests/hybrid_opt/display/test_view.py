@@ -22,7 +22,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display import scene
 from hybrid_opt.errors import DisplayError
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")

@@ -24,12 +24,12 @@ from hybrid_opt.evaluate.evaluations import BETWEEN_SAMPLES, REASONS
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.problem import CarryProblem
 from symbolic.array import Array
-from symbolic.physics.pose import inverse, pose_matrix
-from symbolic.robot.arm import box_flange
+from symbolic.read.cell import load
+from symbolic.records.cell import box_flange
+from symbolic.records.poses import inverse, pose_matrix
+from symbolic.records.task import extended_waypoints, initial_decision
 from symbolic.robot.model import build_robot_model
-from symbolic.workcell.decision import extended_waypoints, initial_decision
-from symbolic.workcell.file import load
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 
 @pytest.fixture(scope="module")

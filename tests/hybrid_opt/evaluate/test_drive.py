@@ -23,11 +23,11 @@ from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing import PathTimer, TimingLimits, drivable_timing, time_path
 from hybrid_opt.timing.path_timer import PATH_INTERVALS
 from symbolic.array import Array
-from symbolic.functions.candidate import candidate_function
+from symbolic.functions import candidate_function
 from symbolic.geometry.clearance import screening_functions
+from symbolic.records import Uncertainty, Workcell
+from symbolic.records.task import initial_decision, waypoints_of
 from symbolic.robot.arm import posture_function
-from symbolic.workcell.decision import initial_decision, waypoints_of
-from symbolic.workcell.records import Uncertainty, Workcell
 from tests.hybrid_opt.timing.cells import hand_timing, near_initial, timing_of
 from tests.symbolic.cells import hand_cell, hand_model, with_task
 

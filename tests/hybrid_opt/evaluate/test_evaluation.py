@@ -19,14 +19,14 @@ from studies.plain.collisions import PlainCollisionChecker
 from studies.plain.verdict import PlainJudge, PlainVerdict
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
-from symbolic.functions.candidate import CONSTRAINTS
-from symbolic.workcell.file import load
-from symbolic.workcell.records import CollisionSettings, Uncertainty, Workcell
+from symbolic.functions import CONSTRAINTS
+from symbolic.read.cell import load
+from symbolic.records import CollisionSettings, Uncertainty, Workcell
 from tests.hybrid_opt.collision.test_checker import checker_of, resting_cell
 from tests.symbolic.cells import RACK
 from tests.symbolic.geometry.collision_cells import geometry_of, random_configurations
 
-pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 
 TRANSFER = RACK.parent / "transfer.toml"
 
@@ -144,7 +144,7 @@ def test_the_plain_check_knows_the_allowed_contacts() -> None:
 WARM_START = """
 import sys
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 workcell = load(sys.argv[1])
 CandidateEvaluator(workcell).evaluate(workcell.task.initial.reshape(-1))
 print(*sys.modules)

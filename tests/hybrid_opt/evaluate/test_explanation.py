@@ -8,10 +8,10 @@ import pytest
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent, missing_reach
-from symbolic.physics.pose import box_placement
-from symbolic.workcell.decision import straight_line
-from symbolic.workcell.file import load
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from symbolic.records.poses import box_placement
+from symbolic.records.task import straight_line
+from tests.symbolic.read.samples import RACK
 
 
 @pytest.fixture(scope="module")

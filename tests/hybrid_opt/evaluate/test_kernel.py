@@ -16,14 +16,9 @@ from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.kernel import Kernel, load_kernel
 from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
 from symbolic.array import Array
-from symbolic.functions.candidate import (
-    SAMPLE_NAMES,
-    force_sizes,
-    sample_functions,
-    sample_sizes,
-)
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.file import load
+from symbolic.functions import SAMPLE_NAMES, force_sizes, sample_functions, sample_sizes
+from symbolic.read.cell import load
+from symbolic.records.task import initial_decision
 from tests.hybrid_opt.evaluate.test_evaluation import TRANSFER, candidates
 from tests.symbolic.cells import RACK, hand_model
 

@@ -15,14 +15,14 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from studies.plain.verdict import PlainJudge
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
-from symbolic.functions.cell import cell_functions
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.records import Workcell
+from symbolic.functions import cell_functions
+from symbolic.records import Workcell
+from symbolic.records.task import initial_decision
 from tests.hybrid_opt.evaluate.test_evaluation import assert_agrees
 from tests.machines import MACHINES, SINGLE, cell_of
 from tests.redundant_cells import machine_on_lift, seven_joints
 
-pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 
 AGREEMENT = 1e-11
 """Largest difference of compiled and interpreted values, absolute or relative."""

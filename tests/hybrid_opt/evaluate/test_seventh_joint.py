@@ -9,7 +9,7 @@ import pytest
 from hybrid_opt.cell import Cell
 from studies.benchmark_turns import interleaved
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 from tests.redundant_cells import free_pandas, locked_pandas
 from tests.symbolic.cells import with_task
 

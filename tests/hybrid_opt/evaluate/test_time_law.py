@@ -9,7 +9,7 @@ import numpy as np
 
 from hybrid_opt.timing import TimingModel, TimingStatus, judge_timing
 from hybrid_opt.timing.model import REFINEMENT
-from symbolic.workcell.records import TimeLaw
+from symbolic.records import TimeLaw
 from tests.hybrid_opt.timing.cells import initial, near_initial, timing_of
 from tests.symbolic.cells import hand_cell
 

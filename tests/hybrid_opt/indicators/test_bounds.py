@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from hybrid_opt.indicators.bounds import binding_bounds
-from symbolic.workcell.decision import variable_names
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Waypoint
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from symbolic.records import Waypoint
+from symbolic.records.task import variable_names
+from tests.symbolic.read.samples import RACK
 
 TASK = load(RACK).task
 MIDDLE = (TASK.lower + TASK.upper) / 2.0

@@ -21,9 +21,9 @@ from hybrid_opt.indicators.selection import (
     select,
     selected_row,
 )
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from symbolic.read.cell import load
+from symbolic.records import Workcell
+from symbolic.records.task import initial_decision
 from tests.hybrid_opt.campaign.fake import RACK
 
 CELL = RACK.with_name("transfer.toml")

@@ -17,7 +17,7 @@ from hybrid_opt.job.compliance import (
 from hybrid_opt.job.text import job_text, position_text, skew_text
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.pose import pose_matrix
+from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.job.jobs import rack_job
 
 

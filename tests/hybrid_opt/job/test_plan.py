@@ -18,11 +18,10 @@ from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.timing import JerkLimits, TimingLimits, time_path, time_with_jerk
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.physics.pose import pose_matrix
+from symbolic.read.arms import arm_model, link_frame
+from symbolic.records import Handling, Uncertainty
+from symbolic.records.poses import pose_matrix
 from symbolic.robot.model import gravity_in_root
-from symbolic.robot.urdf import arm_model, link_frame
-from symbolic.workcell.handling import Handling
-from symbolic.workcell.records import Uncertainty
 from tests.hybrid_opt.job.jobs import rack, rack_job, rack_jobs, rack_timing
 
 

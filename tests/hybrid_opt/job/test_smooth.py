@@ -8,8 +8,8 @@ import pytest
 from hybrid_opt.job.smooth import acceleration_at_ends, rests_at_ends, smoothed
 from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, time_path, time_with_jerk
 from hybrid_opt.timing.use import limit_use, worst
-from symbolic.physics.path import path_basis
-from symbolic.workcell.decision import waypoints_of
+from symbolic.path.spline import path_basis
+from symbolic.records.task import waypoints_of
 from tests.hybrid_opt.job.jobs import rack, rack_jobs, rack_timing
 
 FORCE = 55.0

@@ -18,7 +18,7 @@ from hybrid_opt.polishing.placed_carry import CarryReader, Distances
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.smooth_cell import SmoothCell
 from symbolic.array import Array
-from symbolic.workcell.decision import initial_decision
+from symbolic.records.task import initial_decision
 from tests.hybrid_opt.polishing.test_front import evaluator
 
 PLACES, PAIRS, LIMIT = 60, 4, 0.02

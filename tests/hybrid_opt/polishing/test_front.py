@@ -23,9 +23,9 @@ from hybrid_opt.polishing.records import (
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.file import load
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from symbolic.records.task import initial_decision
+from tests.symbolic.read.samples import RACK
 
 SETTINGS = PolishSettings(attempts=7, fill=FillSettings(attempts=1))
 PATIENT = PolishSettings(attempts=1, rounds=25, max_iterations=80)

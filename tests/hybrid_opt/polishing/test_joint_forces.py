@@ -25,12 +25,12 @@ from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from hybrid_opt.polishing.smooth_cell import SmoothCell
 from studies.run import main
 from symbolic.array import Array
-from symbolic.functions.candidate import candidate_function
+from symbolic.functions import candidate_function
+from symbolic.read.cell import load
+from symbolic.records import TimeLaw, Workcell
+from symbolic.records.task import initial_decision
 from symbolic.smooth.held import held_functions
 from symbolic.smooth.samples import sample_blocks, sample_functions
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.file import load
-from symbolic.workcell.records import TimeLaw, Workcell
 from tests.hybrid_opt.polishing.test_program import (
     TARGET,
     require_curvature,
@@ -38,7 +38,7 @@ from tests.hybrid_opt.polishing.test_program import (
     require_same,
 )
 from tests.symbolic.cells import ROOT, hand_cell, hand_model
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 WORKCELLS = ROOT / "studies" / "workcells"
 SMALL = PolishSettings(attempts=4, fill=FillSettings(attempts=2))

@@ -6,7 +6,7 @@ import numpy as np
 
 from hybrid_opt.polishing.kick import kicked
 from hybrid_opt.polishing.settings import KickSettings
-from symbolic.workcell.decision import initial_decision
+from symbolic.records.task import initial_decision
 from tests.hybrid_opt.polishing.test_front import evaluator
 
 SETTINGS = KickSettings(candidates=400)

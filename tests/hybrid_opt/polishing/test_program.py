@@ -17,15 +17,15 @@ from hybrid_opt.polishing.program import SmoothProgram
 from hybrid_opt.polishing.smooth_cell import SmoothCell
 from hybrid_opt.polishing.targets import Target
 from symbolic.array import Array
+from symbolic.read.cell import load
+from symbolic.records.task import initial_decision
 from symbolic.smooth.clearance import Clearance
 from symbolic.smooth.joint_limit import JointLimit
 from symbolic.smooth.passage import Passing, Separation
 from symbolic.smooth.place import PlaceConstraint
 from symbolic.smooth.reach import Reach
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.file import load
 from tests.redundant_cells import rack_on_rail
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 TRANSFER = RACK.with_name("transfer.toml")
 

@@ -11,13 +11,13 @@ from hybrid_opt.polishing.layout import PlaceRow
 from hybrid_opt.polishing.place_values import Places, PlaceValues
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
-from symbolic.physics.path import path_basis
+from symbolic.path.spline import path_basis
+from symbolic.records.task import extended_waypoints, initial_decision
 from symbolic.smooth.closure import closure_functions
 from symbolic.smooth.joint_limit import JointLimit
 from symbolic.smooth.passage import gap_function
 from symbolic.smooth.place import Place
 from symbolic.smooth.reach import Reach
-from symbolic.workcell.decision import extended_waypoints, initial_decision
 from tests.redundant_cells import rack_on_rail
 
 AT = np.array([30, 60])

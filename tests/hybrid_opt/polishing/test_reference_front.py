@@ -9,8 +9,8 @@ import numpy as np
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators.metrics import front_of
 from studies.reference_front import read_reference_front
-from symbolic.workcell.file import load
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from tests.symbolic.read.samples import RACK
 
 FRONT = Path(__file__).with_name("rack_reference_front.csv")
 

@@ -19,11 +19,11 @@ from hybrid_opt.polishing.robust_samples import RobustSamples
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.smooth_cell import SmoothCell
 from hybrid_opt.polishing.targets import balance
-from symbolic.workcell.decision import initial_decision
+from symbolic.records.task import initial_decision
 from tests.hybrid_opt.polishing.test_program import TARGET, evaluator
 from tests.hybrid_opt.robust.test_force import SET
 from tests.symbolic.cells import hand_cell
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 STEP = 1e-6
 

@@ -8,10 +8,10 @@ from hybrid_opt.proposing.agreement import Agreement
 from hybrid_opt.proposing.holding import Hold
 from hybrid_opt.proposing.kinematics import ArmKinematics, box_to_last_joint
 from symbolic.array import Array
-from symbolic.physics.pose import pose_matrix
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from symbolic.records import Workcell
+from symbolic.records.poses import pose_matrix
+from tests.symbolic.read.samples import RACK
 
 LIFT = 0
 """The lift's index in both arms."""

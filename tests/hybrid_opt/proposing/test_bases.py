@@ -14,7 +14,7 @@ from hybrid_opt.proposing.problem import Problem, read_problem
 from symbolic.array import Array
 from tests.hybrid_opt.proposing.problems import tiago_problem
 
-pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 
 SPINS: Array = 2.0 * np.pi * np.arange(12.0) / 12.0
 

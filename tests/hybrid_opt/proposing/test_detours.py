@@ -9,8 +9,8 @@ import pytest
 
 from hybrid_opt.proposing.detours import ASIDE, LIFT, POSES, free_detours
 from symbolic.array import Array
-from symbolic.physics.pose import pose_matrix
-from symbolic.workcell.records import Body, Box, Workcell
+from symbolic.records import Body, Box, Workcell
+from symbolic.records.poses import pose_matrix
 from tests.symbolic.cells import hand_cell
 
 START, GOAL = np.array([0.0, 0, 0.7, 0, 0, 0]), np.array([0.0, 0, 1.1, 0, 0, 0.2])

@@ -9,10 +9,10 @@ import pytest
 from hybrid_opt.errors import JobError
 from hybrid_opt.proposing.grasping import grasp_blocked
 from hybrid_opt.proposing.trial import Trial
-from symbolic.workcell.file import load
-from symbolic.workcell.handling import Handling
+from symbolic.read.cell import load
+from symbolic.records import Handling
 from tests.hybrid_opt.job.jobs import rack, rack_jobs, rack_timing
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ from hybrid_opt.proposing.kinematics import (
     possible_spins,
     spun,
 )
-from symbolic.physics.pose import pose_matrix
-from symbolic.robot.urdf import arm_model
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from symbolic.read.arms import arm_model
+from symbolic.read.cell import load
+from symbolic.records import Workcell
+from symbolic.records.poses import pose_matrix
 
 RACK = "studies/workcells/rack.toml"
 

@@ -11,7 +11,7 @@ from hybrid_opt.proposing.planner import Budget, Stray, freedom, plan
 from hybrid_opt.proposing.problem import read_problem
 from hybrid_opt.proposing.setup import Setup, prepare
 from hybrid_opt.proposing.via_points import fit, free_share, shortened
-from symbolic.physics.pose import pose_matrix
+from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.proposing.test_proposal import rack_problem
 
 NO_LIMITS = np.empty((0, 2))

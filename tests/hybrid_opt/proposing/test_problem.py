@@ -12,8 +12,8 @@ import trimesh
 from hybrid_opt.proposing.document import completed
 from hybrid_opt.proposing.problem import Problem, contact_points, read_problem
 from symbolic.errors import WorkcellError
-from symbolic.physics.pose import rotation_from_rpy
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
+from symbolic.records.poses import rotation_from_rpy
 from tests.hybrid_opt.proposing.problems import BAXTER, tiago_problem
 from tests.hybrid_opt.proposing.test_proposal import rack_problem
 

@@ -13,7 +13,7 @@ import hybrid_opt as ho
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing.document import completed
 from symbolic.errors import SettingsError, WorkcellError
-from symbolic.workcell.file import load
+from symbolic.read.cell import load
 from tests.hybrid_opt.proposing.generated import write_problem
 from tests.hybrid_opt.proposing.problems import (
     BAXTER,
@@ -107,7 +107,7 @@ def test_generated_cells_get_carries(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["tiago", "baxter", "pandas", "drum", "fork", "turned", "pitched"])
-@pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+@pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 def test_cells_of_every_kind_get_carries(name: str, tmp_path: Path) -> None:
     """Machines with both arms in one file, portals, other payloads and pads, a box turned over."""
     path = tmp_path / "problem.toml"

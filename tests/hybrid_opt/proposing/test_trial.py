@@ -8,9 +8,9 @@ import pytest
 
 from hybrid_opt.proposing.trial import Trial
 from symbolic.cell_model import build_cell_model
-from symbolic.functions.candidate import CONSTRAINTS, candidate_function, motion_function
-from symbolic.workcell.file import load
-from tests.symbolic.workcell.samples import RACK
+from symbolic.functions import CONSTRAINTS, candidate_function, motion_function
+from symbolic.read.cell import load
+from tests.symbolic.read.samples import RACK
 
 
 @pytest.mark.parametrize("name", ["drum", "transfer"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 
 @pytest.fixture(scope="session")

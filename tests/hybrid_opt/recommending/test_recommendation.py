@@ -15,7 +15,7 @@ from hybrid_opt.recommending.recommendation import HAND_MADE
 from hybrid_opt.recommending.unsure import usual_doubts
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 
 def timed(cell: ho.Cell, path: Array, force: float) -> ho.Timing:

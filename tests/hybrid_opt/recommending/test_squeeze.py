@@ -9,7 +9,7 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.recommending.squeeze import commanded
-from symbolic.workcell.records import Uncertainty
+from symbolic.records import Uncertainty
 
 
 @pytest.mark.parametrize("uncertainty", [Uncertainty(), Uncertainty(friction=0.1, mass=0.03)])

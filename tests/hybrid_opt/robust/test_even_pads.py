@@ -10,8 +10,8 @@ from hybrid_opt.robust.even_pads import even_pads
 from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.squeeze import SqueezeSettings, chosen_squeeze, extra_force
 from symbolic.errors import SettingsError
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Uncertainty, Workcell
+from symbolic.read.cell import load
+from symbolic.records import Uncertainty, Workcell
 from tests.symbolic.cells import RACK, rack_cell
 
 SET = Uncertainty(

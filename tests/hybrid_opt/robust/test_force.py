@@ -20,9 +20,9 @@ from hybrid_opt.robust.force import (
 )
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Uncertainty, Workcell
+from symbolic.records import Uncertainty, Workcell
 from tests.symbolic.cells import hand_cell, with_contacts
-from tests.symbolic.physics.test_payload_load import random_motion
+from tests.symbolic.contact.test_payload_load import random_motion
 
 SET = Uncertainty(
     friction=0.1,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hybrid_opt.robust.force import BoxMotion, RobustModel
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Uncertainty
+from symbolic.read.cell import load
+from symbolic.records import Uncertainty
 from tests.hybrid_opt.robust.test_force import at_rest
 from tests.symbolic.cells import ROOT
 

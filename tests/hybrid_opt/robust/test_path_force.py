@@ -11,7 +11,7 @@ from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Uncertainty
+from symbolic.records import Uncertainty
 from tests.hybrid_opt.robust.test_force import SAMPLES, cell, model, motion
 from tests.symbolic.cells import hand_cell
 

@@ -10,7 +10,7 @@ import pytest
 from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.robust.price import SAMPLES, USUAL, RobustPrice, robust_price, thinned
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Uncertainty
+from symbolic.records import Uncertainty
 from tests.hybrid_opt.job.jobs import rack_job
 
 CASES = 2000

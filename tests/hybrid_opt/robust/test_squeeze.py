@@ -19,7 +19,7 @@ from hybrid_opt.robust.squeeze import (
     smooth_above,
 )
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Uncertainty
+from symbolic.records import Uncertainty
 from tests.hybrid_opt.job.jobs import rack, rack_job
 
 FORCES = st.lists(st.floats(0.0, 200.0), min_size=2, max_size=40)

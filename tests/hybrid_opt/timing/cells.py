@@ -10,7 +10,7 @@ import numpy as np
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing import TimingModel
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 from tests.symbolic.cells import hand_cell, hand_model
 
 INTERVALS = 200

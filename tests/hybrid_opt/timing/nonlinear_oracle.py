@@ -13,7 +13,7 @@ from hybrid_opt.timing import TimingLimits, TimingModel
 from hybrid_opt.timing.model import REFINEMENT
 from hybrid_opt.timing.rows import squared_speed_limit
 from symbolic.array import Array
-from symbolic.physics.payload_load import LOAD_OUTPUTS, load_function
+from symbolic.contact.load import LOAD_OUTPUTS, load_function
 
 
 def shortest_duration(model: TimingModel, x: Array, start: Array) -> float:

@@ -16,9 +16,9 @@ from hybrid_opt.timing.path_motion import PathMotion
 from studies.plain.load import GRAVITY
 from studies.plain.motion import angular_rates, rotation
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 from tests.hybrid_opt.timing.convex_oracle import Affine, Program, Terms
-from tests.symbolic.physics.joint_oracle import Case, cone_matrix
+from tests.symbolic.contact.joint_oracle import Case, cone_matrix
 
 FORCE_UNIT = 50.0
 """[N], so that the program's unknowns are around one."""

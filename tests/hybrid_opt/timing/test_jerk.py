@@ -18,7 +18,7 @@ from hybrid_opt.timing import (
     time_with_jerk,
 )
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Uncertainty
+from symbolic.records import Uncertainty
 from tests.hybrid_opt.timing import jerk_oracle
 from tests.hybrid_opt.timing.cells import (
     hand_timing,

@@ -8,7 +8,7 @@ import numpy as np
 
 from hybrid_opt.timing import TimingLimits, TimingModel, TimingStatus, time_path
 from hybrid_opt.timing.robustness import robustness_margins
-from symbolic.workcell.records import Allocation
+from symbolic.records import Allocation
 from tests.hybrid_opt.timing.cells import initial, timing_of
 from tests.symbolic.cells import hand_cell
 

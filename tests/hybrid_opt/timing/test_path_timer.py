@@ -21,8 +21,8 @@ from hybrid_opt.timing import (
 )
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from symbolic.read.cell import load
+from symbolic.records import Workcell
 from tests.hybrid_opt.timing import convex_oracle
 from tests.hybrid_opt.timing.cells import (
     hand_timing,

@@ -11,7 +11,7 @@ from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.timing import TimingLimits, TimingModel, TimingStatus, time_path
 from hybrid_opt.timing.use import limit_ratios, limit_use
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Uncertainty
+from symbolic.records import Uncertainty
 from tests.hybrid_opt.timing.cells import initial, timing_of
 from tests.symbolic.cells import hand_cell
 

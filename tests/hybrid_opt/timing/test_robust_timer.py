@@ -12,7 +12,7 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing import PathTimer, TimingLimits, TimingStatus, drive_path, time_path
-from symbolic.workcell.records import Uncertainty, Workcell
+from symbolic.records import Uncertainty, Workcell
 from tests.hybrid_opt.timing import convex_oracle
 from tests.hybrid_opt.timing.cells import initial, near_initial, timing_of
 from tests.hybrid_opt.timing.robust_oracle import robust_limit

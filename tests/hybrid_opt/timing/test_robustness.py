@@ -13,7 +13,7 @@ from hybrid_opt.timing.robustness import (
     payload_sensitivity,
     robustness_margins,
 )
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 from tests.hybrid_opt.timing.cells import hand_timing, initial, near_initial, timing_of
 from tests.symbolic.cells import hand_cell, with_contacts, with_payload
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from hybrid_opt.timing import TimingLimits, TimingModel, time_path
 from hybrid_opt.timing.rows import linearised_rows
-from symbolic.workcell.file import load
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from tests.symbolic.read.samples import RACK
 
 
 def test_rows_allow_rest_and_touch_the_value_where_they_are_made() -> None:

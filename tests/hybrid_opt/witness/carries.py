@@ -7,7 +7,7 @@ import numpy as np
 from hybrid_opt.carry import ArmMotion, Carry
 from studies.plain.motion import angular_rates
 from symbolic.array import Array
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 
 SAMPLES = 101
 

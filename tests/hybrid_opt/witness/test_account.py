@@ -18,8 +18,8 @@ from hybrid_opt.robust.squeeze import FACTOR, RESERVE
 from hybrid_opt.witness.account import Account, driven_carry, pressed_reference
 from hybrid_opt.witness.arms import CellWitness
 from symbolic.array import Array
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.records import Uncertainty
+from symbolic.records import Uncertainty
+from symbolic.records.task import initial_decision
 from tests.symbolic.cells import rack_cell
 
 

@@ -33,7 +33,7 @@ from hybrid_opt.witness.reference import (
 from studies.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
 from tests.redundant_cells import machine_on_lift, rack_on_rail
 from tests.symbolic.cells import hand_cell, rack_cell, start_posture
 

@@ -16,9 +16,9 @@ from hybrid_opt.witness.scene import (
     tilt_centre,
 )
 from hybrid_opt.witness.simulate import Witness
-from symbolic.physics.payload_load import load_function
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
+from symbolic.contact.load import load_function
+from symbolic.read.cell import load
+from symbolic.records import Workcell
 from tests.symbolic.cells import ROOT, call, with_payload
 
 pytest.importorskip("mujoco")

@@ -15,8 +15,8 @@ from codegen.build import compile_function
 from studies.plain.candidate import PlainCandidate, PlainEvaluator
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
-from symbolic.functions.candidate import CONSTRAINTS, candidate_function
-from symbolic.workcell.records import Robot, Waypoint, Workcell
+from symbolic.functions import CONSTRAINTS, candidate_function
+from symbolic.records import Robot, Waypoint, Workcell
 from tests.symbolic.cells import (
     SEEDS,
     Evaluator,

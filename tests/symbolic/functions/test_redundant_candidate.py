@@ -13,11 +13,11 @@ import pytest
 from studies.plain.candidate import evaluate
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
-from symbolic.functions.candidate import candidate_function
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.file import load
+from symbolic.functions import candidate_function
+from symbolic.read.cell import load
+from symbolic.records.task import initial_decision
 from tests.redundant_cells import free_pandas, locked_pandas, machine_on_lift, rack_on_rail
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 PER_JOINT = ("q_1", "q_2", "joint_torque_1", "joint_torque_2")
 

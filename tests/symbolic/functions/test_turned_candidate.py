@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from studies.plain.candidate import PlainEvaluator
 from symbolic.array import Array
-from symbolic.functions.candidate import candidate_function
-from symbolic.physics.path_motion import path_motion_function
-from symbolic.physics.pose import box_rotation
+from symbolic.functions import candidate_function
+from symbolic.path_motion import path_motion_function
+from symbolic.records import TimeLaw, Workcell
+from symbolic.records.poses import box_rotation
 from symbolic.smooth.closure import closure_functions
 from symbolic.smooth.keys import ClosureKey
-from symbolic.workcell.records import TimeLaw, Workcell
 from tests.symbolic.cells import hand_model, start_posture
 from tests.turned_cells import pitched_cell, random_x, turned_cell
 

@@ -13,15 +13,14 @@ import trimesh
 
 from symbolic.array import Array
 from symbolic.geometry.clearance import screening_functions
-from symbolic.geometry.coal_shapes import coal_distance
-from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.geometry.expressions import EXACT, Softness
+from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance
 from symbolic.geometry.pieces import Piece
-from symbolic.geometry.softness import EXACT, Softness
-from symbolic.physics.pose import pose_matrix
+from symbolic.read.arms import arm_model
+from symbolic.read.cell import load
+from symbolic.records import Body, Box, Cylinder, Mesh, Sphere, Workcell
+from symbolic.records.poses import pose_matrix
 from symbolic.robot.model import build_robot_model
-from symbolic.robot.urdf import arm_model
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Body, Box, Cylinder, Mesh, Sphere, Workcell
 from tests.robots import ur10_urdf
 
 RACK = Path(__file__).parent / "data" / "plain_rack.toml"

@@ -13,11 +13,9 @@ from hypothesis import strategies as st
 
 from symbolic.array import Array
 from symbolic.geometry.clearance import quaternion
-from symbolic.geometry.placements import clean
-from symbolic.geometry.softness import EXACT, Softness
-from symbolic.physics.pose import pose_matrix
-from symbolic.physics.rotation import rotation_matrix
-from symbolic.workcell.orientation import Orientation
+from symbolic.geometry.expressions import EXACT, Softness, clean
+from symbolic.path.rotation import rotation_matrix
+from symbolic.records.poses import Orientation, pose_matrix
 from tests.symbolic.geometry.collision_cells import (
     functions_of,
     geometry_of,
@@ -26,7 +24,7 @@ from tests.symbolic.geometry.collision_cells import (
     true_distances,
 )
 
-pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 
 COAL_ACCURACY = 2e-6
 """Coal's iterative distances stop within this of the truth [m]."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from symbolic.geometry.pairs import build_geometry
-from symbolic.workcell.records import CollisionSettings, IgnoredPair
+from symbolic.records import CollisionSettings, IgnoredPair
 from tests.symbolic.geometry.collision_cells import rack
 
 

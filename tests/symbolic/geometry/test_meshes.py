@@ -14,8 +14,9 @@ from scipy.spatial import ConvexHull
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
-from symbolic.geometry.meshes import MOST_FACES, CollisionModelWarning, convex_pieces
+from symbolic.geometry.hulls import CollisionModelWarning, convex_pieces
 from symbolic.geometry.pieces import Hull
+from symbolic.read.meshes import MOST_FACES
 from tests.robots import ur10_urdf
 
 MESHES = ur10_urdf().parents[1] / "meshes" / "ur10" / "collision"
@@ -45,7 +46,7 @@ def angle_profile() -> trimesh.Trimesh:
     return mesh
 
 
-@pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+@pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 @pytest.mark.parametrize("name", sorted(path.name for path in MESHES.glob("*.stl")))
 def test_pieces_of_the_ur10_contain_its_meshes(name: str) -> None:
     mesh = trimesh.load_mesh(MESHES / name)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from symbolic.array import Array
-from symbolic.geometry.coal_shapes import coal_distance
 from symbolic.geometry.motion_bounds import reach_about_joints
+from symbolic.geometry.pairs import coal_distance
 from symbolic.geometry.pieces import Piece, farthest_from_axis, skeleton
 from tests.symbolic.geometry.collision_cells import (
     functions_of,

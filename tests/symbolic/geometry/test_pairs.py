@@ -12,15 +12,14 @@ import trimesh
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
-from symbolic.geometry.bodies import _link_pieces, collision_bodies
-from symbolic.geometry.coal_shapes import coal_distance
-from symbolic.geometry.pairs import build_geometry
-from symbolic.geometry.pieces import Capsule, Hull, Piece, support
-from symbolic.geometry.shape_reader import MeshReader
-from symbolic.workcell.file import load
-from symbolic.workcell.records import (
+from symbolic.geometry.bodies import MeshReader, _link_pieces, collision_bodies
+from symbolic.geometry.pairs import build_geometry, coal_distance
+from symbolic.geometry.pieces import Hull, Piece, support
+from symbolic.read.cell import load
+from symbolic.records import (
     Body,
     Box,
+    Capsule,
     CollisionSettings,
     Cylinder,
     IgnoredPair,
@@ -34,9 +33,9 @@ from tests.symbolic.geometry.collision_cells import (
     random_configurations,
     ur10_cell,
 )
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
-pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.meshes.CollisionModelWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 
 
 def directions(n: int) -> Array:
@@ -214,7 +213,7 @@ def test_meshes_are_read_once_and_within_limits_together(
     monkeypatch.setattr("symbolic.geometry.bodies.MOST_CORNERS", 1000)
     with pytest.raises(CollisionModelError, match=r"1284 corners, 642 of them 'ball'.*simplify"):
         collision_bodies(twice)
-    monkeypatch.setattr("symbolic.geometry.meshes.MOST_CELL_FACES", 2000)
+    monkeypatch.setattr("symbolic.read.meshes.MOST_CELL_FACES", 2000)
     larger = replace(ball, name="larger", shape=Mesh(path, 2.0 * np.ones(3)))
     with pytest.raises(CollisionModelError, match=r"ball\.stl: with its 1280.*have 2560; allowed"):
         collision_bodies(replace(twice, environment=(*twice.environment, larger)))

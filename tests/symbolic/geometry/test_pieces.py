@@ -11,21 +11,23 @@ from scipy.spatial import ConvexHull
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.covers import chain_cover, slab_cover
-from symbolic.geometry.enclosing import ball, contains, sphere_chain, swept_cylinder
 from symbolic.geometry.pieces import (
-    Capsule,
     ConvexShape,
     Hull,
     Piece,
+    ball,
     bounding_box,
     box_corners,
     check_piece,
+    contains,
     farthest_from_axis,
     farthest_from_point,
+    sphere_chain,
     support,
+    swept_cylinder,
 )
-from symbolic.physics.pose import pose_matrix
-from symbolic.workcell.records import Box, Cylinder, Sphere
+from symbolic.records import Box, Capsule, Cylinder, Sphere
+from symbolic.records.poses import pose_matrix
 from tests.symbolic.geometry.collision_cells import geometry_of
 
 lengths = st.floats(0.02, 1.0)

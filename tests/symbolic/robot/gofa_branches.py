@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from symbolic.array import Array
-from symbolic.workcell.records import Robot
+from symbolic.records import Robot
 
 SHOULDER, UPPER_ARM, OFFSET, FOREARM = 0.338, 0.707, 0.110, 0.534
 WRIST = np.array([0.101, 0.0, 0.080])

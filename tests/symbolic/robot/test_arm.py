@@ -16,12 +16,14 @@ from scipy.spatial.transform import Rotation
 from studies.plain.arm import PlainArm
 from studies.plain.motion import rotation
 from symbolic.array import Array
-from symbolic.physics.rotation import rotation_matrix
+from symbolic.path.rotation import rotation_matrix
+from symbolic.records.poses import Orientation
 from symbolic.robot.arm import (
     CHEAP_STEPS,
     MAX_JOINT_STEP,
     NEWTON_STEPS,
     REACH_TOLERANCE,
+    block_step,
     flange_target,
     follow_function,
     joint_torque,
@@ -31,8 +33,6 @@ from symbolic.robot.arm import (
     pose_error,
     track_function,
 )
-from symbolic.robot.newton import block_step
-from symbolic.workcell.orientation import Orientation
 from tests.symbolic.cells import call, gofa_model, hand_cell, start_posture
 
 CELL = hand_cell()

@@ -11,9 +11,9 @@ import pytest
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
 from symbolic.errors import WorkcellError
+from symbolic.records import Robot
 from symbolic.robot.branches import inverse_kinematics, start_branches
 from symbolic.robot.model import RobotModel, build_robot_model
-from symbolic.workcell.records import Robot
 from tests.robots import GOFA_URDF, robot_record, ur10_urdf
 from tests.symbolic.cells import fixed, rack_cell, with_task
 from tests.symbolic.robot.gofa_branches import gofa_branches

@@ -16,9 +16,9 @@ from numpy.testing import assert_allclose
 
 from symbolic.array import Array
 from symbolic.errors import BridgeError
+from symbolic.read.arms import reduced_model
+from symbolic.read.urdf import read_urdf
 from symbolic.robot import bridge
-from symbolic.robot.urdf import reduced_model
-from symbolic.robot.urdf_file import read_urdf
 from tests.robots import GOFA_URDF, ur10_urdf
 
 # Rounding of some hundred operations on numbers of order 10 (rates) to 1000 (torques).

@@ -6,9 +6,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from symbolic.robot.urdf import flange_problem, reduced_model, structure_problem
-from symbolic.robot.urdf_file import read_urdf
-from tests.symbolic.workcell.samples import GOFA
+from symbolic.read.arms import flange_problem, reduced_model, structure_problem
+from symbolic.read.urdf import read_urdf
+from tests.symbolic.read.samples import GOFA
 
 # ABB's working-range positions: joint angles [deg] -> centre of the flange [m].
 FLANGE_POSITIONS = [

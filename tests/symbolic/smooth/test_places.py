@@ -15,8 +15,11 @@ from hypothesis.extra.numpy import arrays
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.geometry.clearance import screening_functions
-from symbolic.geometry.coal_shapes import coal_distance
-from symbolic.physics.rotation import rotation_matrix
+from symbolic.geometry.pairs import coal_distance
+from symbolic.path.rotation import rotation_matrix
+from symbolic.read.cell import load
+from symbolic.records import Box
+from symbolic.records.poses import Orientation
 from symbolic.robot.arm import flange_target, manipulability, pose_error
 from symbolic.smooth.clearance import Clearance
 from symbolic.smooth.closure import closure_functions
@@ -32,10 +35,7 @@ from symbolic.smooth.passage import (
 )
 from symbolic.smooth.place import TURN, Place, PlaceConstraint, row_function
 from symbolic.smooth.reach import Reach
-from symbolic.workcell.file import load
-from symbolic.workcell.orientation import Orientation
-from symbolic.workcell.records import Box
-from tests.symbolic.workcell.samples import RACK
+from tests.symbolic.read.samples import RACK
 
 STILL = np.zeros(6)
 """The rate of rows that do not depend on it."""

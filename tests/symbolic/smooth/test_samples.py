@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from symbolic.array import Array
-from symbolic.functions.candidate import candidate_function
+from symbolic.functions import candidate_function
+from symbolic.records import TimeLaw, Workcell
 from symbolic.smooth.keys import Quantity, SampleKey
 from symbolic.smooth.samples import branch_coefficients, sample_blocks, sample_functions
-from symbolic.workcell.records import TimeLaw, Workcell
 from tests.symbolic.cells import hand_cell, hand_model
 
 

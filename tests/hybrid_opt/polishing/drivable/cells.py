@@ -14,10 +14,10 @@ from hybrid_opt.polishing.drivable.front import DrivablePolisher
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from symbolic.array import Array
-from symbolic.workcell.decision import initial_decision
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell import load
+from symbolic.records import Workcell
+from symbolic.records.task import initial_decision
+from tests.symbolic.read.samples import RACK
 
 
 @cache

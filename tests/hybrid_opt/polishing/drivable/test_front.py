@@ -19,7 +19,7 @@ from hybrid_opt.polishing.records import PolishedFront, outcome_from_json, outco
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.workcell.decision import initial_decision
+from symbolic.records.task import initial_decision
 from tests.hybrid_opt.polishing.drivable.cells import (
     drivable_rack,
     evaluator,

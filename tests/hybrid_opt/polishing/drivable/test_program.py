@@ -16,8 +16,8 @@ from hybrid_opt.polishing.placed_carry import CarryReader
 from hybrid_opt.polishing.program import place_values
 from hybrid_opt.polishing.smooth_cell import SmoothCell
 from symbolic.array import Array
+from symbolic.records.task import initial_decision
 from symbolic.smooth.reach import Reach
-from symbolic.workcell.decision import initial_decision
 from tests.hybrid_opt.polishing.drivable.cells import (
     drivable_rack,
     functions,

@@ -20,7 +20,7 @@ from hybrid_opt.polishing.drivable.timed import Goal
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing import TimingModel
-from symbolic.workcell.records import Uncertainty, Workcell
+from symbolic.records import Uncertainty, Workcell
 from tests.hybrid_opt.polishing.drivable.cells import drivable_rack, functions, start, start_in
 from tests.hybrid_opt.polishing.drivable.test_program import Programs, direction
 

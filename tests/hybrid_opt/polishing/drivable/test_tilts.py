@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybrid_opt.polishing.drivable.tilts import LEAST_TURN, SHARES, turned
-from symbolic.workcell.records import POSE_SIZE
+from symbolic.records import POSE_SIZE
 from tests.hybrid_opt.polishing.drivable.cells import drivable_rack, polisher, start
 
 FORCE = 55.0

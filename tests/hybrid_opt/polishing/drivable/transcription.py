@@ -19,8 +19,8 @@ import numpy as np
 from studies.plain.motion import evaluate_spline, natural_quintic
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
-from symbolic.physics.pose import inverse
-from symbolic.workcell.records import Workcell
+from symbolic.records import Workcell
+from symbolic.records.poses import inverse
 
 INTERVALS = 30
 

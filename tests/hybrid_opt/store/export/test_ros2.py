@@ -11,7 +11,7 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from symbolic.physics.pose import pose_matrix
+from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.job.jobs import rack, rack_job
 from tests.hybrid_opt.store.export.bundles import contents, sampled, text_of
 

@@ -1,0 +1,342 @@
+"""Least effort of contact patches that balance a load, by an interior-point method.
+
+    minimise effort(w_1, ..., w_k)  subject to  the wrenches w_i balance the load,
+                                                each lies within its patch's cone
+
+The method is primal-dual with a predictor and a corrector (Mehrotra, SIAM J. Optim. 2, 1992): each
+step aims at the central path's place of a smaller weight, to second order by what a first step
+to weight zero leaves out. It starts within the cones, the load balanced, and takes some six steps;
+at most `STEPS`, each of which is passed over once the weight is small enough, so that the whole is
+one expression and compiles. The wrench of the last contact is what the others leave, so that
+6 (k - 1) components are free.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import accumulate
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.contact.force_closure import WRENCH_SIZE
+from symbolic.contact.patches import Elimination, Patch, Step, least
+
+FINAL_WEIGHT = 1e-8
+"""Last weight of the barriers over the effort, which ends above the least by at most the sum of
+the patches' degrees times this: 6e-8 of it for two round ones."""
+
+NEAR = 2.0
+"""Multiple of the final weight at which the steps end."""
+
+CENTRING, CENTRED = 30, 1e-8
+"""Newton steps of the barriers alone, at most, from there onto the central path; the square of
+Newton's decrement, over the weight, that counts as being there."""
+
+STEPS = 30
+STEP_SHARE, LAST_SHARE, APPROACH = 0.97, 0.999, 100.0
+"""Of the way to the cones' boundary that a step goes at most; the same near the end, where what is
+left may be this many times the weight, over the effort."""
+
+START_WEIGHT = 0.5
+"""Weight of a start whose multipliers are not known, over the effort there per degree."""
+
+NEWTON_STEPS, NEWTON_CHANGE = 100, 1e-9
+"""Newton steps to a point on the central path, at most, and the change, over the iterate, that
+counts as none."""
+
+BLOCK = 10
+"""Steps that are passed over at once where nothing goes on: each costs a copy of the iterate."""
+
+PROGRAMS = 16
+"""How many programs' functions are kept."""
+
+
+class Program(Protocol):
+    """What a set of contacts has to balance, and at what cost.
+
+    Its scaled wrenches are those of `symbolic.contact.force_closure`; `cell` are its inputs, in
+    order.
+    """
+
+    @property
+    def patches(self) -> tuple[Patch, ...]:
+        """Of every contact."""
+
+    @property
+    def cell_sizes(self) -> tuple[tuple[str, int], ...]:
+        """Names and sizes of the inputs."""
+
+    def left(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+        """(6,) of the last contact: what the others leave; affine."""
+
+    def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+        """What is minimised: a sum over the contacts, each convex and at most quadratic."""
+
+    def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
+        """States of all patches, well within their cones, that balance the load, and the weight to
+        begin with, over the effort there per degree."""
+
+    def __hash__(self) -> int:
+        """Functions are kept by program."""
+
+
+def least_effort(program: Program, *cell: ca.MX) -> ca.MX:
+    """Scaled wrenches (6 k,) of least effort, in the order of the program's patches.
+
+    Where derivatives are wanted: `differentiable_least_effort`.
+    """
+    return _wrenches(program, central_path(program)(*cell))
+
+
+def differentiable_least_effort(program: Program, *cell: ca.MX) -> ca.MX:
+    """As `least_effort`, on the central path itself; some more steps.
+
+    First derivatives are those of the central path: the last step is differentiated, the
+    iterate it starts from is not. Second ones are not to be had so.
+    """
+    iterate, _ = _barrier_step(program)(centred(program)(*cell), 1.0, *cell)
+    return _wrenches(program, iterate)
+
+
+@lru_cache(PROGRAMS)
+def central_path(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
+    """The cell to an iterate of all patches near the central path's place of a last weight."""
+    cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
+    step = _step(program, final_weight)
+    iterate = _repeated(program, step, STEPS, _start(program)(*cell), cell)
+    return ca.Function("central_path", cell, [iterate])
+
+
+@lru_cache(PROGRAMS)
+def centred(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
+    """The cell to an iterate on the central path. Its derivatives count as zero."""
+    cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
+    near = central_path(program, final_weight)(*cell)
+    iterate = _repeated(program, _barrier_step(program, final_weight), CENTRING, near, cell)
+    constant = {"is_diff_in": [False] * len(cell), "is_diff_out": [False]}
+    return ca.Function("centred", cell, [iterate], constant)
+
+
+def _repeated(
+    program: Program, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
+) -> ca.MX:
+    """The iterate after so many steps at most, whole blocks of them, as long as they go on."""
+    held = [ca.MX.sym("iterate", ends_of(program)[-1]), ca.MX.sym("goes_on")]
+    inputs = [*held, *[ca.MX.sym(name, size) for name, size in program.cell_sizes]]
+    keep = ca.Function("keep", inputs, held)
+
+    def after(count: int, one: ca.Function, state: list[ca.MX], cell: list[ca.MX]) -> list[ca.MX]:
+        choice = ca.Function.if_else(f"{one.name()}_or_not", one, keep)
+        for _ in range(count):
+            state = choice(state[1], *state, *cell)
+        return state
+
+    name = f"{step.name()}s"
+    block = ca.Function(name, inputs, after(BLOCK, step, held, inputs[2:]))
+    return after(most // BLOCK, block, [iterate, ca.MX(1.0)], cell)[0]
+
+
+@lru_cache(PROGRAMS)
+def _step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
+    """An iterate, a flag that does not matter and the cell to the next one and whether to go on."""
+    iterate, cell = iterate_and_cell(program)
+    owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
+    local = [patch.local(own) for patch, own in owns]
+    degree = degree_of(program)
+    weight = sum(own.gap for own in local) / degree
+    equations = Equations(program, cell, [(own.wrench, own.stiffness) for own in local])
+
+    def steps(aimed: ca.SX, corrections: list[ca.SX]) -> list[Step]:
+        pairs = zip(local, corrections, strict=True)
+        aims = [own.aim(aimed, correction) for own, correction in pairs]
+        changes = equations.changes([aim.pull for aim in aims])
+        return [aim.step(change) for aim, change in zip(aims, changes, strict=True)]
+
+    none = [ca.SX.zeros(patch.correction_size) for patch in program.patches]
+    first = steps(ca.SX(0.0), none)
+    far = _length([step.lowest_of_state for step in first], 1.0)
+    final = final_weight * equations.effort
+    aimed = ca.fmax((1.0 - far) ** 2 * weight, final)
+    second = steps(aimed, [step.second_order for step in first])
+    share = ca.fmin(ca.fmax(STEP_SHARE, 1.0 - APPROACH * weight / equations.effort), LAST_SHARE)
+    length = _length([step.lowest for step in second], share)
+    change = ca.vertcat(*[step.change for step in second])
+    gap = sum(step.gap_after(length) for step in second)
+    return ca.Function(
+        "step",
+        [iterate, ca.SX.sym("goes_on"), *cell],
+        ca.cse([iterate + length * change, gap > NEAR * degree * final]),
+    )
+
+
+@lru_cache(PROGRAMS)
+def _barrier_step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
+    """As `_step`, to the one whose state is of the final weight, by Newton's step of the barriers
+    alone; where it has arrived there, its derivatives by the cell are those of the central path."""
+    iterate, cell = iterate_and_cell(program)
+    owns = ca.vertsplit(iterate, ends_of(program))
+    wrenches = [own[:WRENCH_SIZE] for own in owns]
+    weight = final_weight * efforts(program, wrenches, cell)[0]
+    patches = zip(program.patches, owns, strict=True)
+    barriers = [patch.barrier(own, weight) for patch, own in patches]
+    stiff = [own.stiffness for own in barriers]
+    equations = Equations(program, cell, list(zip(wrenches, stiff, strict=True)))
+    changes = equations.changes([own.pull for own in barriers])
+    downhill = equations.downhill([own.pull for own in barriers], changes)
+    steps = [own.step(change) for own, change in zip(barriers, changes, strict=True)]
+    length = _length([step.lowest_of_state for step in steps], STEP_SHARE)
+    found = iterate + length * ca.vertcat(*[step.change for step in steps])
+    inputs = [iterate, ca.SX.sym("goes_on"), *cell]
+    return ca.Function("barrier_step", inputs, ca.cse([found, downhill > CENTRED * weight]))
+
+
+def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
+    """Of a step, at most whole, that goes at most a share of the way to the boundary."""
+    return ca.fmin(1.0, share / ca.fmax(-least(lowest), share))
+
+
+@lru_cache(PROGRAMS)
+def _start(program: Program) -> ca.Function:
+    """The program's start, as an iterate on the central path of a problem like it."""
+    cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
+    states, share = program.start(cell)
+    return ca.Function("start", cell, ca.cse([_centred_at(program, states, share, cell)]))
+
+
+def _centred_at(
+    program: Program, states: list[ca.SX], share: ca.SX | float, cell: list[ca.SX]
+) -> ca.SX:
+    """The iterate whose X S is a weight, given over the effort per degree."""
+    effort = program.effort([own[:WRENCH_SIZE] for own in states], cell)
+    weight = effort * (share / degree_of(program))
+    pairs = zip(program.patches, states, strict=True)
+    return ca.vertcat(*[patch.centred(own, weight) for patch, own in pairs])
+
+
+def central_point(
+    program: Program, states: list[Array], cell: list[Array], share: float
+) -> tuple[Array, Array]:
+    """An iterate (n,) on the central path, and its slope (n, m) by the program's first input (m,).
+
+    Args:
+        states: of all patches, within their cones, that balance the load.
+        cell: the inputs.
+        share: the weight, over the effort there per degree.
+    """
+    newton = _newton_step(program, share)
+    start = _centred_at(program, [ca.SX(ca.DM(s)) for s in states], START_WEIGHT, cell)
+    iterate = np.array(ca.evalf(start)).ravel()
+    for _ in range(NEWTON_STEPS):
+        change, length = (np.array(value).ravel() for value in newton(iterate, *cell))
+        iterate = iterate + length * change
+        if np.linalg.norm(change) < NEWTON_CHANGE * np.linalg.norm(iterate):
+            break
+    load, *others = cell
+    # At one place the step is affine in what is to be balanced.
+    along = [np.array(newton(iterate, load + e, *others)[0]).ravel() for e in np.eye(len(load))]
+    return iterate, np.stack(along, axis=1) - np.array(newton(iterate, *cell)[0])
+
+
+def _newton_step(program: Program, share: float) -> ca.Function:
+    """An iterate and the cell to the whole step to a weight, over the effort per degree, and how
+    much of it can be gone."""
+    iterate, cell = iterate_and_cell(program)
+    owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
+    local = [patch.local(own) for patch, own in owns]
+    equations = Equations(program, cell, [(own.wrench, own.stiffness) for own in local])
+    weight = equations.effort * (share / degree_of(program))
+    pairs = zip(program.patches, local, strict=True)
+    aims = [own.aim(weight, ca.SX.zeros(patch.correction_size)) for patch, own in pairs]
+    changes = equations.changes([aim.pull for aim in aims])
+    steps = [aim.step(change) for aim, change in zip(aims, changes, strict=True)]
+    length = _length([step.lowest for step in steps], STEP_SHARE)
+    return ca.Function(
+        "newton_step", [iterate, *cell], [ca.vertcat(*[step.change for step in steps]), length]
+    )
+
+
+def _wrenches(program: Program, iterate: ca.MX) -> ca.MX:
+    return ca.vertcat(*[own[:WRENCH_SIZE] for own in ca.vertsplit(iterate, ends_of(program))])
+
+
+# --- Newton's equations ---
+
+
+class Equations:
+    """Newton's equations of a program, for the wrenches.
+
+    Attributes:
+        effort: at the iterate.
+    """
+
+    def __init__(
+        self, program: Program, cell: list[ca.SX], local: list[tuple[ca.SX, ca.SX]]
+    ) -> None:
+        """Factors.
+
+        Args:
+            local: of each patch its wrench (6,) and stiffness (6, 6).
+        """
+        wrenches = [wrench for wrench, _ in local]
+        self.effort, self._slopes, curvatures = efforts(program, wrenches, cell)
+        stiff = [curve + own for curve, (_, own) in zip(curvatures, local, strict=True)]
+        symbols = wrench_symbols(len(local) - 1)
+        passed = ca.vertcat(*symbols)
+        self._change = ca.jacobian(program.left(symbols, cell), passed)
+        self._missing = program.left(wrenches[:-1], cell) - wrenches[-1]
+        self._last = stiff[-1]
+        whole = ca.diagcat(*stiff[:-1]) + ca.mtimes([self._change.T, self._last, self._change])
+        size = range(whole.shape[0])
+        self._system = Elimination([[whole[i, j] for j in size] for i in size], len(size))
+
+    def downhill(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
+        """How fast effort and barriers fall along changes: the decrement's square, times the
+        weight."""
+        terms = zip(pulls, self._slopes, changes, strict=True)
+        return sum(ca.dot(pull - slope, change) for pull, slope, change in terms)
+
+    def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
+        """(6,) of every wrench, where the patches' multipliers pull so (6,)."""
+        right = [pull - slope for pull, slope in zip(pulls, self._slopes, strict=True)]
+        on_last = right[-1] - ca.mtimes(self._last, self._missing)
+        pulled = ca.vertcat(*right[:-1]) + ca.mtimes(self._change.T, on_last)
+        reduced = self._system.reduced(ca.vertsplit(pulled))
+        free = ca.vertcat(*self._system.first(reduced, []))
+        return [*ca.vertsplit(free, WRENCH_SIZE), self._missing + ca.mtimes(self._change, free)]
+
+
+def efforts(
+    program: Program, wrenches: list[ca.SX], cell: list[ca.SX]
+) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
+    """The effort at wrenches, its slopes (6,) and curvatures (6, 6) by each of them."""
+    symbols = wrench_symbols(len(wrenches))
+    effort = program.effort(symbols, cell)
+    slopes = [ca.gradient(effort, w) for w in symbols]
+    curvatures = [ca.hessian(effort, w)[0] for w in symbols]
+    passed = ca.Function("effort", [*symbols, *cell], [effort, *slopes, *curvatures])
+    found, k = passed.call([*wrenches, *cell]), len(wrenches)
+    return found[0], list(found[1 : k + 1]), list(found[k + 1 :])
+
+
+def iterate_and_cell(program: Program) -> tuple[ca.SX, list[ca.SX]]:
+    """An iterate and the cell."""
+    cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
+    return ca.SX.sym("iterate", ends_of(program)[-1]), cell
+
+
+def wrench_symbols(count: int) -> list[ca.SX]:
+    """Symbols (6,) of so many wrenches."""
+    return [ca.SX.sym(f"w_{i}", WRENCH_SIZE) for i in range(count)]
+
+
+def degree_of(program: Program) -> float:
+    """Pairing of all X with S over the weight on the central path."""
+    return sum(patch.degree for patch in program.patches)
+
+
+def ends_of(program: Program) -> list[int]:
+    """Where in an iterate the patches' own ones begin, and its size."""
+    return [0, *accumulate(patch.iterate_size for patch in program.patches)]

@@ -1,0 +1,192 @@
+"""Force closure: whether pads anywhere on a payload can hold it against whatever the motion asks.
+
+They can if an internal squeeze exists that lies strictly within every patch's cone (Bicchi and
+Kumar, Robotic grasping and contact: a review, ICRA 2000): pressing along it carries anything.
+
+Scaled wrenches of a contact, in its pad's axes, z into the payload: N, T / mu, N d / r and
+M / (mu r) with the normal force N, the tangential force T (2,), the centre of pressure d (2,), the
+moment M about the normal through the patch's centre, and r the patch's radius or half diagonal.
+A patch's state begins with it; see `corner_modes` for what follows where the patch is rectangular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.records import Contact, Workcell
+from symbolic.records.poses import skew
+
+WRENCH_SIZE = 6
+POINT_SIZE, STATE_SIZE = 3, 12
+"""Of a corner's force, and of a rectangular patch's state."""
+
+RIM_POINTS, DIRECTIONS = 12, 24
+"""Points on a round patch's rim and directions of friction that stand for its cone."""
+
+NEWTON_STEPS = 100
+BALANCED = 1e-6
+"""Newton decrement at which the search ends; what it leaves out of balance is mended after it."""
+
+LEAST_SHARE = 0.05
+"""Least share of the friction that a squeeze is looked for at."""
+
+BISECTIONS = 6
+
+SPARE_FRICTION = 0.95
+"""Share of their friction with which pads still have to close their grasp."""
+
+
+@dataclass(frozen=True)
+class Squeeze:
+    """An internal squeeze of a grasp.
+
+    Attributes:
+        states: per pad its state, at the nominal friction; the normal forces sum to one.
+        least_share: share of the friction, at least `LEAST_SHARE`, that such a squeeze needs.
+    """
+
+    states: tuple[Array, ...]
+    least_share: float
+
+
+def closing_squeeze(contacts: Sequence[Contact]) -> Squeeze | None:
+    """A squeeze that holds with as little as half the friction (on a logarithmic scale) between
+    the nominal and the least; None where the grasp is not closed with `SPARE_FRICTION`."""
+    if _balanced_states(contacts, SPARE_FRICTION) is None:
+        return None
+    low, high = LEAST_SHARE, SPARE_FRICTION
+    if _balanced_states(contacts, low) is not None:
+        high = low
+    else:
+        for _ in range(BISECTIONS):
+            middle = float(np.sqrt(low * high))
+            if _balanced_states(contacts, middle) is None:
+                low = middle
+            else:
+                high = middle
+    states = _balanced_states(contacts, float(np.sqrt(high * SPARE_FRICTION)))
+    assert states is not None
+    return Squeeze(states, high)
+
+
+def is_closed(workcell: Workcell) -> bool:
+    """Whether a workcell's pads hold its payload whatever the motion asks."""
+    return _balanced_states(workcell.pads, SPARE_FRICTION) is not None
+
+
+def _balanced_states(contacts: Sequence[Contact], share: float) -> tuple[Array, ...] | None:
+    """States within the cones at a share of the friction, whose wrenches cancel.
+
+    They are weighted sums of points on the cones' boundaries, all weights positive.
+    """
+    generators = [_generators(contact) for contact in contacts]
+    lessened = [_with_friction(rows, share) for rows in generators]
+    maps = [state_to_box(contact) for contact in contacts]
+    columns = np.vstack([rows @ A.T for rows, A in zip(lessened, maps, strict=True)])
+    weights = _weights(columns / np.abs(columns).max(axis=0))
+    if weights is None:
+        return None
+    ends = np.cumsum([len(rows) for rows in lessened])[:-1]
+    parts = np.split(weights, ends)
+    stacked = np.concatenate([part @ rows for part, rows in zip(parts, lessened, strict=True)])
+    whole = np.hstack(maps)
+    stacked -= np.linalg.pinv(whole) @ (whole @ stacked)
+    return tuple(np.split(stacked, np.cumsum([A.shape[1] for A in maps])[:-1]))
+
+
+def _weights(columns: Array) -> Array | None:
+    """Positive weights (n,) that sum to one and cancel the rows a_j of `columns` (n, 6), or None.
+
+    At the analytic centre of the polytope 1 + a_j . y > 0, which exists if and only if such weights
+    do, the weights 1 / (1 + a_j . y) are.
+    """
+    if np.linalg.matrix_rank(columns) < WRENCH_SIZE:
+        return None
+    y = np.zeros(WRENCH_SIZE)
+    for _ in range(NEWTON_STEPS):
+        weights = 1.0 / (1.0 + columns @ y)
+        scaled = weights[:, None] * columns
+        gradient = -scaled.sum(axis=0)
+        step = -np.linalg.lstsq(scaled.T @ scaled, gradient, rcond=None)[0]
+        decrement = float(np.sqrt(max(-gradient @ step, 0.0)))
+        if decrement < BALANCED:
+            return np.asarray(weights / weights.sum())
+        y = y + step / (1.0 + decrement)  # which stays within the polytope
+    return None
+
+
+def state_to_box(contact: Contact) -> Array:
+    """(6, n) from a patch's state to force and moment about the box frame's origin, box axes."""
+    R, p = contact.T_box_pad[:3, :3], contact.T_box_pad[:3, 3]
+    mu, r = contact.friction, contact.patch_radius
+    local = np.zeros((WRENCH_SIZE, WRENCH_SIZE))
+    local[[0, 1, 2], [1, 2, 0]] = mu, mu, 1.0
+    # A normal force N n at d turns about d x n = (d_y, -d_x).
+    local[[3, 4, 5], [4, 3, 5]] = r, -r, mu * r
+    in_box = np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
+    size = WRENCH_SIZE if contact.half_sides is None else STATE_SIZE
+    return np.asarray(in_box @ local @ np.eye(WRENCH_SIZE, size))
+
+
+def corner_modes(half_sides: tuple[float, float]) -> Array:
+    """(12, 12) from a rectangular patch's state to its corners' forces N, T / mu, corner by corner.
+
+    The state is the scaled wrench, shared out evenly, and six ways to change the corners' forces
+    that leave it as it is.
+    """
+    x, y = np.array(half_sides) / np.hypot(*half_sides)
+    s_x, s_y = np.array([1.0, -1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0, -1.0])
+    even, twisted = np.ones(4), s_x * s_y
+    n, t_x, t_y = np.eye(POINT_SIZE)
+    columns = [
+        np.outer(even, n) / 4.0,
+        np.outer(even, t_x) / 4.0,
+        np.outer(even, t_y) / 4.0,
+        np.outer(s_x, n) / (4.0 * x),
+        np.outer(s_y, n) / (4.0 * y),
+        (x * np.outer(s_x, t_y) - y * np.outer(s_y, t_x)) / 4.0,
+        np.outer(twisted, n) / 4.0,
+        np.outer(s_x, t_x) / 4.0,
+        np.outer(twisted, t_x) / 4.0,
+        np.outer(s_y, t_y) / 4.0,
+        np.outer(twisted, t_y) / 4.0,
+        (y * np.outer(s_x, t_y) + x * np.outer(s_y, t_x)) / 4.0,
+    ]
+    return np.column_stack([column.ravel() for column in columns])
+
+
+def tangential(state_size: int) -> list[int]:
+    """Which entries of a state friction carries."""
+    return [k for k in (1, 2, 5, 7, 8, 9, 10, 11) if k < state_size]
+
+
+def size_powers(state_size: int) -> tuple[int, ...]:
+    """With which power of a patch's size over another's a state's entries shrink, if the forces at
+    its corners are shared among those of the other: once for each axis along which they vary."""
+    return (0, 0, 0, 1, 1, 1, 2, 1, 2, 1, 2, 1)[:state_size]
+
+
+def _with_friction(states: Array, share: float) -> Array:
+    lessened = states.copy()
+    lessened[:, tangential(states.shape[1])] *= share
+    return lessened
+
+
+def _generators(contact: Contact) -> Array:
+    """(n, state size) states on the boundary of a patch's cone that span it, each with N = 1."""
+    around = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    friction = np.column_stack([np.cos(around), np.sin(around)])
+    ones = np.ones((DIRECTIONS, 1))
+    if contact.half_sides is not None:
+        at_corners = np.kron(np.eye(4), np.hstack([ones, friction]))
+        return np.asarray(np.linalg.solve(corner_modes(contact.half_sides), at_corners.T).T)
+    around = 2.0 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
+    rows = []
+    for x, y in np.column_stack([np.cos(around), np.sin(around)]):
+        moment = x * friction[:, 1:] - y * friction[:, :1]
+        rows.append(np.hstack([ones, friction, np.tile([x, y], (DIRECTIONS, 1)), moment]))
+    return np.concatenate(rows)

@@ -1,0 +1,254 @@
+"""The least contact forces of pads anywhere on a payload: any normals, any of the patches.
+
+The least of the sum of all squared contact forces, as `symbolic.contact.facing` has it
+for pads that face one another. The method starts from an internal squeeze
+(`symbolic.contact.force_closure`), pressed as hard as the load asks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.contact.central_path import (
+    START_WEIGHT,
+    central_point,
+    differentiable_least_effort,
+    least_effort,
+)
+from symbolic.contact.force_closure import (
+    WRENCH_SIZE,
+    closing_squeeze,
+    size_powers,
+    state_to_box,
+    tangential,
+)
+from symbolic.contact.patches import Patch, least
+from symbolic.contact.rectangular_patch import RectangularPatch
+from symbolic.contact.round_patch import RoundPatch
+from symbolic.errors import SettingsError
+from symbolic.expression import reciprocal
+from symbolic.path.rotation import rotation_matrix
+from symbolic.records import Contact, Workcell
+from symbolic.records.quantities import GRAVITY
+
+LOAD_SIZE = 6
+"""Force and moment about the box frame's origin, along the box's axes [N, N m]."""
+
+SCALE_FLOOR = 1e-9
+"""Force scale [N] where nothing has to be carried."""
+
+START_FLOOR = 1e-3
+"""Squeeze over the scale to start from where nothing has to be carried."""
+
+START_SHARE = 0.97
+"""Of the way to the cones' boundary that the load takes a start from the squeeze."""
+
+BEYOND = 1e12
+"""Normal force over the load's scale that says that friction does not close the grasp."""
+
+REST_WEIGHT = 0.02
+"""Weight, over the effort per degree, of the central path's place that is known at rest."""
+
+REST_SHARE = 0.95
+"""Of the way from there to the cones' boundary that the slope by the load is followed."""
+
+ALIKE = 0.1
+"""Squeeze, over the scale, up to which a load counts as like that at rest."""
+
+MOMENT_ARM = 0.1
+"""Of moments in the load's scale [m]: about half a payload, so that they count like forces."""
+
+
+WHOLE = ca.SX.ones(2)
+"""Patches of their own size."""
+
+
+class Grasp:
+    """The pads of one workcell, as the allocation's program. Compared by identity.
+
+    Attributes:
+        robots: per pad the index of its robot.
+        patches, cell_sizes: see `symbolic.contact.central_path.Program`.
+        nominal: the cell's own numbers for the inputs after the load.
+    """
+
+    def __init__(self, workcell: Workcell) -> None:
+        """Find the squeeze to start from.
+
+        Raises:
+            SettingsError: no squeeze holds the payload whatever is asked.
+        """
+        pads = workcell.pads
+        squeeze = closing_squeeze(pads)
+        if squeeze is None:
+            raise SettingsError(
+                "the pads do not close their grasp: no internal squeeze lies within their friction "
+                "cones; raise the friction or turn them towards one another"
+            )
+        self.robots = workcell.pad_robots
+        self.patches = tuple(_patch(pad) for pad in pads)
+        self.cell_sizes: tuple[tuple[str, int], ...] = (("load", LOAD_SIZE), ("friction", 2))
+        self.nominal: tuple[list[float], ...] = ([c.friction for c in workcell.contacts],)
+        self._load_at_rest = _load_at_rest(workcell)
+        self._pads = pads
+        self._squeeze = squeeze.states
+        # The least states that balance a load, whether they lie within the cones or not.
+        spread = np.linalg.pinv(np.hstack([state_to_box(pad) for pad in pads]))
+        ends = np.cumsum([len(state) for state in squeeze.states])[:-1]
+        self._spread = tuple(np.split(spread, ends))
+        in_units = [
+            state_to_box(replace(pad, friction=1.0, patch_radius=1.0, half_sides=None))
+            for pad in pads
+        ]
+        to_last = np.asarray(np.linalg.inv(in_units[-1]), dtype=float)
+        self._load_to_last = _sparse(to_last)
+        self._pads_to_last = [_sparse(to_last @ matrix) for matrix in in_units[:-1]]
+
+    def left(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+        """See `symbolic.contact.central_path.Program`."""
+        load, *sizes = cell
+        rest = ca.mtimes(self._load_to_last, load)
+        for i, (wrench, to_last) in enumerate(zip(wrenches, self._pads_to_last, strict=True)):
+            rest -= ca.mtimes(to_last, self.units(i, *sizes) * wrench)
+        return rest * reciprocal(self.units(len(self.patches) - 1, *sizes))
+
+    def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+        """Half the sum of all squared forces."""
+        friction, total = cell[1], 0.0
+        for wrench, robot in zip(wrenches, self.robots, strict=True):
+            total += wrench[0] ** 2 + friction[robot] ** 2 * ca.sumsqr(wrench[1:3])
+        return 0.5 * total
+
+    def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
+        """For loads like that at rest what to first order lies on their central path, else the
+        least states that balance them; and as much of the squeeze as takes that into the cones."""
+        load, *sizes = cell
+        given, rest = self.squeezed(*sizes), ca.DM(self._load_at_rest)
+        states, slopes = self._at_rest
+        times = ca.fmax(ca.dot(rest, load) / ca.sumsqr(rest), 0.0)
+        near = self._at([times * ca.DM(state) for state in states], *sizes)
+        moves = self._at([ca.mtimes(ca.DM(by), load - times * rest) for by in slopes], *sizes)
+        inside = [p.slack(state) for p, state in zip(self.patches, near, strict=True)]
+        taken = [p.lowest(s, move) for p, s, move in zip(self.patches, near, moves, strict=True)]
+        stays = ca.logic_and(least(inside) > 0.0, least(taken) > -REST_SHARE)
+        part = [move + REST_SHARE * s for s, move in zip(near, moves, strict=True)]
+        press = ca.if_else(stays, START_FLOOR, self._pressed(given, part))
+        asked, alike = self.asked(*cell), press < ALIKE
+        press = ca.if_else(alike, press, self._pressed(given, asked))
+        pairs = zip(near, moves, asked, strict=True)
+        chosen = [ca.if_else(alike, s + move, a) for s, move, a in pairs]
+        share = ca.if_else(alike, REST_WEIGHT + press, START_WEIGHT)
+        return [c + press * s for c, s in zip(chosen, given, strict=True)], share
+
+    def _pressed(self, given: list[ca.SX], asked: list[ca.SX]) -> ca.SX:
+        """How much of the squeeze takes states into the cones."""
+        shares = [p.lowest(s, a) for p, s, a in zip(self.patches, given, asked, strict=True)]
+        return ca.fmax(-least(shares), 0.0) / START_SHARE + START_FLOOR
+
+    @cached_property
+    def _at_rest(self) -> tuple[list[Array], list[Array]]:
+        """States (n,) on the central path under `_load_at_rest`, and their slopes (n, 6) by it."""
+        inputs = [self._load_at_rest, *[np.array(value) for value in self.nominal]]
+        cell = [ca.SX(ca.DM(value)) for value in inputs]
+        asked, given = self.asked(*cell), self.squeezed(*cell[1:])
+        press = self._pressed(given, asked)
+        pairs = zip(asked, given, strict=True)
+        states = [np.array(ca.evalf(a + press * s)).ravel() for a, s in pairs]
+        iterate, slope = central_point(self, states, inputs, REST_WEIGHT)
+        starts = np.cumsum([0, *[patch.iterate_size for patch in self.patches]])
+        places = [slice(at, at + len(own)) for at, own in zip(starts, states, strict=False)]
+        return [iterate[at] for at in places], [slope[at] for at in places]
+
+    def asked(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
+        """The least states that balance a load (6,), whether they lie within the cones or not."""
+        states = [ca.mtimes(ca.DM(spread), load) for spread in self._spread]
+        return self._at(states, friction, reach)
+
+    def squeezed(self, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
+        """The squeeze to start from, as states at friction coefficients (2,) of the robots; it may
+        lie beyond the cones where they are far below the nominal ones.
+
+        Args:
+            reach: (2,) sizes of the robots' patches over their own.
+        """
+        return self._at([ca.SX(ca.DM(state)) for state in self._squeeze], friction, reach)
+
+    def squeeze_normals(self) -> Array:
+        """(2,) what each robot's pads press with in the squeeze."""
+        normals = np.array([state[0] for state in self._squeeze])
+        return np.bincount(np.array(self.robots), normals, 2).astype(float)
+
+    def units(self, i: int, friction: ca.SX, reach: ca.SX = WHOLE) -> ca.SX:
+        """(6,) what the entries of pad i's scaled wrench are multiples of."""
+        robot = self.robots[i]
+        mu, r = friction[robot], reach[robot] * self._pads[i].patch_radius
+        return ca.vertcat(1.0, mu, mu, r, r, mu * r)
+
+    def _at(self, states: list[ca.SX], friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
+        """States at the nominal friction and size with what they carry, at others: each corner's
+        force is shared among those of the other size."""
+        moved = []
+        for pad, robot, state in zip(self._pads, self.robots, states, strict=True):
+            by_friction, by_reach = pad.friction / friction[robot], 1.0 / reach[robot]
+            size = state.shape[0]
+            held, by_size = tangential(size), size_powers(size)
+            factors = [
+                (by_friction if k in held else 1.0) * by_reach ** by_size[k] for k in range(size)
+            ]
+            moved.append(state * ca.vertcat(*factors))
+        return moved
+
+
+def grasp_wrenches(
+    grasp: Grasp, load: ca.MX, friction: ca.MX, differentiable: bool = False
+) -> ca.MX:
+    """Per pad (6,) side by side: N, T (2,) [N], the first moment N d (2,) and M [N m], of least
+    effort, in its pad's axes. Friction that does not close the grasp gives normal forces beyond
+    any limit.
+
+    Args:
+        load: (6,) force and moment about the box frame's origin, along the box's axes.
+        friction: (2,) Coulomb coefficients of the robots' pads.
+        differentiable: whether first derivatives are wanted.
+    """
+    size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
+    solve = differentiable_least_effort if differentiable else least_effort
+    found = solve(grasp, load / size, friction)
+    return _in_newtons(grasp)(found, size, friction)
+
+
+def _in_newtons(grasp: Grasp) -> ca.Function:
+    n = len(grasp.patches)
+    found, size, friction = ca.SX.sym("w", WRENCH_SIZE * n), ca.SX.sym("s"), ca.SX.sym("mu", 2)
+    units = ca.vertcat(*[grasp.units(i, friction) for i in range(n)])
+    squeezed = zip(grasp.patches, grasp.squeezed(friction), strict=True)
+    closes = least([patch.slack(state) for patch, state in squeezed]) > 0.0
+    beyond = ca.repmat(ca.DM([BEYOND, 0, 0, 0, 0, 0]), n, 1)
+    return ca.Function(
+        "in_newtons", [found, size, friction], [size * ca.if_else(closes, units * found, beyond)]
+    )
+
+
+def _load_at_rest(workcell: Workcell) -> Array:
+    """(6,) of the payload as it stands at the start, as a direction that is scaled like loads."""
+    task = workcell.task
+    turn = ca.evalf(rotation_matrix(task.orientation, ca.SX(ca.DM(task.waypoints[0].lower[3:]))))
+    force = -np.array(turn).T @ np.array(GRAVITY)
+    moment = np.cross(workcell.payload.centre_of_mass, force)
+    load = np.concatenate([force, moment])
+    return np.asarray(load / np.hypot(np.linalg.norm(force), np.linalg.norm(moment) / MOMENT_ARM))
+
+
+def _patch(contact: Contact) -> Patch:
+    return RoundPatch() if contact.half_sides is None else RectangularPatch(*contact.half_sides)
+
+
+def _sparse(matrix: Array) -> ca.DM:
+    """Without what is zero but for rounding."""
+    small = np.abs(matrix) < 1e-14 * np.abs(matrix).max()
+    return ca.sparsify(ca.DM(np.where(small, 0.0, matrix)))

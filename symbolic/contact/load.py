@@ -1,0 +1,403 @@
+"""What one sample of the box motion asks of the two contacts, as one CasADi function.
+
+Joins rotation, force allocation and centre of pressure (paper Section 4.4). With the allocation
+`joint` the paper's result is kept wherever its shifts stay within the patches and leave no moment,
+and `symbolic.contact.facing` takes over where not. For pads that do not face one another,
+or are not round, or more than two, the paper has no result: `symbolic.contact.grasp` alone answers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import casadi as ca
+import numpy as np
+
+from symbolic.contact.facing import JointAllocation, allocate_jointly, balance_of
+from symbolic.contact.force_closure import WRENCH_SIZE
+from symbolic.contact.grasp import Grasp, grasp_wrenches
+from symbolic.contact.paper import allocate, pressure_shift, required_force, required_moment
+from symbolic.expression import Expression
+from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
+from symbolic.records import Workcell
+
+LOAD_OUTPUTS = (
+    "angular_velocity",
+    "angular_acceleration",
+    "normal_force",
+    "tangential_force",
+    "contact_force",
+    "pressure_shift",
+    "shift_vector",
+    "required_moment",
+    "point_moment_residual",
+    "moment_residual",
+    "wrench_1",
+    "wrench_2",
+)
+"""Outputs of `load_function`, in order.
+
+angular_velocity, angular_acceleration (3,): world frame [rad/s, rad/s^2]. normal_force,
+tangential_force (2,) [N]. contact_force (6,): forces of robots 1 and 2 on the box, world [N].
+pressure_shift (2,): lengths of the shifts [m]; shift_vector (6,): both shifts, world [m]. Of a
+robot with several pads: the sums of their normal forces and of the lengths of their tangential
+ones, the longest shift, and the first pad's shift.
+required_moment, point_moment_residual, moment_residual (3,): about the centre of mass, world
+[N m]. wrench_1, wrench_2 (6,): force and moment that each robot exerts on the box, about the
+nominal contact point, world axes [N, N m].
+"""
+
+SIZES = {"pose": 6, "rate": 6, "second_rate": 6, "friction": 2, "centre_of_mass": 3}
+"""Inputs of `uncertain_load_function` and how many entries each has."""
+
+SAMPLE_SIZES = (
+    ("pose", 6),
+    ("force", 3),
+    ("moment", 3),
+    ("friction", 2),
+    ("centre_of_mass", 3),
+)
+"""Inputs of the functions that allocate anew; force and moment in the world frame."""
+
+RESIDUAL_TOLERANCE = 1e-9
+"""Moment that counts as carried, as a share of the force times the distance of the contacts."""
+
+
+def load_function(workcell: Workcell) -> ca.Function:
+    """Contact forces and centres of pressure from a box pose and its time derivatives.
+
+    Inputs: pose, rate, second_rate (6,) as in `symbolic.path.time_law.TimedPath`.
+    Outputs: see `LOAD_OUTPUTS`.
+    """
+    kind = ca.SX if workcell.task.allocation == "paper" else ca.MX
+    motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    friction = kind([contact.friction for contact in workcell.contacts])
+    centre_of_mass = kind(ca.DM(workcell.payload.centre_of_mass))
+    return ca.Function(
+        "load",
+        motion,
+        uncertain_load_function(workcell).call([*motion, friction, centre_of_mass]),
+        ["pose", "rate", "second_rate"],
+        list(LOAD_OUTPUTS),
+    )
+
+
+def resultant_force(
+    mass: float, offset: ca.SX, omega: ca.SX, alpha: ca.SX, acceleration: ca.SX
+) -> ca.SX:
+    """Resultant force (3,) on a turning and accelerating box, world frame (Eq. 34) [N].
+
+    Args:
+        offset: (3,) from the box centre to its centre of mass [m].
+        omega, alpha: (3,) angular velocity and acceleration [rad/s, rad/s^2].
+        acceleration: (3,) of the box centre [m/s^2].
+    """
+    turning = ca.cross(alpha, offset) + ca.cross(omega, ca.cross(omega, offset))
+    return required_force(mass, acceleration + turning)
+
+
+def uncertain_load_function(workcell: Workcell) -> ca.Function:
+    """`load_function` with further inputs for what is known least.
+
+    Inputs: pose, rate, second_rate (6,); friction (2,) coefficients of the contacts;
+    centre_of_mass (3,) in the box frame [m]. Outputs: see `LOAD_OUTPUTS`.
+    """
+    if workcell.task.allocation == "paper":
+        return paper_load_function(workcell)
+    if workcell.has_opposite_pads:
+        return _joint_load_function(workcell)
+    return _grasp_load_function(workcell)
+
+
+def paper_load_function(workcell: Workcell) -> ca.Function:
+    """`uncertain_load_function` by the paper's allocation, whatever the workcell's own is."""
+    inputs = {name: ca.SX.sym(name, size) for name, size in SIZES.items()}
+    pose, rate, second, friction, centre_of_mass = inputs.values()
+    payload, contacts = workcell.payload, workcell.contacts
+    turned = workcell.task.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], rate[3:])
+    alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
+
+    offset = ca.mtimes(rotation, centre_of_mass)
+    force = resultant_force(payload.mass, offset, omega, alpha, second[:3])
+    normal = ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, 2]))
+    forces = allocate(force, normal, (friction[0], friction[1]))
+
+    moment = required_moment(ca.SX(ca.DM(payload.inertia)), rotation, omega, alpha)
+    arms = tuple(ca.mtimes(rotation, ca.DM(c.T_box_pad[:3, 3]) - centre_of_mass) for c in contacts)
+    tangents = tuple(ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, k])) for k in (0, 1))
+    shift = pressure_shift(
+        moment, (arms[0], arms[1]), (forces.force_1, forces.force_2), (tangents[0], tangents[1])
+    )
+    outputs = {
+        "angular_velocity": omega,
+        "angular_acceleration": alpha,
+        "normal_force": forces.normal,
+        "tangential_force": forces.tangential,
+        "contact_force": ca.vertcat(forces.force_1, forces.force_2),
+        "pressure_shift": ca.vertcat(_length(shift.shift_1), _length(shift.shift_2)),
+        "shift_vector": ca.vertcat(shift.shift_1, shift.shift_2),
+        "required_moment": shift.required_moment,
+        "point_moment_residual": shift.point_residual,
+        "moment_residual": shift.residual,
+        "wrench_1": ca.vertcat(forces.force_1, ca.cross(shift.shift_1, forces.force_1)),
+        "wrench_2": ca.vertcat(forces.force_2, ca.cross(shift.shift_2, forces.force_2)),
+    }
+    return _named(inputs, {name: ca.densify(value) for name, value in outputs.items()})
+
+
+def _joint_load_function(workcell: Workcell) -> ca.Function:
+    """The paper's result where the patches suffice for it, and the joint allocation elsewhere."""
+    inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
+    found = paper_load_function(workcell)(*inputs.values())
+    paper = dict(zip(LOAD_OUTPUTS, found, strict=True))
+    force = paper["contact_force"][:3] + paper["contact_force"][3:]
+    shift = "pressure_shift" if workcell.has_facing_pads else "shift_vector"
+    suffices = _suffices_function(workcell)(
+        inputs["pose"], paper[shift], paper["moment_residual"], force
+    )
+    kept = [paper[name] for name in GRASP_OUTPUTS]
+    passed = [
+        ca.MX.sym(name, value.shape[0]) for name, value in zip(GRASP_OUTPUTS, kept, strict=True)
+    ]
+    asked = [inputs["pose"], force, paper["required_moment"], inputs["friction"]]
+    asked.append(inputs["centre_of_mass"])
+    unused = [ca.MX.sym("unused", value.shape[0]) for value in asked]
+    general = not workcell.has_facing_pads
+    anew = _grasp_sample_function(workcell) if general else _joint_sample_function(workcell)
+    choice = ca.Function.if_else(
+        "allocation",
+        ca.Function("keep", [*unused, *passed], passed),
+        ca.Function("anew", [*unused, *passed], anew(*unused)),
+    )
+    chosen = choice(suffices, *asked, *kept)
+    outputs = paper | dict(zip(GRASP_OUTPUTS, chosen, strict=True))
+    return _named(inputs, outputs)
+
+
+def _grasp_load_function(workcell: Workcell) -> ca.Function:
+    """The least forces of pads anywhere, see `symbolic.contact.grasp`."""
+    inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
+    names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
+    found = _required_function(workcell)(*[inputs[name] for name in SIZES if name != "friction"])
+    outputs = dict(zip(names, found, strict=True))
+    asked = (inputs["pose"], outputs["force"], outputs["required_moment"])
+    held = _grasp_sample_function(workcell)(*asked, inputs["friction"], inputs["centre_of_mass"])
+    outputs |= dict(zip(GRASP_OUTPUTS, held, strict=True))
+    return _named(inputs, outputs)
+
+
+def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
+    """`uncertain_load_function` from its inputs and outputs."""
+    return ca.Function(
+        "uncertain_load",
+        list(inputs.values()),
+        [outputs[name] for name in LOAD_OUTPUTS],
+        list(inputs),
+        list(LOAD_OUTPUTS),
+    )
+
+
+def _required_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate and centre of mass to the angular velocity and acceleration, and to
+    the force and moment about the centre of mass that the motion asks for, (3,) each, world."""
+    pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
+    centre_of_mass = ca.SX.sym("centre_of_mass", 3)
+    turned = workcell.task.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], rate[3:])
+    alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
+    offset = ca.mtimes(rotation, centre_of_mass)
+    force = resultant_force(workcell.payload.mass, offset, omega, alpha, second[:3])
+    moment = required_moment(ca.SX(ca.DM(workcell.payload.inertia)), rotation, omega, alpha)
+    return ca.Function(
+        "required", [pose, rate, second, centre_of_mass], [omega, alpha, force, moment]
+    )
+
+
+def _suffices_function(workcell: Workcell) -> ca.Function:
+    """pose, shifts, moment_residual (3,) and force (3,) to whether the paper's result holds.
+
+    The shifts are their lengths (2,) where both patches are round, else shift_vector (6,).
+    """
+    sizes = (("pose", 6), ("shift", 2 if workcell.has_facing_pads else 6), ("rest", 3), ("f", 3))
+    pose, shift, residual, force = inputs = [ca.SX.sym(*entry) for entry in sizes]
+    points = [contact.T_box_pad[:3, 3] for contact in workcell.contacts]
+    distance = float(np.linalg.norm(points[0] - points[1]))
+    carried = ca.sumsqr(residual) <= (RESIDUAL_TOLERANCE * distance) ** 2 * ca.sumsqr(force)
+    rotation = rotation_matrix(workcell.task.orientation, pose[3:])
+    within = []
+    for i, contact in enumerate(workcell.contacts):
+        if workcell.has_facing_pads:
+            within.append(shift[i] <= contact.patch_radius)
+            continue
+        axes = ca.mtimes(rotation, ca.DM(contact.T_box_pad[:3, :2]))
+        moved = ca.mtimes(axes.T, shift[3 * i : 3 * i + 3])
+        if contact.half_sides is None:
+            within.append(_length(moved) <= contact.patch_radius)
+        else:
+            x, y = contact.half_sides
+            within.append(ca.logic_and(ca.fabs(moved[0]) <= x, ca.fabs(moved[1]) <= y))
+    holds = ca.logic_and(ca.logic_and(within[0], within[1]), carried)
+    return ca.Function("suffices", inputs, [holds])
+
+
+def _grasp_sample_function(workcell: Workcell) -> ca.Function:
+    """As `_joint_sample_function`, for pads anywhere."""
+    inputs = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES]
+    pose, force, moment, friction, centre_of_mass = inputs
+    asked = (pose, force, moment, centre_of_mass)
+    wrenches = grasp_wrenches(Grasp(workcell), box_load_function(workcell)(*asked), friction)
+    return ca.Function("grasp_sample", inputs, grasp_world_function(workcell)(*asked, wrenches))
+
+
+def _joint_sample_function(workcell: Workcell) -> ca.Function:
+    """pose, force, moment (world), friction and centre of mass to the outputs `GRASP_OUTPUTS`."""
+    inputs = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES]
+    pose, force, moment, friction, centre_of_mass = inputs
+    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
+    asked = (pose, force, moment, centre_of_mass)
+    held = allocate_jointly(_balance_function(workcell)(*asked), friction, radius)
+    wrenches = [getattr(held, each.name) for each in fields(held)]
+    return ca.Function("joint_sample", inputs, _world_function(workcell)(*asked, *wrenches))
+
+
+def _balance_function(workcell: Workcell) -> ca.Function:
+    """pose, force, moment (world) and centre of mass to what the contacts have to balance (9,)."""
+    inputs, _, needed, arms = _in_pad_axes(workcell)
+    return ca.Function("joint_balance", inputs, [balance_of(*needed, arms)])
+
+
+def _world_function(workcell: Workcell) -> ca.Function:
+    """As `_balance_function`, then the fields of a `JointAllocation`, to the outputs
+    `GRASP_OUTPUTS`."""
+    inputs, axes, needed, arms = _in_pad_axes(workcell)
+    held = JointAllocation(*[ca.SX.sym(each.name, 2) for each in fields(JointAllocation)])
+    forces = [
+        ca.vertcat(held.tangent_1, held.normal[0]),
+        ca.vertcat(held.tangent_2, -held.normal[1]),
+    ]
+    shifts = [ca.vertcat(shift, 0.0) for shift in (held.shift_1, held.shift_2)]
+    moments = [
+        ca.cross(shift, at) + ca.vertcat(0.0, 0.0, held.torsion[i])
+        for i, (shift, at) in enumerate(zip(shifts, forces, strict=True))
+    ]
+    point = needed[1] - ca.cross(arms[0], forces[0]) - ca.cross(arms[1], forces[1])
+    local = (*forces, *shifts, *moments, point, point - moments[0] - moments[1])
+    first, second, shift_1, shift_2, moment_1, moment_2, before, left = (
+        ca.mtimes(axes, vector) for vector in local
+    )
+    outputs = {
+        "normal_force": held.normal,
+        "tangential_force": ca.vertcat(_length(held.tangent_1), _length(held.tangent_2)),
+        "contact_force": ca.vertcat(first, second),
+        "pressure_shift": ca.vertcat(_length(held.shift_1), _length(held.shift_2)),
+        "shift_vector": ca.vertcat(shift_1, shift_2),
+        "point_moment_residual": before,
+        "moment_residual": left,
+        "wrench_1": ca.vertcat(first, moment_1),
+        "wrench_2": ca.vertcat(second, moment_2),
+    }
+    wrenches = [getattr(held, each.name) for each in fields(held)]
+    return ca.Function(
+        "joint_world", [*inputs, *wrenches], [outputs[name] for name in GRASP_OUTPUTS]
+    )
+
+
+def _in_pad_axes(
+    workcell: Workcell,
+) -> tuple[list[ca.SX], ca.SX, tuple[ca.SX, ca.SX], tuple[ca.SX, ca.SX]]:
+    """Inputs pose, force, moment and centre of mass; the axes of pad 1 in the world (3, 3); force
+    and moment, and the contacts' arms from the centre of mass, along these axes."""
+    sizes = (("pose", 6), ("force", 3), ("moment", 3), ("centre_of_mass", 3))
+    pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in sizes]
+    first, second = (contact.T_box_pad for contact in workcell.contacts)
+    in_box = ca.DM(first[:3, :3])
+    axes = ca.mtimes(rotation_matrix(workcell.task.orientation, pose[3:]), in_box)
+    arms = tuple(ca.mtimes(in_box.T, ca.DM(T[:3, 3]) - centre_of_mass) for T in (first, second))
+    return inputs, axes, (ca.mtimes(axes.T, force), ca.mtimes(axes.T, moment)), (arms[0], arms[1])
+
+
+def _length(vector: Expression) -> Expression:
+    """Length with a finite derivative at zero; 1e-12 m is far below any patch."""
+    return ca.sqrt(ca.sumsqr(vector) + 1e-24)
+
+
+# --- wrenches of pads in the world ---
+
+
+GRASP_OUTPUTS = (
+    "normal_force",
+    "tangential_force",
+    "contact_force",
+    "pressure_shift",
+    "shift_vector",
+    "point_moment_residual",
+    "moment_residual",
+    "wrench_1",
+    "wrench_2",
+)
+"""Those of `symbolic.contact.load.LOAD_OUTPUTS` that depend on the allocation."""
+
+LEAST_FORCE = 1e-9
+"""Normal force below which a centre of pressure counts as the patch's [N]."""
+
+_ASKED = (("pose", 6), ("force", 3), ("moment", 3), ("centre_of_mass", 3))
+
+
+def box_load_function(workcell: Workcell) -> ca.Function:
+    """pose, force, moment about the centre of mass (world) and centre of mass to force and moment
+    about the box frame's origin (6,), along the box's axes."""
+    pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
+    to_box = rotation_matrix(workcell.task.orientation, pose[3:]).T
+    in_box = ca.mtimes(to_box, force)
+    about = ca.mtimes(to_box, moment) + ca.cross(centre_of_mass, in_box)
+    return ca.Function("box_load", inputs, [ca.vertcat(in_box, about)])
+
+
+def grasp_world_function(workcell: Workcell) -> ca.Function:
+    """The inputs of `box_load_function` and the pads' wrenches (6 k,), see
+    `symbolic.contact.grasp.grasp_wrenches`, to `GRASP_OUTPUTS`."""
+    pose, _, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
+    pads, robots = workcell.pads, workcell.pad_robots
+    wrenches = ca.SX.sym("wrenches", WRENCH_SIZE * len(pads))
+    rotation = rotation_matrix(workcell.task.orientation, pose[3:])
+    zero = ca.SX.zeros(3)
+    normal, tangential, longest = [ca.SX(0.0)] * 2, [ca.SX(0.0)] * 2, [ca.SX(0.0)] * 2
+    forces, moments, shifts = [zero] * 2, [zero] * 2, [zero] * 2
+    point, left = moment, moment
+    for pad, robot, own in zip(pads, robots, ca.vertsplit(wrenches, WRENCH_SIZE), strict=True):
+        axes = ca.mtimes(rotation, ca.DM(pad.T_box_pad[:3, :3]))
+        pushed = ca.mtimes(axes, ca.vertcat(own[1:3], own[0]))
+        # A normal force N n at d turns about d x n = (d_y, -d_x).
+        turned = ca.mtimes(axes, ca.vertcat(own[4], -own[3], own[5]))
+        shift = own[3:5] / ca.fmax(own[0], LEAST_FORCE)
+        first = workcell.contacts[robot]
+        beside = ca.mtimes(rotation, ca.DM(pad.T_box_pad[:3, 3] - first.T_box_pad[:3, 3]))
+        arm = ca.mtimes(rotation, ca.DM(pad.T_box_pad[:3, 3]) - centre_of_mass)
+        normal[robot] += own[0]
+        tangential[robot] += _length(own[1:3])
+        longest[robot] = ca.fmax(longest[robot], _length(shift))
+        forces[robot] += pushed
+        moments[robot] += turned + ca.cross(beside, pushed)
+        if pad is first:
+            shifts[robot] = ca.mtimes(axes, ca.vertcat(shift, 0.0))
+        point -= ca.cross(arm, pushed)
+        left -= ca.cross(arm, pushed) + turned
+    outputs = {
+        "normal_force": ca.vertcat(*normal),
+        "tangential_force": ca.vertcat(*tangential),
+        "contact_force": ca.vertcat(*forces),
+        "pressure_shift": ca.vertcat(*longest),
+        "shift_vector": ca.vertcat(*shifts),
+        "point_moment_residual": point,
+        "moment_residual": left,
+        "wrench_1": ca.vertcat(forces[0], moments[0]),
+        "wrench_2": ca.vertcat(forces[1], moments[1]),
+    }
+    return ca.Function(
+        "grasp_world",
+        [*inputs, wrenches],
+        ca.cse([ca.densify(outputs[name]) for name in GRASP_OUTPUTS]),
+    )

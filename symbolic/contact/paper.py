@@ -1,0 +1,208 @@
+"""The paper's allocation: least contact forces of two facing pads, then their centres of pressure.
+
+Paper Eqs. 34-42 and 50. With antiparallel contact normals n and -n and the resultant force
+F = m (a - g) split into F_n = F.n and F_t = |F - F_n n|, the problem
+
+    minimise |f_1|^2 + |f_2|^2   subject to   f_1 + f_2 = F,  both forces in their friction cones
+
+has its tangential parts along F_t, so that it is a convex program in N_2 and the tangential
+share of contact 1. Its solution is the largest of five smooth functions (see
+`normal_force_branches`); with equal friction coefficients mu it is
+
+    N_1 + N_2 = max( F_t / mu,  |F_n|,  (mu F_t + mu^2 |F_n|) / (1 + mu^2) ).
+
+Centres of pressure: paper Eqs. 51-59. The forces are those of the allocation; each may act anywhere
+in the tangent plane of its contact, and the shifts are the least-norm ones that minimise the moment
+left over.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from symbolic.expression import Expression
+from symbolic.records.quantities import GRAVITY
+
+TANGENT_FLOOR = 1e-9
+"""Added in squares below the root of the tangential force [N]: keeps derivatives finite."""
+
+
+@dataclass(frozen=True)
+class ContactForces:
+    """Forces that the robots exert on the box, world frame.
+
+    Attributes:
+        normal: (2,) normal forces N_1, N_2 [N].
+        tangential: (2,) magnitudes of the tangential forces [N].
+        force_1, force_2: (3,) contact forces [N].
+    """
+
+    normal: Expression
+    tangential: Expression
+    force_1: Expression
+    force_2: Expression
+
+
+def required_force(
+    mass: float,
+    acceleration: Expression,
+) -> Expression:
+    """Resultant force (3,) on the box [N], from its centre of mass's acceleration (Eq. 34)."""
+    return mass * (acceleration - ca.DM(GRAVITY))
+
+
+def split_force(force: Expression, normal: Expression) -> tuple[Expression, Expression, Expression]:
+    """Normal component, tangential magnitude and unit tangential direction of a force.
+
+    Args:
+        force: (3,) [N].
+        normal: (3,) unit normal of contact 1.
+    """
+    f_n = ca.dot(force, normal)
+    tangent = force - f_n * normal
+    f_t = ca.sqrt(ca.dot(tangent, tangent) + TANGENT_FLOOR**2)
+    return f_n, f_t, tangent / f_t
+
+
+def normal_force_branches(
+    f_n: Expression, f_t: Expression, friction: tuple[float, float]
+) -> Expression:
+    """The five smooth functions (5,) whose largest is the normal force N_2 of contact 2 [N].
+
+    N_1 = N_2 + F_n. In order: both friction cones tight; contact 2 unloaded; contact 1
+    unloaded; least effort with only the cone of contact 2 tight; with only that of contact 1.
+    A branch that is not the largest never cuts off the solution, because the effort is convex
+    in N_2 and rises wherever a cone is slack.
+    """
+    mu_1, mu_2 = friction
+    return ca.vertcat(
+        (f_t - mu_1 * f_n) / (mu_1 + mu_2),
+        0.0 * f_n,
+        -f_n,
+        (mu_2 * f_t - f_n) / (2.0 * (1.0 + mu_2**2)),
+        (mu_1 * f_t + f_n) / (2.0 * (1.0 + mu_1**2)) - f_n,
+    )
+
+
+def allocate(force: Expression, normal: Expression, friction: tuple[float, float]) -> ContactForces:
+    """Minimum-effort contact forces for a resultant force.
+
+    Args:
+        force: (3,) resultant force on the box, world frame [N].
+        normal: (3,) unit normal of contact 1 in the world frame; contact 2 has its opposite.
+        friction: Coulomb coefficients of the two contacts.
+    """
+    f_n, f_t, direction = split_force(force, normal)
+    n_2 = ca.mmax(normal_force_branches(f_n, f_t, friction))
+    n_1 = n_2 + f_n
+    # Equal shares cost least; the friction cones push the share away from one half.
+    t_1 = ca.fmin(ca.fmax(f_t / 2.0, f_t - friction[1] * n_2), friction[0] * n_1)
+    t_2 = f_t - t_1
+    return ContactForces(
+        normal=ca.vertcat(n_1, n_2),
+        tangential=ca.vertcat(t_1, t_2),
+        force_1=n_1 * normal + t_1 * direction,
+        force_2=-n_2 * normal + t_2 * direction,
+    )
+
+
+# --- centres of pressure ---
+
+
+RELATIVE_DAMPING = 1e-8
+"""Damping of the normal equations relative to their trace.
+
+Where one contact is unloaded or nothing is tangential, a direction of moment cannot be had, and
+rounding over the damping is the error that remains.
+"""
+
+REFINEMENTS = 7
+"""Repeated solves for what is left (iterated Tikhonov regularisation): they take the damping's
+own error to its eighth power, below rounding wherever a moment can be had at all."""
+
+
+@dataclass(frozen=True)
+class PressureShift:
+    """Shifts of the centres of pressure and the moments around them, world frame.
+
+    Attributes:
+        shift_1, shift_2: (3,) in the tangent planes of the contacts [m].
+        required_moment: (3,) about the centre of mass, needed by the motion [N m].
+        point_residual: (3,) moment missing with the forces at the nominal points [N m].
+        residual: (3,) moment missing with the shifts applied [N m].
+    """
+
+    shift_1: Expression
+    shift_2: Expression
+    required_moment: Expression
+    point_residual: Expression
+    residual: Expression
+
+
+def required_moment(
+    inertia: Expression, rotation: Expression, velocity: Expression, acceleration: Expression
+) -> Expression:
+    """Moment (3,) about the centre of mass that the rotation needs (Eqs. 52-53) [N m].
+
+    Args:
+        inertia: (3, 3) about the centre of mass, box axes [kg m^2].
+        rotation: R_world_box (3, 3).
+        velocity, acceleration: (3,) angular, world frame [rad/s, rad/s^2].
+    """
+    inertia_world = ca.mtimes([rotation, inertia, rotation.T])
+    return ca.mtimes(inertia_world, acceleration) + ca.cross(
+        velocity, ca.mtimes(inertia_world, velocity)
+    )
+
+
+def pressure_shift(
+    moment: Expression,
+    arms: tuple[Expression, Expression],
+    forces: tuple[Expression, Expression],
+    tangents: tuple[Expression, Expression],
+) -> PressureShift:
+    """Least-norm shifts of both centres of pressure (Eqs. 54-59).
+
+    Args:
+        moment: (3,) required moment about the centre of mass [N m].
+        arms: (3,) each, from the centre of mass to the nominal contact points [m].
+        forces: (3,) each, contact forces on the box [N].
+        tangents: two orthonormal tangent vectors (3, 2) spanning both contact planes, which
+            are parallel; the two entries are the columns.
+    """
+    point_residual = moment - ca.cross(arms[0], forces[0]) - ca.cross(arms[1], forces[1])
+    plane = ca.horzcat(*tangents)
+    lever = ca.horzcat(
+        *[ca.cross(tangent, force) for force in forces for tangent in tangents]
+    )  # A (3, 4): moment per unit of each tangential shift
+    gram = ca.mtimes(lever, lever.T)
+    damping = RELATIVE_DAMPING * ca.trace(gram) + 1e-300
+    damped = gram + damping * ca.DM.eye(3)
+    dual = _solve_symmetric_3(damped, point_residual)
+    for _ in range(REFINEMENTS):
+        dual += _solve_symmetric_3(damped, point_residual - ca.mtimes(gram, dual))
+    shifts = ca.mtimes(lever.T, dual)
+    return PressureShift(
+        shift_1=ca.mtimes(plane, shifts[:2]),
+        shift_2=ca.mtimes(plane, shifts[2:]),
+        required_moment=moment,
+        point_residual=point_residual,
+        residual=point_residual - ca.mtimes(lever, shifts),
+    )
+
+
+def _solve_symmetric_3(matrix: Expression, right: Expression) -> Expression:
+    """Solution of a symmetric positive definite 3 by 3 system by its LDL^T factors."""
+    d_1 = matrix[0, 0]
+    l_21, l_31 = matrix[1, 0] / d_1, matrix[2, 0] / d_1
+    d_2 = matrix[1, 1] - l_21 * matrix[1, 0]
+    l_32 = (matrix[2, 1] - l_31 * matrix[1, 0]) / d_2
+    d_3 = matrix[2, 2] - l_31 * matrix[2, 0] - l_32**2 * d_2
+    y_1 = right[0]
+    y_2 = right[1] - l_21 * y_1
+    y_3 = right[2] - l_31 * y_1 - l_32 * y_2
+    z_3 = y_3 / d_3
+    z_2 = y_2 / d_2 - l_32 * z_3
+    return ca.vertcat(y_1 / d_1 - l_21 * z_2 - l_31 * z_3, z_2, z_3)

@@ -1,0 +1,245 @@
+"""A rectangular patch in the allocation's interior-point method.
+
+It carries what pressures on it with Coulomb friction can: the sum of what its four corners carry,
+each a force in its circular friction cone, because a force within the rectangle can be shared out
+among the corners without changing its wrench. With pyramids in place of the circles this is the
+cone of Caron, Pham and Nakamura (Stability of surface contacts for humanoid robots: closed-form
+formulae of the contact wrench cone for rectangular support areas, ICRA 2015).
+
+A corner's force (N, T / mu) is a real symmetric matrix [[N + T_x, T_y], [T_y, N - T_x]], so that
+inverses and products of three are those of vectors: 1 / f = J f / det f with J = diag(1, -1, -1)
+and det f = f . J f, and sym(a b c) = a (b . c) + c (a . b) - (a . J c) J b.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from symbolic.contact.force_closure import POINT_SIZE, STATE_SIZE, WRENCH_SIZE, corner_modes
+from symbolic.contact.patches import BarrierPatch, Elimination, StateStep, least
+from symbolic.expression import reciprocal
+
+CORNERS = 4
+WAVES = 4
+"""Ways in which a number varies over the corners: all the same, alternating along x, along y, and
+along both."""
+
+_J = ca.DM([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class RectangularPatch:
+    """A rectangle.
+
+    Attributes:
+        half_x, half_y: half its sides along the pad's x and y axes [m].
+    """
+
+    half_x: float
+    half_y: float
+    iterate_size: int = 2 * STATE_SIZE
+    state_size: int = STATE_SIZE
+    correction_size: int = STATE_SIZE
+    degree: float = CORNERS
+
+    def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
+        """See `symbolic.contact.patches.Patch`."""
+        return ca.vertcat(state, *[weight * _inverse(f) for f in self._corners(state)])
+
+    def local(self, iterate: ca.SX) -> LocalRectangle:
+        """See `symbolic.contact.patches.Patch`."""
+        return LocalRectangle(self, iterate)
+
+    def barrier(self, iterate: ca.SX, weight: ca.SX) -> BarrierPatch:
+        """See `symbolic.contact.patches.Patch`."""
+        local = self.local(self.centred(iterate[:STATE_SIZE], weight))
+        aim = local.aim(weight, ca.SX.zeros(self.correction_size))
+
+        def step(change: ca.SX) -> StateStep:
+            whole = aim.step(change)
+            alone = ca.vertcat(whole.change[:STATE_SIZE], ca.SX.zeros(STATE_SIZE))
+            return StateStep(alone, whole.lowest_of_state)
+
+        return BarrierPatch(local.stiffness, aim.pull, step)
+
+    def potential(self, state: ca.SX) -> ca.SX:
+        """See `symbolic.contact.patches.Patch`."""
+        return -0.5 * sum(ca.log(_determinant(f)) for f in self._corners(state))
+
+    def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
+        """Exactly: each corner has two eigenvalues."""
+        pairs = zip(self._corners(state), self._corners(change), strict=True)
+        return least([_lowest(f, move) for f, move in pairs])
+
+    def slack(self, state: ca.SX) -> ca.SX:
+        """What friction leaves at the corner where it leaves least."""
+        return least([f[0] - ca.sqrt(ca.sumsqr(f[1:])) for f in self._corners(state)])
+
+    def _corners(self, state: ca.SX) -> list[ca.SX]:
+        """The corners' forces (3,)."""
+        modes = ca.sparsify(ca.DM(corner_modes((self.half_x, self.half_y))))
+        return [ca.mtimes(mode, state) for mode in ca.vertsplit(modes, POINT_SIZE)]
+
+    def waves(self, state: ca.SX) -> list[list[ca.SX]]:
+        """Four times what the corners' N, T_x and T_y are sums of, wave by wave."""
+        radius = (self.half_x**2 + self.half_y**2) ** 0.5
+        x, y = self.half_x / radius, self.half_y / radius
+        n, t_x, t_y, q_x, q_y, m, n_xy, x_x, x_xy, y_y, y_xy, more = ca.vertsplit(state)
+        return [
+            [n, q_x * (1.0 / x), q_y * (1.0 / y), n_xy],
+            [t_x, x_x, x * more - y * m, x_xy],
+            [t_y, x * m + y * more, y_y, y_xy],
+        ]
+
+    def gathered(self, waves: list[list[ca.SX]]) -> list[ca.SX]:
+        """The transposed map: what acts on the waves, as it acts on the state, a quarter of it."""
+        radius = (self.half_x**2 + self.half_y**2) ** 0.5
+        x, y = self.half_x / radius, self.half_y / radius
+        (n, n_x, n_y, n_xy), (t_x, x_x, x_y, x_xy), (t_y, y_x, y_y, y_xy) = waves
+        outer = [n, t_x, t_y, n_x * (1.0 / x), n_y * (1.0 / y), x * y_x - y * x_y]
+        return [*outer, n_xy, x_x, x_xy, y_y, y_xy, x * x_y + y * y_x]
+
+
+class LocalRectangle:
+    """See `symbolic.contact.patches.LocalPatch`."""
+
+    def __init__(self, patch: RectangularPatch, iterate: ca.SX) -> None:
+        """Inverses of the corners' matrices, and the stiffness left by what moves freely."""
+        self.patch = patch
+        state = iterate[:STATE_SIZE]
+        self.wrench = state[:WRENCH_SIZE]
+        self.force = corners_of(patch.waves(state))
+        self.multiplier = list(ca.vertsplit(iterate[STATE_SIZE:], POINT_SIZE))
+        self.inverse = [_inverse(f) for f in self.force]
+        pairs = zip(self.force, self.multiplier, strict=True)
+        self.gap = sum(ca.dot(f, s) for f, s in pairs)
+        pairs = zip(self.multiplier, self.inverse, strict=True)
+        self.stiff = [_both_sides(s, inverse) for s, inverse in pairs]
+        self._elimination = Elimination(self._matrix(), STATE_SIZE - WRENCH_SIZE)
+        self.stiffness = ca.vertcat(*[ca.horzcat(*row) for row in self._elimination.left])
+
+    def aim(self, weight: ca.SX, correction: ca.SX) -> RectangleAim:
+        """See `symbolic.contact.patches.LocalPatch`."""
+        corrections = ca.vertsplit(correction, POINT_SIZE)
+        pairs = zip(self.inverse, corrections, strict=True)
+        return RectangleAim(self, [weight * inverse - c for inverse, c in pairs])
+
+    def eliminated(self, right: list[ca.SX]) -> list[ca.SX]:
+        """Of what acts on the state, inner entries first, what is left for the wrench."""
+        return self._elimination.reduced([*right[WRENCH_SIZE:], *right[:WRENCH_SIZE]])
+
+    def inner(self, reduced: list[ca.SX], change: ca.SX) -> list[ca.SX]:
+        """The inner entries' change beside the wrench's (6,)."""
+        return self._elimination.first(reduced, ca.vertsplit(change))
+
+    def _matrix(self) -> list[list[ca.SX]]:
+        """(12, 12) stiffness of the state, inner entries first.
+
+        Of two waves it is the sum over the corners with both waves' signs: that of a third one.
+        """
+        parts, waves = range(POINT_SIZE), range(WAVES)
+        sums = [
+            [_wave_sums([stiff[i, j] * WAVES**-2 for stiff in self.stiff]) for j in range(i + 1)]
+            for i in parts
+        ]
+
+        def column(i: int, wave: int) -> list[ca.SX]:
+            entry = [sums[max(i, j)][min(i, j)] for j in parts]
+            return self.patch.gathered([[each[wave ^ other] for other in waves] for each in entry])
+
+        columns = [[column(i, wave) for wave in waves] for i in parts]
+        rows = [
+            self.patch.gathered([[of_wave[k] for of_wave in of_part] for of_part in columns])
+            for k in range(STATE_SIZE)
+        ]
+        order = [*range(WRENCH_SIZE, STATE_SIZE), *range(WRENCH_SIZE)]
+        return [[rows[i][j] for j in order] for i in order]
+
+
+class RectangleAim:
+    """See `symbolic.contact.patches.Aim`."""
+
+    def __init__(self, local: LocalRectangle, given: list[ca.SX]) -> None:
+        """From what the multipliers become where nothing moves, per corner."""
+        self._local, self._given = local, given
+        waves = [_wave_sums([g[i] for g in given]) for i in range(POINT_SIZE)]
+        whole = [value * (1.0 / WAVES) for value in local.patch.gathered(waves)]
+        self._reduced = local.eliminated(whole)
+        self.pull = ca.vertcat(*self._reduced[WRENCH_SIZE:])
+
+    def step(self, change: ca.SX) -> RectangleStep:
+        """See `symbolic.contact.patches.Aim`."""
+        moved = ca.vertcat(change, *self._local.inner(self._reduced, change))
+        return RectangleStep(self._local, self._given, moved)
+
+
+class RectangleStep:
+    """See `symbolic.contact.patches.Step`; force and multiplier: the corners' changes."""
+
+    def __init__(self, local: LocalRectangle, given: list[ca.SX], moved: ca.SX) -> None:
+        """The corners' steps from the state's."""
+        self.force = corners_of(local.patch.waves(moved))
+        corners = zip(given, local.stiff, self.force, local.multiplier, strict=True)
+        self.multiplier = [g - ca.mtimes(stiff, df) - s for g, stiff, df, s in corners]
+        self.change = ca.vertcat(moved, *self.multiplier)
+        of_force = zip(local.force, self.force, strict=True)
+        of_multiplier = zip(local.multiplier, self.multiplier, strict=True)
+        self.lowest_of_state = least([_lowest(f, df) for f, df in of_force])
+        of_both = [self.lowest_of_state, *[_lowest(s, ds) for s, ds in of_multiplier]]
+        self.lowest = least(of_both)
+        self._local = local
+
+    @property
+    def second_order(self) -> ca.SX:
+        """See `symbolic.contact.patches.Step`."""
+        moves = zip(self._local.inverse, self.force, self.multiplier, strict=True)
+        return ca.vertcat(*[_product(inverse, df, ds) for inverse, df, ds in moves])
+
+    def gap_after(self, length: ca.SX) -> ca.SX:
+        """See `symbolic.contact.patches.Step`."""
+        local = self._local
+        corners = zip(local.force, self.force, local.multiplier, self.multiplier, strict=True)
+        return sum(ca.dot(f + length * df, s + length * ds) for f, df, s, ds in corners)
+
+
+def corners_of(waves: list[list[ca.SX]]) -> list[ca.SX]:
+    """The corners' forces (3,) from `RectangularPatch.waves`."""
+    sums = [_wave_sums(wave) for wave in waves]
+    # Corners (+, +), (-, +), (-, -), (+, -) have these waves' signs in common with the waves.
+    return [ca.vertcat(*[each[k] for each in sums]) * (1.0 / WAVES) for k in (0, 3, 1, 2)]
+
+
+def _wave_sums(values: list[ca.SX]) -> list[ca.SX]:
+    """Of four numbers at the corners the sums with each wave's signs."""
+    a, b, c, d = values
+    ab, cd, a_b, d_c = a + b, c + d, a - b, d - c
+    # Corners (+, +), (-, +), (-, -), (+, -).
+    return [ab + cd, a_b + d_c, ab - cd, a_b - d_c]
+
+
+def _inverse(f: ca.SX) -> ca.SX:
+    return _J * f * reciprocal(_determinant(f))
+
+
+def _determinant(f: ca.SX) -> ca.SX:
+    return f[0] ** 2 - ca.sumsqr(f[1:])
+
+
+def _both_sides(a: ca.SX, c: ca.SX) -> ca.SX:
+    """(3, 3) matrix of sym(a b c) as a function of b."""
+    outer = ca.mtimes(a, c.T)
+    return outer + outer.T - ca.dot(a, _J * c) * ca.diag(_J)
+
+
+def _product(a: ca.SX, b: ca.SX, c: ca.SX) -> ca.SX:
+    """sym(a b c)."""
+    return a * ca.dot(b, c) + c * ca.dot(a, b) - ca.dot(a, _J * c) * (_J * b)
+
+
+def _lowest(f: ca.SX, move: ca.SX) -> ca.SX:
+    """What a move adds to the lower eigenvalue of a corner's matrix, over the matrix."""
+    over = reciprocal(_determinant(f))
+    mean = ca.dot(f, _J * move) * over
+    return mean - ca.sqrt(ca.fmax(mean**2 - _determinant(move) * over, 0.0))

@@ -1,0 +1,247 @@
+"""Least contact forces of two soft fingers: elastic pads that press evenly, on arms that keep the
+orientation of their pads.
+
+Such a pad carries a normal force N, a tangential force T and a torsion tau about its normal, but
+no tilting moment (soft-finger contact: Howe and Cutkosky, IJRR 1996). Two of them with opposite
+normals share a load in one way only, up to the squeeze: a difference of their tangential forces
+carries the moments across the line between them, torsion carries the moment about it. Friction
+holds within the limit surface of a patch under even pressure. With a = mu N and
+s = 1 - |T|^2 / a^2 it is
+
+    |tau| <= a sqrt(s) (h / 2 + s (c - h / 2) - 3/80 c s (1 - s))                            (1)
+
+c is the mean distance of the patch's points from its centre, which bounds pure torsion; h is twice
+the root of the mean square of their coordinates along T: what is left for torsion when a patch
+begins to slide. Both ends are exact. A disc of radius r has c = 2/3 r and h = r: (1) asks for
+0.4 % less to 0.3 % more force than its exact limit curve. Rectangles: 0.7 % less to 2.9 % more up
+to sides of 2 to 1, 6 % more at 5 to 1.
+
+The capacities of both pads add up: the one that slips first hands torsion over to the other.
+
+Coordinates: tangents a, b and normal n = a x b of contact 1. Forces in N, lengths in m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.contact.worst_cases import CASE_SIZE, case_load_function, case_parts
+from symbolic.expression import Expression
+from symbolic.records import Contact, Workcell
+
+FACING_STEPS = 6
+"""Newton steps for given tangential forces; the equation is nearly linear, five leave 1e-9."""
+
+OFFSET_STEPS = 7
+"""Secant steps where the pads lie beside one another."""
+
+LEAST_SLOPE = 1e-3
+"""Of those steps: where pressing harder asks for nearly as much more, nothing holds."""
+
+LEVER_FLOOR = 1e-12
+"""Keeps a slope of the torsion by the grip positive [m]."""
+
+BEND = 3.0 / 80.0
+"""Last coefficient of (1): least largest error for a disc."""
+
+FORCE_FLOOR = 1e-9
+"""Added in squares to forces [N], so that lengths have slopes where there is no force."""
+
+
+@dataclass(frozen=True)
+class SoftPatch:
+    """What a patch's shape means for torsion under even pressure.
+
+    Attributes:
+        twist: mean distance of the points from the centre [m].
+        spread: (2, 2) makes of a unit vector along the tangents of contact 1 one whose length is
+            twice the root of the mean square of the points' coordinates along it [m]; the radius
+            times a rotation for a disc.
+    """
+
+    twist: float
+    spread: Array
+
+    @classmethod
+    def of(cls, contact: Contact, axes: Array) -> SoftPatch:
+        """The patch of a contact.
+
+        Args:
+            contact: of a round or rectangular patch.
+            axes: (3, 3) those of contact 1 in the box frame.
+        """
+        in_pad = contact.T_box_pad[:3, :2].T @ axes[:, :2]
+        if contact.half_sides is None:
+            return cls(2.0 / 3.0 * contact.patch_radius, contact.patch_radius * in_pad)
+        x, y = contact.half_sides
+        # Integral of the distance over a rectangle about its centre.
+        corners = x**2 / y * np.arcsinh(y / x) + y**2 / x * np.arcsinh(x / y)
+        twist = (np.hypot(x, y) + corners / 2.0) / 3.0
+        return cls(float(twist), 2.0 / np.sqrt(3.0) * np.diag([x, y]) @ in_pad)
+
+
+@dataclass(frozen=True)
+class SoftFingers:
+    """Forces of both contacts, in the coordinates of the module.
+
+    Attributes:
+        normal: (2,) N_1, N_2 [N].
+        tangent_1, tangent_2: (2,) tangential forces on the box [N].
+        torsion: moment about n that both carry together [N m].
+        capacity: (2,) torsion that each could carry beside its tangential force [N m].
+    """
+
+    normal: Expression
+    tangent_1: Expression
+    tangent_2: Expression
+    torsion: Expression
+    capacity: Expression
+
+
+def torsion_capacity(
+    grip: Expression, tangent: Expression, patch: SoftPatch
+) -> tuple[Expression, Expression]:
+    """The right side of (1) [N m], and its slope by sqrt(grip^2 - |tangent|^2) [m].
+
+    Args:
+        grip: sqrt(mu^2 N^2 - |T|^2), what friction leaves beside the tangential force [N].
+        tangent: (2,) tangential force [N].
+        patch: the pad's.
+    """
+    squared = ca.sumsqr(tangent) + FORCE_FLOOR**2
+    bound = grip**2 + squared
+    s = grip**2 / bound
+    spread = ca.mtimes(ca.DM(patch.spread), tangent)
+    half = ca.sqrt(ca.sumsqr(spread) / squared + 1e-24) / 2.0
+    bend = BEND * patch.twist
+    # h / 2 + s (c - h / 2) - bend s (1 - s)
+    linear = patch.twist - half - bend
+    lever = half + s * (linear + s * bend)
+    lever_slope = 2.0 * s * (1.0 - s) * (linear + 2.0 * s * bend)
+    return grip * lever, lever + lever_slope
+
+
+def least_soft_squeeze(
+    force: Expression,
+    moment: Expression,
+    arms: tuple[Expression, Expression],
+    friction: Expression,
+    patches: tuple[SoftPatch, SoftPatch],
+    offset: bool = False,
+) -> SoftFingers:
+    """The least normal forces that hold.
+
+    Args:
+        force, moment: (3,) that the contacts have to give, about the payload's centre of mass.
+        arms: (3,) each, from there to the contacts.
+        friction: (2,) Coulomb coefficients.
+        patches: of both pads.
+        offset: whether the contacts may lie beside one another, seen along n; tangential forces
+            and torsion then depend on the squeeze.
+    """
+    apart = arms[0] - arms[1]
+    # About the middle of the contacts: apart x half the difference of both forces, and torsion.
+    rest = moment - ca.cross((arms[0] + arms[1]) / 2.0, force)
+
+    def shared(squeeze: Expression) -> tuple[Expression, Expression, Expression]:
+        """Tangential forces of both contacts and the torsion under N_1 + N_2 = squeeze."""
+        half = ca.vertcat(
+            (rest[1] + apart[0] * squeeze / 2.0) / apart[2],
+            (apart[1] * squeeze / 2.0 - rest[0]) / apart[2],
+        )
+        torsion = rest[2] - (apart[0] * half[1] - apart[1] * half[0])
+        return force[:2] / 2.0 + half, force[:2] / 2.0 - half, torsion
+
+    squeeze = ca.fabs(force[2])
+    load = shared(squeeze)
+    normal, capacity = _pressed(load, force[2], friction, patches)
+    # The least squeeze for what a squeeze asks is a convex function of it: secants reach the one
+    # that asks for itself.
+    before = squeeze
+    for step in range(OFFSET_STEPS if offset else 0):
+        found = normal[0] + normal[1]
+        if step == 0:
+            squeeze, before, excess = found, squeeze, found - squeeze
+        else:
+            now = found - squeeze
+            slope = (now - excess) / (squeeze - before + FORCE_FLOOR)
+            slope = ca.fmin(slope, -LEAST_SLOPE)
+            squeeze, before, excess = squeeze - now / slope, squeeze, now
+        load = shared(squeeze)
+        normal, capacity = _pressed(load, force[2], friction, patches)
+    return SoftFingers(normal, *load, capacity)
+
+
+def _pressed(
+    load: tuple[Expression, Expression, Expression],
+    difference: Expression,
+    friction: Expression,
+    patches: tuple[SoftPatch, SoftPatch],
+) -> tuple[Expression, Expression]:
+    """Least normal forces (2,) [N] and torsion capacities (2,) [N m] for given tangential forces.
+
+    Args:
+        load: tangential force (2,) of each contact, and the torsion.
+        difference: N_1 - N_2.
+        friction, patches: of both pads.
+    """
+    *tangents, torsion = load
+    needed = [
+        (ca.sumsqr(tangent) + FORCE_FLOOR**2) / friction[i] ** 2
+        for i, tangent in enumerate(tangents)
+    ]
+    # The pad that slips first: what its friction leaves beside the tangential force is solved for.
+    first_binds = ca.sqrt(needed[0]) - difference > ca.sqrt(needed[1])
+    own = ca.if_else(first_binds, needed[0], needed[1])
+    mu = ca.if_else(first_binds, friction[0], friction[1])
+    beside = ca.if_else(first_binds, difference, 0.0)
+    grip = ca.fabs(torsion) / (patches[0].twist + patches[1].twist)
+
+    def at(grip: Expression) -> tuple[Expression, list[Expression], Expression]:
+        """Normal forces, capacities, and the slope of the latter's sum by the grip."""
+        bound = ca.sqrt(own + (grip / mu) ** 2)
+        n_2 = bound - beside
+        normal, slope, capacity = ca.vertcat(n_2 + difference, n_2), 0.0, []
+        for i, patch in enumerate(patches):
+            left = ca.fmax(normal[i] ** 2 - needed[i], 0.0) + FORCE_FLOOR**2
+            own_grip = friction[i] * ca.sqrt(left)
+            carried, by_grip = torsion_capacity(own_grip, tangents[i], patch)
+            capacity.append(carried)
+            slope += by_grip * friction[i] ** 2 * normal[i] / own_grip
+        return normal, capacity, slope * grip / (mu**2 * bound)
+
+    for _ in range(FACING_STEPS):
+        _, capacity, slope = at(grip)
+        missing = ca.fabs(torsion) - capacity[0] - capacity[1]
+        grip = ca.fmax(grip + missing / (slope + LEVER_FLOOR), FORCE_FLOOR)
+    normal, capacity, _ = at(grip)
+    return normal, ca.vertcat(*capacity)
+
+
+def case_soft_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,) and a case (15,), see `case_squeeze.CASE_SIZES`, to normal_force
+    (2,) [N]: the least with which two pads with opposite normals that press evenly hold the case.
+
+    The radii of a case are not read: a displaced patch presses evenly about its displaced centre.
+    """
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.SX.sym("case", CASE_SIZE)
+    friction, *_, displacement = case_parts(case)
+    axes = workcell.contacts[0].T_box_pad[:3, :3]
+    force, moment = (ca.mtimes(axes.T, x) for x in case_load_function(workcell)(*motion, case))
+    arms = [
+        axes.T @ (contact.T_box_pad[:3, 3] - workcell.payload.centre_of_mass)
+        + ca.vertcat(displacement[2 * i : 2 * i + 2], 0.0)
+        for i, contact in enumerate(workcell.contacts)
+    ]
+    patches = [SoftPatch.of(contact, axes) for contact in workcell.contacts]
+    held = least_soft_squeeze(
+        force, moment, (arms[0], arms[1]), friction, (patches[0], patches[1]), offset=True
+    )
+    names = ["pose", "rate", "second_rate", "case"]
+    outputs = ca.cse([ca.densify(held.normal)])
+    return ca.Function("case_soft", [*motion, case], outputs, names, ["normal_force"])

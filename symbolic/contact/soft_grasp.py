@@ -1,0 +1,211 @@
+"""Normal forces of the joint allocation on its central path, with exact derivatives by the load.
+
+The least effort has kinks in the load, where a cone begins or ceases to be tight. At a weight mu of
+the barriers the states s of all patches, affine in the load w and in what is free, y, minimise
+
+    f(y, w) = log effort(s) + mu * sum of the patches' barriers,    s = Y y + W w,
+
+which is the central path of `symbolic.contact.central_path`: weight over effort is mu. It is smooth
+and as homogeneous in the load as the least effort itself, above which its own lies by at most mu
+times the patches' degrees, relatively; the normal forces C s tend to those of least effort. By the
+implicit function theorem, with F = D^2 f and T = D^3 f, both by s,
+
+    Y' F Y dy = -Y' F W dw,    U = ds/dw = Y dy/dw + W,    d(C s)/dw = C U,
+    d^2(weight . C s)/dw^2 = U' T[d] U,    Y' F Y p = -Y' C' weight,    d = Y p.
+
+Y' F Y is positive definite for every mu > 0, whether the least effort is unique or not.
+"""
+
+from __future__ import annotations
+
+from itertools import accumulate
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.contact.central_path import centred
+from symbolic.contact.force_closure import WRENCH_SIZE
+from symbolic.contact.grasp import LOAD_SIZE, MOMENT_ARM, SCALE_FLOOR, Grasp
+from symbolic.contact.patches import Elimination, Patch
+
+POLISH_STEPS = 2
+"""Newton steps of f itself, from the central path's iterate, which lies a tenth of a per mille of
+the barriers' scale from its minimum or nearer."""
+
+ROBOTS = 2
+
+
+class SoftGrasp:
+    """The program of a grasp's pads at their own friction, at one weight.
+
+    Attributes:
+        grasp: the pads.
+        weight: mu.
+        size, ends: of the states of all patches together, and where each begins.
+        free, loaded: Y (size, .) and W (size, 6).
+        normals: C (2, size).
+    """
+
+    def __init__(self, grasp: Grasp, friction: Array, weight: float) -> None:
+        """friction: (2,) Coulomb coefficients of the robots' pads."""
+        self.grasp, self.weight = grasp, weight
+        self._friction = ca.DM(friction)
+        sizes = [patch.state_size for patch in grasp.patches]
+        self.ends = [0, *accumulate(sizes)]
+        self.size = self.ends[-1]
+        self.free, self.loaded = self._states()
+        normals = np.zeros((ROBOTS, self.size))
+        normals[list(grasp.robots), self.ends[:-1]] = 1.0
+        self.normals = ca.sparsify(ca.DM(normals))
+
+    def first(self) -> ca.Function:
+        """load (6,), see `symbolic.contact.grasp.grasp_wrenches`, to normal (2,) forces of the
+        robots [N], slope (6, 2), their gradients, and state (size,)."""
+        load = ca.MX.sym("load", LOAD_SIZE)
+        scale = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
+        iterate = centred(self.grasp, self.weight)(load / scale, self._friction)
+        held, at = [], 0
+        for patch in self.grasp.patches:
+            held.append(iterate[at : at + patch.state_size])
+            at += patch.iterate_size
+        state = scale * ca.vertcat(*held)
+        step = self._newton()
+        for _ in range(POLISH_STEPS):
+            state = step(state)
+        outputs = [*self._slopes()(state), state]
+        return ca.Function("held_first", [load], outputs, ["load"], ["normal", "slope", "state"])
+
+    def second(self) -> ca.Function:
+        """state (size,) and weight (2,) to curvature (6, 6), the weighted second derivatives of the
+        normal forces by the load."""
+        state, weight = ca.SX.sym("state", self.size), ca.SX.sym("weight", ROBOTS)
+        local = _Local(self, state)
+        pulled = -ca.mtimes([self.free.T, self.normals.T, weight])
+        along = ca.mtimes(self.free, local.solved(pulled))
+        curvature = local.third(along, local.by_load())
+        return ca.Function(
+            "held_second",
+            [state, weight],
+            [ca.cse(ca.densify(curvature))],
+            ["state", "weight"],
+            ["curvature"],
+        )
+
+    def _slopes(self) -> ca.Function:
+        """A state to both normal forces and their gradients by the load (6, 2)."""
+        state = ca.SX.sym("state", self.size)
+        by_load = _Local(self, state).by_load()
+        outputs = [ca.mtimes(self.normals, state), ca.mtimes(self.normals, by_load).T]
+        return ca.Function("slopes", [state], ca.cse([ca.densify(value) for value in outputs]))
+
+    def _newton(self) -> ca.Function:
+        """A state to the next one, under the same load."""
+        state = ca.SX.sym("state", self.size)
+        local = _Local(self, state)
+        change = local.solved(-ca.mtimes(self.free.T, local.slope))
+        return ca.Function("newton", [state], [ca.cse(state + ca.mtimes(self.free, change))])
+
+    def effort(self, state: ca.SX) -> ca.SX:
+        """Half the sum of all squared forces."""
+        wrenches = [own[:WRENCH_SIZE] for own in ca.vertsplit(state, self.ends)]
+        return self.grasp.effort(wrenches, [ca.SX(LOAD_SIZE, 1), ca.SX(self._friction)])
+
+    def _states(self) -> tuple[ca.DM, ca.DM]:
+        """Y (n, free) and W (n, 6). What is free: whatever leaves the wrenches as they are, then
+        all wrenches but the last, which is what the others leave."""
+        patches = self.grasp.patches
+        inner = [ca.SX.sym(f"inner_{i}", p.state_size - WRENCH_SIZE) for i, p in enumerate(patches)]
+        wrenches = [ca.SX.sym(f"wrench_{i}", WRENCH_SIZE) for i in range(len(patches) - 1)]
+        load = ca.SX.sym("load", LOAD_SIZE)
+        last = self.grasp.left(wrenches, [load, ca.SX(self._friction)])
+        pairs = zip([*wrenches, last], inner, strict=True)
+        state = ca.vertcat(*[part for pair in pairs for part in pair])
+        free = ca.vertcat(*inner, *wrenches)
+        by = [ca.jacobian(state, symbols) for symbols in (free, load)]
+        found = ca.Function("by", [], [ca.sparsify(ca.evalf(matrix)) for matrix in by])
+        free_part, loaded = found.call([])
+        return free_part, loaded
+
+
+class _Local:
+    """Derivatives of f at a state: those of the barriers, patch by patch, and those of log effort,
+    whose curvature Q / effort - g g' is of rank one beside a diagonal.
+
+    Attributes:
+        slope: g plus the barriers' (n,).
+    """
+
+    def __init__(self, program: SoftGrasp, state: ca.SX) -> None:
+        self._program, self._ends = program, program.ends
+        symbol = ca.SX.sym("s", program.size)
+        effort = program.effort(symbol)
+        by = ca.Function("effort", [symbol], [effort, *ca.hessian(effort, symbol)[::-1]])
+        self._effort, self._by_effort, self._square = by(state)
+        self._g = self._by_effort / self._effort
+        self._owns = ca.vertsplit(state, self._ends)
+        patches = zip(program.grasp.patches, self._owns, strict=True)
+        slopes, stiff = zip(*[_barrier(patch)(own) for patch, own in patches], strict=True)
+        self.slope = self._g + program.weight * ca.vertcat(*slopes)
+        # Without g g'.
+        self._curvature = program.weight * ca.diagcat(*stiff) + self._square / self._effort
+        free = program.free
+        reduced = ca.mtimes([free.T, self._curvature, free])
+        n = range(reduced.shape[0])
+        self._system = Elimination([[reduced[i, j] for j in n] for i in n], len(n))
+        self._g_free = ca.mtimes(free.T, self._g)
+        self._answer = self._without(self._g_free)
+        self._share = 1.0 / (1.0 - ca.dot(self._g_free, self._answer))
+
+    def solved(self, right: ca.SX) -> ca.SX:
+        """y of Y' F Y y = right, by Sherman and Morrison's formula."""
+        found = self._without(right)
+        return found + self._answer * (self._share * ca.dot(self._g_free, found))
+
+    def by_load(self) -> ca.SX:
+        """U (n, 6)."""
+        program = self._program
+        right = ca.mtimes([program.free.T, self._curvature, program.loaded])
+        right -= ca.mtimes(self._g_free, ca.mtimes(self._g.T, program.loaded))
+        columns = [self.solved(-right[:, k]) for k in range(LOAD_SIZE)]
+        return ca.mtimes(program.free, ca.horzcat(*columns)) + program.loaded
+
+    def third(self, along: ca.SX, by_load: ca.SX) -> ca.SX:
+        """U' T[d] U for a direction d (n,)."""
+        rows = zip(
+            self._program.grasp.patches,
+            self._owns,
+            ca.vertsplit(along, self._ends),
+            ca.vertsplit(by_load, self._ends),
+            strict=True,
+        )
+        barriers = sum(ca.mtimes(u.T, _third(patch)(own, d, u)) for patch, own, d, u in rows)
+        # Of log effort.
+        over = 1.0 / self._effort
+        turned = ca.mtimes(self._square, along)
+        by, bent = (ca.mtimes(by_load.T, v) for v in (self._g, turned))
+        size, both = ca.dot(self._g, along), ca.mtimes(by, bent.T)
+        square = ca.mtimes([by_load.T, self._square, by_load])
+        of_effort = 2.0 * size * ca.mtimes(by, by.T) - over * (size * square + both + both.T)
+        return self._program.weight * barriers + of_effort
+
+    def _without(self, right: ca.SX) -> ca.SX:
+        """The same without g g'."""
+        return ca.vertcat(*self._system.first(self._system.reduced(ca.vertsplit(right)), []))
+
+
+def _barrier(patch: Patch) -> ca.Function:
+    """A state to the barrier's gradient and Hessian."""
+    state = ca.SX.sym("state", patch.state_size)
+    hessian, gradient = ca.hessian(patch.potential(state), state)
+    return ca.Function("barrier", [state], ca.cse([ca.densify(gradient), hessian]))
+
+
+def _third(patch: Patch) -> ca.Function:
+    """A state, a direction and columns (., 6) to the barrier's third derivative along the direction
+    and each of the columns."""
+    size = patch.state_size
+    state, along = ca.SX.sym("state", size), ca.SX.sym("along", size)
+    columns = ca.SX.sym("columns", size, LOAD_SIZE)
+    moved = ca.jtimes(ca.gradient(patch.potential(state), state), state, along)
+    return ca.Function("third", [state, along, columns], [ca.jtimes(moved, state, columns)])

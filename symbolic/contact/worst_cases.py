@@ -1,0 +1,334 @@
+"""The least force that holds a moving payload in one case of what is not exactly known.
+
+A case says what friction, mass, centre of mass, pad positions and disturbance really are. What is
+known of the payload's inertia is taken to hold about the nominal centre of mass, whatever the true
+one, and to grow with the mass: with it the required force and moment are affine in the centre of
+mass and in the disturbance, each for itself.
+
+Of facing pads it is the least squeeze, of pads anywhere the least force of one robot: a linear
+objective in the program of `symbolic.contact.grasp`. That force is commanded before the case is
+known. Whatever wrenches of all pads then carry the load, an internal squeeze can be added to them
+that presses this robot's pads harder, so that with more than its least force the load is held as
+well.
+
+A displaced pad counts as a smaller one that lies within it: a disc shrinks by the displacement, a
+rectangle in proportion, so that its shorter side does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+
+from symbolic.contact.central_path import least_effort
+from symbolic.contact.facing import balance_of, even_slack, least_squeeze
+from symbolic.contact.force_closure import WRENCH_SIZE, is_closed
+from symbolic.contact.grasp import BEYOND, LOAD_SIZE, MOMENT_ARM, SCALE_FLOOR, Grasp
+from symbolic.contact.load import resultant_force
+from symbolic.contact.paper import required_moment
+from symbolic.contact.patches import least
+from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
+from symbolic.records import Contact, Workcell
+
+CASE_SIZES = {
+    "friction": 2,
+    "radius": 2,
+    "mass": 1,
+    "centre_of_mass": 3,
+    "disturbance": 3,
+    "displacement": 4,
+}
+"""Parts of a case, in order: coefficients; radii of the patches [m]; mass [kg]; centre of mass in
+the box frame [m]; acceleration beside the motion's, world frame [m/s^2]; displacements of both
+pads along the tangents of contact 1 [m], of pads anywhere along their own."""
+
+SQUARED_SPEED_FLOOR = 1e-12
+"""Of u'^2 [1/s^2]; what it adds to a force is far below rounding."""
+
+CASE_SIZE = sum(CASE_SIZES.values())
+
+
+def case_squeeze_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to normal_force (2,) [N].
+
+    With the least squeeze the patches can carry the case; with more they can, with less not.
+    """
+    motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.MX.sym("case", CASE_SIZE)
+    friction, radius, *_ = case_parts(case)
+    held = least_squeeze(_balance_function(workcell)(*motion, case), friction, radius)
+    names = ["pose", "rate", "second_rate", "case"]
+    return ca.Function("case_squeeze", [*motion, case], [held.normal], names, ["normal_force"])
+
+
+def case_gradient_function(workcell: Workcell) -> ca.Function:
+    """As `case_squeeze_function`, and slope (NumPy shape (2, 18)), of each force by pose, rate and
+    second_rate."""
+    motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.MX.sym("case", CASE_SIZE)
+    friction, radius, *_ = case_parts(case)
+    balance = _balance_function(workcell)(*motion, case)
+    force = least_squeeze(balance, friction, radius, differentiable=True).normal
+    slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in motion]).T)
+    names = ["pose", "rate", "second_rate", "case"]
+    outputs = ["normal_force", "slope"]
+    return ca.Function("case_gradient", [*motion, case], [force, slope], names, outputs)
+
+
+def case_slopes_function(workcell: Workcell) -> ca.Function:
+    """Box pose and its derivatives by u (6,), u'', u'^2 and a case (15,), see `CASE_SIZES`, to
+    normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 20)), of each
+    force by pose, both derivatives, u'' and u'^2."""
+    path = [ca.MX.sym(name, 6) for name in ("pose", "first", "second")]
+    a, w, case = ca.MX.sym("a"), ca.MX.sym("w"), ca.MX.sym("case", CASE_SIZE)
+    pose, first, second = path
+    # A root has no slope at rest, what follows from its square has.
+    motion = (pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w)
+    friction, radius, *_ = case_parts(case)
+    balance = _balance_function(workcell)(*motion, case)
+    held = least_squeeze(balance, friction, radius, differentiable=True)
+    slope = ca.densify(ca.jacobian(held.normal, ca.vertcat(*path, a, w)).T)
+    names = ["pose", "first", "second", "a", "w", "case"]
+    outputs = ["normal_force", "slope"]
+    return ca.Function("case_slopes", [*path, a, w, case], [held.normal, slope], names, outputs)
+
+
+def case_difference_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to difference N_1 - N_2 [N],
+    which no squeeze changes."""
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.SX.sym("case", CASE_SIZE)
+    difference = ca.cse([_balance_function(workcell)(*motion, case)[0]])
+    names = ["pose", "rate", "second_rate", "case"]
+    return ca.Function("case_difference", [*motion, case], difference, names, ["difference"])
+
+
+def case_slack_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,), a case (15,), force [N] and arm to slack.
+
+    With the force commanded of the arm (0 or 1), a pressure that shares everything evenly holds the
+    case where slack is positive; elsewhere `case_squeeze_function` knows. It takes a
+    thirtieth of that one's time.
+    """
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case, force, arm = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force"), ca.SX.sym("arm")
+    friction, radius, *_ = case_parts(case)
+    balance = _balance_function(workcell)(*motion, case)
+    n_1 = force + arm * balance[0]
+    names = ["pose", "rate", "second_rate", "case", "force", "arm"]
+    slack = ca.cse([even_slack(balance, friction, radius, n_1)])
+    return ca.Function("case_slack", [*motion, case, force, arm], slack, names, ["slack"])
+
+
+def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
+    """The parts of a case (15,), see `CASE_SIZES`."""
+    ends = [0]
+    for size in CASE_SIZES.values():
+        ends.append(ends[-1] + size)
+    return list(ca.vertsplit(case, ends))
+
+
+def _balance_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate and a case to what the contacts have to balance (9,)."""
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.SX.sym("case", CASE_SIZE)
+    *_, displacement = case_parts(case)
+    in_box = case_load_function(workcell)(*motion, case)
+    nominal = ca.DM(workcell.payload.centre_of_mass)
+    axes = ca.DM(workcell.contacts[0].T_box_pad[:3, :3])
+    arms = [
+        ca.mtimes(axes.T, ca.DM(contact.T_box_pad[:3, 3]) - nominal)
+        + ca.vertcat(displacement[2 * i : 2 * i + 2], 0.0)
+        for i, contact in enumerate(workcell.contacts)
+    ]
+    force, moment = (ca.mtimes(axes.T, part) for part in in_box)
+    return ca.Function(
+        "case_balance", [*motion, case], [balance_of(force, moment, (arms[0], arms[1]))]
+    )
+
+
+def case_load_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate and a case to the force and the moment about the nominal centre of
+    mass that the case asks for, (3,) each, box axes."""
+    pose, rate, second = motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.SX.sym("case", CASE_SIZE)
+    _, _, mass, centre, disturbance, _ = case_parts(case)
+    payload = workcell.payload
+    turned = workcell.task.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], rate[3:])
+    alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
+    share = mass / payload.mass
+    nominal = ca.DM(payload.centre_of_mass)
+    pulled = second[:3] + disturbance
+
+    def resultant(offset: ca.SX | ca.DM) -> ca.SX:
+        return resultant_force(payload.mass, ca.mtimes(rotation, offset), omega, alpha, pulled)
+
+    # About the nominal centre of mass; the true one's distance turns the force on a mass there.
+    turning = required_moment(ca.SX(ca.DM(payload.inertia)), rotation, omega, alpha)
+    moment = turning + ca.cross(ca.mtimes(rotation, centre - nominal), resultant(nominal))
+    parts = [share * ca.mtimes(rotation.T, part) for part in (resultant(centre), moment)]
+    return ca.Function("case_load", [*motion, case], parts)
+
+
+# --- pads anywhere ---
+
+
+def case_grasp_function(workcell: Workcell, commanded: int) -> ca.Function:
+    """pose, rate, second_rate (6,) and a case (15,), see `case_squeeze.CASE_SIZES`, to
+    normal_force (2,) [N], see `grasp_squeeze.commanded_forces`.
+
+    Args:
+        commanded: index of the robot whose force is commanded.
+
+    Raises:
+        SettingsError: the pads do not close their grasp.
+    """
+    motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.MX.sym("case", CASE_SIZE)
+    friction, *_ = case_parts(case)
+    squeeze = GraspSqueeze(workcell, commanded)
+    load = _origin_load_function(workcell)(*motion, case)
+    force = commanded_forces(squeeze, load, friction, _sizes(workcell, case))
+    names = ["pose", "rate", "second_rate", "case"]
+    return ca.Function("case_grasp", [*motion, case], [force], names, ["normal_force"])
+
+
+def case_grasp_slack_function(workcell: Workcell, commanded: int) -> ca.Function:
+    """pose, rate, second_rate (6,), a case (15,) and the commanded force [N] to slack: where it is
+    positive, one pressure that is known holds the case; elsewhere `case_grasp_function` knows."""
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case, force = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force")
+    friction, *_ = case_parts(case)
+    squeeze = GraspSqueeze(workcell, commanded)
+    load = _origin_load_function(workcell)(*motion, case)
+    slack = held_slack(squeeze, load, friction, _sizes(workcell, case), force)
+    names = ["pose", "rate", "second_rate", "case", "force"]
+    inputs = [*motion, case, force]
+    return ca.Function("case_grasp_slack", inputs, ca.cse([slack]), names, ["slack"])
+
+
+def least_reaches(workcell: Workcell) -> tuple[float, float]:
+    """Of each robot's patches the least radius or half side [m]."""
+    first, second = (
+        min(pad.patch_radius if pad.half_sides is None else min(pad.half_sides) for pad in pads)
+        for pads in ((contact, *contact.further) for contact in workcell.contacts)
+    )
+    return first, second
+
+
+def _sizes(workcell: Workcell, case: ca.SX | ca.MX) -> ca.SX | ca.MX:
+    """(2,) of the robots' patches over the cell's own."""
+    _, radius, *_, displacement = case_parts(case)
+    own = ca.DM([contact.patch_radius for contact in workcell.contacts])
+    lengths = [ca.norm_2(displacement[2 * i : 2 * i + 2]) for i in (0, 1)]
+    return radius / own - ca.vertcat(*lengths) / ca.DM(least_reaches(workcell))
+
+
+def _origin_load_function(workcell: Workcell) -> ca.Function:
+    """The load about the box frame's origin (6,), box axes."""
+    inputs = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    inputs.append(ca.SX.sym("case", CASE_SIZE))
+    force, moment = case_load_function(workcell)(*inputs)
+    about = moment + ca.cross(ca.DM(workcell.payload.centre_of_mass), force)
+    return ca.Function("origin_load", inputs, ca.cse([ca.vertcat(force, about)]))
+
+
+REACHES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+"""Sizes of the patches, as shares, at which a squeeze to start from is looked for."""
+
+OTHER_WEIGHT = 1e-3
+"""Weight of the other robot's normal force, which alone may be anything: what it adds to the
+commanded force makes that a little more than the least."""
+
+
+class GraspSqueeze(Grasp):
+    """Least normal force of one robot, plus a little of the other's; see `OTHER_WEIGHT`. Inputs are
+    load, coefficients and sizes of the patches over the cell's own, (2,) by robot.
+
+    Attributes:
+        commanded: index of the robot whose force is commanded.
+        reach: the size of the patches that the squeeze lies within, as a share.
+    """
+
+    def __init__(self, workcell: Workcell, commanded: int) -> None:
+        """Find the squeeze to start from, within smaller patches where these close the grasp.
+
+        Raises:
+            SettingsError: no squeeze holds the payload whatever is asked.
+        """
+        smaller = ((share, smaller_patches(workcell, share)) for share in REACHES)
+        closed = ((share, cell) for share, cell in smaller if is_closed(cell))
+        self.reach, cell = next(closed, (1.0, workcell))
+        super().__init__(cell)
+        self.commanded = commanded
+        self.cell_sizes = (("load", LOAD_SIZE), ("friction", 2), ("reach", 2))
+        self.nominal = (*self.nominal, [1.0, 1.0])
+
+    def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+        """See `symbolic.contact.central_path.Program`."""
+        total = 0.0
+        for wrench, robot in zip(wrenches, self.robots, strict=True):
+            total += wrench[0] * (1.0 if robot == self.commanded else OTHER_WEIGHT)
+        return total
+
+
+def commanded_forces(squeeze: GraspSqueeze, load: ca.MX, friction: ca.MX, share: ca.MX) -> ca.MX:
+    """(2,) normal forces of the robots [N]: what is commanded, a convex function of the load, and
+    what the other one then presses with. Beyond any limit where the grasp does not close.
+
+    Args:
+        load: (6,) force and moment about the box frame's origin, along the box's axes.
+        friction: (2,) Coulomb coefficients of the robots' pads.
+        share: (2,) sizes of their patches over the cell's own.
+    """
+    size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
+    reach = share / squeeze.reach
+    found = least_effort(squeeze, load / size, friction, reach)
+    return _in_newtons(squeeze)(found, size, friction, reach)
+
+
+def held_slack(
+    squeeze: GraspSqueeze, load: ca.SX, friction: ca.SX, share: ca.SX, force: ca.SX
+) -> ca.SX:
+    """Positive where the least wrenches that balance a load, and as much of the squeeze as makes
+    the commanded force (arguments as in `commanded_forces`), lie within all cones."""
+    reach = share / squeeze.reach
+    asked, given = squeeze.asked(load, friction, reach), squeeze.squeezed(friction, reach)
+    own = [k for k, robot in enumerate(squeeze.robots) if robot == squeeze.commanded]
+    pressed = (force - sum(asked[k][0] for k in own)) / sum(given[k][0] for k in own)
+    held = [a + pressed * g for a, g in zip(asked, given, strict=True)]
+    slack = [patch.slack(state) for patch, state in zip(squeeze.patches, held, strict=True)]
+    return ca.fmin(least(slack), pressed)
+
+
+def smaller_patches(workcell: Workcell, share: float) -> Workcell:
+    """The cell with smaller patches about the same places."""
+
+    def smaller(contact: Contact) -> Contact:
+        sides = contact.half_sides
+        return replace(
+            contact,
+            patch_radius=share * contact.patch_radius,
+            half_sides=None if sides is None else (share * sides[0], share * sides[1]),
+            further=tuple(smaller(pad) for pad in contact.further),
+        )
+
+    first, second = (smaller(contact) for contact in workcell.contacts)
+    return replace(workcell, contacts=(first, second))
+
+
+def _in_newtons(squeeze: GraspSqueeze) -> ca.Function:
+    n = len(squeeze.patches)
+    found, size = ca.SX.sym("w", WRENCH_SIZE * n), ca.SX.sym("s")
+    friction, reach = ca.SX.sym("mu", 2), ca.SX.sym("reach", 2)
+    force = [ca.SX(0.0), ca.SX(0.0)]
+    for own, robot in zip(ca.vertsplit(found, WRENCH_SIZE), squeeze.robots, strict=True):
+        force[robot] += own[0]
+    force[squeeze.commanded] += OTHER_WEIGHT * force[1 - squeeze.commanded]
+    squeezed = zip(squeeze.patches, squeeze.squeezed(friction, reach), strict=True)
+    closes = least([patch.slack(state) for patch, state in squeezed]) > 0.0
+    outputs = size * ca.if_else(closes, ca.vertcat(*force), BEYOND)
+    return ca.Function("in_newtons", [found, size, friction, reach], [outputs])

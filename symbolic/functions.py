@@ -1,0 +1,376 @@
+"""The functions that are compiled, by who needs them.
+
+A whole candidate, from its decision vector to every sample: path, time law, payload load and both
+arms composed. The outputs hold one sample per column, so that NumPy sees (n_samples, dim). For the
+evaluator also postures and collision bounds; for timings the derivatives along the path.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from symbolic.cell_model import CellModel
+from symbolic.contact.load import LOAD_OUTPUTS, load_function, uncertain_load_function
+from symbolic.path.spline import extended_matrix, sample_basis, waypoint_matrix
+from symbolic.path.time_law import driven_path, timed_path
+from symbolic.path_motion import arm_derivative_function, path_motion_function
+from symbolic.records import Workcell
+from symbolic.records.quantities import GRAVITY
+from symbolic.robot.arm import (
+    REACH_TOLERANCE,
+    TRACK_OUTPUTS,
+    follow_function,
+    posture_function,
+    prediction_function,
+    start_function,
+    torque_function,
+    track_function,
+)
+
+CONSTRAINTS = (
+    "reach_1",
+    "reach_2",
+    "joint_limits_1",
+    "joint_limits_2",
+    "singularity_1",
+    "singularity_2",
+    "friction",
+    "pressure_1",
+    "pressure_2",
+)
+"""Columns of the `constraint` output, each at most 0 where a sample satisfies it.
+
+reach: pose residual over its tolerance [m, rad], or 1 once the arm lost the path.
+joint_limits: excess over the nearest limit [rad]. singularity: 1 - |det J| over its least value.
+friction: excess of the tangential over the limiting force, over the payload's weight.
+pressure: shift of the centre of pressure over the patch radius, minus 1.
+Limits and singularity of a lost arm are unknown and count as satisfied; its loss does not.
+"""
+
+DRIVE_INPUTS = ("drive_time", "drive_speed", "drive_acceleration")
+"""(n,) times [s], u' [1/s] and u'' [1/s^2] at the samples, found by a solver."""
+
+TIMING_TOLERANCE = 5e-3
+"""Excess over a limit that a timing may have, as a share of it (`hybrid_opt.timing.use`)."""
+
+FRICTION_TOLERANCE = 1e-9
+"""Rounding allowed in a tight friction cone, as a share of the payload's weight."""
+
+
+def candidate_function(model: CellModel) -> ca.Function:
+    """Evaluator of one candidate: x (n_var,) to every per-sample quantity.
+
+    Outputs (NumPy shapes, n samples): time (n,) [s]; pose (n, 6), rate, second_rate (n, 6) with
+    respect to time; those of `LOAD_OUTPUTS` without the wrenches; per robot i = 1, 2 those of
+    `TRACK_OUTPUTS` as q_i (n, joints) and so on; constraint (n, 9), see `CONSTRAINTS`; violation
+    (9,): largest positive value of each constraint over the samples; violation_time (9,): time
+    for which each is violated, over the duration.
+
+    Under the time law 'optimal' the inputs of `DRIVE_INPUTS` follow x.
+    """
+    workcell = model.workcell
+    n = workcell.task.samples
+    inputs = {"x": ca.MX.sym("x", workcell.task.n_var)}
+    basis, waypoints = sample_basis(workcell.task), waypoint_matrix(workcell.task, inputs["x"])
+    if workcell.task.time_law == "optimal":
+        inputs |= {name: ca.MX.sym(name, n) for name in DRIVE_INPUTS}
+        path = driven_path(basis, waypoints, *[inputs[name].T for name in DRIVE_INPUTS])
+    else:
+        path = timed_path(workcell.task, basis, waypoints)
+    load = dict(
+        zip(
+            LOAD_OUTPUTS,
+            load_function(workcell).map(n)(path.pose, path.rate, path.second_rate),
+            strict=True,
+        )
+    )
+    outputs: dict[str, ca.MX] = {
+        "time": path.time,
+        "pose": path.pose,
+        "rate": path.rate,
+        "second_rate": path.second_rate,
+        **{name: load[name] for name in LOAD_OUTPUTS if not name.startswith("wrench")},
+    }
+    whole = extended_matrix(workcell.task, inputs["x"], waypoints)
+    pose = ca.mtimes(whole, ca.DM(basis.position.T))
+    for i in (0, 1):
+        tracked = _track(model, i, pose, load[f"wrench_{i + 1}"])
+        outputs |= {f"{name}_{i + 1}": tracked[name] for name in TRACK_OUTPUTS}
+    constraint = _constraint_function(workcell).map(n)(
+        *[outputs[name] for name in _CONSTRAINT_INPUTS]
+    )
+    violated = ca.fmax(constraint, 0.0)
+    outputs["constraint"] = constraint
+    outputs["violation"] = _row_max(violated)
+    outputs["violation_time"] = ca.mtimes(violated > 0.0, _time_share(path.time).T)
+    return ca.Function(
+        "candidate",
+        list(inputs.values()),
+        list(outputs.values()),
+        list(inputs),
+        list(outputs),
+        {"cse": True},
+    )
+
+
+def motion_function(model: CellModel) -> ca.Function:
+    """What of a candidate needs no forces, much cheaper where those are found by a solver; not for
+    'optimal'.
+
+    Outputs as of `candidate_function`: time, pose, q_1, q_2, and the violation (9,) of reach,
+    joint limits and singularity; friction and pressure count as satisfied.
+    """
+    workcell = model.workcell
+    n = workcell.task.samples
+    x = ca.MX.sym("x", workcell.task.n_var)
+    basis, waypoints = sample_basis(workcell.task), waypoint_matrix(workcell.task, x)
+    path = timed_path(workcell.task, basis, waypoints)
+    whole = extended_matrix(workcell.task, x, waypoints)
+    pose = ca.mtimes(whole, ca.DM(basis.position.T))
+    values = {name: ca.DM.zeros(2, n) for name in _CONSTRAINT_INPUTS[-3:]}
+    for i in (0, 1):
+        tracked = _track(model, i, pose, ca.DM.zeros(6, n))
+        values |= {f"{name}_{i + 1}": tracked[name] for name in TRACK_OUTPUTS}
+    inputs = [values[name] for name in _CONSTRAINT_INPUTS]
+    constraint = _constraint_function(workcell).map(n)(*inputs)
+    outputs = {
+        "time": path.time,
+        "pose": path.pose,
+        "q_1": values["q_1"],
+        "q_2": values["q_2"],
+        "violation": _row_max(ca.fmax(constraint, 0.0)),
+    }
+    names = list(outputs)
+    return ca.Function("motion_alone", [x], list(outputs.values()), ["x"], names, {"cse": True})
+
+
+_LOAD_SIZES = {
+    "angular_velocity": 3,
+    "angular_acceleration": 3,
+    "normal_force": 2,
+    "tangential_force": 2,
+    "contact_force": 6,
+    "pressure_shift": 2,
+    "shift_vector": 6,
+    "required_moment": 3,
+    "point_moment_residual": 3,
+    "moment_residual": 3,
+}
+
+FORCE_CONSTRAINTS = CONSTRAINTS[6:]
+"""Those that depend on the contact forces."""
+
+SAMPLE_NAMES = frozenset(
+    (*_LOAD_SIZES, *(f"{name}_{i}" for i in (1, 2) for name in TRACK_OUTPUTS), "constraint")
+)
+"""Outputs of `sample_functions`' `sample` after the states."""
+
+
+def sample_sizes(workcell: Workcell) -> dict[str, int]:
+    """Outputs of `sample_functions`' `sample` after the states, and their entries; the candidate's
+    function has the same ones."""
+    sizes = dict(_LOAD_SIZES)
+    for i, robot in enumerate(workcell.robots, start=1):
+        joints = len(robot.position_lower)
+        own = dict.fromkeys(TRACK_OUTPUTS, 1) | {"q": joints, "joint_torque": joints}
+        sizes |= {f"{name}_{i}": size for name, size in own.items()}
+    return sizes | {"constraint": len(CONSTRAINTS)}
+
+
+def forces_come_last(workcell: Workcell) -> bool:
+    """Whether a candidate's forces are found after all else is known of it, where that is free of
+    violations: a program solves for them, and then nothing but objectives depends on them."""
+    return workcell.task.allocation == "joint"
+
+
+def force_sizes(workcell: Workcell) -> dict[str, int]:
+    """Outputs of `sample_functions`' `forces`, and their entries."""
+    torques = [f"joint_torque_{i}" for i in (1, 2)]
+    sizes = _LOAD_SIZES | {name: sample_sizes(workcell)[name] for name in torques}
+    return sizes | {"force_constraint": len(FORCE_CONSTRAINTS)}
+
+
+def sample_functions(model: CellModel) -> dict[str, ca.Function]:
+    """A candidate's function in parts, to be put together sample by sample; not for 'optimal'.
+
+    path: x (n_var,) -> time (1, n), pose (6 + m, n), extended by the redundant joints, rate,
+    second_rate (6, n). begin: -> joints of both arms at the first box pose. start: first pose, such
+    joints -> state_1, state_2 before the first sample. predict: state_1, state_2, second pose ->
+    both states before it. sample: pose, rate, second_rate, state_1, state_2 -> next_state_1,
+    next_state_2, then `sample_sizes`. Where `forces_come_last` these are without forces, all zero,
+    and forces: pose, rate, second_rate, joints of both arms -> `force_sizes`, the last of them
+    those entries of the constraints.
+    """
+    workcell = model.workcell
+    x = ca.MX.sym("x", workcell.task.n_var)
+    basis = sample_basis(workcell.task)
+    waypoints = waypoint_matrix(workcell.task, x)
+    path = timed_path(workcell.task, basis, waypoints)
+    whole = ca.mtimes(extended_matrix(workcell.task, x, waypoints), ca.DM(basis.position.T))
+    motion = [path.time, whole, path.rate, path.second_rate]
+    pose = ca.MX.sym("pose", workcell.task.extended_size)
+    box = [pose[:6], *[ca.MX.sym(name, 6) for name in ("rate", "second_rate")]]
+    load = dict(zip(LOAD_OUTPUTS, load_function(workcell).call(box), strict=True))
+    apart = forces_come_last(workcell)
+    outputs = {k: ca.MX(ca.DM.zeros(v.shape)) for k, v in load.items()} if apart else load
+    states, starts, following, predicted = [], [], [], []
+    begins = [ca.MX.sym(f"begin_{i + 1}", len(q)) for i, q in enumerate(model.start)]
+    for i in (0, 1):
+        arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
+        starts.append(start_function(*arm, f"arm_{i + 1}_start")(begins[i], pose))
+        state = ca.MX.sym(f"state_{i + 1}", starts[i].shape[0])
+        states.append(state)
+        track = track_function(*arm, f"arm_{i + 1}_sample")
+        after, *tracked = track(state, pose, outputs[f"wrench_{i + 1}"])
+        following.append(after)
+        outputs |= {
+            f"{name}_{i + 1}": value for name, value in zip(TRACK_OUTPUTS, tracked, strict=True)
+        }
+        predicted.append(prediction_function(*arm, f"arm_{i + 1}_prediction")(state, pose))
+    inputs = [outputs[name] for name in _CONSTRAINT_INPUTS]
+    outputs["constraint"] = _constraint_function(workcell)(*inputs)
+    sizes = sample_sizes(workcell)
+    results = [*following, *(outputs[name] for name in sizes)]
+    names = ["next_state_1", "next_state_2", *sizes]
+    given = [pose, *box[1:], *states]
+    return {
+        "path": ca.Function("path", [x], motion, {"cse": True}),
+        "begin": ca.Function("begin", [], [ca.SX(ca.DM(q)) for q in model.start]),
+        "start": ca.Function("start", [pose, *begins], starts),
+        "predict": ca.Function("predict", [*states, pose], predicted),
+        "sample": ca.Function("sample", given, results, [v.name() for v in given], names),
+        **({"forces": _forces_function(model, pose, box, load)} if apart else {}),
+    }
+
+
+def _forces_function(
+    model: CellModel, pose: ca.MX, box: list[ca.MX], load: dict[str, ca.MX]
+) -> ca.Function:
+    """See `sample_functions`."""
+    workcell = model.workcell
+    joints = [ca.MX.sym(f"q_{i + 1}", model.robots[i].n_joints) for i in (0, 1)]
+    outputs = dict(load)
+    for i, q in enumerate(joints):
+        arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
+        torque = torque_function(*arm, f"arm_{i + 1}_torque")
+        outputs[f"joint_torque_{i + 1}"] = torque(q, pose, load[f"wrench_{i + 1}"])
+    known = [ca.DM.zeros(1)] * (len(_CONSTRAINT_INPUTS) - 3)
+    of_forces = [outputs[name] for name in _CONSTRAINT_INPUTS[-3:]]
+    constraint = _constraint_function(workcell)(*known, *of_forces)
+    outputs["force_constraint"] = constraint[-len(FORCE_CONSTRAINTS) :]
+    names = list(force_sizes(workcell))
+    given = [pose, *box[1:], *joints]
+    results = [outputs[name] for name in names]
+    return ca.Function("forces", given, results, [v.name() for v in given], names)
+
+
+def _track(model: CellModel, i: int, pose: ca.MX, wrench: ca.MX) -> dict[str, ca.MX]:
+    robot, contact = model.workcell.robots[i], model.workcell.contacts[i]
+    n = model.workcell.task.samples
+    follow = follow_function(robot, model.robots[i], contact, n, f"arm_{i + 1}")
+    results = follow(ca.DM(model.start[i]), pose, wrench)
+    return dict(zip(TRACK_OUTPUTS, results, strict=True))
+
+
+_CONSTRAINT_INPUTS = (
+    "ik_residual_1",
+    "ik_residual_2",
+    "lost_1",
+    "lost_2",
+    "limit_margin_1",
+    "limit_margin_2",
+    "manipulability_1",
+    "manipulability_2",
+    "normal_force",
+    "tangential_force",
+    "pressure_shift",
+)
+
+
+def _constraint_function(workcell: Workcell) -> ca.Function:
+    """Constraint values (9,) of one sample from the named outputs."""
+    sizes = {"normal_force": 2, "tangential_force": 2, "pressure_shift": 2}
+    inputs = {name: ca.SX.sym(name, sizes.get(name, 1)) for name in _CONSTRAINT_INPUTS}
+    weight = -workcell.payload.mass * GRAVITY[2]
+    values: dict[str, ca.SX] = {}
+    cones = []
+    for i in (0, 1):
+        robot, contact, arm = workcell.robots[i], workcell.contacts[i], i + 1
+        lost = inputs[f"lost_{arm}"]
+        off_path = ca.fmax(inputs[f"ik_residual_{arm}"] - REACH_TOLERANCE, lost)
+        values[f"reach_{arm}"] = ca.if_else(lost > 0.5, off_path, -REACH_TOLERANCE)
+        values[f"joint_limits_{arm}"] = ca.if_else(lost > 0.5, 0.0, -inputs[f"limit_margin_{arm}"])
+        values[f"singularity_{arm}"] = ca.if_else(
+            lost > 0.5, 0.0, 1.0 - inputs[f"manipulability_{arm}"] / robot.min_manipulability
+        )
+        allowed = 1.0 + (TIMING_TOLERANCE if workcell.task.time_law == "optimal" else 0.0)
+        values[f"pressure_{arm}"] = inputs["pressure_shift"][i] / contact.patch_radius - allowed
+        limit = contact.friction * inputs["normal_force"][i]
+        cones.append((inputs["tangential_force"][i] - limit) / weight - FRICTION_TOLERANCE)
+    values["friction"] = ca.fmax(cones[0], cones[1])
+    return ca.Function(
+        "constraints",
+        list(inputs.values()),
+        [ca.vertcat(*[values[name] for name in CONSTRAINTS])],
+    )
+
+
+def _row_max(matrix: ca.MX) -> ca.MX:
+    return ca.vertcat(*[ca.mmax(matrix[i, :]) for i in range(matrix.shape[0])])
+
+
+def _time_share(time: ca.MX) -> ca.MX:
+    """Share (1, n) of the duration that each sample stands for: half of both neighbouring steps."""
+    steps = time[:, 1:] - time[:, :-1]
+    return (ca.horzcat(0.0, steps) + ca.horzcat(steps, 0.0)) / (2.0 * time[-1])
+
+
+# --- sets of functions ---
+
+
+def cell_functions(model: CellModel) -> dict[str, ca.Function]:
+    """The functions by name.
+
+    candidate: the evaluator of a whole candidate (`symbolic.functions`).
+    inverse_dynamics_i: of each arm i = 1, 2 (`symbolic.robot.model`).
+    posture: both arms at one box pose (`symbolic.robot.arm.posture_function`).
+    clearance, piece_poses, motion: collision bounds, placements and bounds of the motion
+    (`symbolic.geometry.clearance.screening_functions`).
+    """
+    return {
+        "candidate": candidate_function(model),
+        **{f"inverse_dynamics_{i + 1}": model.robots[i].inverse_dynamics for i in (0, 1)},
+        "posture": posture_function(model.workcell.robots, model.robots, model.workcell.contacts),
+        **model.screening,
+    }
+
+
+def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
+    """What a whole evaluation is put together from, sample by sample.
+
+    path, begin, start, predict, sample and, of some cells, forces: see
+    `symbolic.functions.sample_functions`.
+    clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
+    """
+    screening = {name: model.screening[name] for name in ("clearance", "piece_poses")}
+    return sample_functions(model) | screening
+
+
+def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
+    """Functions for the timing of one workcell.
+
+    path_motion: see `symbolic.path_motion`, at that many samples. load, uncertain_load: see
+    `symbolic.contact.load`. arm_i per arm i = 1, 2: see
+    `symbolic.path_motion.arm_derivative_function`.
+    """
+    workcell = model.workcell
+    functions = {
+        "path_motion": path_motion_function(model, samples),
+        "load": load_function(workcell),
+        "uncertain_load": uncertain_load_function(workcell),
+    }
+    for i, (robot, robot_model, contact) in enumerate(
+        zip(workcell.robots, model.robots, workcell.contacts, strict=True), start=1
+    ):
+        functions[f"arm_{i}"] = arm_derivative_function(robot, robot_model, contact, f"arm_{i}")
+    return functions

@@ -1,0 +1,121 @@
+"""What bounds of distances are made of: operations on their safe side, and placements.
+
+A lower bound of a distance stays one if every operation that it is made of errs downwards (or
+upwards where it is subtracted). `EXACT` computes the sharpest bound, with kinks; `Smooth(width)`
+replaces each kink by a hyperbola of that width, twice (in fact infinitely often) differentiable:
+
+  |x|  <=  sqrt(x^2 + w^2)              exceeds |x| by at most w,
+  max(a, b)  >=  (a + b + sqrt((a-b)^2 + w^2) - w) / 2    falls short by at most w / 2,
+  min(a, b)  >=  (a + b - sqrt((a-b)^2 + w^2)) / 2        falls short by at most w / 2,
+  |v|  >=  sqrt(v.v + w^2) - w          falls short by at most w.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+
+_TINY = 1e-12
+"""Added under roots so that derivatives stay finite."""
+
+
+@dataclass(frozen=True)
+class Softness:
+    """The operations; width 0 means exact.
+
+    `above` results are at least the true value, `below` results at most.
+
+    Attributes:
+        width: of the kinks [m].
+        turn: of those of the entries of rotations [1], whose effect is a body's size longer; None
+            for the same number as `width`.
+    """
+
+    width: float = 0.0
+    turn: float | None = None
+
+    def absolute_above(self, x: ca.SX) -> ca.SX:
+        """|x| or slightly more."""
+        return ca.sqrt(x * x + self.width**2) if self.width else ca.fabs(x)
+
+    def entry_above(self, x: ca.SX) -> ca.SX:
+        """|x| of an entry of a rotation, or slightly more."""
+        turn = self.width if self.turn is None else self.turn
+        return ca.sqrt(x * x + turn**2) if turn else ca.fabs(x)
+
+    def absolute_below(self, x: ca.SX) -> ca.SX:
+        """|x| or slightly less."""
+        return self.absolute_above(x) - self.width
+
+    def ramp_above(self, x: ca.SX) -> ca.SX:
+        """max(x, 0) or up to half a width more; never negative."""
+        return (x + ca.sqrt(x * x + self.width**2)) / 2.0 if self.width else ca.fmax(x, 0.0)
+
+    def maximum_above(self, values: Sequence[ca.SX]) -> ca.SX:
+        """Largest value or slightly more."""
+        return _fold(self._pair_above if self.width else ca.fmax, values)
+
+    def maximum_below(self, values: Sequence[ca.SX]) -> ca.SX:
+        """Largest value or slightly less."""
+        if not self.width:
+            return _fold(ca.fmax, values)
+        return _fold(lambda a, b: self._pair_above(a, b) - self.width / 2.0, values)
+
+    def minimum_below(self, values: Sequence[ca.SX]) -> ca.SX:
+        """Least value or slightly less."""
+        return -self.maximum_above([-value for value in values])
+
+    def norm_below(self, squared: ca.SX) -> ca.SX:
+        """Root of a squared length, or slightly less."""
+        if self.width:
+            return ca.sqrt(squared + self.width**2) - self.width
+        return ca.sqrt(ca.fmax(squared, _TINY)) - _TINY**0.5
+
+    def cosine_above(self, sine: ca.SX) -> ca.SX:
+        """sqrt(1 - sine^2) or slightly more."""
+        rest = 1.0 - sine * sine
+        if self.width:
+            # 1 - sine^2 may be -1e-16 by roundoff; the width keeps the root's argument positive.
+            return ca.sqrt(rest + self.width**2)
+        return ca.sqrt(ca.fmax(rest, _TINY))
+
+    def _pair_above(self, a: ca.SX, b: ca.SX) -> ca.SX:
+        return (a + b + ca.sqrt((a - b) ** 2 + self.width**2)) / 2.0
+
+
+def _fold(operation: Callable[[ca.SX, ca.SX], ca.SX], values: Sequence[ca.SX]) -> ca.SX:
+    return reduce(operation, values)
+
+
+EXACT = Softness()
+
+
+# --- placements ---
+
+
+def world_placements(
+    T_world_root: Array, placements: tuple[ca.SX, ca.SX]
+) -> list[tuple[ca.SX, ca.SX]]:
+    """Rotation and position in the world of each joint frame given in the root."""
+    rotations, positions = placements
+    T = ca.SX(clean(T_world_root))
+    return [
+        (
+            ca.mtimes(T[:3, :3], rotations[:, 3 * j : 3 * j + 3]),
+            ca.mtimes(T[:3, :3], positions[:, j]) + T[:3, 3],
+        )
+        for j in range(positions.shape[1])
+    ]
+
+
+def clean(matrix: Array) -> Array:
+    """Entries within 1e-15 of -1, 0 or 1 made exact, so that expressions simplify."""
+    rounded = np.round(matrix)
+    near = (np.abs(matrix - rounded) < 1e-15) & (np.abs(rounded) <= 1.0)
+    return np.where(near, rounded, matrix)

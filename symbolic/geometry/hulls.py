@@ -1,0 +1,190 @@
+"""Triangle meshes as convex pieces whose union contains them.
+
+A watertight component is cut by planes where that makes the hulls of its parts markedly
+smaller. The hull of a part contains the part's surface and, with the cut's outline, the cap
+that closes it: so the union of the hulls contains the solid. A component with holes has no
+inside; its whole hull is used, with a warning.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull, QhullError
+
+from symbolic.array import Array
+from symbolic.errors import CollisionModelError, DualArmWarning
+from symbolic.geometry.pieces import Hull
+from symbolic.read.meshes import read_mesh
+from symbolic.records.quantities import SMALLEST_SIZE
+
+
+class CollisionModelWarning(DualArmWarning):
+    """A collision shape is used in a coarser form than the file describes."""
+
+
+_TOLD: dict[str | tuple[str, type[Warning], int], int] = {}
+"""What Python's warnings remember, so that each is told once."""
+
+
+def convex_pieces(path: Path, scale: Array) -> tuple[Hull, ...]:
+    """Convex hulls, in the mesh's frame, whose union contains the mesh.
+
+    Args:
+        path: a file in one of `FORMATS`.
+        scale: (3,) factor per axis.
+
+    Raises:
+        CollisionModelError: unreadable, empty, flat, with non-finite vertices, or enormous.
+    """
+    return cut(read_mesh(path, scale), path)
+
+
+def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
+    """The convex pieces of a mesh of `read_mesh`; `path` names it in messages.
+
+    Raises:
+        CollisionModelError: a part has no convex hull.
+    """
+    pieces: list[Hull] = []
+    open_components = 0
+    try:
+        for component in mesh.split(only_watertight=False, repair=False):
+            triangles = np.asarray(component.triangles, dtype=float)
+            filled = hull_volume(triangles)
+            if component.is_watertight and component.is_winding_consistent and filled > 0.0:
+                pieces.extend(decompose(triangles, abs(float(component.volume))))
+            else:
+                open_components += 1
+                pieces.append(hull_of(triangles if filled > 0.0 else _thickened(triangles)))
+    except QhullError as error:
+        raise CollisionModelError(
+            f"{path}: a part of the mesh has no convex hull; remove triangles that are points or "
+            "lines"
+        ) from error
+    if open_components:
+        warnings.warn_explicit(
+            f"{open_components} part(s) of the mesh {path.name} are not watertight; the convex "
+            "hull of each is used as its collision shape. Close the holes to get a tighter shape",
+            CollisionModelWarning,
+            filename=path.name,  # the mesh is to be corrected, not a line of this source
+            lineno=0,
+            registry=_TOLD,
+        )
+    return _outermost(pieces)
+
+
+def _outermost(pieces: list[Hull]) -> tuple[Hull, ...]:
+    """The pieces without those that lie in another: screws and bearings inside a housing."""
+    volumes = [hull_volume(piece.vertices[piece.faces]) for piece in pieces]
+    kept: list[tuple[Hull, Array]] = []
+    for k in np.argsort(volumes, kind="stable")[::-1]:
+        piece = pieces[k]
+        inside = (
+            np.all(piece.vertices @ planes[:, :3].T + planes[:, 3] <= 1e-12) for _, planes in kept
+        )
+        if not any(inside):
+            kept.append((piece, ConvexHull(piece.vertices).equations))
+    chosen = {id(piece) for piece, _ in kept}
+    return tuple(piece for piece in pieces if id(piece) in chosen)
+
+
+def _thickened(triangles: Array) -> Array:
+    """The corners of a flat surface, moved both ways along every axis."""
+    steps = SMALLEST_SIZE * np.concatenate([np.eye(3), -np.eye(3)])
+    return np.asarray(triangles.reshape(-1, 1, 3) + steps, dtype=float)
+
+
+# --- convex decomposition ---
+
+
+CUTS = np.linspace(0.125, 0.875, 7)
+"""Where planes are tried, as fractions of a part's extent."""
+
+
+MOST_PIECES = 8
+"""Most convex pieces per connected component."""
+
+
+WORTHWHILE = 0.05
+"""A cut is made if it removes at least this part of the component's hull volume."""
+
+
+def hull_of(points: Array) -> Hull:
+    """The convex hull of points, its faces turned outwards."""
+    hull = ConvexHull(points.reshape(-1, 3))
+    vertices = hull.points[hull.vertices]
+    index = np.full(len(hull.points), -1)
+    index[hull.vertices] = np.arange(len(hull.vertices))
+    faces = index[hull.simplices]
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    vertices.setflags(write=False)
+    faces.setflags(write=False)
+    return Hull(vertices, faces)
+
+
+def decompose(triangles: Array, solid: float) -> list[Hull]:
+    """Cut greedily, always the part whose best cut removes the most empty volume.
+
+    Args:
+        triangles: (n, 3, 3) of a watertight surface.
+        solid: the volume that it encloses [m^3].
+    """
+    whole = hull_volume(triangles)
+    if whole - solid < WORTHWHILE * whole:
+        return [hull_of(triangles)]
+    parts = [(triangles, *_best_cut(triangles))]
+    while len(parts) < MOST_PIECES:
+        k = int(np.argmax([gain for _, gain, _ in parts]))
+        _, gain, halves = parts[k]
+        if gain < WORTHWHILE * whole:
+            break
+        parts[k : k + 1] = [(half, *_best_cut(half)) for half in halves]
+    return [hull_of(part) for part, _, _ in parts]
+
+
+def hull_volume(triangles: Array) -> float:
+    """Volume of the convex hull; zero where it is flat."""
+    try:
+        return float(ConvexHull(triangles.reshape(-1, 3)).volume)
+    except (QhullError, ValueError):
+        return 0.0
+
+
+def _best_cut(triangles: Array) -> tuple[float, tuple[Array, ...]]:
+    """The gain [m^3] of the best plane across a coordinate axis, and the two halves."""
+    volume = hull_volume(triangles)
+    lower, upper = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    best: tuple[float, tuple[Array, ...]] = (0.0, ())
+    for axis in range(3):
+        for level in lower[axis] + CUTS * (upper[axis] - lower[axis]):
+            halves = (_clip(triangles, axis, level, 1.0), _clip(triangles, axis, level, -1.0))
+            gain = volume - sum(hull_volume(half) for half in halves)
+            if gain > best[0]:
+                best = (gain, halves)
+    return best
+
+
+def _clip(triangles: Array, axis: int, level: float, side: float) -> Array:
+    """The parts of triangles (n, 3, 3) where side * (coordinate - level) >= 0, as triangles."""
+    height = side * (triangles[:, :, axis] - level)
+    inside = height >= 0.0
+    count = inside.sum(axis=1)
+    kept = [triangles[count == 3]]
+    for lone_is_inside, chosen in ((True, count == 1), (False, count == 2)):
+        lone = np.argmax(inside[chosen] == lone_is_inside, axis=1)
+        order = (lone[:, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(np.take_along_axis(triangles[chosen], order[:, :, None], 1), 1, 0)
+        ha, hb, hc = np.take_along_axis(height[chosen], order, 1).T[:, :, None]
+        ab, ac = a + ha / (ha - hb) * (b - a), a + ha / (ha - hc) * (c - a)
+        if lone_is_inside:
+            kept.append(np.stack([a, ab, ac], axis=1))
+        else:
+            kept += [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
+    return np.concatenate(kept)

@@ -1,0 +1,226 @@
+"""What bounds the timing of a path, as coefficients that compiled passes read.
+
+`symbolic.path_motion` gives a carry's geometry in physical quantities. Here every limit at
+a sample is a function of (u'', u'^2) whose coefficients lie packed in one row of numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from symbolic.cell_model import CellModel
+from symbolic.contact.paper import allocate, pressure_shift
+from symbolic.path.spline import path_basis, waypoint_matrix
+from symbolic.path_motion import (
+    ARM_OUTPUTS,
+    BOX_OUTPUTS,
+    arm_derivative_function,
+    box_function,
+    extended_motion,
+)
+from symbolic.records import Workcell
+from symbolic.records.quantities import GRAVITY
+from symbolic.robot.arm import TRACK_OUTPUTS, follow_function
+
+VERDICTS = ("ik_residual", "lost", "limit_margin", "manipulability")
+"""What `symbolic.robot.arm.TRACK_OUTPUTS` says of an arm beside its joints."""
+
+SPEEDS_OF_BOX = 4
+"""Payload, payload turning, reference, reference turning."""
+
+
+@dataclass(frozen=True)
+class LimitLayout:
+    """Where the coefficients lie in a sample's row; `joints` counts those of both arms.
+
+    Blocks, in order:
+    speed (joints + 4): demands d, each |d u'| <= 1: joints, payload, payload turning, and the
+    reference speeds of both, which hold only on request.
+    acceleration (2, joints): alpha, beta of |alpha u'' + beta u'^2| <= 1.
+    cone (2, 2, 3): payload's acceleration and angular acceleration, each
+    |first u'' + second u'^2| <= 1.
+    force (3, 3): required force by u'', by u'^2 and at rest, along the axes of contact 1, whose
+    third is the normal [N]. moment (2, 3): required moment about the centre of mass by u'' and by
+    u'^2, likewise [N m].
+    torque (3, joints): the arms' own torques by u'', by u'^2 and at rest; wrench (joints, 6): from
+    the contact wrench about the nominal point, along the axes of contact 1; both over the torque
+    limits.
+    """
+
+    joints: int
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Numbers per block."""
+        j = self.joints
+        return {
+            "speed": j + SPEEDS_OF_BOX,
+            "acceleration": 2 * j,
+            "cone": 12,
+            "force": 9,
+            "moment": 6,
+            "torque": 3 * j,
+            "wrench": 6 * j,
+        }
+
+    @property
+    def offsets(self) -> dict[str, int]:
+        """First place of each block."""
+        sizes = self.sizes
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        return dict(zip(sizes, ends, strict=False))
+
+    @property
+    def size(self) -> int:
+        """Numbers per sample."""
+        return sum(self.sizes.values())
+
+
+def limit_layout(workcell: Workcell) -> LimitLayout:
+    """The layout for a workcell's arms."""
+    return LimitLayout(sum(len(robot.velocity_max) for robot in workcell.robots))
+
+
+PATH_OUTPUTS = ("pose", "pose_first", "pose_second", "q_1", "q_2")
+"""Outputs of `path_function` that `sample_limits_function` takes; poses are extended by the
+redundant joints."""
+
+
+def path_function(model: CellModel, samples: int) -> ca.Function:
+    """The path's variables x (n_path,) to box and arms at uniform samples of u in [0, 1].
+
+    Outputs (NumPy shapes, n samples): those of `PATH_OUTPUTS`: the extended pose and its
+    derivatives by u (n, 6 + m), and both arms' joints (n, joints of the arm); then per arm
+    i = 1, 2 ik_residual_i, lost_i, limit_margin_i, manipulability_i (n,) as in
+    `symbolic.robot.arm.TRACK_OUTPUTS`.
+
+    Args:
+        model: the cell.
+        samples: number of samples, at least 3.
+    """
+    workcell = model.workcell
+    x = ca.MX.sym("x", workcell.task.n_path)
+    waypoints = waypoint_matrix(workcell.task, x)
+    basis = path_basis(len(workcell.task.waypoints), np.linspace(0.0, 1.0, samples))
+    moved = extended_motion(workcell.task, x, basis, waypoints)
+    outputs = dict(zip(PATH_OUTPUTS, moved, strict=False))
+    no_wrench = ca.DM.zeros(6, samples)
+    verdicts: dict[str, ca.MX] = {}
+    for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
+        follow = follow_function(robot, model.robots[i], contact, samples, f"limits_arm_{i + 1}")
+        results = follow(ca.DM(model.start[i]), outputs["pose"], no_wrench)
+        tracked = dict(zip(TRACK_OUTPUTS, results, strict=True))
+        outputs[f"q_{i + 1}"] = tracked["q"]
+        verdicts |= {f"{name}_{i + 1}": tracked[name] for name in VERDICTS}
+    outputs |= verdicts
+    return ca.Function("path", [x], list(outputs.values()), ["x"], list(outputs), {"cse": True})
+
+
+def sample_limits_function(model: CellModel) -> ca.Function:
+    """A sample's `LimitLayout` row, limits (size,), from the `PATH_OUTPUTS` of the sample."""
+    workcell = model.workcell
+    payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
+    given = [ca.SX.sym(name, task.extended_size) for name in ("pose", "first", "second")]
+    pose, first, second = (values[:6] for values in given)
+    box = dict(zip(BOX_OUTPUTS, box_function(workcell)(pose, first, second), strict=True))
+    rotation = ca.reshape(box["rotation"], 3, 3).T
+    axes = ca.mtimes(rotation, ca.DM(workcell.contacts[0].T_box_pad[:3, :3]))
+    q, speed, by_a, by_w, torque, wrench = [], [], [], [], [], []
+    for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
+        q.append(ca.SX.sym(f"q_{i + 1}", len(robot.velocity_max)))
+        derivatives = arm_derivative_function(robot, model.robots[i], contact, f"limits_of_{i + 1}")
+        arm = dict(zip(ARM_OUTPUTS, derivatives(q[i], *given), strict=True))
+        speed.append(arm["q_first"] / ca.DM(robot.velocity_max))
+        by_a.append(arm["q_first"] / ca.DM(robot.acceleration_max))
+        by_w.append(arm["q_second"] / ca.DM(robot.acceleration_max))
+        own = ("torque_by_acceleration", "torque_by_speed", "torque_at_rest")
+        torque.append(ca.horzcat(*[arm[name] / ca.DM(robot.torque_max) for name in own]))
+        world = ca.reshape(arm["wrench_torque"], 6, len(robot.velocity_max)).T
+        turned = ca.mtimes(world, ca.diagcat(axes, axes))
+        wrench.append(ca.mtimes(ca.diag(1.0 / ca.DM(robot.torque_max)), turned))
+    linear, angular = ca.norm_2(first[:3]), ca.norm_2(box["angular_first"])
+    weight = ca.DM(GRAVITY) * payload.mass
+    forces = (box["force_by_acceleration"], box["force_by_speed"], -weight)
+    moments = (box["moment_by_acceleration"], box["moment_by_speed"])
+    blocks = {
+        "speed": ca.vertcat(
+            *speed,
+            linear / payload.velocity_max,
+            angular / payload.angular_velocity_max,
+            linear / task.reference_speed,
+            angular / task.reference_angular_speed,
+        ),
+        "acceleration": ca.vertcat(*by_a, *by_w),
+        "cone": ca.vertcat(
+            ca.vertcat(first[:3], second[:3]) / payload.acceleration_max,
+            ca.vertcat(box["angular_first"], box["angular_second"])
+            / payload.angular_acceleration_max,
+        ),
+        "force": ca.vertcat(*[ca.mtimes(axes.T, force) for force in forces]),
+        "moment": ca.vertcat(*[ca.mtimes(axes.T, moment) for moment in moments]),
+        "torque": ca.vec(ca.vertcat(*torque)),
+        "wrench": ca.vec(ca.vertcat(*wrench).T),
+    }
+    assert {name: block.shape[0] for name, block in blocks.items()} == layout.sizes
+    row = ca.vertcat(*[ca.densify(blocks[name]) for name in layout.sizes])
+    return ca.Function(
+        "sample_limits",
+        [*given, *q],
+        ca.cse([row]),
+        list(PATH_OUTPUTS),
+        ["limits"],
+    )
+
+
+def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
+    """Limits that are not convex, at one sample, and their derivatives by (u'', u'^2).
+
+    Both take force (9,), moment (6,), torque and wrench blocks of `LimitLayout` as one input, then
+    u'' and u'^2. `limit_ratios` gives (joints + 2,): joint torques over their limits, signed, then
+    the shifts of both centres of pressure over their patch radii. `limit_slopes` gives the same
+    and its derivatives (joints + 2,) by u'' and by u'^2.
+    """
+    layout = limit_layout(workcell)
+    sizes, joints = layout.sizes, layout.joints
+    blocks = {
+        name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment", "torque", "wrench")
+    }
+    a, w = ca.SX.sym("a"), ca.SX.sym("w")
+    by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
+    force = by[0] * a + by[1] * w + by[2]
+    moment = blocks["moment"][:3] * a + blocks["moment"][3:] * w
+    friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
+    forces = allocate(force, ca.SX(ca.DM([0.0, 0.0, 1.0])), friction)
+    axes = workcell.contacts[0].T_box_pad[:3, :3]
+    arms = [
+        ca.SX(ca.DM(axes.T @ (contact.T_box_pad[:3, 3] - workcell.payload.centre_of_mass)))
+        for contact in workcell.contacts
+    ]
+    unit = ca.SX(ca.DM.eye(3))
+    shift = pressure_shift(
+        moment, (arms[0], arms[1]), (forces.force_1, forces.force_2), (unit[:, 0], unit[:, 1])
+    )
+    shifts, pushes = (shift.shift_1, shift.shift_2), (forces.force_1, forces.force_2)
+    own = ca.reshape(blocks["torque"], joints, 3)
+    wrench_by_joint = ca.reshape(blocks["wrench"], 6, joints).T
+    torque, start = own[:, 0] * a + own[:, 1] * w + own[:, 2], 0
+    ratios = []
+    for i, robot in enumerate(workcell.robots):
+        stop = start + len(robot.velocity_max)
+        wrench = ca.vertcat(pushes[i], ca.cross(shifts[i], pushes[i]))
+        ratios.append(torque[start:stop] + ca.mtimes(wrench_by_joint[start:stop, :], wrench))
+        start = stop
+    ratios += [
+        ca.sqrt(ca.sumsqr(moved) + 1e-24) / contact.patch_radius
+        for moved, contact in zip(shifts, workcell.contacts, strict=True)
+    ]
+    value = ca.vertcat(*ratios)
+    inputs = [ca.vertcat(*blocks.values()), a, w]
+    slopes = [ca.densify(ca.jacobian(value, z)) for z in (a, w)]
+    return (
+        ca.Function("limit_ratios", inputs, ca.cse([value])),
+        ca.Function("limit_slopes", inputs, ca.cse([value, *slopes])),
+    )

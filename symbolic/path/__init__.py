@@ -1,0 +1,1 @@
+"""The box path: its spline, its rotation, its time laws; functions of records alone."""

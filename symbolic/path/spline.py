@@ -1,0 +1,140 @@
+"""The box path: a natural quintic spline through waypoints, linear in the waypoints.
+
+Paper Eqs. 13-20. The paper leaves the joining of the segments open; here the spline is C4 at
+the inner waypoints with third and fourth derivatives zero at both ends (the natural quintic
+spline, the curve of least integrated squared jerk through the waypoints). Knots are uniform in
+the path parameter u in [0, 1].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.expression import Expression
+from symbolic.records import Task
+
+
+@dataclass(frozen=True)
+class PathBasis:
+    """Constant matrices that turn waypoints into samples: poses = position @ waypoints.
+
+    Attributes:
+        parameter: (n,) path parameter u of every sample.
+        position: (n, n_waypoints), value of the spline.
+        first, second: (n, n_waypoints), its first and second derivative with respect to u.
+    """
+
+    parameter: Array
+    position: Array
+    first: Array
+    second: Array
+
+
+def path_basis(n_waypoints: int, parameter: Array) -> PathBasis:
+    """Basis matrices of the natural quintic spline at the given parameters.
+
+    Args:
+        n_waypoints: number of waypoints, at least 2; two make a straight line.
+        parameter: (n,) values of u in [0, 1].
+    """
+    if n_waypoints == 2:
+        # Two points do not determine a natural quintic spline: the straight line has least jerk.
+        position = np.column_stack([1.0 - parameter, parameter])
+        slope = np.tile([-1.0, 1.0], (len(parameter), 1))
+        return _read_only(parameter, position, slope, np.zeros_like(slope))
+    return _read_only(parameter, *(spline(parameter) for spline in _natural_splines(n_waypoints)))
+
+
+def path_position(n_waypoints: int, parameter: Array) -> Array:
+    """`PathBasis.position` alone."""
+    if n_waypoints == 2:
+        return path_basis(n_waypoints, parameter).position
+    return np.ascontiguousarray(_natural_splines(n_waypoints)[0](parameter), dtype=float)
+
+
+@cache
+def _natural_splines(n_waypoints: int) -> tuple[Callable[[Array], Array], ...]:
+    """The natural quintic splines of unit waypoints, and their first and second derivatives."""
+    # Not imported at the top: SciPy takes long to start, and compiled functions need no basis.
+    from scipy.interpolate import make_interp_spline
+
+    knots = np.linspace(0.0, 1.0, n_waypoints)
+    natural = [(3, np.zeros(n_waypoints)), (4, np.zeros(n_waypoints))]
+    spline = make_interp_spline(knots, np.eye(n_waypoints), k=5, bc_type=(natural, natural))
+    return spline, spline.derivative(1), spline.derivative(2)
+
+
+def sample_basis(task: Task) -> PathBasis:
+    """Basis at the task's samples, uniform in u."""
+    return path_basis(len(task.waypoints), np.linspace(0.0, 1.0, task.samples))
+
+
+def waypoint_matrix(task: Task, x: Expression) -> Expression:
+    """All waypoints (6, n_waypoints) from the decision vector (paper Eq. 17), angles unwrapped.
+
+    Args:
+        x: (n_var,) free waypoints in path order, each a pose.
+    """
+    columns = []
+    taken = 0
+    for waypoint in task.waypoints:
+        if waypoint.is_fixed:
+            columns.append(type(x)(ca.DM(waypoint.lower)))
+        else:
+            columns.append(x[6 * taken : 6 * taken + 6])
+            taken += 1
+    pairs = [] if task.orientation.is_vector else pairwise(range(len(columns)))
+    for previous, current in pairs:
+        columns[current] = ca.vertcat(
+            columns[current][:3], _unwrap(columns[previous][3:], columns[current][3:])
+        )
+    return ca.horzcat(*columns)
+
+
+def extended_matrix(task: Task, x: Expression, waypoints: Expression) -> Expression:
+    """The extended waypoints (6 + m, n_waypoints): the redundant joints' values below the poses.
+
+    Args:
+        x: (n_var,) decision vector.
+        waypoints: (6, n_waypoints) from `waypoint_matrix`.
+    """
+    if not task.redundant:
+        return waypoints
+    at, rows = task.n_box, []
+    for joint in task.redundant:
+        row = []
+        for low, high in zip(joint.lower, joint.upper, strict=True):
+            row.append(x[at] if low < high else type(x)(low))
+            at += int(low < high)
+        rows.append(row)
+    # Column by column, a form that code for lanes knows.
+    return ca.horzcat(
+        *[
+            ca.vertcat(waypoints[:, k], *[row[k] for row in rows])
+            for k in range(len(task.waypoints))
+        ]
+    )
+
+
+def _unwrap(reference: Expression, angles: Expression) -> Expression:
+    """Angles moved by full turns to lie within half a turn of the reference.
+
+    Half a turn in either direction stays as it is written (NumPy's `unwrap`).
+    """
+    difference = angles - reference
+    turns = ca.sign(difference) * ca.ceil(ca.fabs(difference) / (2.0 * np.pi) - 0.5)
+    return angles - 2.0 * np.pi * turns
+
+
+def _read_only(parameter: Array, position: Array, first: Array, second: Array) -> PathBasis:
+    arrays = [np.ascontiguousarray(a, dtype=float) for a in (parameter, position, first, second)]
+    for array in arrays:
+        array.setflags(write=False)
+    return PathBasis(*arrays)

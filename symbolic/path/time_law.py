@@ -1,0 +1,205 @@
+"""Time laws: when the box is at which sample, and how fast and accelerated it is there.
+
+`constant` is the paper's (Eqs. 22-26): every step takes its length over the reference speed,
+velocity and acceleration are second-order finite differences on those times, one-sided at the
+ends. It starts and stops at full speed, which no robot can do. The paper gives a pure rotation
+no time at all; here a step takes at least the time that its rotation needs at the reference
+angular speed.
+
+`ramped` drives the same geometry from rest to rest: the speed rises by a smooth cubic step to
+the reference speed, cruises, and falls again; derivatives are exact.
+
+`optimal` is no expression: a solver finds how the path is driven (`hybrid_opt.timing`), and
+`driven_path` takes what it found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from symbolic.path.rotation import angular_acceleration, angular_velocity
+from symbolic.path.spline import PathBasis
+from symbolic.records import Task
+
+LENGTH_FLOOR = 1e-10
+"""Added in squares below the root of lengths [m]: keeps derivatives of a zero step finite."""
+
+STEP_TIME_FLOOR = 1e-6
+"""Least duration of a step [s]: a step without motion still advances the clock."""
+
+RAMP_NEWTON_STEPS = 8
+"""Newton steps that invert the ramp; it is convex and started on its safe side."""
+
+
+@dataclass(frozen=True)
+class TimedPath:
+    """A sampled box motion; one sample per column.
+
+    Attributes:
+        time: (1, n) [s], starts at 0.
+        pose: (6, n) position [m] and orientation [rad] (`symbolic.records.poses`).
+        rate: (6, n) first time derivative of the pose.
+        second_rate: (6, n) second time derivative of the pose.
+    """
+
+    time: ca.MX
+    pose: ca.MX
+    rate: ca.MX
+    second_rate: ca.MX
+
+
+def timed_path(
+    task: Task, basis: PathBasis, waypoints: ca.MX, rounding: ca.MX | None = None
+) -> TimedPath:
+    """Poses at the samples of `basis` with the task's time law.
+
+    Args:
+        waypoints: (6, n_waypoints) from `symbolic.path.spline.waypoint_matrix`.
+        rounding: share of a step's duration by which the constant-speed law's kink is rounded,
+            where rotation takes over from translation; None for none.
+    """
+    pose = ca.mtimes(waypoints, ca.DM(basis.position.T))
+    if task.time_law == "constant":
+        return _constant(task, pose, rounding)
+    first = ca.mtimes(waypoints, ca.DM(basis.first.T))
+    second = ca.mtimes(waypoints, ca.DM(basis.second.T))
+    return _ramped(task, basis, pose, first, second)
+
+
+def driven_path(
+    basis: PathBasis, waypoints: ca.MX, time: ca.MX, speed: ca.MX, acceleration: ca.MX
+) -> TimedPath:
+    """Poses at the samples of `basis`, driven as found elsewhere.
+
+    Args:
+        waypoints: (6, n_waypoints) from `symbolic.path.spline.waypoint_matrix`.
+        time, speed, acceleration: (1, n) times [s], u' [1/s] and u'' [1/s^2] of the samples.
+    """
+    pose, first, second = (
+        ca.mtimes(waypoints, ca.DM(matrix.T))
+        for matrix in (basis.position, basis.first, basis.second)
+    )
+    rows = ca.repmat(1.0, 6, 1)
+    return TimedPath(
+        time=time,
+        pose=pose,
+        rate=first * ca.mtimes(rows, speed),
+        second_rate=second * ca.mtimes(rows, speed**2) + first * ca.mtimes(rows, acceleration),
+    )
+
+
+def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None) -> TimedPath:
+    count = pose.shape[1] - 1
+    step = _step_time_function(task, rounding is not None).map(count)
+    rounded = [] if rounding is None else [ca.repmat(rounding, 1, count)]
+    durations = step(pose[:, :-1], pose[:, 1:], *rounded)
+    time = ca.horzcat(0.0, ca.cumsum(durations, 1))
+    rate = _gradient(pose, durations)
+    return TimedPath(time, pose, rate, _gradient(rate, durations))
+
+
+def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
+    """Duration of the step between two neighbouring poses (paper Eqs. 23-24), and by which share
+    its kink is rounded, if it is."""
+    start, end = ca.SX.sym("start", 6), ca.SX.sym("end", 6)
+    step = end - start
+    length = _smooth_norm(step[:3])
+    angle = _smooth_norm(angular_velocity(task.orientation, (start[3:] + end[3:]) / 2.0, step[3:]))
+    moving, turning = length / task.reference_speed, angle / task.reference_angular_speed
+    if not is_rounded:
+        duration = ca.fmax(ca.fmax(moving, turning), STEP_TIME_FLOOR)
+        return ca.Function("step_time", [start, end], [duration])
+    rounding, both = ca.SX.sym("rounding"), moving + turning
+    # A hyperbola; the floor keeps its slope finite where there is no rounding.
+    width = ca.sqrt((moving - turning) ** 2 + (rounding * both) ** 2 + LENGTH_FLOOR**2)
+    duration = ca.fmax((both + width) / 2.0, STEP_TIME_FLOOR)
+    return ca.Function("step_time", [start, end, rounding], [duration])
+
+
+def _gradient(values: ca.MX, durations: ca.MX) -> ca.MX:
+    """Second-order finite differences along the columns on uneven steps, one-sided at the ends."""
+    rows = values.shape[0]
+    before, after = durations[:, :-1], durations[:, 1:]
+    step = ca.repmat(1.0, rows, 1)
+    inner = (
+        values[:, 2:] * ca.mtimes(step, before / (after * (before + after)))
+        + values[:, 1:-1] * ca.mtimes(step, (after - before) / (before * after))
+        - values[:, :-2] * ca.mtimes(step, after / (before * (before + after)))
+    )
+    first = _one_sided(values[:, 0], values[:, 1], values[:, 2], durations[0], durations[1])
+    last = _one_sided(values[:, -1], values[:, -2], values[:, -3], -durations[-1], -durations[-2])
+    return ca.horzcat(first, inner, last)
+
+
+def _one_sided(here: ca.MX, near: ca.MX, far: ca.MX, near_step: ca.MX, far_step: ca.MX) -> ca.MX:
+    """Derivative at `here` of the parabola through three values with signed steps."""
+    total = near_step + far_step
+    return (
+        -(2.0 * near_step + far_step) / (near_step * total) * here
+        + total / (near_step * far_step) * near
+        - near_step / (far_step * total) * far
+    )
+
+
+def _ramped(task: Task, basis: PathBasis, pose: ca.MX, first: ca.MX, second: ca.MX) -> TimedPath:
+    n = pose.shape[1]
+    slope, curvature = _length_rate_function(task).map(n)(pose, first, second)
+    width = float(basis.parameter[1] - basis.parameter[0])
+    # Trapezoid with end correction: fourth order in the sample width.
+    pieces = width / 2.0 * (slope[:, :-1] + slope[:, 1:]) + width**2 / 12.0 * (
+        curvature[:, :-1] - curvature[:, 1:]
+    )
+    arc = ca.horzcat(0.0, ca.cumsum(pieces, 1))
+    time, speed, acceleration = _ramp_function(task).map(n)(arc, ca.repmat(arc[-1], 1, n))
+    u_rate = speed / slope
+    u_second = (acceleration - curvature * u_rate**2) / slope
+    rows = ca.repmat(1.0, 6, 1)
+    return TimedPath(
+        time=time - time[0],
+        pose=pose,
+        rate=first * ca.mtimes(rows, u_rate),
+        second_rate=second * ca.mtimes(rows, u_rate**2) + first * ca.mtimes(rows, u_second),
+    )
+
+
+def _length_rate_function(task: Task) -> ca.Function:
+    """Arc length per unit of u and its derivative; rotation counts at the reference speeds."""
+    pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
+    lever = task.reference_speed / task.reference_angular_speed
+    turn = angular_velocity(task.orientation, pose[3:], first[3:])
+    turn_rate = angular_acceleration(task.orientation, pose[3:], first[3:], second[3:])
+    linear, angular = _smooth_norm(first[:3]), lever * _smooth_norm(turn)
+    linear_rate = ca.dot(first[:3], second[:3]) / linear
+    angular_rate = lever**2 * ca.dot(turn, turn_rate) / angular
+    slope = ca.fmax(linear, angular)
+    curvature = ca.if_else(linear >= angular, linear_rate, angular_rate)
+    return ca.Function("length_rate", [pose, first, second], [slope, curvature])
+
+
+def _ramp_function(task: Task) -> ca.Function:
+    """Time, speed and acceleration at an arc length of a smooth rest-to-rest drive."""
+    arc, total = ca.SX.sym("arc"), ca.SX.sym("total")
+    ramp = task.ramp_time
+    cruise = ca.fmin(task.reference_speed, total / ramp)
+    duration = ramp + total / cruise
+    from_end = arc > total / 2.0
+    share = ca.fmin(arc, total - arc) / (cruise * ramp)
+    # Speed rises as 3 tau^2 - 2 tau^3, so that share = tau^3 - tau^4 / 2 during the ramp.
+    # The floor keeps the root's derivative finite; it leaves less than 1e-9 m/s^2 at the ends.
+    inside = ca.fmin(ca.fmax(share, 1e-30), 0.5)
+    tau = (2.0 * inside) ** (1.0 / 3.0)
+    for _ in range(RAMP_NEWTON_STEPS):
+        tau = tau - (tau**3 - tau**4 / 2.0 - inside) / (3.0 * tau**2 - 2.0 * tau**3)
+    ramping = share < 0.5
+    elapsed = ca.if_else(ramping, ramp * tau, ramp + (share - 0.5) * ramp)
+    time = ca.if_else(from_end, duration - elapsed, elapsed)
+    speed = ca.if_else(ramping, cruise * (3.0 * tau**2 - 2.0 * tau**3), cruise)
+    push = ca.if_else(ramping, cruise / ramp * 6.0 * tau * (1.0 - tau), 0.0)
+    acceleration = ca.if_else(from_end, -push, push)
+    return ca.Function("ramp", [arc, total], [time, speed, acceleration])
+
+
+def _smooth_norm(vector: ca.SX) -> ca.SX:
+    return ca.sqrt(ca.sumsqr(vector) + LENGTH_FLOOR**2)

@@ -1,0 +1,194 @@
+"""The carry as geometry: everything along the path that does not depend on its timing.
+
+With the path parameter u driven as u(t), every velocity is its derivative by u times u', and every
+acceleration is affine in (u'', u'^2). So are the force and the moment that the box needs and the
+torque that moves an arm; what time-optimal path parameterisation needs are the coefficients
+(Verscheure et al., IEEE TAC 54(10), 2009; Pham and Pham, IEEE T-RO 34(3), 2018).
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from symbolic.cell_model import CellModel
+from symbolic.contact.paper import required_moment
+from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
+from symbolic.path.spline import PathBasis, extended_matrix, path_basis, waypoint_matrix
+from symbolic.records import Contact, Robot, Task, Workcell
+from symbolic.records.cell import box_flange
+from symbolic.robot.arm import TRACK_OUTPUTS, follow_function, following_columns, joint_torque
+from symbolic.robot.model import RobotModel
+
+BOX_OUTPUTS = (
+    "rotation",
+    "angular_first",
+    "angular_second",
+    "normal",
+    "force_by_acceleration",
+    "force_by_speed",
+    "moment_by_acceleration",
+    "moment_by_speed",
+)
+"""Per sample of the box, world frame.
+
+rotation (9,): R_world_box row by row. angular_first, angular_second (3,): the angular velocity is
+angular_first u', the angular acceleration angular_first u'' + angular_second u'^2. normal (3,): of
+contact 1; contact 2 has its opposite. force_by_... (3,) [kg m]: the required force is
+force_by_acceleration u'' + force_by_speed u'^2 - m g. moment_by_... (3,) [kg m^2]: the required
+moment about the centre of mass, likewise, without a constant.
+"""
+
+ARM_OUTPUTS = (
+    "q_first",
+    "q_second",
+    "torque_by_acceleration",
+    "torque_by_speed",
+    "torque_at_rest",
+    "wrench_torque",
+)
+"""Per sample and arm, beside those of `symbolic.robot.arm.TRACK_OUTPUTS` without its joint torque.
+
+q_first, q_second (n,): derivatives of the joints by u [rad or m]. torque_by_... and torque_at_rest
+(n,): the bare arm's inverse dynamics is torque_by_acceleration u'' + torque_by_speed u'^2 +
+torque_at_rest [N m]. wrench_torque (6 n,): the (n, 6) matrix, row by row, from the contact wrench
+(force and moment on the box about the nominal contact point, world axes) to joint torques.
+"""
+
+
+def path_motion_function(model: CellModel, samples: int) -> ca.Function:
+    """Decision vector x (n_var,) to the geometry of the carry at uniform samples of u in [0, 1].
+
+    Outputs (NumPy shapes, n samples): pose, pose_first, pose_second (n, 6), the box pose and its
+    derivatives by u; those of `BOX_OUTPUTS`; and per arm i = 1, 2 those of
+    `symbolic.robot.arm.TRACK_OUTPUTS` without the joint torque and of `ARM_OUTPUTS`, as q_i
+    (n, joints) and so on.
+
+    Args:
+        samples: number of samples, at least 3.
+    """
+    workcell = model.workcell
+    x = ca.MX.sym("x", workcell.task.n_var)
+    waypoints = waypoint_matrix(workcell.task, x)
+    basis = path_basis(len(workcell.task.waypoints), np.linspace(0.0, 1.0, samples))
+    pose, first, second = (
+        ca.mtimes(waypoints, ca.DM(matrix.T))
+        for matrix in (basis.position, basis.first, basis.second)
+    )
+    outputs = {"pose": pose, "pose_first": first, "pose_second": second}
+    box = box_function(workcell).map(samples)(pose, first, second)
+    outputs |= dict(zip(BOX_OUTPUTS, box, strict=True))
+    no_wrench = ca.DM.zeros(6, samples)
+    moved = extended_motion(workcell.task, x, basis, waypoints)
+    for i in (0, 1):
+        robot, contact = workcell.robots[i], workcell.contacts[i]
+        follow = follow_function(robot, model.robots[i], contact, samples, f"path_arm_{i + 1}")
+        tracked = dict(
+            zip(TRACK_OUTPUTS, follow(ca.DM(model.start[i]), moved[0], no_wrench), strict=True)
+        )
+        del tracked["joint_torque"]
+        arm = arm_derivative_function(robot, model.robots[i], contact, f"path_derivatives_{i + 1}")
+        derivatives = arm.map(samples)(tracked["q"], *moved)
+        derived = dict(zip(ARM_OUTPUTS, derivatives, strict=True))
+        outputs |= {f"{name}_{i + 1}": value for name, value in (tracked | derived).items()}
+    return ca.Function(
+        "path_motion", [x], list(outputs.values()), ["x"], list(outputs), {"cse": True}
+    )
+
+
+def extended_motion(task: Task, x: ca.MX, basis: PathBasis, waypoints: ca.MX) -> list[ca.MX]:
+    """Extended poses and their first and second derivative by u (6 + m, n), at the samples of a
+    basis.
+
+    Args:
+        x: (n_var,) decision vector.
+        waypoints: (6, n_waypoints) of the box.
+    """
+    whole = extended_matrix(task, x, waypoints)
+    matrices = (basis.position, basis.first, basis.second)
+    return [ca.mtimes(whole, ca.DM(matrix.T)) for matrix in matrices]
+
+
+def box_function(workcell: Workcell) -> ca.Function:
+    """`BOX_OUTPUTS` of one sample from the box pose and its derivatives by u."""
+    pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
+    payload = workcell.payload
+    turned = workcell.task.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], first[3:])
+    alpha = angular_acceleration(turned, pose[3:], first[3:], second[3:])
+    offset = ca.mtimes(rotation, ca.DM(payload.centre_of_mass))
+    inertia = ca.SX(ca.DM(payload.inertia))
+    outputs = {
+        "rotation": ca.vec(rotation.T),
+        "angular_first": omega,
+        "angular_second": alpha,
+        "normal": ca.mtimes(rotation, ca.DM(workcell.contacts[0].T_box_pad[:3, 2])),
+        "force_by_acceleration": payload.mass * (first[:3] + ca.cross(omega, offset)),
+        "force_by_speed": payload.mass
+        * (second[:3] + ca.cross(alpha, offset) + ca.cross(omega, ca.cross(omega, offset))),
+        "moment_by_acceleration": required_moment(inertia, rotation, ca.SX.zeros(3), omega),
+        "moment_by_speed": required_moment(inertia, rotation, omega, alpha),
+    }
+    return ca.Function(
+        "path_box", [pose, first, second], [ca.densify(outputs[name]) for name in BOX_OUTPUTS]
+    )
+
+
+def arm_derivative_function(
+    robot: Robot, model: RobotModel, contact: Contact, name: str
+) -> ca.Function:
+    """`ARM_OUTPUTS` of one sample.
+
+    Inputs: q (n,) that holds the box at the pose; pose, first, second (6 + m,): the extended pose
+    and its derivatives by u.
+    """
+    n = model.n_joints
+    q, names = ca.SX.sym("q", n), ("pose", "first", "second")
+    given = [ca.SX.sym(each, model.pose_size) for each in names]
+    pose, first, second = (values[:6] for values in given)
+    turned = model.orientation
+    rotation = rotation_matrix(turned, pose[3:])
+    omega = angular_velocity(turned, pose[3:], first[3:])
+    alpha = angular_acceleration(turned, pose[3:], first[3:], second[3:])
+    lever = ca.mtimes(rotation, ca.DM(box_flange(robot, contact)[:3, 3]))
+    to_root = ca.DM(robot.T_world_base[:3, :3].T)
+    twist = ca.vertcat(
+        ca.mtimes(to_root, first[:3] + ca.cross(omega, lever)), ca.mtimes(to_root, omega)
+    )
+    twist_rate = ca.vertcat(
+        ca.mtimes(
+            to_root,
+            second[:3] + ca.cross(alpha, lever) + ca.cross(omega, ca.cross(omega, lever)),
+        ),
+        ca.mtimes(to_root, alpha),
+    )
+    jacobian = model.jacobian(q)
+    following = list(model.following)
+    own = [model.with_redundant(ca.SX(n, 1), moved) for moved in given[1:]]
+    if model.redundant:  # J_following qd_following = twist - J_redundant qd_redundant
+        twist -= ca.mtimes(jacobian, own[0])
+        twist_rate -= ca.mtimes(jacobian, own[1])
+    Q, upper = ca.qr(following_columns(model, jacobian))
+    q_first, q_second = own
+    q_first[following] = ca.solve(upper, ca.mtimes(Q.T, twist))
+    q_second[following] = ca.solve(upper, ca.mtimes(Q.T, twist_rate - model.drift(q, q_first)))
+    still = ca.SX.zeros(n)
+    at_rest = model.inverse_dynamics(q, still, still)
+    wrench = ca.SX.sym("wrench", 6)
+    torque = joint_torque(robot, contact, jacobian, rotation, wrench)
+    outputs = {
+        "q_first": q_first,
+        "q_second": q_second,
+        "torque_by_acceleration": model.inverse_dynamics(q, still, q_first) - at_rest,
+        "torque_by_speed": model.inverse_dynamics(q, q_first, q_second) - at_rest,
+        "torque_at_rest": at_rest,
+        "wrench_torque": ca.vec(ca.jacobian(torque, wrench).T),
+    }
+    return ca.Function(
+        name,
+        [q, *given],
+        ca.cse([ca.densify(outputs[name]) for name in ARM_OUTPUTS]),
+        ["q", *names],
+        list(ARM_OUTPUTS),
+    )

@@ -1,1 +1,0 @@
-"""Motion and forces of the payload: path, time laws, rotation, contact forces, pressure, loads."""

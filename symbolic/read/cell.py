@@ -1,0 +1,255 @@
+"""Reading a workcell from a TOML file. docs/workcell.md describes every key."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from symbolic import outside
+from symbolic.errors import OutsideError, WorkcellError
+from symbolic.read.arms import robot_urdf
+from symbolic.read.checks import check_all
+from symbolic.read.descriptions import description_content, resolve_mesh
+from symbolic.read.payload import check_count, read_contact, read_payload
+from symbolic.read.redundancy import read_redundant, with_redundancy
+from symbolic.read.robots import read_robot
+from symbolic.read.tables import Table, read_body
+from symbolic.read.task import read_task, with_force_limit
+from symbolic.records import (
+    SEARCHED,
+    Body,
+    CollisionSettings,
+    Handling,
+    IgnoredPair,
+    Mesh,
+    Payload,
+    Robot,
+    Uncertainty,
+    Workcell,
+)
+from symbolic.records import quantities as quantity
+from symbolic.records.cell import reading_of
+from symbolic.records.problems import Problems
+
+if TYPE_CHECKING:
+    from symbolic.read.tables import Table
+
+
+Check = Callable[[Workcell], Iterable[str]]
+
+
+def load(
+    path: str | Path,
+    checks: Sequence[Check] = (),
+    stored: bool = False,
+    decided: tuple[int, int] = (SEARCHED, SEARCHED),
+) -> Workcell:
+    """The workcell that a TOML file describes.
+
+    Args:
+        path: the file; every path inside it is relative to its folder.
+        checks: further checks of an otherwise valid workcell, e.g. inverse kinematics at the
+            start; each yields its problems as `key.path: what was found; what is allowed`.
+        stored: whether it was unpacked from an archive: packages that `package_dirs` lacks are
+            not looked for on this machine, and xacro files were expanded before.
+        decided: per robot the start branch that takes the place of "search" in the file.
+
+    Raises:
+        WorkcellError: with all problems of the file, each with its key path.
+    """
+    path = Path(path)
+    try:
+        source = outside.resolved(path)
+        content = outside.read_bytes(source, outside.WORKCELL_BYTES)
+        content = with_branches(content, outside.toml_tables(content), decided)
+        data = outside.toml_tables(content)
+    except OutsideError as error:
+        raise WorkcellError(str(path), (f"file: {error}",)) from error
+    problems = Problems()
+    workcell = _build(Table(data, "", problems), source, content, stored)
+    if workcell is None or problems.found:
+        raise WorkcellError(str(path), problems.messages())
+    further = tuple(problem for check in checks for problem in check(workcell))
+    if further:
+        raise WorkcellError(str(path), further)
+    return workcell
+
+
+def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell | None:
+    """The records, as far as they can be built; None where a section has the wrong count."""
+    problems, folder = table.problems, source.parent
+    name = table.text("name")
+    robots = [read_robot(entry, folder, stored) for entry in table.tables("robots", exactly=2)]
+    payload = read_payload(table.table("payload"), folder)
+    contacts = [read_contact(entry, payload) for entry in table.tables("contacts", exactly=2)]
+    check_count(contacts, problems)
+    task_table = table.table("task")
+    task = read_task(task_table)
+    redundant = read_redundant(task_table, len(task.waypoints))
+    task_table.close()
+    environment = tuple(read_body(entry, folder) for entry in table.tables("environment"))
+    collision = read_collision(table.table("collision", {}))
+    uncertainty = read_uncertainty(table.table("uncertainty", {}))
+    handling = read_handling(table.table("handling", {}))
+    table.close()
+    if len(robots) != 2 or len(contacts) != 2:
+        return None
+    arms = [robot for robot, _ in robots]
+    try:
+        identity = "" if problems.found else digest(content, arms, environment, payload)
+    except OutsideError as error:
+        problems.add("file", str(error))
+        identity = ""
+    workcell = Workcell(
+        name=name,
+        robots=(robots[0][0], robots[1][0]),
+        payload=payload,
+        contacts=(contacts[0], contacts[1]),
+        task=with_force_limit(task, payload, contacts),
+        environment=environment,
+        collision=collision,
+        start_branch=(robots[0][1], robots[1][1]),
+        source=source,
+        uncertainty=uncertainty,
+        handling=handling,
+    )
+    check_all(workcell, problems)
+    workcell = with_redundancy(workcell, redundant, problems)
+    return replace(workcell, reading=reading_of(workcell, identity)) if identity else workcell
+
+
+def digest(
+    content: bytes,
+    robots: Sequence[Robot],
+    environment: Sequence[Body],
+    payload: Payload | None = None,
+) -> str:
+    """SHA-256 over a workcell file and the content of every file it names.
+
+    Where the files stand does not matter, only what is in them: the file's own bytes, per robot
+    its URDF (a xacro file as it expands), the meshes the URDF names and its SRDF, and the meshes
+    of tools, environment and payload, in order.
+
+    Raises:
+        OutsideError: one of them cannot be read, or together they are too large.
+    """
+    outer = hashlib.sha256(hashlib.sha256(content).digest())
+    room = outside.CELL_BYTES
+    # Fixed-length inner digests keep the parts apart.
+    for part in _named(robots, environment, payload):
+        room -= len(part)
+        if room < 0:
+            raise OutsideError(
+                "the files that it names are together larger than "
+                f"{outside.megabytes(outside.CELL_BYTES)}; simplify the meshes"
+            )
+        outer.update(hashlib.sha256(part).digest())
+    return outer.hexdigest()
+
+
+def _content(path: Path | None, most: int) -> bytes:
+    if path is None:
+        return b""
+    try:
+        return outside.read_bytes(path, most)
+    except OutsideError as error:
+        raise OutsideError(f"names {path.name}, which {error}") from error
+
+
+def _named(
+    robots: Sequence[Robot], environment: Sequence[Body], payload: Payload | None
+) -> Iterator[bytes]:
+    """The content of every file that a workcell names, nothing for a missing one."""
+    for robot in robots:
+        yield description_content(robot.urdf, robot.xacro_arguments, robot.package_dirs)
+        urdf = robot_urdf(robot)
+        for address in (*urdf.collision_meshes, *urdf.visual_meshes):
+            mesh = resolve_mesh(address, robot.urdf, robot.package_dirs)
+            yield _content(mesh, outside.MESH_BYTES)
+        if robot.srdf is not None:
+            yield _content(robot.srdf, outside.URDF_BYTES)
+    for body in (*(body for robot in robots for body in robot.tool), *environment):
+        if isinstance(body.shape, Mesh):
+            yield _content(body.shape.path, outside.MESH_BYTES)
+    if payload is not None and isinstance(payload.shape, Mesh):
+        yield _content(payload.shape.path, outside.MESH_BYTES)
+
+
+# --- start branches ---
+
+
+_SEARCH = re.compile(rb"""(\bstart_branch["']?\s*=\s*)(["'])search\2""")
+
+
+def with_branches(content: bytes, data: Mapping[str, Any], decided: tuple[int, int]) -> bytes:
+    """A workcell file's text with start branches in the place of "search", where decided."""
+    robots = data.get("robots")
+    for robot, branch in zip(robots if isinstance(robots, list) else (), decided, strict=False):
+        if not isinstance(robot, Mapping) or robot.get("start_branch") != "search":
+            continue
+        if branch != SEARCHED:
+            content = _SEARCH.sub(rb"\g<1>%d" % branch, content, count=1)
+    return content
+
+
+# --- small sections ---
+
+
+MOST_PIECES = 20_000
+
+
+def read_collision(table: Table) -> CollisionSettings:
+    """How collisions are judged."""
+    tolerance = table.number("tolerance", quantity.TOLERANCE, 0.0)
+    most_pieces = table.integer("most_pieces", 1, MOST_PIECES, CollisionSettings().most_pieces)
+    ignored = []
+    for entry in table.tables("ignored"):
+        pair = IgnoredPair(entry.text("first"), entry.text("second"), entry.text("reason"))
+        entry.close()
+        # A pattern may stand against itself: all bodies that it matches against one another.
+        if pair.first and pair.first == pair.second and not set(pair.first) & {"*", "?"}:
+            entry.problems.add(entry.path, f"pairs {pair.first!r} with itself")
+        ignored.append(pair)
+    table.close()
+    return CollisionSettings(tolerance, tuple(ignored), most_pieces)
+
+
+def read_uncertainty(table: Table) -> Uncertainty:
+    """How far from nominal each quantity may be; nothing by default."""
+    none = (0.0, 0.0, 0.0)
+    uncertainty = Uncertainty(
+        friction=table.number("friction", quantity.SHARE, 0.0),
+        mass=table.number("mass", quantity.SHARE, 0.0),
+        centre_of_mass=table.vector("centre_of_mass", (quantity.DISPLACEMENT,) * 3, none),
+        pad_position=table.number("pad_position", quantity.DISPLACEMENT, 0.0),
+        disturbance=table.vector("disturbance", (quantity.DISTURBANCE,) * 3, none),
+    )
+    table.close()
+    return uncertainty
+
+
+def read_handling(table: Table) -> Handling:
+    """How the box is taken hold of and let go, by default as `Handling` says."""
+    # Not imported at the top: the records, which hold this one, are free of reading.
+    from symbolic.records import quantities as quantity
+
+    usual = Handling()
+
+    def height(key: str) -> float | None:
+        given = table.raw(key, None) is not None
+        return table.number(key, quantity.LIFT) if given else None
+
+    handling = Handling(
+        stand_off=table.number("stand_off", quantity.STAND_OFF, usual.stand_off),
+        pressing_speed=table.number("pressing_speed", quantity.SPEED, usual.pressing_speed),
+        pressing_rate=table.number("pressing_rate", quantity.FORCE_RATE, usual.pressing_rate),
+        lifting_speed=table.number("lifting_speed", quantity.SPEED, usual.lifting_speed),
+        lift_height=height("lift_height"),
+        set_down_height=height("set_down_height"),
+    )
+    table.close()
+    return handling

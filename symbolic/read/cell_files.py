@@ -1,0 +1,448 @@
+"""A workcell file with every file it names, as one value that can be stored and unpacked.
+
+The layout keeps the file's own relative references valid, so that the workcell's digest stays
+the same. Absolute references are replaced by relative ones. Unpacking writes below one folder
+only, and refuses files that refer to anything outside it.
+
+The drivable variant of a cell is the same under the time law 'optimal': its file is the original's
+text with one key changed, comments and all else as they were.
+"""
+
+from __future__ import annotations
+
+import base64
+import copy
+import hashlib
+import posixpath
+import re
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from symbolic import outside
+from symbolic.errors import BundleError, DualArmError, OutsideError, RobotModelError
+from symbolic.read.cell import load, with_branches
+from symbolic.read.descriptions import PACKAGE_SCHEME, description_content, is_xacro, resolve_mesh
+from symbolic.read.urdf import parse_urdf, read_urdf
+from symbolic.records import Robot, Workcell
+from symbolic.records.problems import shown
+
+MAX_FILES = 1000
+MAX_TOTAL_BYTES = outside.CELL_BYTES
+MAX_PLAIN_BYTES = 256 * 2**10
+"""Text up to this size is stored as it is, anything else compressed."""
+
+_SAFE_PART = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
+
+
+@dataclass(frozen=True)
+class CellFiles:
+    """A workcell's files.
+
+    Attributes:
+        workcell: path of the workcell file among `files`.
+        files: content by relative POSIX path without `..`.
+        folders: package folders that have to exist, as relative POSIX paths.
+        digest: digest of the workcell as unpacked (`Workcell.digest`).
+    """
+
+    workcell: str
+    files: Mapping[str, bytes]
+    folders: tuple[str, ...]
+    digest: str
+
+
+def collect_cell(workcell: Workcell) -> CellFiles:
+    """Collect the files of a workcell that was read with `symbolic.read.cell.load`.
+
+    Raises:
+        BundleError: the file on disk no longer describes this workcell, or a reference cannot
+            be made relative.
+    """
+    return _collected(workcell.source, workcell.digest, workcell.start_branch)
+
+
+@lru_cache(maxsize=4)
+def _collected(source: Path, digest: str, branches: tuple[int, int]) -> CellFiles:
+    try:
+        current = load(source, decided=branches)
+    except DualArmError as error:
+        raise BundleError(f"the workcell cannot be stored: {error}") from error
+    if current.digest != digest:
+        raise BundleError(
+            f"{source.name} does not describe the workcell in memory (it was changed after "
+            "reading); store trajectories of a workcell as its file has it"
+        )
+    collector = CellCollector(source)
+    collector.collect(current)
+    draft = CellFiles(*collector.layout(), digest="")
+    with TemporaryDirectory() as folder:
+        unpacked = unpack_cell(draft, Path(folder), check_digest=False)
+    return CellFiles(draft.workcell, draft.files, draft.folders, unpacked.digest)
+
+
+def unpack_cell(stored: CellFiles, folder: Path, check_digest: bool = True) -> Workcell:
+    """Write a cell's files below a folder and read the workcell from there.
+
+    Raises:
+        BundleError: a path would leave the folder, a reference points outside of it, or the
+            workcell is not the one that was stored.
+    """
+    root = folder.resolve()
+    for name in (*stored.files, *stored.folders, stored.workcell):
+        _check_name(name)
+    for name in stored.folders:
+        try:
+            (root / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BundleError(
+                f"stored folder {shown(name)} cannot be unpacked ({error.strerror})"
+            ) from error
+    for name, content in stored.files.items():
+        target = root / name
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with target.open("xb") as file:
+                file.write(content)
+        except OSError as error:
+            raise BundleError(
+                f"stored file {shown(name)} cannot be unpacked ({error.strerror})"
+            ) from error
+    _check_references(stored, root)
+    try:
+        workcell = load(root / stored.workcell, stored=True)
+    except DualArmError as error:
+        raise BundleError(f"the stored workcell is not valid: {error}") from error
+    if check_digest and workcell.digest != stored.digest:
+        raise BundleError("the stored workcell's digest does not match its files")
+    return workcell
+
+
+def cell_to_json(stored: CellFiles) -> dict[str, Any]:
+    """The files as JSON values: text as it is, binary and large files compressed."""
+    return {
+        "workcell": stored.workcell,
+        "digest": stored.digest,
+        "folders": list(stored.folders),
+        "files": [_file_to_json(name, stored.files[name]) for name in sorted(stored.files)],
+    }
+
+
+def cell_from_json(data: Any) -> CellFiles:
+    """The files from JSON values, every field checked.
+
+    Raises:
+        BundleError: with the field that is wrong.
+    """
+    if not isinstance(data, dict) or set(data) != {"workcell", "digest", "folders", "files"}:
+        raise BundleError("cell: expected the keys workcell, digest, folders and files")
+    entries, folders = data["files"], data["folders"]
+    if not isinstance(entries, list) or not 0 < len(entries) <= MAX_FILES:
+        raise BundleError(f"cell.files: expected 1 to {MAX_FILES} files")
+    if not isinstance(folders, list) or not all(isinstance(name, str) for name in folders):
+        raise BundleError("cell.folders: expected texts")
+    if len(folders) > MAX_FILES:
+        raise BundleError(f"cell.folders: expected at most {MAX_FILES} folders")
+    if not isinstance(data["workcell"], str) or not isinstance(data["digest"], str):
+        raise BundleError("cell.workcell and cell.digest: expected texts")
+    files: dict[str, bytes] = {}
+    room = MAX_TOTAL_BYTES
+    for index, entry in enumerate(entries):
+        name, content = _file_from_json(entry, index, room)
+        if name in files:
+            raise BundleError(f"cell.files[{index}]: {shown(name)} is stored twice")
+        files[name] = content
+        room -= len(content)
+    if data["workcell"] not in files:
+        raise BundleError("cell.workcell: names no stored file")
+    return CellFiles(data["workcell"], files, tuple(folders), data["digest"])
+
+
+def _file_to_json(name: str, content: bytes) -> dict[str, Any]:
+    entry: dict[str, Any] = {"path": name, "sha256": hashlib.sha256(content).hexdigest()}
+    if len(content) <= MAX_PLAIN_BYTES:
+        try:
+            return entry | {"encoding": "utf-8", "content": content.decode("utf-8")}
+        except UnicodeDecodeError:
+            pass
+    packed = base64.b64encode(zlib.compress(content, 9)).decode("ascii")
+    return entry | {"encoding": "zlib+base64", "content": packed}
+
+
+def _file_from_json(entry: Any, index: int, room: int) -> tuple[str, bytes]:
+    where = f"cell.files[{index}]"
+    keys = ("path", "sha256", "encoding", "content")
+    if not isinstance(entry, dict) or not all(isinstance(entry.get(key), str) for key in keys):
+        raise BundleError(f"{where}: expected texts {', '.join(keys)}")
+    _check_name(entry["path"])
+    try:
+        if entry["encoding"] == "utf-8":
+            content = entry["content"].encode("utf-8")
+        elif entry["encoding"] == "zlib+base64":
+            packed = base64.b64decode(entry["content"], validate=True)
+            # The limit keeps a small file from unfolding into a huge one.
+            content = zlib.decompressobj().decompress(packed, room + 1)
+        else:
+            raise BundleError(f"{where}.encoding: expected utf-8 or zlib+base64")
+    except (ValueError, zlib.error) as error:
+        raise BundleError(f"{where}.content: cannot be decoded ({error})") from error
+    if len(content) > room:
+        raise BundleError(f"{where}: the files exceed {MAX_TOTAL_BYTES // 2**20} MiB unpacked")
+    if hashlib.sha256(content).hexdigest() != entry["sha256"]:
+        raise BundleError(f"{where}: the content of {shown(entry['path'])} is damaged")
+    return entry["path"], content
+
+
+def _check_name(name: str) -> None:
+    parts = name.split("/")
+    if not all(_SAFE_PART.fullmatch(part) and part not in (".", "..") for part in parts):
+        raise BundleError(
+            f"stored path {shown(name)} is not allowed; only plain relative paths are"
+        )
+
+
+def _check_references(stored: CellFiles, root: Path) -> None:
+    """No reference of the workcell or of its URDFs may lead out of the files."""
+    base = posixpath.dirname(stored.workcell)
+    for reference, package_dirs in references(parse_toml(stored.files[stored.workcell])):
+        target = joined(base, reference)
+        if target not in stored.files:
+            raise BundleError(f"the stored workcell names {shown(reference)}, which is not stored")
+        if package_dirs is None:
+            continue
+        folders = [joined(base, entry) for entry in package_dirs]
+        try:
+            if is_xacro(stored.files[target]):
+                raise OutsideError(
+                    "holds xacro macros, which are never expanded from a stored cell"
+                )
+            named = read_urdf(root / target)
+        except (OutsideError, RobotModelError) as error:
+            raise BundleError(f"the stored {shown(target)} is not valid: {error}") from error
+        for address in (*named.collision_meshes, *named.visual_meshes):
+            relative = address.removeprefix("package://").removeprefix("file://")
+            bases = folders if address.startswith("package://") else [posixpath.dirname(target)]
+            if any(_leads_out(joined(folder, relative)) for folder in bases):
+                raise BundleError(
+                    f"the stored {shown(target)} names {shown(address)}, not stored with it"
+                )
+
+
+def _leads_out(path: str) -> bool:
+    return path.startswith(("/", "../")) or path == ".."
+
+
+# --- finding the files ---
+
+
+class CellCollector:
+    """Gathers a workcell's files and gives each a place relative to the workcell file."""
+
+    def __init__(self, source: Path) -> None:
+        self._source = source
+        self._text = outside.text(_content(source, outside.WORKCELL_BYTES))
+        self._files: dict[str, bytes] = {}
+        self._folders: list[str] = []
+        self._moved = 0
+        self._places: dict[str, str] = {}
+
+    def collect(self, workcell: Workcell) -> None:
+        """Add every file that the workcell names."""
+        text = self._text.encode("utf-8")
+        text = with_branches(text, parse_toml(text), workcell.start_branch)
+        self._text, data = outside.text(text), parse_toml(text)
+        for robot, entry in zip(workcell.robots, data["robots"], strict=True):
+            urdf = self._place(str(entry["urdf"]))
+            folders = [self._place(str(folder)) for folder in entry.get("package_dirs", [])]
+            self._folders.extend(folders)
+            # Folders beyond those of the file belong to this machine; what they hold is embedded.
+            named = list(zip(robot.package_dirs, folders, strict=False))
+            self._files[urdf] = self._with_meshes(robot, urdf, named)
+            if robot.srdf is not None:
+                place = self._place(str(entry["srdf"]))
+                self._files[place] = _content(robot.srdf, outside.URDF_BYTES)
+        for reference, package_dirs in references(data):
+            if package_dirs is None and self._place(reference) not in self._files:
+                content = _content(self._source.parent / reference, outside.MESH_BYTES)
+                self._files[self._place(reference)] = content
+
+    def layout(self) -> tuple[str, dict[str, bytes], tuple[str, ...]]:
+        """Everything collected, moved so that no path leads upwards.
+
+        Returns:
+            The path of the workcell file, the content of every file by path, and the package
+            folders.
+        """
+        names = [name.split("/") for name in (*self._files, *self._folders)]
+        depth = max((parts.count("..") for parts in names), default=0)
+        taken = {part for parts in names for part in parts}
+        level = next(name for name in (f"cell{k or ''}" for k in count()) if name not in taken)
+        base = "/".join([level] * depth)
+        workcell = joined(base, "workcell.toml" if depth else f"{level}.toml")
+        files = {joined(base, name): content for name, content in self._files.items()}
+        files[workcell] = self._text.encode("utf-8")
+        folders = dict.fromkeys(joined(base, name) for name in self._folders)
+        return workcell, files, tuple(folders)
+
+    def _place(self, reference: str) -> str:
+        """The place of a reference of the workcell file, relative to that file."""
+        if not posixpath.isabs(reference) and not reference.startswith(PACKAGE_SCHEME):
+            return posixpath.normpath(reference)
+        if reference in self._places:  # both robots may name one file
+            return self._places[reference]
+        moved = self._places[reference] = self._new_place(reference)
+        self._text = _replaced(self._text, reference, moved, self._source.name)
+        return moved
+
+    def _new_place(self, reference: str) -> str:
+        self._moved += 1
+        return f"embedded/{self._moved}/{posixpath.basename(reference) or 'folder'}"
+
+    def _with_meshes(self, robot: Robot, place: str, packages: list[tuple[Path, str]]) -> bytes:
+        """Add the meshes of a URDF; its content with this machine's addresses replaced."""
+        path = robot.urdf
+        try:
+            content = description_content(path, robot.xacro_arguments, robot.package_dirs)
+            named = parse_urdf(content, path.name)
+        except (OutsideError, RobotModelError) as error:
+            raise BundleError(str(error)) from error
+        for address in dict.fromkeys((*named.collision_meshes, *named.visual_meshes)):
+            mesh = resolve_mesh(address, path, robot.package_dirs)
+            if mesh is None:
+                continue
+            target = self._own_place(address, path, place, packages)
+            if target is None:
+                # Below the URDF's folder, whose own name the address need not know.
+                relative = self._new_place(mesh.as_posix())
+                target = joined(posixpath.dirname(place), relative)
+                content = _replaced(content.decode("utf-8"), address, relative, path.name).encode(
+                    "utf-8"
+                )
+            self._files[target] = _content(mesh, outside.MESH_BYTES)
+        return content
+
+    @staticmethod
+    def _own_place(
+        address: str, urdf: Path, place: str, packages: list[tuple[Path, str]]
+    ) -> str | None:
+        """Where a mesh address leads within the workcell's own folders; None beyond them."""
+        if address.startswith(PACKAGE_SCHEME):
+            held = (at for folder, at in packages if resolve_mesh(address, urdf, (folder,)))
+            folder = next(held, None)
+            return folder and joined(folder, address.removeprefix(PACKAGE_SCHEME))
+        target = address.removeprefix("file://")
+        return None if posixpath.isabs(target) else joined(posixpath.dirname(place), target)
+
+
+def _content(path: Path, most: int) -> bytes:
+    try:
+        return outside.read_bytes(path, most)
+    except OutsideError as error:
+        raise BundleError(f"{path} {error}") from error
+
+
+def _replaced(text: str, reference: str, moved: str, file: str) -> str:
+    """Text with every quoted occurrence of a reference replaced."""
+    for quote in ('"', "'"):
+        if f"{quote}{reference}{quote}" in text:
+            return text.replace(f"{quote}{reference}{quote}", f"{quote}{moved}{quote}")
+    raise BundleError(
+        f"{file} names {reference!r} by an absolute path in an unusual spelling; write it "
+        "relative to the file so that the trajectory can be stored with it"
+    )
+
+
+def joined(base: str, reference: str) -> str:
+    """A reference seen from the folder that `base` is relative to, `..` resolved."""
+    return posixpath.normpath(posixpath.join(base, reference))
+
+
+def parse_toml(content: bytes) -> dict[str, Any]:
+    """The tables of a workcell file.
+
+    Raises:
+        BundleError: it is not TOML.
+    """
+    try:
+        return outside.toml_tables(content)
+    except OutsideError as error:
+        raise BundleError(f"the stored workcell: {error}") from error
+
+
+def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]]:
+    """Files named by a workcell: the reference and, for a URDF, its package folders.
+
+    Raises:
+        BundleError: a key is missing or has another type.
+    """
+    try:
+        for robot in data.get("robots", []):
+            yield str(robot["urdf"]), [str(entry) for entry in robot.get("package_dirs", [])]
+            if "srdf" in robot:
+                yield str(robot["srdf"]), None
+            yield from _meshes(robot.get("tool", []))
+        yield from _meshes(data.get("environment", []))
+        yield from _meshes([data.get("payload", {})])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise BundleError(f"the stored workcell lacks or misuses the key {error}") from error
+
+
+def _meshes(bodies: Any) -> Iterator[tuple[str, None]]:
+    for body in bodies:
+        if body.get("kind") == "mesh":
+            yield str(body["path"]), None
+
+
+# --- the drivable variant ---
+
+
+LAW = "optimal"
+_TASK = re.compile(r"^[ \t]*\[[ \t]*task[ \t]*\][^\n]*$", re.MULTILINE)
+_LAW = re.compile(r"^([ \t]*)time_law[ \t]*=[^\n]*$", re.MULTILINE)
+_TABLE = re.compile(r"^[ \t]*\[{1,2}[ \t]*[A-Za-z_][\w. \t-]*\]{1,2}[ \t]*(#.*)?$", re.MULTILINE)
+
+
+def drivable_files(stored: CellFiles) -> CellFiles:
+    """The files of a cell (`symbolic.read.cell_files.collect_cell`) under 'optimal'.
+
+    Raises:
+        BundleError: the file writes the task in a way that cannot be changed line by line, or the
+            changed cell is not valid.
+    """
+    content = stored.files[stored.workcell]
+    wanted = copy.deepcopy(parse_toml(content))
+    if isinstance(wanted.get("task"), dict):
+        wanted["task"]["time_law"] = LAW
+    changed = _with_law(content.decode("utf-8")).encode()
+    try:
+        as_wanted = parse_toml(changed) == wanted
+    except BundleError:
+        as_wanted = False
+    if not as_wanted:
+        raise BundleError(
+            f"{stored.workcell}: the time law cannot be changed in it; begin its task with a line "
+            "[task], and write time_law = ... on a line of its own"
+        )
+    draft = replace(stored, files={**stored.files, stored.workcell: changed}, digest="")
+    with TemporaryDirectory() as folder:
+        digest = unpack_cell(draft, Path(folder), check_digest=False).digest
+    return replace(draft, digest=digest)
+
+
+def _with_law(text: str) -> str:
+    """The text with its task's time law replaced, or written below the task's heading."""
+    heading = _TASK.search(text)
+    if heading is None:
+        return text
+    begin = heading.end()
+    following = _TABLE.search(text, begin)
+    end = following.start() if following else len(text)
+    task, count = _LAW.subn(rf'\1time_law = "{LAW}"', text[begin:end], count=1)
+    if not count:
+        task = f'\ntime_law = "{LAW}"{text[begin:end]}'
+    return text[:begin] + task + text[end:]

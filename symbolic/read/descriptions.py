@@ -1,0 +1,392 @@
+"""Where robot descriptions and their meshes lie, and what xacro macros in them expand to.
+
+Packages are looked up in given folders, above the description, where ROS's environment variables
+point, and beside the installed Python packages.
+
+xacro expands its macros itself, in a process of its own: `python -m symbolic.read.descriptions`. It
+evaluates Python expressions and calls macros as often as the file likes, so the process gets so
+much time and memory and no more, writes no file and starts nothing. A request goes in as JSON, an
+answer comes out. The package `xacrodoc`, which wraps xacro, was looked at and left: it keeps one
+list of packages per process, and loses the folder that relative includes are relative to.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import json
+import os
+import re
+import resource
+import signal
+import site
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from symbolic import outside
+from symbolic.errors import OutsideError
+
+PACKAGE_SCHEME = "package://"
+DEEPEST_PACKAGE = 4
+"""How far below a folder of ROS_PACKAGE_PATH a package may lie."""
+
+LONGEST_NAME = 200
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+_SKIPPED = ("build", "devel", "install", "log")
+
+
+def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> Path | None:
+    """The folder of a package, or None where there is none.
+
+    In this order: NAME in one of `package_dirs`; a folder NAME above the description;
+    `share/NAME` below each prefix of AMENT_PREFIX_PATH; NAME in or at most `DEEPEST_PACKAGE`
+    levels below a folder of ROS_PACKAGE_PATH; `share/NAME` of the Python environment and of the
+    prefix that wheels of robotics libraries share in it (`cmeel.prefix`).
+
+    Args:
+        name: the package.
+        package_dirs: the folders that a workcell names.
+        description: the file that names the package.
+    """
+    if len(name) > LONGEST_NAME or not _NAME.fullmatch(name):
+        return None
+    for folder in package_dirs:
+        if os.path.isdir(folder / name):
+            return folder / name
+    for parent in description.resolve().parents:
+        if parent.name == name:
+            return parent
+    for prefix in _paths("AMENT_PREFIX_PATH"):
+        if (prefix / "share" / name).is_dir():
+            return prefix / "share" / name
+    for folder in _paths("ROS_PACKAGE_PATH"):
+        found = _below(folder, name, DEEPEST_PACKAGE)
+        if found is not None:
+            return found
+    installed = (prefix / "share" / name for prefix in _environment_prefixes())
+    return next((folder for folder in installed if folder.is_dir()), None)
+
+
+def further_package_dirs(
+    addresses: Iterable[str], package_dirs: Sequence[Path], description: Path
+) -> tuple[Path, ...]:
+    """Folders besides `package_dirs` that hold the packages of mesh addresses, each once.
+
+    A package that a given folder already holds is left out, and one that is nowhere.
+    """
+    names = dict.fromkeys(
+        address.removeprefix(PACKAGE_SCHEME).split("/", 1)[0]
+        for address in addresses
+        if address.startswith(PACKAGE_SCHEME)
+    )
+    found = (find_package(name, package_dirs, description) for name in names)
+    folders = dict.fromkeys(package.resolve().parent for package in found if package is not None)
+    return tuple(folder for folder in folders if folder not in package_dirs)
+
+
+def _paths(variable: str) -> Iterator[Path]:
+    return (Path(entry) for entry in os.environ.get(variable, "").split(os.pathsep) if entry)
+
+
+def _below(folder: Path, name: str, levels: int) -> Path | None:
+    """A folder of that name with a package.xml, in a folder or below it."""
+    if folder.name == name and (folder / "package.xml").is_file():
+        return folder
+    try:
+        inner = sorted(entry for entry in folder.iterdir() if entry.is_dir())
+    except OSError:
+        return None
+    if levels == 0 or (folder / "package.xml").is_file():  # packages do not hold packages
+        return None
+    searched = (
+        _below(entry, name, levels - 1)
+        for entry in inner
+        if not entry.name.startswith(".") and entry.name not in _SKIPPED
+    )
+    return next((found for found in searched if found is not None), None)
+
+
+def _environment_prefixes() -> Iterator[Path]:
+    yield Path(sys.prefix)
+    for folder in (*site.getsitepackages(), *sys.path):
+        if folder:
+            yield Path(folder) / "cmeel.prefix"
+
+
+def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
+    """The file behind a mesh address of a URDF, or None where there is none.
+
+    `package://NAME/REST` is looked up as NAME/REST in each package folder; `file://` addresses
+    are absolute; anything else is relative to the URDF's folder.
+    """
+    if address.startswith("package://"):
+        rest = address.removeprefix("package://")
+        candidates = [folder / rest for folder in package_dirs]
+    else:
+        candidates = [urdf.parent / address.removeprefix("file://")]
+    return next(
+        (candidate.resolve() for candidate in candidates if os.path.exists(candidate)), None
+    )
+
+
+# --- xacro ---
+
+
+XACRO_NAMESPACE = b"http://www.ros.org/wiki/xacro"
+WAIT_SECONDS = 60.0
+"""So long an expansion may take, its computing time being bounded more tightly."""
+
+_MACRO = re.compile(rb"<xacro:|\$\{|\$\(")
+_PROCESS = "symbolic.read.descriptions"
+
+Arguments = tuple[tuple[str, str], ...]
+Parts = tuple[tuple[str, bytes], ...]
+
+
+def description_content(
+    path: Path, arguments: Arguments = (), package_dirs: Sequence[Path] = ()
+) -> bytes:
+    """The URDF text of a robot's description: the file's own, or what its macros expand to.
+
+    Args:
+        path: a URDF, or a xacro file.
+        arguments: values of the xacro file's arguments, by name; a plain URDF takes none.
+        package_dirs: folders of packages that `$(find NAME)` looks in first.
+
+    Raises:
+        OutsideError: it cannot be read or expanded, or not within the bounds of
+            `symbolic.read.descriptions`.
+    """
+    content = outside.read_bytes(path, outside.URDF_BYTES)
+    if not is_xacro(content):
+        return content
+    key = (path, content, arguments, tuple(package_dirs))
+    expanded, parts = _expanded(*key)
+    if parts != _state(path for path, _ in parts):  # an included file has changed since
+        _expanded.cache_clear()
+        expanded, _ = _expanded(*key)
+    if expanded is None:
+        raise OutsideError(
+            f"takes longer than {CPU_SECONDS} s to be expanded; does a macro call itself, or an "
+            "expression count too far?"
+        )
+    return expanded
+
+
+def is_xacro(content: bytes) -> bool:
+    """Whether a description holds macros to be expanded; generated URDFs often keep the name."""
+    return XACRO_NAMESPACE in content and _MACRO.search(content) is not None
+
+
+@lru_cache(maxsize=8)
+def _expanded(
+    path: Path, content: bytes, arguments: Arguments, package_dirs: tuple[Path, ...]
+) -> tuple[bytes | None, Parts]:
+    """The expanded text, and path and digest of every file that was included.
+
+    The text is None where it took too long: that is remembered too, since both robots of a cell
+    may name the file.
+    """
+    answer = _answer(
+        {
+            "path": str(path.absolute()),
+            "arguments": dict(arguments),
+            "package_dirs": [str(folder.absolute()) for folder in package_dirs],
+        }
+    )
+    if answer is None:
+        return None, ()
+    if "refused" in answer:
+        raise OutsideError(answer["refused"])
+    return answer["urdf"].encode(), _state(answer["included"])
+
+
+def _answer(request: Any) -> Any:
+    """What the process says to a request; None where it takes too long."""
+    paths = [os.path.abspath(entry) for entry in sys.path]
+    with tempfile.TemporaryFile() as answer:
+        try:
+            code = subprocess.run(
+                [sys.executable, "-P", "-m", _PROCESS],
+                input=json.dumps(request).encode(),
+                stdout=answer,
+                stderr=subprocess.DEVNULL,
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+                timeout=WAIT_SECONDS,
+                check=False,
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return None
+        if code in (-signal.SIGXCPU, -signal.SIGKILL):
+            return None
+        answer.seek(0)
+        try:
+            return json.loads(answer.read())
+        except ValueError as error:
+            raise OutsideError(
+                f"holds xacro macros that cannot be expanded: their process ended with code {code}"
+            ) from error
+
+
+def _state(paths: Iterable[str]) -> Parts:
+    """Each file with the digest of its content; with nothing where it is missing."""
+    return tuple((path, _digest(path) if os.path.exists(path) else b"") for path in paths)
+
+
+def _digest(path: str) -> bytes:
+    return hashlib.sha256(outside.read_bytes(Path(path), outside.URDF_BYTES)).digest()
+
+
+# --- the process in which xacro runs ---
+
+
+CPU_SECONDS = 5
+"""So long an expansion may compute."""
+
+MEMORY_BYTES = 192 * outside.MEBIBYTE
+MEMORY_PER_BYTE = 6
+"""So much memory it may take, and so much more per byte of the file."""
+
+ANSWER_BYTES = 8 * outside.URDF_BYTES
+"""Largest answer; JSON may take six bytes for a letter."""
+
+_REFUSED = ("os.", "subprocess.", "socket.", "shutil.", "ctypes.", "resource.", "signal.", "pty.")
+_LOOKING = ("os.listdir", "os.scandir", "os.walk")
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
+
+
+def main() -> int:
+    """Answer the request on standard input; the exit code."""
+    request = json.load(sys.stdin)
+    path = Path(request["path"])
+    answer, sys.stdout = sys.stdout, io.StringIO()
+    import xacro
+    import xacro.substitution_args  # their own files are read before the limits
+
+    _limit(os.stat(path).st_size)
+    try:
+        found = _expand(xacro, path, request["arguments"], request["package_dirs"])
+    except Exception as error:  # a macro may raise anything
+        found = {"refused": _refusal(error, xacro)}
+    json.dump(found, answer)
+    answer.flush()
+    return 0
+
+
+def _limit(size: int) -> None:
+    """Bound what is left of this process's life."""
+    for kind, most in (
+        (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_CPU, CPU_SECONDS),
+        (resource.RLIMIT_FSIZE, ANSWER_BYTES),
+        (resource.RLIMIT_AS, MEMORY_BYTES + MEMORY_PER_BYTE * size),
+    ):
+        _, hard = resource.getrlimit(kind)
+        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(kind, (most, most))
+    sys.addaudithook(_refuse_deeds)
+
+
+def _refuse_deeds(event: str, arguments: tuple[Any, ...]) -> None:
+    """An expansion reads files; whatever else its expressions find a way to is refused."""
+    writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING
+    if writes or (event.startswith(_REFUSED) and event not in _LOOKING):
+        raise OutsideError(f"holds an expression that does more than compute ({event})")
+
+
+def _expand(
+    xacro: Any, path: Path, arguments: Mapping[str, str], package_dirs: list[str]
+) -> dict[str, Any]:
+    """The expanded text, and the paths of the files that were included."""
+    found: dict[str, Path] = {}
+
+    def find(name: str) -> str:
+        package = find_package(name, [Path(folder) for folder in package_dirs], path)
+        if package is None:
+            raise OutsideError(
+                f"names the package {name!r}, which is not found; name the folder that holds it "
+                "in package_dirs, or set ROS_PACKAGE_PATH or AMENT_PREFIX_PATH"
+            )
+        found[name] = package
+        return str(package)
+
+    xacro.substitution_args._eval_find = find
+    xacro.open = _opened  # stands before Python's own in that module
+    document = xacro.process_file(str(path), mappings=dict(arguments))
+    for mesh in document.getElementsByTagName("mesh"):
+        mesh.setAttribute("filename", _by_package(mesh.getAttribute("filename"), found))
+    # What stands beside the root are comments that name this machine's folders.
+    text = document.documentElement.toxml()
+    if len(text) > outside.URDF_BYTES:
+        raise OutsideError(
+            f"expands to more than {outside.megabytes(outside.URDF_BYTES)}; allowed is so much"
+        )
+    return {"urdf": text, "included": list(dict.fromkeys(map(str, xacro.all_includes)))}
+
+
+def _opened(name: str) -> io.StringIO:
+    """An included file, through the door; what is missing may be optional."""
+    if not os.path.exists(name):
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
+    try:
+        return io.StringIO(outside.text(outside.read_bytes(Path(name), outside.URDF_BYTES)))
+    except OutsideError as error:
+        raise OutsideError(f"includes {Path(name).name}, which {error}") from error
+
+
+def _by_package(address: str, packages: Mapping[str, Path]) -> str:
+    """A mesh address without this machine's folders, as far as they are those of packages."""
+    for name, folder in packages.items():
+        start = f"{folder}/"
+        if address.removeprefix("file://").startswith(start):
+            return f"{PACKAGE_SCHEME}{name}/{address.removeprefix('file://').removeprefix(start)}"
+    return address
+
+
+def _refusal(error: BaseException, xacro: Any) -> str:
+    """What went wrong, and in which file and macro."""
+    causes = tuple(_causes(error))
+    own = next((cause for cause in causes if isinstance(cause, OutsideError)), None)
+    if own is not None:
+        return str(own)
+    place = _place(xacro)
+    if any(isinstance(cause, MemoryError) for cause in causes):
+        return f"needs too much memory to be expanded{place}; simplify its expressions and macros"
+    if any(isinstance(cause, RecursionError) for cause in causes):
+        return (
+            f"is nested too deeply to be expanded{place}; does a macro call or a file include "
+            "itself?"
+        )
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return f"holds xacro macros that cannot be expanded: {reason[:300]}{place}"
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    """An error and those that it was made of."""
+    left, met = [error], set[int]()
+    while left:
+        one = left.pop()
+        if id(one) not in met:
+            met.add(id(one))
+            yield one
+            inner = (getattr(one, "exc", None), one.__cause__, one.__context__)
+            left += [cause for cause in inner if isinstance(cause, BaseException)]
+
+
+def _place(xacro: Any) -> str:
+    files = [Path(file).name for file in xacro.filestack or () if file is not None]
+    macros = [macro.body.getAttribute("name") for macro in xacro.macrostack or ()]
+    where = [f"file {files[-1]}"] if len(files) > 1 else []
+    where += [f"macro {macros[-1]}"] if macros else []
+    return f" ({', '.join(where)})" if where else ""
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,201 @@
+"""Elements of an XML document, read attribute by attribute, every problem with its place."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from xml.etree import ElementTree
+
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.errors import OutsideError
+from symbolic.read.tables import checked_number
+from symbolic.records.poses import read_only
+from symbolic.records.problems import Problems, shown, suggestion
+from symbolic.records.quantities import Quantity
+
+MOST_ELEMENTS = 100_000
+MOST_ATTRIBUTES = 500_000
+MOST_DEPTH = 32
+MOST_NAME = 200
+
+# Python's float() takes more than that (1_000, other digits), and C readers other things (0x1p3).
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+
+
+class _Bounded(ElementTree.TreeBuilder):
+    """Builds elements, but neither too many nor too deep."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._depth = 0
+        self._count = 0
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> ElementTree.Element:
+        self._depth += 1
+        self._count += 1
+        if self._depth > MOST_DEPTH:
+            raise OutsideError(f"nested too deeply; allowed is a depth of {MOST_DEPTH}")
+        if self._count > MOST_ELEMENTS:
+            raise OutsideError(f"has more than {MOST_ELEMENTS} elements; allowed are so many")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> ElementTree.Element:
+        self._depth -= 1
+        return super().end(tag)
+
+
+def parse_elements(document: str) -> ElementTree.Element:
+    """The root element `robot` of an XML document.
+
+    Raises:
+        OutsideError: it is no XML, has too many elements, or another root.
+    """
+    if document.count("=") > MOST_ATTRIBUTES:
+        raise OutsideError(f"has more than {MOST_ATTRIBUTES} attributes; allowed are so many")
+    parser = ElementTree.XMLParser(target=_Bounded())
+    # The declaration may name ASCII; by now it is text.
+    body = re.sub(r"^\s*<\?xml[^>]*\?>", "", document, count=1)
+    lines = document[: len(document) - len(body)].count("\n")
+    try:
+        parser.feed(body)
+        root = parser.close()
+    except ElementTree.ParseError as error:
+        line, column = error.position
+        said = str(error).split(":")[0]
+        raise OutsideError(
+            f"is not readable XML: {said}, line {line + lines}, column {column}"
+        ) from error
+    except ValueError as error:
+        raise OutsideError("is not readable XML: it holds characters that are none") from error
+    if root.tag != "robot":
+        raise OutsideError(f"its root is <{shown(root.tag)[1:-1]}>; allowed is <robot>")
+    if any("xacro}" in element.tag for element in root.iter()):
+        raise OutsideError("holds xacro macros; expand it: `xacro FILE > robot.urdf`")
+    return root
+
+
+class Part:
+    """One element with the words by which messages name it.
+
+    Args:
+        element: the element.
+        path: where it stands, as `link 'arm'/collision[0]`; empty for the root.
+        problems: where problems go.
+    """
+
+    def __init__(self, element: ElementTree.Element, path: str, problems: Problems) -> None:
+        self.element = element
+        self.path = path
+        self.problems = problems
+
+    @property
+    def tag(self) -> str:
+        """The element's tag."""
+        return self.element.tag
+
+    def named(self, tag: str) -> dict[str, Part]:
+        """The root's elements of a tag by their names, which have to differ."""
+        found: dict[str, Part] = {}
+        for index, element in enumerate(self.element.findall(tag)):
+            part = Part(element, f"{tag}[{index}]", self.problems)
+            name = part.text("name")
+            if name in found:
+                self.problems.add(f"{part.path} name", f"found {name!r} again; names differ")
+            elif name:
+                found[name] = Part(element, f"{tag} {name!r}", self.problems)
+        return found
+
+    def child(self, tag: str) -> Part | None:
+        """The first inner element of a tag, or None."""
+        element = self.element.find(tag)
+        return None if element is None else self._inner(element, tag)
+
+    def required(self, tag: str) -> Part:
+        """The first inner element of a tag; one that reports nothing further if it is missing."""
+        found = self.child(tag)
+        if found is None:
+            self.problems.add(self.path, f"<{tag}> is missing")
+            return Part(ElementTree.Element(tag), f"{self.path}/{tag}", Problems())
+        return found
+
+    def all(self, tag: str) -> list[Part]:
+        """Every inner element of a tag."""
+        return [
+            self._inner(element, f"{tag}[{index}]")
+            for index, element in enumerate(self.element.findall(tag))
+        ]
+
+    def only(self, tags: Sequence[str]) -> Part:
+        """The first inner element, whose tag has to be one of these."""
+        element = next(iter(self.element), None)
+        if element is None or element.tag not in tags:
+            found = "nothing" if element is None else shown(element.tag)
+            self.problems.add(self.path, f"found {found}; allowed is one of {', '.join(tags)}")
+            return Part(ElementTree.Element("none"), self.path, Problems())
+        return self._inner(element, element.tag)
+
+    def raw(self, key: str) -> str | None:
+        """An attribute as written."""
+        return self.element.get(key)
+
+    def written(self, *keys: str) -> dict[str, str]:
+        """Those of these attributes that are there, as written."""
+        return {key: self.element.attrib[key] for key in keys if key in self.element.attrib}
+
+    def text(self, key: str, most: int = MOST_NAME) -> str:
+        """A printable text that is not empty; '' after a problem."""
+        value = self.raw(key)
+        if value is None:
+            self.problems.add(f"{self.path} {key}".lstrip(), "is missing")
+        elif not value or len(value) > most or not value.isprintable():
+            self.problems.add(
+                f"{self.path} {key}".lstrip(),
+                f"found {shown(value)}; allowed are 1 to {most} printable characters",
+            )
+        else:
+            return value
+        return ""
+
+    def choice(self, key: str, allowed: Sequence[str]) -> str:
+        """One of the allowed words; '' after a problem."""
+        value = self.text(key)
+        if value and value not in allowed:
+            hint = suggestion(value, allowed)
+            self.problems.add(
+                f"{self.path} {key}",
+                f"found {shown(value)}; allowed is one of {', '.join(allowed)}{hint}",
+            )
+            return ""
+        return value
+
+    def number(self, key: str, allowed: Quantity, default: str | None = None) -> float:
+        """A finite number within the quantity's range."""
+        return float(self.numbers(key, (allowed,), default)[0])
+
+    def numbers(self, key: str, allowed: Sequence[Quantity], default: str | None = None) -> Array:
+        """Numbers separated by spaces, one quantity each."""
+        path = f"{self.path} {key}"
+        value = self.element.get(key, default)
+        if value is None:
+            self.problems.add(path, "is missing")
+            return read_only(np.ones(len(allowed)))
+        words = value.split()
+        count = "a number" if len(allowed) == 1 else f"{len(allowed)} numbers"
+        if len(words) != len(allowed):
+            self.problems.add(path, f"found {shown(value)}; allowed: {count}")
+            return read_only(np.ones(len(allowed)))
+        found = []
+        for index, (word, kind) in enumerate(zip(words, allowed, strict=True)):
+            place = path if len(allowed) == 1 else f"{path}[{index}]"
+            if _NUMBER.fullmatch(word):
+                found.append(checked_number(float(word), kind, place, self.problems))
+            else:
+                told = f"found {shown(word)}; allowed is a number, {kind.allowed()}"
+                self.problems.add(place, told)
+                found.append(1.0)
+        return read_only(found)
+
+    def _inner(self, element: ElementTree.Element, name: str) -> Part:
+        return Part(element, f"{self.path}/{name}", self.problems)

@@ -1,0 +1,156 @@
+"""Triangle meshes read from files, within bounds."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from symbolic import outside
+from symbolic.array import Array
+from symbolic.errors import CollisionModelError, OutsideError
+from symbolic.records.quantities import SMALLEST_SIZE
+
+FORMATS = ("stl", "dae", "obj", "ply", "off")
+"""Formats that are read: those that name no other file that matters. Lengths are metres, but for
+COLLADA (dae), which names its unit; its up axis is not turned, as in ROS."""
+
+MOST_FACES = 100_000
+MOST_CELL_FACES = 200_000
+"""Most triangles of one mesh, and of all meshes of a cell together: cutting them takes about 0.1 ms
+each, and collision shapes are simplified shapes."""
+
+MOST_WORDS = {"obj": 2_000_000, "off": 2_000_000, "ply": 800_000}
+"""Most words of a mesh that is a text, by format: what reads them keeps them all, with 100 bytes
+each, of PLY 300. A mesh of `MOST_FACES` has fewer."""
+
+MOST_MARKS = 500_000
+"""Most elements and attributes of a COLLADA mesh."""
+
+MOST_PARTS = 400
+"""Most connected components of one mesh: each becomes a convex piece or several."""
+
+LARGEST_EXTENT = 100.0
+"""Largest extent and coordinate of a mesh [m]: more is a file in millimetres without its scale."""
+
+
+# What it has to say is in the errors below; its log would add tracebacks on the terminal.
+trimesh.util.log.setLevel(logging.CRITICAL)
+
+
+def read_mesh(path: Path, scale: Array) -> trimesh.Trimesh:
+    """A mesh, scaled by (3,) factors, its equal vertices merged.
+
+    Raises:
+        CollisionModelError: see `convex_pieces`.
+    """
+    mesh = _read(path)
+    if not np.all(np.isfinite(mesh.vertices)):
+        raise CollisionModelError(f"{path}: the mesh has vertices that are not finite numbers")
+    if len(mesh.faces) > MOST_FACES:
+        raise CollisionModelError(
+            f"{path}: enormous mesh, {len(mesh.faces)} triangles; at most {MOST_FACES} are "
+            "allowed: simplify it for collision checking"
+        )
+    with np.errstate(over="ignore"):
+        factors = np.asarray(scale, dtype=float) * _collada_unit(mesh)
+        mesh.vertices = np.asarray(mesh.vertices, dtype=float) * factors
+        largest = np.abs(mesh.vertices).max()
+    if np.prod(np.sign(scale)) < 0.0:
+        mesh.faces = mesh.faces[:, ::-1]
+    if not largest <= LARGEST_EXTENT:
+        raise CollisionModelError(
+            f"{path}: enormous mesh, {largest:g} m from its origin; at most {LARGEST_EXTENT:g} m "
+            "is allowed: is the file in millimetres? Set its scale"
+        )
+    extents = np.ptp(mesh.vertices, axis=0)
+    if extents.min() < SMALLEST_SIZE:
+        raise CollisionModelError(
+            f"{path}: the mesh is flat, extents {np.round(extents, 9).tolist()} m; "
+            "give it a thickness or use a box"
+        )
+    mesh.merge_vertices()
+    parts = len(
+        trimesh.graph.connected_components(
+            mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1
+        )
+    )
+    if parts > MOST_PARTS:
+        raise CollisionModelError(
+            f"{path}: {parts} separate parts; at most {MOST_PARTS} are allowed: simplify the mesh, "
+            "weld its triangles or leave small parts out"
+        )
+    return mesh
+
+
+def _read(path: Path) -> trimesh.Trimesh:
+    """The triangles of a file, nothing but their number of corners checked."""
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise CollisionModelError(
+            f"{path}: cannot be read as a mesh; allowed are the formats {', '.join(FORMATS)}"
+        )
+    try:
+        content = outside.read_bytes(path, outside.MESH_BYTES)
+    except OutsideError as error:
+        raise CollisionModelError(f"{path}: the mesh {error}; correct its path") from error
+    if kind == "dae":
+        _require_collada(content, path)
+    elif _is_text(kind, content) and _gaps(content) > MOST_WORDS[kind]:
+        raise CollisionModelError(
+            f"{path}: enormous mesh, more than {MOST_WORDS[kind]} words; simplify it for collision "
+            "checking"
+        )
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            mesh = trimesh.load_mesh(BytesIO(content), file_type=kind, process=False)
+            if isinstance(mesh, trimesh.Scene):
+                mesh = mesh.to_mesh()
+    except Exception as error:  # trimesh raises whatever its many readers raise
+        said = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise CollisionModelError(
+            f"{path}: cannot be read as a mesh ({said}); give an STL, DAE, OBJ or PLY file"
+        ) from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise CollisionModelError(f"{path}: the mesh is empty; export triangles")
+    if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+        raise CollisionModelError(f"{path}: the mesh's vertices have not three coordinates each")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise CollisionModelError(f"{path}: the mesh has triangles whose corners it does not have")
+    return mesh
+
+
+def _require_collada(content: bytes, path: Path) -> None:
+    try:
+        outside.xml_text(content)
+    except OutsideError as error:
+        raise CollisionModelError(f"{path}: the mesh {error}") from error
+    # A meshful of attributes is one element too; its numbers are text in few elements.
+    if content.count(b"<") + content.count(b"=") > MOST_MARKS:
+        raise CollisionModelError(
+            f"{path}: enormous mesh, more than {MOST_MARKS} elements and attributes; simplify it "
+            "for collision checking"
+        )
+
+
+def _is_text(kind: str, content: bytes) -> bool:
+    """Whether a mesh is read word by word; of STL the reader keeps numbers only."""
+    second = content[:1000].split(b"\n", 2)[1:2]
+    return kind in ("obj", "off") or (kind == "ply" and b"binary" not in b"".join(second).lower())
+
+
+def _gaps(content: bytes) -> int:
+    """At least as many as there are gaps between words: letters beyond ASCII may be some."""
+    letters = np.frombuffer(content, np.uint8)
+    return int(np.count_nonzero((letters <= 32) | (letters >= 128)))
+
+
+def _collada_unit(mesh: trimesh.Trimesh) -> float:
+    """Metres per unit; trimesh tells a COLLADA file's as '0.01 * meters' and does not apply it."""
+    factor, _, unit = str(mesh.units or "").partition(" * ")
+    return float(factor) if unit == "meters" else 1.0

@@ -1,0 +1,440 @@
+"""A URDF file as checked records, before any other library sees it.
+
+What is taken over is what this project uses: the tree of links and joints, masses and inertias,
+collision shapes, and the addresses of meshes. Everything taken is checked here, each problem with
+its element and attribute; everything else in the file is left alone. Pinocchio is given
+`Urdf.kinematics`, which holds nothing that was not checked.
+
+An SRDF, MoveIt's companion of a URDF, says which pairs of links are not checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from types import MappingProxyType
+from xml.etree import ElementTree
+
+import numpy as np
+
+from symbolic import outside
+from symbolic.array import Array
+from symbolic.errors import OutsideError, UrdfError
+from symbolic.read.descriptions import Arguments, description_content
+from symbolic.read.elements import Part, parse_elements
+from symbolic.records import Box, Capsule, Cylinder, Sphere
+from symbolic.records import quantities as quantity
+from symbolic.records.poses import pose_matrix, read_only
+from symbolic.records.problems import Problems, shown, suggestion
+
+MOST_LINKS = 500
+MOST_MESHES = 2000
+"""Most different mesh files."""
+
+LARGEST_GYRATION = 10.0
+"""No inertia is larger than that of its mass at this distance [m]."""
+
+INERTIA_SLACK = 1e-6
+"""Published inertias are rounded, and those of small covers often wrong by more than they are: so
+much below zero a principal moment may lie [kg m^2]; a hundredth of it at larger ones."""
+
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+@dataclass(frozen=True)
+class UrdfMesh:
+    """A mesh by its address as written; scale: (3,) factor per axis."""
+
+    address: str
+    scale: Array
+
+
+@dataclass(frozen=True)
+class UrdfCollision:
+    """A collision shape of a link; pose: (4, 4) in the link's frame."""
+
+    shape: Box | Cylinder | Sphere | Capsule | UrdfMesh
+    pose: Array
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """What a URDF file says, checked.
+
+    Attributes:
+        file: the file's name, without its folder.
+        links: names, in the order of the file.
+        joints: by name, in the order of the file.
+        collisions: by link that has any, in the order of the file.
+        visuals: by link the addresses of its visual meshes as written.
+        kinematics: URDF text of links with their inertias and of joints, nothing else.
+    """
+
+    file: str
+    links: tuple[str, ...]
+    joints: Mapping[str, UrdfJoint]
+    collisions: Mapping[str, tuple[UrdfCollision, ...]]
+    visuals: Mapping[str, tuple[str, ...]]
+    kinematics: str
+
+    @property
+    def collision_links(self) -> tuple[str, ...]:
+        """Links that have a collision shape."""
+        return tuple(self.collisions)
+
+    @property
+    def collision_meshes(self) -> tuple[str, ...]:
+        """Addresses of collision meshes as written, each once."""
+        shapes = (shape.shape for found in self.collisions.values() for shape in found)
+        return tuple(dict.fromkeys(s.address for s in shapes if isinstance(s, UrdfMesh)))
+
+    @property
+    def visual_meshes(self) -> tuple[str, ...]:
+        """Addresses of visual meshes as written, each once."""
+        return tuple(dict.fromkeys(mesh for found in self.visuals.values() for mesh in found))
+
+
+def read_urdf(path: Path, arguments: Arguments = (), package_dirs: Sequence[Path] = ()) -> Urdf:
+    """Read and check a robot's description.
+
+    Args:
+        path: a URDF, or a xacro file, which is expanded.
+        arguments: values of the xacro file's arguments, by name.
+        package_dirs: folders of packages that the xacro file may name.
+
+    Raises:
+        UrdfError: the file cannot be read, is no XML in UTF-8, or an element of it is wrong; every
+            problem with its element and attribute.
+    """
+    try:
+        content = description_content(path, arguments, package_dirs)
+    except OutsideError as error:
+        raise UrdfError(path.name, (str(error),)) from error
+    return parse_urdf(content, path.name)
+
+
+@lru_cache(maxsize=8)
+def parse_urdf(content: bytes, file: str) -> Urdf:
+    """The records of a URDF's content; `file` names it in messages.
+
+    Raises:
+        UrdfError: see `read_urdf`.
+    """
+    problems = Problems()
+    try:
+        root = parse_elements(outside.xml_text(content))
+        urdf = _read_robot(Part(root, "", problems), file)
+    except OutsideError as error:
+        raise UrdfError(file, (str(error),)) from error
+    if problems.found:
+        raise UrdfError(file, problems.messages())
+    return urdf
+
+
+def _read_robot(root: Part, file: str) -> Urdf:
+    links = root.named("link")
+    joints = root.named("joint")
+    if len(links) > MOST_LINKS:
+        raise OutsideError(
+            f"has {len(links)} links; allowed are {MOST_LINKS}: remove what the arm does not need"
+        )
+    reduced = ElementTree.Element("robot", {"name": "robot"})
+    for name, link in links.items():
+        element = ElementTree.SubElement(reduced, "link", {"name": name})
+        element.extend(_inertial(link))
+    read: dict[str, UrdfJoint] = {}
+    for name, joint in joints.items():
+        element, read[name] = read_joint(joint, name)
+        reduced.append(element)
+    if root.problems.clean():
+        problem = tree_problem(tuple(links), {n: (j.parent, j.child) for n, j in read.items()})
+        # Published files name joints to be mimicked that they do not have.
+        read = {n: j if j.mimics in read else replace(j, mimics="") for n, j in read.items()}
+        problem = problem or mimic_problem({n: j.mimics for n, j in read.items() if j.mimics})
+        if problem:
+            root.problems.add(*problem)
+    collisions = {
+        name: tuple(map(_collision, link.all("collision"))) for name, link in links.items()
+    }
+    urdf = Urdf(
+        file=file,
+        links=tuple(links),
+        joints=MappingProxyType(read),
+        collisions=MappingProxyType({name: found for name, found in collisions.items() if found}),
+        visuals=MappingProxyType({name: _visual_meshes(link) for name, link in links.items()}),
+        kinematics=ElementTree.tostring(reduced, encoding="unicode"),
+    )
+    meshes = len({*urdf.collision_meshes, *urdf.visual_meshes})
+    if meshes > MOST_MESHES:
+        raise OutsideError(f"names {meshes} mesh files; allowed are {MOST_MESHES}: merge them")
+    return urdf
+
+
+def _inertial(link: Part) -> list[ElementTree.Element]:
+    """The checked inertial element of a link, if it has one."""
+    inertial = link.child("inertial")
+    if inertial is None:
+        return []
+    kept = ElementTree.Element("inertial")
+    kept.extend(origin_element(inertial))
+    mass_part = inertial.required("mass")
+    mass = mass_part.number("value", quantity.LINK_MASS)
+    matrix = inertial.required("inertia")
+    values = {key: matrix.number(key, quantity.INERTIA) for key in _MOMENTS}
+    if inertial.problems.clean(mass_part.path, matrix.path):
+        xx, xy, xz, yy, yz, zz = values.values()
+        problem = _inertia_problem(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), mass)
+        if problem:
+            inertial.problems.add(matrix.path, problem)
+    ElementTree.SubElement(kept, "mass", mass_part.written("value"))
+    ElementTree.SubElement(kept, "inertia", matrix.written(*_MOMENTS))
+    return [kept]
+
+
+def _inertia_problem(inertia: Array, mass: float) -> str:
+    moments = np.linalg.eigvalsh(inertia)
+    listed = ", ".join(f"{moment:.6g}" for moment in moments)
+    if moments[0] < -max(INERTIA_SLACK, 0.01 * moments[2]):
+        return f"found principal moments {listed} kg m^2; allowed are none below zero"
+    if moments[2] > mass * LARGEST_GYRATION**2 + INERTIA_SLACK:
+        return (
+            f"found a principal moment of {moments[2]:.6g} kg m^2 with a mass of {mass:g} kg; "
+            f"allowed is at most that mass times ({LARGEST_GYRATION:g} m)^2 (are the units kg m^2?)"
+        )
+    return ""
+
+
+def _collision(part: Part) -> UrdfCollision:
+    pose = pose_of(part)
+    shape: Box | Cylinder | Sphere | Capsule | UrdfMesh = Sphere(1.0)
+    element = part.required("geometry").only(("box", "cylinder", "sphere", "capsule", "mesh"))
+    size = quantity.SHAPE_SIZE
+    match element.tag:
+        case "box":
+            shape = Box(element.numbers("size", (size,) * 3))
+        case "sphere":
+            shape = Sphere(element.number("radius", size))
+        case "cylinder":
+            shape = Cylinder(element.number("radius", size), element.number("length", size))
+        case "capsule":
+            shape = Capsule(element.number("radius", size), element.number("length", size))
+        case "mesh":
+            scale = element.numbers("scale", (quantity.MESH_SCALE,) * 3, "1 1 1")
+            if element.problems.clean(element.path) and np.any(scale == 0.0):
+                element.problems.add(f"{element.path} scale", "is zero; allowed is none of it zero")
+            shape = UrdfMesh(element.text("filename", most=1000), scale)
+    return UrdfCollision(shape, pose)
+
+
+def _visual_meshes(link: Part) -> tuple[str, ...]:
+    found = (mesh.get("filename", "") for mesh in link.element.findall("visual/geometry/mesh"))
+    return tuple(address for address in found if address)
+
+
+# --- joints and origins ---
+
+
+JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+SMALLEST_AXIS = 1e-6
+FULL_TURNS = 4.0 * np.pi
+"""A continuous joint is taken as a revolute one with these limits either way [rad]."""
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """A joint of the tree of links.
+
+    Attributes:
+        kind: one of `JOINT_TYPES`.
+        parent, child: names of links.
+        lower, upper: limits [rad or m]; of a continuous joint `FULL_TURNS` either way.
+        mimics: the joint that it follows, '' where it moves by itself.
+        multiplier, offset: its position is multiplier * (the other's) + offset.
+    """
+
+    kind: str
+    parent: str
+    child: str
+    lower: float
+    upper: float
+    mimics: str = ""
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+def read_joint(joint: Part, name: str) -> tuple[ElementTree.Element, UrdfJoint]:
+    """The checked element of a joint, and what it says."""
+    kind = joint.choice("type", JOINT_TYPES)
+    # Pinocchio gives a continuous joint two coordinates; here every moving joint has one.
+    kept = ElementTree.Element(
+        "joint", {"name": name, "type": "revolute" if kind == "continuous" else kind}
+    )
+    parent, child = joint.required("parent"), joint.required("child")
+    kept.extend(origin_element(joint))
+    ElementTree.SubElement(kept, "parent", parent.written("link"))
+    ElementTree.SubElement(kept, "child", child.written("link"))
+    axis = joint.child("axis")
+    if axis is not None and kind not in ("fixed", "floating"):
+        direction = axis.numbers("xyz", (quantity.DIRECTION,) * 3)
+        if axis.problems.clean(axis.path) and np.linalg.norm(direction) < SMALLEST_AXIS:
+            axis.problems.add(
+                f"{axis.path} xyz",
+                f"found {shown(axis.raw('xyz'))}, an axis without length; allowed is a direction "
+                "such as '0 0 1'",
+            )
+        ElementTree.SubElement(kept, "axis", axis.written("xyz"))
+    limit = joint.child("limit")
+    if kind in ("revolute", "prismatic"):
+        limit = joint.required("limit")
+    lower = upper = 0.0
+    if limit is not None:
+        for key in ("effort", "velocity"):
+            limit.number(key, quantity.JOINT_MOST)
+        lower, upper = (limit.number(key, quantity.JOINT_LIMIT, "0") for key in ("lower", "upper"))
+    written = {} if limit is None else limit.written("lower", "upper", "effort", "velocity")
+    if kind == "continuous":
+        lower, upper = -FULL_TURNS, FULL_TURNS
+        written = {"effort": "0", "velocity": "0"} | written
+        written |= {"lower": repr(lower), "upper": repr(upper)}
+    if written:
+        ElementTree.SubElement(kept, "limit", written)
+    dynamics = joint.child("dynamics")
+    if dynamics is not None:
+        for key in ("damping", "friction"):
+            dynamics.number(key, quantity.JOINT_LIMIT, "0")
+        ElementTree.SubElement(kept, "dynamics", dynamics.written("damping", "friction"))
+    found = UrdfJoint(kind, parent.text("link"), child.text("link"), lower, upper)
+    mimic = joint.child("mimic")
+    if mimic is None:
+        return kept, found
+    return kept, replace(
+        found,
+        mimics=mimic.text("joint"),
+        multiplier=mimic.number("multiplier", quantity.JOINT_LIMIT, "1"),
+        offset=mimic.number("offset", quantity.JOINT_LIMIT, "0"),
+    )
+
+
+def origin_element(part: Part) -> list[ElementTree.Element]:
+    """The checked origin of an element, if it has one."""
+    origin = part.child("origin")
+    if origin is None:
+        return []
+    pose_of(part)
+    return [ElementTree.Element("origin", origin.written("xyz", "rpy"))]
+
+
+def pose_of(part: Part) -> Array:
+    """(4, 4) of an element's origin; the identity where it has none."""
+    origin = part.child("origin")
+    if origin is None:
+        return read_only(np.eye(4))
+    xyz = origin.numbers("xyz", (quantity.POSITION,) * 3, "0 0 0")
+    rpy = origin.numbers("rpy", (quantity.URDF_ANGLE,) * 3, "0 0 0")
+    return read_only(pose_matrix(xyz, rpy))
+
+
+# --- the tree of links ---
+
+
+def tree_problem(
+    links: tuple[str, ...], joints: Mapping[str, tuple[str, str]]
+) -> tuple[str, str] | None:
+    """Why links and joints are no tree, as (element, text); None where they are one.
+
+    Args:
+        links: names.
+        joints: parent and child link by joint.
+    """
+    if not links:
+        return "robot", "has no links; allowed is a tree of links and joints"
+    moved_by: dict[str, str] = {}
+    for joint, ends in joints.items():
+        for role, link in zip(("parent", "child"), ends, strict=True):
+            if link not in links:
+                hint = suggestion(link, links)
+                return f"joint {joint!r}/{role} link", f"found {link!r}, no link of the file{hint}"
+        parent, child = ends
+        if parent == child:
+            return f"joint {joint!r}", f"its parent and its child are the same link {child!r}"
+        if child in moved_by:
+            return (
+                f"joint {joint!r}/child link",
+                f"found {child!r}, which is the child of joint {moved_by[child]!r} already; "
+                "allowed is a tree",
+            )
+        moved_by[child] = joint
+    roots = [link for link in links if link not in moved_by]
+    if not roots:
+        return "robot", "every link is the child of a joint, so they form a loop; allowed is a tree"
+    if len(roots) > 1:
+        listed = ", ".join(map(repr, roots[:5])) + (" ..." if len(roots) > 5 else "")
+        return "robot", f"found {len(roots)} links without parent ({listed}); allowed is one root"
+    for start in links:
+        met, link = {start}, start
+        while link in moved_by:
+            link = joints[moved_by[link]][0]
+            if link in met:
+                return f"link {link!r}", "is part of a loop of joints; allowed is a tree"
+            met.add(link)
+    return None
+
+
+def mimic_problem(mimics: Mapping[str, str]) -> tuple[str, str] | None:
+    """Why joints that follow others follow none, as (element, text); None where all is well.
+
+    Args:
+        mimics: the followed joint by the following one.
+    """
+    for name in mimics:
+        met, followed = {name}, mimics[name]
+        while followed in mimics:
+            if followed in met:
+                return f"joint {name!r}/mimic joint", "joints follow one another in a circle"
+            met.add(followed)
+            followed = mimics[followed]
+    return None
+
+
+# --- SRDF ---
+
+
+@dataclass(frozen=True)
+class DisabledPair:
+    """Two links that are not checked against one another.
+
+    Attributes:
+        first, second: names of links.
+        reason: the file's, e.g. 'Adjacent' or 'Never'; may be empty.
+    """
+
+    first: str
+    second: str
+    reason: str
+
+
+def read_srdf(path: Path) -> tuple[DisabledPair, ...]:
+    """The `disable_collisions` elements of an SRDF file, in its order; the rest is not read.
+
+    Raises:
+        UrdfError: the file cannot be read, is no XML, or one of these elements lacks a link.
+    """
+    try:
+        return _parse_srdf(outside.read_bytes(path, outside.URDF_BYTES), path.name)
+    except OutsideError as error:
+        raise UrdfError(path.name, (str(error),)) from error
+
+
+@lru_cache(maxsize=8)
+def _parse_srdf(content: bytes, file: str) -> tuple[DisabledPair, ...]:
+    problems = Problems()
+    root = Part(parse_elements(outside.xml_text(content)), "", problems)
+    pairs = tuple(
+        DisabledPair(part.text("link1"), part.text("link2"), part.raw("reason") or "")
+        for part in root.all("disable_collisions")
+    )
+    if problems.found:
+        raise UrdfError(file, problems.messages())
+    return pairs

@@ -1,0 +1,70 @@
+"""The description of a dual-arm cell as frozen, validated records.
+
+Units are SI throughout: m, rad, kg, s, N, N m. A transform `T_a_b` is a (4, 4) homogeneous
+matrix that maps coordinates of frame b into frame a, so that `T_a_c = T_a_b @ T_b_c`.
+
+Frames: `world` (z up), one `base` per robot, its `flange`, its `pad` (origin at the centre of
+the contact patch, z along the contact normal, pointing from the robot into the box) and the
+`box` (origin at the geometric centre of the payload, axes along its edges).
+
+Arrays are read-only. The records hold no behaviour that depends on a solver or on a file
+format; `symbolic.read.cell` reads them from TOML.
+"""
+
+from symbolic.records.cell import (
+    PAYLOAD,
+    SEARCHED,
+    Body,
+    Box,
+    Capsule,
+    CollisionSettings,
+    Contact,
+    Cylinder,
+    Handling,
+    IgnoredPair,
+    Mesh,
+    Payload,
+    Robot,
+    Shape,
+    Sphere,
+    ToolLoad,
+    Uncertainty,
+    Workcell,
+)
+from symbolic.records.task import (
+    POSE_SIZE,
+    Allocation,
+    AllowedContact,
+    RedundantJoint,
+    Task,
+    TimeLaw,
+    Waypoint,
+)
+
+__all__ = [
+    "PAYLOAD",
+    "POSE_SIZE",
+    "SEARCHED",
+    "Allocation",
+    "AllowedContact",
+    "Body",
+    "Box",
+    "Capsule",
+    "CollisionSettings",
+    "Contact",
+    "Cylinder",
+    "Handling",
+    "IgnoredPair",
+    "Mesh",
+    "Payload",
+    "RedundantJoint",
+    "Robot",
+    "Shape",
+    "Sphere",
+    "Task",
+    "TimeLaw",
+    "ToolLoad",
+    "Uncertainty",
+    "Waypoint",
+    "Workcell",
+]

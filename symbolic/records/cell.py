@@ -1,0 +1,459 @@
+"""The cell: shapes, robots, payload, contacts, uncertainty, handling, and what identifies it all.
+
+A workcell that is as it was read has the digest of its files. One that was changed in memory
+(`dataclasses.replace`) has one of its own, made from that and from its values, so that nothing that
+is kept under a digest belongs to another cell.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.records.poses import inverse
+from symbolic.records.task import Task
+
+if TYPE_CHECKING:
+    pass
+
+
+@dataclass(frozen=True)
+class Box:
+    """A cuboid centred at its frame. size: (3,) full edge lengths [m]."""
+
+    size: Array
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A cylinder centred at its frame, axis along z. radius, length [m]."""
+
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere centred at its frame. radius [m]."""
+
+    radius: float
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh file (STL, OBJ, PLY or OFF). scale: (3,) factor per axis."""
+
+    path: Path
+    scale: Array
+
+
+Shape = Box | Cylinder | Sphere | Mesh
+
+
+@dataclass(frozen=True)
+class Body:
+    """A named collision shape.
+
+    Attributes:
+        name: unique within its owner.
+        shape: its geometry.
+        pose: (4, 4), the shape's frame in its parent frame (world for the environment,
+            flange for a tool).
+    """
+
+    name: str
+    shape: Shape
+    pose: Array
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """A segment along z, centred at its frame, thickened by a radius.
+
+    radius [m]; length between the centres of the end spheres [m].
+    """
+
+    radius: float
+    length: float
+
+
+# --- an arm with its tool ---
+
+
+@dataclass(frozen=True)
+class ToolLoad:
+    """The tool as a rigid body on the flange.
+
+    Attributes:
+        mass: [kg].
+        centre_of_mass: (3,) in the flange frame [m].
+        inertia: (3, 3) about the centre of mass, flange axes [kg m^2].
+    """
+
+    mass: float
+    centre_of_mass: Array
+    inertia: Array
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One arm: its model file, where it stands, what it carries and what it may do.
+
+    Attributes:
+        name: unique in the workcell.
+        urdf: the model file, a URDF or a xacro file.
+        package_dirs: folders that `package://` addresses of the URDF are looked up in: those of
+            the workcell file, then those of ROS and of the Python environment that it needs.
+        flange: name of the URDF frame that the tool is mounted on.
+        locked_joints: joints of the URDF held at a fixed position [rad or m].
+        T_world_base: (4, 4), the URDF's root in the world.
+        T_flange_pad: (4, 4), the pad frame on the flange.
+        tool: collision bodies of the tool, in the flange frame.
+        position_lower, position_upper: (n,) joint limits [rad, or m where a joint slides].
+        velocity_max: (n,) [rad/s].
+        acceleration_max: (n,) [rad/s^2].
+        torque_max: (n,) [N m, or N].
+        min_manipulability: least allowed |det J| of the flange-pad Jacobian of the six joints that
+            follow the box [m^3].
+        xacro_arguments: names and values of the xacro file's arguments.
+        srdf: file whose disabled pairs of links are not checked for collision.
+        chain_root: link of the URDF that the arm begins at, the flange being its other end; ''
+            where every joint that is not locked belongs to the arm.
+        drop_links: links, by name or pattern, that are left out with all that hangs on them.
+        tool_load: mass and inertia of the tool; None where nothing is known of them.
+        redundant_joints: names of the joints beyond six, whose paths are part of the decision
+            vector; () where the arm has six.
+        jerk_max: (n,) [rad/s^3], or None without limits.
+    """
+
+    name: str
+    urdf: Path
+    package_dirs: tuple[Path, ...]
+    flange: str
+    locked_joints: tuple[tuple[str, float], ...]
+    T_world_base: Array
+    T_flange_pad: Array
+    tool: tuple[Body, ...]
+    position_lower: Array
+    position_upper: Array
+    velocity_max: Array
+    acceleration_max: Array
+    torque_max: Array
+    min_manipulability: float
+    xacro_arguments: tuple[tuple[str, str], ...] = ()
+    srdf: Path | None = None
+    chain_root: str = ""
+    drop_links: tuple[str, ...] = ()
+    tool_load: ToolLoad | None = None
+    redundant_joints: tuple[str, ...] = ()
+    jerk_max: Array | None = None
+
+
+# --- the payload, how it is held, and how sure that is ---
+
+
+@dataclass(frozen=True)
+class Payload:
+    """What is carried, called the box.
+
+    Attributes:
+        size: (3,) edge lengths along the box axes [m]; of another shape those of a box about the
+            frame that holds it.
+        mass: [kg].
+        centre_of_mass: (3,) in the box frame [m].
+        inertia: (3, 3) about the centre of mass, box axes [kg m^2].
+        velocity_max, acceleration_max: limits of the box's translation [m/s, m/s^2].
+        angular_velocity_max, angular_acceleration_max: of its rotation [rad/s, rad/s^2].
+        jerk_max: of its translation [m/s^3], or None without a limit.
+        shape: its geometry in the box frame; None for a box of its size.
+    """
+
+    size: Array
+    mass: float
+    centre_of_mass: Array
+    inertia: Array
+    velocity_max: float
+    acceleration_max: float
+    angular_velocity_max: float
+    angular_acceleration_max: float
+    jerk_max: float | None = None
+    shape: Cylinder | Mesh | None = None
+
+    @property
+    def solid(self) -> Box | Cylinder | Mesh:
+        """Its geometry in the box frame."""
+        return Box(self.size) if self.shape is None else self.shape
+
+
+@dataclass(frozen=True)
+class Contact:
+    """The frictional contact between one robot's pad and the box.
+
+    Attributes:
+        T_box_pad: (4, 4), the pad frame in the box frame; its z axis is the contact normal, which
+            points into the box.
+        friction: Coulomb coefficient.
+        patch_radius: radius of a round contact patch, half the diagonal of a rectangular one [m].
+        half_sides: half the sides of a rectangular patch along the pad's x and y axes [m]; None
+            for a round one.
+        further: other pads of the same robot, rigidly beside the first, as on a fork; with its
+            friction and its kind of patch.
+    """
+
+    T_box_pad: Array
+    friction: float
+    patch_radius: float
+    half_sides: tuple[float, float] | None = None
+    further: tuple[Contact, ...] = ()
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """How far from its nominal value each quantity may be while the robots hold the box.
+
+    Attributes:
+        friction: share by which either coefficient may be lower or higher.
+        mass: share by which the mass may be lower or higher.
+        centre_of_mass: (3,) half the width of its range along the box axes [m].
+        pad_position: how far either pad may be displaced in its contact plane [m].
+        disturbance: (3,) largest acceleration of the box beside the motion's, along the world's
+            axes, either way [m/s^2].
+    """
+
+    friction: float = 0.0
+    mass: float = 0.0
+    centre_of_mass: Array = field(default_factory=lambda: np.zeros(3))
+    pad_position: float = 0.0
+    disturbance: Array = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing may be different from what the workcell says."""
+        ranges = (self.friction, self.mass, self.pad_position)
+        return not (any(ranges) or self.centre_of_mass.any() or self.disturbance.any())
+
+    def scaled(self, factor: float) -> Uncertainty:
+        """All ranges times a factor."""
+        return Uncertainty(
+            factor * self.friction,
+            factor * self.mass,
+            factor * self.centre_of_mass,
+            factor * self.pad_position,
+            factor * self.disturbance,
+        )
+
+
+@dataclass(frozen=True)
+class Handling:
+    """What the robots do before and after the carry.
+
+    Attributes:
+        stand_off: distance of both pads from the box before it is gripped and after it is let
+            go, along the contact normals [m].
+        pressing_speed: fastest of the pads between there and the box [m/s].
+        pressing_rate: fastest rise and fall of the normal forces there [N/s].
+        lifting_speed: fastest of the box when it is lifted off and set down [m/s].
+        lift_height: how far below the carry's start the box stands [m]; None for the height above
+            what lies beneath it.
+        set_down_height: likewise below the carry's goal.
+    """
+
+    stand_off: float = 0.05
+    pressing_speed: float = 0.05
+    pressing_rate: float = 100.0
+    lifting_speed: float = 0.1
+    lift_height: float | None = None
+    set_down_height: float | None = None
+
+
+# --- identity ---
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a workcell was like when it was read.
+
+    Attributes:
+        files: SHA-256 over the workcell file and the content of every file it names.
+        values: `values_digest` of its records.
+        named: `named` of its records.
+    """
+
+    files: str
+    values: str
+    named: frozenset[str]
+
+
+def reading_of(workcell: Any, files: str) -> Reading:
+    """The reading of a workcell as it is now."""
+    return Reading(files, values_digest(workcell), named(workcell))
+
+
+def digest_of(workcell: Any, reading: Reading | None) -> str:
+    """The digest of a workcell; '' where no files, or others than were read, describe it."""
+    if reading is None:
+        return ""
+    values = values_digest(workcell)
+    if values == reading.values:
+        return reading.files
+    if not named(workcell) <= reading.named:
+        return ""
+    return hashlib.sha256(f"{reading.files} {values}".encode()).hexdigest()
+
+
+def values_digest(workcell: Any) -> str:
+    """SHA-256 over every value of the records, files by their place beside the workcell file."""
+    total = hashlib.sha256()
+    for part in _parts(workcell, workcell.source.parent):
+        # The length before each part keeps them apart.
+        total.update(len(part).to_bytes(8, "big") + part)
+    return total.hexdigest()
+
+
+def named(workcell: Any) -> frozenset[str]:
+    """What decides which files describe the cell: the paths in its records, and what each robot's
+    description is expanded with."""
+    arms = [(r.urdf, r.package_dirs, r.xacro_arguments, r.srdf) for r in workcell.robots]
+    return frozenset([*_paths(workcell), *map(repr, arms)])
+
+
+def _parts(value: Any, folder: Path) -> Iterator[bytes]:
+    if is_dataclass(value):
+        yield type(value).__name__.encode()
+        for field in fields(value):
+            if field.name not in ("source", "reading"):
+                yield from _parts(getattr(value, field.name), folder)
+    elif isinstance(value, tuple):
+        yield f"tuple {len(value)}".encode()
+        for entry in value:
+            yield from _parts(entry, folder)
+    elif isinstance(value, np.ndarray):
+        yield f"array {value.dtype} {value.shape}".encode()
+        yield value.tobytes()
+    elif isinstance(value, Path):
+        yield os.path.relpath(value, folder).encode(errors="surrogateescape")
+    else:
+        # Numbers come back from their representation to the bit.
+        yield f"{type(value).__name__} {value!r}".encode(errors="surrogateescape")
+
+
+def _paths(value: Any) -> Iterator[str]:
+    if is_dataclass(value):
+        for field in fields(value):
+            yield from _paths(getattr(value, field.name))
+    elif isinstance(value, tuple):
+        for entry in value:
+            yield from _paths(entry)
+    elif isinstance(value, Path):
+        yield str(value)
+
+
+# --- the whole cell ---
+
+
+SEARCHED = -2
+"""`Workcell.start_branch` of a robot whose branches compete."""
+
+
+@dataclass(frozen=True)
+class IgnoredPair:
+    """Bodies that collision checking leaves out against one another, with the user's reason.
+
+    Attributes:
+        first, second: names of bodies, or patterns with `*` and `?` that stand for several.
+        reason: shown wherever pairs are listed.
+    """
+
+    first: str
+    second: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class CollisionSettings:
+    """How collisions are judged.
+
+    Attributes:
+        tolerance: bodies closer than this count as colliding [m].
+        ignored: pairs left out by the user.
+        most_pieces: most convex pieces of all bodies together that are worked with.
+    """
+
+    tolerance: float = 0.0
+    ignored: tuple[IgnoredPair, ...] = ()
+    most_pieces: int = 500
+
+
+@dataclass(frozen=True)
+class Workcell:
+    """A dual-arm cell and its task.
+
+    Attributes:
+        name: title for reports.
+        robots: the two arms; robot i holds contact i.
+        payload, contacts, task, environment, collision, uncertainty, handling: see their records.
+        start_branch: (2,) per robot the index of the start branch among the ranked branches,
+            -1 for the stated criterion's choice, or `SEARCHED`: all compete, see
+            `hybrid_opt.branches`, and until then it is the criterion's choice.
+        source: the file it came from.
+        reading: what it was like when it was read from `source`.
+    """
+
+    name: str
+    robots: tuple[Robot, Robot]
+    payload: Payload
+    contacts: tuple[Contact, Contact]
+    task: Task
+    environment: tuple[Body, ...]
+    collision: CollisionSettings = field(default_factory=CollisionSettings)
+    start_branch: tuple[int, int] = (-1, -1)
+    source: Path = Path()
+    reading: Reading | None = None
+    uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    handling: Handling = field(default_factory=Handling)
+
+    @property
+    def has_facing_pads(self) -> bool:
+        """Whether two round pads with opposite normals hold the payload: what the paper's
+        allocation and all closed forms are for."""
+        return self.has_opposite_pads and not any(c.half_sides for c in self.contacts)
+
+    @property
+    def has_opposite_pads(self) -> bool:
+        """Whether two pads with opposite normals hold the payload, whatever their patches."""
+        first, second = (contact.T_box_pad[:3, 2] for contact in self.contacts)
+        opposite = np.allclose(first, -second, atol=1e-9)
+        return opposite and not any(contact.further for contact in self.contacts)
+
+    @property
+    def pads(self) -> tuple[Contact, ...]:
+        """All pads: those of the first robot, then those of the second."""
+        return tuple(pad for contact in self.contacts for pad in (contact, *contact.further))
+
+    @property
+    def pad_robots(self) -> tuple[int, ...]:
+        """Per pad the index of the robot that holds it."""
+        return tuple(i for i, c in enumerate(self.contacts) for _ in range(1 + len(c.further)))
+
+    @cached_property
+    def digest(self) -> str:
+        """Identifies the cell in caches and results: SHA-256 over the file and every file it names
+        (URDF, meshes), and over its values where it was changed in memory; '' without files."""
+        return digest_of(self, self.reading)
+
+
+def box_flange(robot: Robot, contact: Contact) -> Array:
+    """T_box_flange (4, 4) of the arm that holds this contact."""
+    return contact.T_box_pad @ inverse(robot.T_flange_pad)
+
+
+PAYLOAD = "payload"
+"""Name of the payload's body."""

@@ -1,0 +1,133 @@
+"""Poses as numbers: homogeneous transforms, and the chart of rotations that a cell's poses use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from symbolic.array import Array
+
+
+def read_only(values: Any) -> Array:
+    """A read-only float64 copy of an array-like."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+# --- a chart of the rotations ---
+
+
+Rotation = Literal["roll-pitch-yaw", "quaternion"]
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """How three numbers [rad] give R_world_box.
+
+    'roll-pitch-yaw', the paper's: Rz(yaw) Ry(pitch) Rx(roll). 'quaternion': a rotation vector v
+    along the world's axes, whose unit quaternion (cos |v|/2, sin |v|/2 v/|v|) turns the reference:
+    R_world_box = exp(v) R_reference.
+
+    Attributes:
+        rotation: which of the two.
+        reference: (3, 3), R_world_box at v = 0; of 'quaternion' only.
+    """
+
+    rotation: Rotation = "roll-pitch-yaw"
+    reference: Array = field(default_factory=lambda: read_only(np.eye(3)))
+
+    @property
+    def is_vector(self) -> bool:
+        """Whether the numbers are a rotation vector; angles otherwise, each up to full turns."""
+        return self.rotation == "quaternion"
+
+    @property
+    def components(self) -> tuple[str, str, str]:
+        """Names of the three numbers."""
+        if self.is_vector:
+            return ("rotation x", "rotation y", "rotation z")
+        return ("roll", "pitch", "yaw")
+
+    def unwrapped(self, numbers: Array) -> Array:
+        """Numbers (n, 3) along a path, angles without jumps of full turns."""
+        return numbers if self.is_vector else np.unwrap(numbers, axis=0)
+
+
+# --- homogeneous transforms ---
+
+
+def rotation_from_rpy(rpy: ArrayLike) -> Array:
+    """Rotations Rz(yaw) Ry(pitch) Rx(roll), the convention of URDF.
+
+    Args:
+        rpy: (..., 3) roll, pitch, yaw [rad].
+
+    Returns:
+        (..., 3, 3).
+    """
+    angles = np.moveaxis(np.asarray(rpy, dtype=float), -1, 0)
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [0.0 - sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def rotation_from_vector(vector: ArrayLike) -> Array:
+    """Rotations exp(v) of rotation vectors (..., 3) [rad], by Rodrigues' formula: (..., 3, 3)."""
+    v = np.asarray(vector, dtype=float)
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    across = np.cross(v[..., None, :], np.eye(3))
+    # The rows of `across` are v x e_k: the transpose of the skew matrix of v.
+    skew = np.swapaxes(across, -1, -2)
+    bend = np.sinc(angle / (2.0 * np.pi)) ** 2 / 2.0
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * skew + bend * (skew @ skew))
+
+
+def box_rotation(orientation: Orientation, pose: ArrayLike) -> Array:
+    """R_world_box (..., 3, 3) of poses (..., 6) [m, rad] of a cell with this orientation."""
+    numbers = np.asarray(pose, dtype=float)[..., 3:6]
+    if orientation.is_vector:
+        return np.asarray(rotation_from_vector(numbers) @ orientation.reference)
+    return rotation_from_rpy(numbers)
+
+
+def box_placement(orientation: Orientation, pose: ArrayLike) -> Array:
+    """T_world_box (..., 4, 4) of poses (..., 6) [m, rad] of a cell with this orientation."""
+    given = np.asarray(pose, dtype=float)
+    T = np.zeros((*given.shape[:-1], 4, 4))
+    T[..., :3, :3] = box_rotation(orientation, given)
+    T[..., :3, 3] = given[..., :3]
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def pose_matrix(xyz: ArrayLike, rpy: ArrayLike) -> Array:
+    """Homogeneous transform from a position [m] and roll, pitch, yaw [rad]. Returns (4, 4)."""
+    return transform(rotation_from_rpy(rpy), xyz)
+
+
+def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Homogeneous transform from a rotation (3, 3) and a translation (3,) [m]. Returns (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def inverse(T_a_b: Array) -> Array:
+    """The transform T_b_a of a rigid T_a_b, without a general matrix inversion."""
+    rotation = T_a_b[:3, :3].T
+    return transform(rotation, -rotation @ T_a_b[:3, 3])
+
+
+def skew(vector: ArrayLike) -> Array:
+    """The matrix (3, 3) whose product with another vector is the cross product of (3,) with it."""
+    x, y, z = np.asarray(vector, dtype=float)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,0 +1,122 @@
+"""Problems of a file gathered by place, the words in which they are told, and patterns of names."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import reprlib
+import unicodedata
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+MAX_NAME_LENGTH = 80
+
+
+MOST_LETTERS = 2000
+"""So much of a problem is told: it may quote what was found, or list what is allowed."""
+
+MOST_PROBLEMS = 100
+"""So many problems of a file are told, the rest is counted."""
+
+
+LONGEST_WORD = 200
+"""Longest word for which a similar one is looked for."""
+
+
+@dataclass
+class Problems:
+    """The problems found so far, as (key path, text)."""
+
+    found: list[tuple[str, str]] = field(default_factory=list)
+
+    uncounted: int = 0
+
+    def add(self, path: str, text: str) -> None:
+        """Record that the value at `path` is wrong; `text` says what is found and allowed.
+
+        After `MOST_PROBLEMS` they are only counted.
+        """
+        if len(self.found) < MOST_PROBLEMS:
+            told = text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS - 4]} ..."
+            self.found.append((path, told))
+        else:
+            self.uncounted += 1
+
+    def clean(self, *prefixes: str) -> bool:
+        """Whether nothing was found at, below or above any of these key paths."""
+        return not any(
+            _is_within(path, prefix) or _is_within(prefix, path)
+            for path, _ in self.found
+            for prefix in prefixes
+        )
+
+    def messages(self) -> tuple[str, ...]:
+        """All problems as `key.path: text`, and how many more there are."""
+        told = tuple(f"{path}: {text}" for path, text in self.found)
+        return (*told, f"and {self.uncounted} more") if self.uncounted else told
+
+
+def _is_within(path: str, prefix: str) -> bool:
+    return path == prefix or path.startswith((f"{prefix}.", f"{prefix}["))
+
+
+def suggestion(word: str, candidates: Iterable[str]) -> str:
+    """A 'did you mean' for a misspelt word, or an empty string."""
+    if len(word) > LONGEST_WORD:
+        return ""
+    close = difflib.get_close_matches(word, list(candidates), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def shown(value: Any) -> str:
+    """A value as a short single line for a message, control characters escaped.
+
+    Of a long one both ends: a path is known by its last part.
+    """
+    text = _short.repr(value)
+    return text if len(text) <= 60 else f"{text[:28]}...{text[-29:]}"
+
+
+class _Short(reprlib.Repr):
+    """Looks only as far into a value as a message can show."""
+
+    def repr_int(self, x: int, level: int) -> str:
+        """Python refuses to write out numbers of thousands of digits."""
+        return repr(x) if x.bit_length() < 200 else f"a number of {x.bit_length()} bits"
+
+
+_short = _Short()
+_short.maxlevel, _short.maxstring, _short.maxother = 4, 200, 200
+_short.maxlist = _short.maxdict = 60
+
+
+def text_problem(value: Any) -> str:
+    """What is wrong with a value as a text for people and reports, or an empty string."""
+    if not isinstance(value, str):
+        return "allowed is a text"
+    if not value.strip():
+        return "allowed is a text that is not empty"
+    if len(value) > MAX_NAME_LENGTH:
+        return f"it has {len(value)} characters; allowed are {MAX_NAME_LENGTH}"
+    if value != value.strip():
+        return "allowed is a text without spaces at its ends"
+    if any(unicodedata.category(character).startswith(("C", "Zl", "Zp")) for character in value):
+        return "it contains a control character; allowed are printable characters in one line"
+    return ""
+
+
+# --- patterns that stand for several names ---
+
+
+def matching(pattern: str, names: Iterable[str]) -> tuple[str, ...]:
+    """The names that a pattern stands for: `*` is any text, `?` any character.
+
+    A name that is written out stands for itself, also where it holds such a character.
+    """
+    names = tuple(names)
+    if pattern in names:
+        return (pattern,)
+    words = {"*": ".*", "?": "."}
+    form = re.compile("".join(words.get(letter, re.escape(letter)) for letter in pattern))
+    return tuple(name for name in names if form.fullmatch(name))

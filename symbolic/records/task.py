@@ -1,0 +1,248 @@
+"""What is to be carried where, and the decision vector that this makes.
+
+The decision vector holds the free waypoints of a task's path, one after the other. The free values
+of the redundant joints follow them, joint by joint; under the time law 'optimal' the force limit
+[N] is the last. Here they are put into the path, and taken out, as numbers; as expressions it is
+`symbolic.path.spline.waypoint_matrix` and `extended_matrix`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symbolic.array import Array
+from symbolic.records.poses import Orientation
+
+TimeLaw = Literal["constant", "ramped", "optimal"]
+Allocation = Literal["paper", "joint"]
+
+POSE_SIZE = 6
+"""x, y, z [m] and three numbers of the orientation [rad], see `symbolic.records.poses`."""
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """A pose of the box path: fixed where lower equals upper, otherwise free within them.
+
+    Attributes:
+        lower, upper: (6,) poses [m, rad].
+    """
+
+    lower: Array
+    upper: Array
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether the task fixes this pose."""
+        return bool(np.all(self.lower == self.upper))
+
+
+@dataclass(frozen=True)
+class RedundantJoint:
+    """A joint beyond the six that follow the box: its path is part of the decision vector.
+
+    Its values at the waypoints are joined by the spline of the box path. A joint that moves both
+    arms of a machine is one of these, not two.
+
+    Attributes:
+        name: robot and joint, as 'north/panda_joint3'.
+        drives: per robot its index among the arm's joints, -1 where it is none of them.
+        lower, upper: (n_waypoints,) bounds [rad or m]; equal where it is fixed.
+        initial: (n_waypoints,) its path in the hand-made trajectory [rad or m].
+    """
+
+    name: str
+    drives: tuple[int, int]
+    lower: Array
+    upper: Array
+    initial: Array
+
+
+@dataclass(frozen=True)
+class AllowedContact:
+    """The payload may touch a named environment body near the fixed poses.
+
+    Attributes:
+        body: name of the environment body.
+        departure: the contact is allowed while the box centre is within this distance of a
+            fixed waypoint at which the payload touches (or is within tolerance of) the body [m].
+    """
+
+    body: str
+    departure: float
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be carried where, and how a candidate is sampled and judged.
+
+    Attributes:
+        waypoints: the ordered poses of the path; the first and last are fixed.
+        samples: number of samples along the path, ends included.
+        time_law: 'constant' (the paper's), 'ramped' (from rest to rest) or 'optimal' (the fastest
+            from rest to rest within all limits and a force limit that is a decision variable).
+        reference_speed: [m/s], speed of the box centre (cruise speed of 'ramped').
+        reference_angular_speed: [rad/s], for steps that mostly rotate.
+        ramp_time: [s], duration of each ramp of 'ramped'.
+        reference_force: (2,) [N], normalises each robot's normal force.
+        initial: (n_free, 6), the hand-made trajectory's free waypoints.
+        allowed_contacts: contacts that are no collisions, see AllowedContact.
+        allocation: 'paper' (least forces first, then the moments) or 'joint' (the least forces
+            that carry the moments as well).
+        force_limit: (2,) bounds of the force limit, the last decision variable of 'optimal' [N].
+        redundant: the joints whose paths are decided beside the box's, see RedundantJoint.
+        orientation: what the last three numbers of every pose mean.
+    """
+
+    waypoints: tuple[Waypoint, ...]
+    samples: int
+    time_law: TimeLaw
+    reference_speed: float
+    reference_angular_speed: float
+    ramp_time: float
+    reference_force: Array
+    initial: Array
+    allowed_contacts: tuple[AllowedContact, ...]
+    allocation: Allocation = "paper"
+    force_limit: tuple[float, float] = (0.0, np.inf)
+    redundant: tuple[RedundantJoint, ...] = ()
+    orientation: Orientation = field(default_factory=Orientation)
+
+    @property
+    def extended_size(self) -> int:
+        """Entries of an extended pose: the box pose, then the redundant joints."""
+        return POSE_SIZE + len(self.redundant)
+
+    def redundant_of(self, arm: int) -> tuple[tuple[int, int], ...]:
+        """Of each redundant joint of robot `arm` its index in the arm and its place in the
+        extended pose."""
+        return tuple(
+            (joint.drives[arm], POSE_SIZE + k)
+            for k, joint in enumerate(self.redundant)
+            if joint.drives[arm] >= 0
+        )
+
+    @property
+    def free_indices(self) -> tuple[int, ...]:
+        """Positions of the free waypoints in `waypoints`."""
+        return tuple(i for i, w in enumerate(self.waypoints) if not w.is_fixed)
+
+    @property
+    def n_path(self) -> int:
+        """Number of variables of the path: six per free waypoint (paper Eq. 14), then the free
+        values of the redundant joints, joint by joint."""
+        return len(self.free_entries[0])
+
+    @property
+    def n_box(self) -> int:
+        """Number of variables of the box path, the first of the decision vector."""
+        return POSE_SIZE * len(self.free_indices)
+
+    @cached_property
+    def free_entries(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows and columns (n_path,) of the path's variables among the extended waypoints
+        (n_waypoints, 6 + m), whose columns are the pose and the redundant joints."""
+        free = np.array(self.free_indices, dtype=np.intp)
+        rows, columns = [np.repeat(free, POSE_SIZE)], [np.tile(np.arange(POSE_SIZE), len(free))]
+        for k, joint in enumerate(self.redundant):
+            moving = np.flatnonzero(joint.lower < joint.upper)
+            rows.append(moving)
+            columns.append(np.full(len(moving), POSE_SIZE + k))
+        found = np.concatenate(rows), np.concatenate(columns)
+        for part in found:  # every caller gets the same
+            part.flags.writeable = False
+        return found
+
+    @property
+    def n_var(self) -> int:
+        """Number of decision variables: those of the path, then under 'optimal' the force limit."""
+        return self.n_path + (self.time_law == "optimal")
+
+    @property
+    def lower(self) -> Array:
+        """(n_var,) lower bounds of the decision vector."""
+        return self._bounds("lower", self.force_limit[0])
+
+    @property
+    def upper(self) -> Array:
+        """(n_var,) upper bounds of the decision vector."""
+        return self._bounds("upper", self.force_limit[1])
+
+    def _bounds(self, name: str, force: float) -> Array:
+        parts = [getattr(self.waypoints[i], name) for i in self.free_indices]
+        parts += [getattr(joint, name)[joint.lower < joint.upper] for joint in self.redundant]
+        return np.concatenate(parts + ([np.array([force])] if self.time_law == "optimal" else []))
+
+
+# --- the decision vector ---
+
+
+def components(orientation: Orientation) -> tuple[str, ...]:
+    """What the numbers of a pose are called [m, rad]."""
+    return ("x", "y", "z", *orientation.components)
+
+
+def waypoints_of(task: Task, x: Array) -> Array:
+    """All waypoints (n_waypoints, 6) of a decision vector (n_var,), angles unwrapped."""
+    return extended_waypoints(task, x)[:, :POSE_SIZE]
+
+
+def extended_waypoints(task: Task, x: Array) -> Array:
+    """All waypoints (n_waypoints, 6 + m) of a decision vector (n_var,), the values of the redundant
+    joints beside the poses."""
+    points = np.array([waypoint.lower for waypoint in task.waypoints])
+    points = np.column_stack([points, *[joint.lower for joint in task.redundant]])
+    points[task.free_entries] = x[: task.n_path]
+    points[:, 3:POSE_SIZE] = task.orientation.unwrapped(points[:, 3:POSE_SIZE])
+    return points
+
+
+def place_redundant(task: Task, extended: Array, joints: Sequence[Array]) -> None:
+    """Put both arms' redundant joints, (n, joints) each and changed in place, where the extended
+    poses (n, 6 + m) say."""
+    for arm, q in enumerate(joints):
+        for joint, place in task.redundant_of(arm):
+            q[:, joint] = extended[:, place]
+
+
+def decision_of(task: Task, waypoints: Array) -> Array:
+    """The decision vector (n_var,) of all waypoints (n_waypoints, 6 + m); a force limit at its
+    upper bound."""
+    path = np.array(waypoints[task.free_entries], dtype=float)
+    return np.append(path, task.force_limit[1]) if task.time_law == "optimal" else path
+
+
+def initial_decision(task: Task) -> Array:
+    """The decision vector (n_var,) of the hand-made trajectory, a force limit at its upper
+    bound."""
+    points = np.array([waypoint.lower for waypoint in task.waypoints])
+    points[list(task.free_indices)] = task.initial
+    return decision_of(task, _beside_initial(task, points))
+
+
+def _beside_initial(task: Task, poses: Array) -> Array:
+    return np.column_stack([poses, *[joint.initial for joint in task.redundant]])
+
+
+def straight_line(task: Task) -> Array:
+    """(n_var,) free waypoints evenly spaced on the straight lines between the fixed ones, the
+    redundant joints as in the hand-made trajectory."""
+    fixed = [i for i, waypoint in enumerate(task.waypoints) if waypoint.is_fixed]
+    poses = np.array([waypoint.lower for waypoint in task.waypoints])
+    numbers = np.arange(len(task.waypoints))
+    line = [np.interp(numbers, fixed, poses[fixed, k]) for k in range(POSE_SIZE)]
+    return decision_of(task, _beside_initial(task, np.column_stack(line)))
+
+
+def variable_names(task: Task) -> tuple[str, ...]:
+    """What the decision variables (n_var,) are; waypoints count from 1, the start is none."""
+    names = [*components(task.orientation), *(joint.name for joint in task.redundant)]
+    rows, columns = task.free_entries
+    found = [f"waypoint {row}, {names[column]}" for row, column in zip(rows, columns, strict=True)]
+    return tuple(found + ["force limit"] * (task.n_var - task.n_path))

@@ -1,0 +1,250 @@
+"""Forces of pads anywhere against clarabel, Caron's cone, known cases, laws and differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import clarabel
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import sparse
+from scipy.spatial.transform import Rotation
+
+from symbolic.array import Array
+from symbolic.contact.central_path import START_WEIGHT
+from symbolic.contact.force_closure import state_to_box
+from symbolic.contact.grasp import REST_WEIGHT, Grasp, grasp_wrenches
+from symbolic.errors import SettingsError
+from symbolic.records import Contact, Workcell
+from tests.symbolic.cells import hand_cell
+from tests.symbolic.contact.grasp_oracle import (
+    in_box,
+    least_wrenches,
+    random_grasp,
+    random_load,
+    turned,
+)
+
+KINDS = (
+    ("round", "round"),
+    ("round", "rectangle"),
+    ("rectangle", "rectangle"),
+    ("round", "round", "round"),
+    ("rectangle", "round", "rectangle"),
+    ("rectangle",) * 4,
+)
+
+
+def function_of(cell: Workcell, differentiable: bool = False) -> ca.Function:
+    load, friction = ca.MX.sym("load", 6), ca.MX.sym("friction", 2)
+    found = grasp_wrenches(Grasp(cell), load, friction, differentiable)
+    return ca.Function("grasp", [load, friction], [found])
+
+
+def friction_of(cell: Workcell) -> list[float]:
+    return [contact.friction for contact in cell.contacts]
+
+
+def wrenches(cell: Workcell, load: Array, function: ca.Function | None = None) -> Array:
+    """(k, 6) force and moment about the pads' centres, in their axes."""
+    found = np.array((function or function_of(cell))(load, friction_of(cell))).reshape(-1, 6)
+    n, t_x, t_y, q_x, q_y, m = found.T
+    return np.column_stack([t_x, t_y, n, q_y, -q_x, m])
+
+
+def effort(found: Array) -> float:
+    return float(np.sum(found[:, :3] ** 2))
+
+
+def check_against_clarabel(kinds: tuple[str, ...], grasps: int, loads: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(grasps):
+        cell = random_grasp(rng, hand_cell(), kinds)
+        function = function_of(cell)
+        for _ in range(loads):
+            load = random_load(rng)
+            found, expected = wrenches(cell, load, function), least_wrenches(cell.pads, load)
+            assert effort(found) == pytest.approx(effort(expected), rel=1e-6)
+            size = np.sqrt(effort(found))
+            np.testing.assert_allclose(found[:, :3] / size, expected[:, :3] / size, atol=2e-3)
+            balance = sum(in_box(p) @ w for p, w in zip(cell.pads, found, strict=True))
+            np.testing.assert_allclose(balance, load, atol=1e-9 * size)
+
+
+@pytest.mark.parametrize("kinds", KINDS)
+def test_agrees_with_clarabel(kinds: tuple[str, ...]) -> None:
+    check_against_clarabel(kinds, grasps=6, loads=3, seed=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kinds", KINDS)
+def test_agrees_with_clarabel_on_two_thousand_cases(kinds: tuple[str, ...]) -> None:
+    check_against_clarabel(kinds, grasps=112, loads=3, seed=2)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_rectangle_needs_no_less_than_carons_cone_and_no_more_than_the_one_within(
+    seed: int,
+) -> None:
+    """Its friction pyramids hold the circular cones, those of friction over sqrt(2) lie within."""
+    rng = np.random.default_rng(seed)
+    cell = random_grasp(rng, hand_cell(), ("rectangle", "rectangle"))
+    load = random_load(rng)
+    least, ours, most = (
+        caron_effort(cell.pads, load, 1.0),
+        effort(wrenches(cell, load)),
+        caron_effort(cell.pads, load, 0.5**0.5),
+    )
+    assert least * (1.0 - 1e-6) <= ours <= most * (1.0 + 1e-6)
+
+
+def caron_effort(pads: tuple[Contact, ...], load: Array, share: float) -> float:
+    """Least effort by clarabel with Caron's inequalities; infinite where there is none."""
+    rows = []
+    for i, pad in enumerate(pads):
+        own = np.zeros((16, 6 * len(pads)))
+        own[:, 6 * i : 6 * i + 6] = caron_rows(pad, share * pad.friction)
+        rows.append(own)
+    squares = sparse.diags(np.tile([1.0, 1, 1, 0, 0, 0], len(pads)))
+    options = clarabel.DefaultSettings()
+    options.verbose = False
+    options.tol_gap_abs = options.tol_gap_rel = options.tol_feas = 1e-10
+    size = float(np.linalg.norm(load))
+    solution = clarabel.DefaultSolver(
+        sparse.csc_matrix(squares),
+        np.zeros(6 * len(pads)),
+        sparse.csc_matrix(np.vstack([np.hstack([in_box(pad) for pad in pads]), *rows])),
+        np.concatenate([load / size, np.zeros(16 * len(pads))]),
+        [clarabel.ZeroConeT(6), clarabel.NonnegativeConeT(16 * len(pads))],
+        options,
+    ).solve()
+    if str(solution.status) == "PrimalInfeasible":
+        return float("inf")
+    assert str(solution.status) in ("Solved", "AlmostSolved"), solution.status
+    return size**2 * effort(np.array(solution.x).reshape(-1, 6))
+
+
+def caron_rows(pad: Contact, mu: float) -> Array:
+    """(16, 6) rows that are at most zero within the cone of Caron et al. (ICRA 2015, Prop. 2)."""
+    assert pad.half_sides is not None
+    x, y = pad.half_sides
+    f_x, f_y, f_z, m_x, m_y, m_z = np.eye(6)
+    rows = [sign * f - mu * f_z for f in (f_x, f_y) for sign in (1, -1)]
+    rows += [sign * m_x - y * f_z for sign in (1, -1)]
+    rows += [sign * m_y - x * f_z for sign in (1, -1)]
+    for one in (1, -1):
+        for two in (1, -1):
+            low = one * (y * f_x - mu * m_x) + two * (x * f_y - mu * m_y)
+            high = one * (y * f_x + mu * m_x) + two * (x * f_y + mu * m_y)
+            rows += [-m_z - mu * (x + y) * f_z + low, m_z - mu * (x + y) * f_z + high]
+    return np.array(rows)
+
+
+@given(seed=st.integers(0, 2**31), kinds=st.sampled_from(KINDS[:5]))
+@settings(max_examples=12, deadline=None)
+def test_turning_all_turns_the_forces(seed: int, kinds: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(seed)
+    cell, load = random_grasp(rng, hand_cell(), kinds), random_load(rng)
+    rotation = Rotation.random(random_state=seed)
+    first, last = cell.contacts
+    moved = replace(
+        turned(first, rotation), further=tuple(turned(p, rotation) for p in first.further)
+    )
+    other = replace(cell, contacts=(moved, turned(last, rotation)))
+    there = wrenches(other, np.concatenate([rotation.apply(load[:3]), rotation.apply(load[3:])]))
+    here = wrenches(cell, load)
+    size = np.sqrt(effort(here))
+    np.testing.assert_allclose(there[:, :3], here[:, :3], atol=1e-4 * size)
+
+
+@given(seed=st.integers(0, 2**31), kinds=st.sampled_from(KINDS[:5]))
+@settings(max_examples=8, deadline=None)
+def test_derivatives_are_those_of_the_forces(seed: int, kinds: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(seed)
+    cell, load = random_grasp(rng, hand_cell(), kinds), random_load(rng)
+    function, friction = function_of(cell, differentiable=True), friction_of(cell)
+    symbol = ca.MX.sym("load", 6)
+    normal = function(symbol, friction)[0]
+    derivative = ca.Function("derivative", [symbol], [ca.jacobian(normal, symbol)])
+    jacobian: Array = np.array(derivative(load)).ravel()
+    scale = max(1.0, float(np.abs(jacobian).max()))
+    for k, step in enumerate(1e-4 * np.eye(6)):
+        ends = [float(function(load + sign * step, friction)[0]) for sign in (1.0, -1.0)]
+        assert (ends[0] - ends[1]) / 2e-4 == pytest.approx(jacobian[k], abs=1e-3 * scale)
+
+
+def pad(
+    place: tuple[float, float, float], normal: tuple[float, float, float], mu: float
+) -> Contact:
+    """A pad of 1 mm radius."""
+    z = np.array(normal) / np.linalg.norm(normal)
+    x = np.cross(z, [0.3, 0.5, 0.8])
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.column_stack([x, np.cross(z, x), z]), place
+    return Contact(T, mu, 1e-3)
+
+
+@pytest.mark.parametrize(("mu", "closes"), [(1.02, False), (1.1, True)])
+def test_adjacent_faces_hold_where_both_cones_reach_across_the_edge(
+    mu: float, closes: bool
+) -> None:
+    """The line between points as far from the edge lies at 45 degrees to both faces: friction
+    above one, with five percent to spare."""
+    contacts = (pad((0.1, 0.0, 0.0), (-1, 0, 0), mu), pad((0.0, 0.1, 0.0), (0, -1, 0), mu))
+    cell = replace(hand_cell(), contacts=contacts)
+    if not closes:
+        with pytest.raises(SettingsError, match="do not close their grasp"):
+            Grasp(cell)
+        return
+    # A force along the bisector: its halves act at the pads, at 45 degrees to both normals.
+    found = wrenches(cell, np.array([-10.0, -10.0, 0.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(found[:, 2], 5.0, rtol=1e-3)
+
+
+def test_a_fork_shares_what_one_pad_carries() -> None:
+    """Level box, friction 0.5: both arms press with weight / (2 mu), the fork's pads with half."""
+    fork = replace(
+        pad((0.1, 0.2, 0.0), (0, -1, 0), 0.5), further=(pad((-0.1, 0.2, 0.0), (0, -1, 0), 0.5),)
+    )
+    cell = replace(hand_cell(), contacts=(fork, pad((0.0, -0.2, 0.0), (0, 1, 0), 0.5)))
+    found = wrenches(cell, np.array([0.0, 0.0, 98.1, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(found[:, 2], [49.05, 49.05, 98.1], rtol=1e-5)
+
+
+def test_friction_that_closes_nothing_asks_for_forces_beyond_any_limit() -> None:
+    contacts = (pad((0.1, 0.0, 0.0), (-1, 0, 0), 1.5), pad((0.0, 0.1, 0.0), (0, -1, 0), 1.5))
+    function = function_of(replace(hand_cell(), contacts=contacts))
+    load = np.array([1.0, 2.0, 30.0, 0.0, 0.0, 0.0])
+    assert np.array(function(load, [0.3, 0.3]))[0] > 1e9
+    assert np.array(function(load, [1.4, 1.4]))[0] < 1e4
+
+
+@pytest.mark.parametrize("kinds", KINDS)
+def test_starts_balance_the_load_within_the_cones_and_at_rest_near_the_least_effort(
+    kinds: tuple[str, ...],
+) -> None:
+    rng = np.random.default_rng(3)
+    cell = random_grasp(rng, hand_cell(), kinds)
+    upright = np.array([0.0, 0.0, 1.0])
+    at_rest = np.concatenate([upright, np.cross(cell.payload.centre_of_mass, upright)])
+    grasp = Grasp(cell)
+    load, friction = ca.SX.sym("load", 6), ca.SX.sym("friction", 2)
+    states, weight = grasp.start([load, friction])
+    outputs = [patch.slack(state) for patch, state in zip(grasp.patches, states, strict=True)]
+    outputs += [weight, grasp.effort([state[:6] for state in states], [load, friction])]
+    start = ca.Function("start", [load, friction], [ca.vertcat(*outputs), *states])
+    maps = [state_to_box(pad) for pad in cell.pads]
+    disturbed = [0.05 * rng.normal(size=6) * [1, 1, 1, 0.1, 0.1, 0.1] for _ in range(8)]
+    for asked in [at_rest, -at_rest, *[sign * at_rest + d for d in disturbed for sign in (1, -1)]]:
+        found, *held = (np.array(v).ravel() for v in start(asked, friction_of(cell)))
+        assert found[:-2].min() > 0.0
+        balance = sum(A @ state for A, state in zip(maps, held, strict=True))
+        np.testing.assert_allclose(balance, asked, atol=1e-9)
+        if asked is at_rest:
+            least = effort(least_wrenches(cell.pads, asked)) / 2.0
+            assert least < found[-1] < least * (1.0 + 1.5 * REST_WEIGHT)
+            assert found[-2] < START_WEIGHT

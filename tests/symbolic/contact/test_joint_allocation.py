@@ -1,0 +1,287 @@
+"""The joint allocation against clarabel, known cases, laws and finite differences."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from symbolic.array import Array
+from symbolic.contact.facing import JointAllocation, allocate_jointly, balance_of, least_squeeze
+from symbolic.contact.paper import allocate
+from tests.symbolic.contact.joint_oracle import Case, least_wrenches
+
+REGIMES = (
+    "patch suffices",
+    "patch does not suffice",
+    "pressure at the rim 1",
+    "pressure at the rim 2",
+    "friction used up 1",
+    "friction used up 2",
+    "torsion",
+    "friction not used up",
+    "pads beside one another",
+)
+
+
+def _function(solve: Callable[..., JointAllocation], differentiable: bool = False) -> ca.Function:
+    force, moment, arms = ca.MX.sym("force", 3), ca.MX.sym("moment", 3), ca.MX.sym("arms", 3, 2)
+    friction, radius = ca.MX.sym("friction", 2), ca.MX.sym("radius", 2)
+    balance = balance_of(force, moment, (arms[:, 0], arms[:, 1]))
+    held = solve(balance, friction, radius, differentiable)
+    columns = [
+        ca.vertcat(held.tangent_1, held.normal[0], held.shift_1, held.torsion[0]),
+        ca.vertcat(held.tangent_2, -held.normal[1], held.shift_2, held.torsion[1]),
+    ]
+    inputs = [force, moment, arms, friction, radius]
+    return ca.Function("joint", inputs, [ca.horzcat(*columns)])
+
+
+FUNCTION = _function(allocate_jointly)
+DIFFERENTIABLE = _function(allocate_jointly, differentiable=True)
+SQUEEZE = _function(least_squeeze)
+
+
+def held(case: Case) -> tuple[Array, Array, Array]:
+    """Forces (2, 3), shifts (2, 2) and torsions (2,)."""
+    result: Array = np.array(
+        FUNCTION(case.force, case.moment, case.arms.T, case.friction, case.radius)
+    ).T
+    return result[:, :3], result[:, 3:5], result[:, 5]
+
+
+def effort(forces: Array) -> float:
+    return float(np.sum(forces**2))
+
+
+def random_case(rng: np.random.Generator) -> Case:
+    """Boxes of any proportions, level or tumbling, held anywhere near their middle."""
+    friction, radius = rng.uniform(0.2, 1.2, 2), rng.uniform(0.005, 0.05, 2)
+    if rng.random() < 0.4:
+        friction[1], radius[1] = friction[0], radius[0]
+    length, force = rng.uniform(0.15, 0.6), rng.normal(size=3)
+    if rng.random() < 0.3:
+        force[:2] *= 0.05
+    force *= rng.uniform(10.0, 150.0) / np.linalg.norm(force)
+    beside = 0.5 * radius.sum() * rng.uniform(-1.0, 1.0, 2) * (rng.random() < 0.5)
+    centre = np.array([*rng.normal(scale=0.03, size=2), rng.uniform(-0.3, 0.3) * length])
+    centre *= rng.choice([0.1, 1.0, 2.0])
+    arms = np.array([[*beside, -length / 2.0], [0.0, 0.0, length / 2.0]]) - centre
+    return Case(force, rng.normal(size=3) * rng.choice([0.1, 1.0, 5.0]), arms, friction, radius)
+
+
+def slack(case: Case, forces: Array, shifts: Array, torsion: Array) -> tuple[Array, Array]:
+    """What friction and patch leave, as shares (2,), by the ellipse at the centre of pressure."""
+    normal = forces[:, 2] * [1.0, -1.0]
+    lever = np.sqrt(np.maximum(case.radius**2 - np.sum(shifts**2, axis=1), 0.0))
+    tangential = np.linalg.norm(forces[:, :2], axis=1)
+    used = np.hypot(tangential, torsion / np.maximum(lever, 1e-12))
+    rim = 1.0 - np.linalg.norm(shifts, axis=1) / case.radius
+    return 1.0 - used / (case.friction * normal), rim
+
+
+def paper_effort(case: Case) -> float:
+    result = allocate(ca.DM(case.force), ca.DM([0, 0, 1]), (case.friction[0], case.friction[1]))
+    return effort(np.array([result.force_1, result.force_2]).reshape(2, 3))
+
+
+def regimes(case: Case, forces: Array, shifts: Array, torsion: Array) -> set[str]:
+    friction, rim = slack(case, forces, shifts, torsion)
+    more = effort(forces) > (1.0 + 1e-5) * paper_effort(case)
+    found = {REGIMES[1] if more else REGIMES[0]}
+    for i in (0, 1):
+        found |= {f"pressure at the rim {i + 1}"} if rim[i] < 1e-4 else set()
+        found |= {f"friction used up {i + 1}"} if friction[i] < 1e-4 else set()
+    capacity = case.friction * np.abs(forces[:, 2]) * case.radius
+    found |= {"torsion"} if (np.abs(torsion) > 0.1 * capacity).any() else set()
+    found |= {"friction not used up"} if (friction > 0.05).all() else set()
+    beside = np.linalg.norm((case.arms[0] - case.arms[1])[:2])
+    return found | ({"pads beside one another"} if beside > 0.2 * case.radius.sum() else set())
+
+
+def check_against_clarabel(cases: int, seed: int) -> Counter[str]:
+    rng = np.random.default_rng(seed)
+    hits: Counter[str] = Counter()
+    for _ in range(cases):
+        case = random_case(rng)
+        forces, shifts, torsion = held(case)
+        expected = least_wrenches(case)
+        assert effort(forces) == pytest.approx(effort(expected[:, :3]), rel=1e-6)
+        # Where the effort is flat, forces differ by the root of what the efforts may.
+        size = np.sqrt(effort(forces))
+        np.testing.assert_allclose(forces / size, expected[:, :3] / size, atol=1e-4)
+        hits.update(regimes(case, forces, shifts, torsion))
+    return hits
+
+
+def test_agrees_with_clarabel() -> None:
+    hits = check_against_clarabel(150, seed=1)
+    assert min(hits[name] for name in REGIMES) >= 5, hits
+
+
+@pytest.mark.slow
+def test_agrees_with_clarabel_on_two_thousand_cases() -> None:
+    hits = check_against_clarabel(2000, seed=2)
+    assert min(hits[name] for name in REGIMES) >= 60, hits
+
+
+def level_box(half_height: float, offset: float) -> Case:
+    """10 kg, friction 0.5, contacts 0.4 m apart; a points up, the centre of mass lies `offset`
+    towards contact 1. The planar case: discs of that radius, nothing out of the plane."""
+    arms = np.array([[0.0, 0.0, -0.2 + offset], [0.0, 0.0, 0.2 + offset]])
+    both = np.ones(2)
+    return Case(np.array([98.1, 0.0, 0.0]), np.zeros(3), arms, 0.5 * both, half_height * both)
+
+
+@pytest.mark.parametrize(
+    ("half_height", "offset", "published"),
+    [
+        (0.02, 0.0, 98.1),
+        (0.02, 0.05, 102.2),
+        (0.01, 0.05, 111.5),
+        (0.005, 0.05, 116.8),
+        (1e-6, 0.05, 122.6),
+    ],
+)
+def test_known_cases(half_height: float, offset: float, published: float) -> None:
+    """Friction of the nearer contact and both rims are used up, or friction alone."""
+    forces, _, torsion = held(level_box(half_height, offset))
+    weight, mu, length = 98.1, 0.5, 0.4
+    # About pad 2: mu N L and both rims' 2 h N carry weight (L / 2 + offset).
+    tilted = weight * (length / 2.0 + offset) / (mu * length + 2.0 * half_height)
+    expected = max(tilted, weight / (2.0 * mu))
+    np.testing.assert_allclose(forces[:, 2], [expected, -expected], rtol=2e-7)
+    assert expected == pytest.approx(published, abs=0.05)
+    np.testing.assert_allclose(torsion, 0.0, atol=1e-5)
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=150, deadline=None)
+def test_balances_force_and_moment_within_both_patches(seed: int) -> None:
+    case = random_case(np.random.default_rng(seed))
+    forces, shifts, torsion = held(case)
+    np.testing.assert_allclose(forces.sum(axis=0), case.force, atol=1e-9)
+    points = case.arms + np.column_stack([shifts, np.zeros(2)])
+    moment = np.cross(points, forces).sum(axis=0) + torsion.sum() * np.eye(3)[2]
+    np.testing.assert_allclose(moment, case.moment, atol=1e-9)
+    friction, rim = slack(case, forces, shifts, torsion)
+    assert friction.min() > 0.0
+    assert rim.min() > 0.0
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=150, deadline=None)
+def test_never_needs_less_than_the_paper(seed: int) -> None:
+    case = random_case(np.random.default_rng(seed))
+    assert effort(held(case)[0]) >= (1.0 - 1e-12) * paper_effort(case)
+
+
+@given(seed=st.integers(0, 2**31), larger=st.floats(1.01, 3.0))
+@settings(max_examples=60, deadline=None)
+def test_larger_patches_and_more_friction_never_cost_more(seed: int, larger: float) -> None:
+    case = random_case(np.random.default_rng(seed))
+    least = effort(held(case)[0])
+    for change in (
+        Case(case.force, case.moment, case.arms, case.friction, larger * case.radius),
+        Case(case.force, case.moment, case.arms, larger * case.friction, case.radius),
+    ):
+        assert effort(held(change)[0]) <= (1.0 + 2e-7) * least
+
+
+@given(seed=st.integers(0, 2**31), factor=st.floats(0.05, 20.0))
+@settings(max_examples=60, deadline=None)
+def test_forces_are_proportional_to_what_they_carry(seed: int, factor: float) -> None:
+    case = random_case(np.random.default_rng(seed))
+    scaled = Case(factor * case.force, factor * case.moment, case.arms, case.friction, case.radius)
+    for one, other, power in zip(held(case), held(scaled), (1, 0, 1), strict=True):
+        size = max(1.0, float(np.abs(one).max()))
+        np.testing.assert_allclose(other, factor**power * one, atol=1e-5 * size * factor**power)
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=60, deadline=None)
+def test_exchanging_the_contacts_exchanges_the_forces(seed: int) -> None:
+    """Half a turn about a puts contact 2 in the place of contact 1."""
+    case = random_case(np.random.default_rng(seed))
+    turn = np.array([1.0, -1.0, -1.0])
+    there = held(
+        Case(
+            turn * case.force,
+            turn * case.moment,
+            case.arms[::-1] * turn,
+            case.friction[::-1],
+            case.radius[::-1],
+        )
+    )[0]
+    here = held(case)[0]
+    np.testing.assert_allclose(there[::-1] * turn, here, atol=1e-5 * np.sqrt(effort(here)))
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=40, deadline=None)
+def test_derivatives_are_those_of_the_forces(seed: int) -> None:
+    case = random_case(np.random.default_rng(seed))
+    names = ("force", "moment", "arms", "friction", "radius")
+    symbols = [ca.MX.sym(name, *np.array(getattr(case, name)).T.shape) for name in names]
+    normal = DIFFERENTIABLE(*symbols)[2, :].T
+    motion = ca.vertcat(symbols[0], symbols[1])
+    function = ca.Function("derivatives", symbols, [normal, ca.jacobian(normal, motion)])
+
+    def at(change: Array) -> list[Array]:
+        force, moment = case.force + change[:3], case.moment + change[3:]
+        values = function(force, moment, case.arms.T, case.friction, case.radius)
+        return [np.array(value) for value in values]
+
+    value, jacobian = at(np.zeros(6))
+    np.testing.assert_allclose(value[:, 0], held(case)[0][:, 2], atol=1e-5 * np.abs(value).max())
+    size = max(1.0, float(np.abs(jacobian).max()))
+    for k, direction in enumerate(1e-4 * np.eye(6)):
+        difference = (at(direction)[0] - at(-direction)[0]) / 2e-4
+        np.testing.assert_allclose(difference[:, 0], jacobian[:, k], atol=1e-4 * size)
+
+
+def test_nothing_to_carry_needs_next_to_nothing() -> None:
+    case = level_box(0.02, 0.0)
+    nothing = Case(np.zeros(3), np.zeros(3), case.arms, case.friction, case.radius)
+    forces, _, _ = held(nothing)
+    assert np.isfinite(forces).all()
+    assert np.abs(forces).max() < 1e-6
+
+
+def test_least_squeeze_agrees_with_clarabel() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        case = random_case(rng)
+        found: Array = np.array(
+            SQUEEZE(case.force, case.moment, case.arms.T, case.friction, case.radius)
+        )[2]
+        expected = least_wrenches(case, squeeze=True)[:, 2]
+        assert found[0] - found[1] == pytest.approx(expected[0] - expected[1], rel=1e-6)
+        assert found.sum() == pytest.approx(case.force[2], abs=1e-9)
+
+
+@given(seed=st.integers(0, 2**31), harder=st.floats(1.001, 10.0))
+@settings(max_examples=40, deadline=None)
+def test_what_holds_holds_when_pressed_harder(seed: int, harder: float) -> None:
+    """Squeezed along the line of the centres of pressure, the wrenches stay within the cones."""
+    case = random_case(np.random.default_rng(seed))
+    beside = (case.arms[0] - case.arms[1])[:2]
+    share = case.radius[:, None] / case.radius.sum() * np.outer([-1.0, 1.0], beside)
+    forces, shifts, torsion = held(case)
+    normal = forces[:, 2] * [1.0, -1.0]
+    squeeze = (harder - 1.0) * normal.max()
+    moved = (normal[:, None] * shifts + squeeze * share) / (normal + squeeze)[:, None]
+    about = _cross(shifts, forces) + torsion
+    pressed = np.column_stack([forces[:, :2], (normal + squeeze) * [1.0, -1.0]])
+    left = slack(case, pressed, moved, about - _cross(moved, forces))
+    assert min(left[0].min(), left[1].min()) > -1e-9
+
+
+def _cross(shifts: Array, forces: Array) -> Array:
+    """Moments (2,) about the normal of forces (2, 3) at shifts (2, 2)."""
+    return np.asarray(shifts[:, 0] * forces[:, 1] - shifts[:, 1] * forces[:, 0])

@@ -1,0 +1,185 @@
+"""xacro files as they expand, held to URDFs written by hand."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from symbolic.errors import OutsideError, UrdfError
+from symbolic.read.descriptions import description_content, is_xacro
+from symbolic.read.urdf import read_urdf
+
+HEAD = '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+LINK = '<link name="{name}"><collision><geometry><mesh filename="{mesh}"/></geometry></collision>'
+
+
+def write(folder: Path, body: str, name: str = "arm.urdf.xacro") -> Path:
+    path = folder / name
+    path.write_text(f"{HEAD}{body}</robot>", encoding="utf-8")
+    return path
+
+
+def test_arguments_and_relative_includes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(
+        tmp_path,
+        '<xacro:macro name="joint" params="a b"><joint name="${a}_${b}" type="fixed">'
+        '<parent link="${a}"/><child link="${b}"/></joint></xacro:macro>',
+        "joint.xacro",
+    )
+    path = write(
+        tmp_path,
+        '<xacro:arg name="tool" default="tool"/><xacro:include filename="joint.xacro"/>'
+        '<link name="base"/><link name="$(arg tool)"/><xacro:joint a="base" b="$(arg tool)"/>',
+    )
+    monkeypatch.chdir("/")
+    assert '"base_tool"' in read_urdf(path).kinematics
+    assert '"base_gripper"' in read_urdf(path, (("tool", "gripper"),)).kinematics
+    assert str(tmp_path).encode() not in description_content(path)
+
+
+def test_a_changed_include_is_seen(tmp_path: Path) -> None:
+    write(tmp_path, '<link name="one"/>', "links.xacro")
+    path = write(tmp_path, '<xacro:include filename="links.xacro"/>')
+    assert '"one"' in read_urdf(path).kinematics
+    write(tmp_path, '<link name="two"/>', "links.xacro")
+    assert '"two"' in read_urdf(path).kinematics
+
+
+def test_found_packages_leave_no_folder_in_mesh_addresses(tmp_path: Path) -> None:
+    (tmp_path / "packages" / "arm").mkdir(parents=True)
+    mesh = LINK.format(name="base", mesh="file://$(find arm)/meshes/base.stl") + "</link>"
+    path = write(tmp_path, mesh)
+    urdf = read_urdf(path, package_dirs=[tmp_path / "packages"])
+    assert urdf.collision_meshes == ("package://arm/meshes/base.stl",)
+    with pytest.raises(UrdfError, match="names the package 'arm', which is not found"):
+        read_urdf(path)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        '<link name="${unknown}"/>',
+        "<xacro:unknown/>",
+        '<xacro:include filename="gone.xacro"/>',
+        '<link name="$(arg unknown)"/>',
+        "<link name='${__import__(\"os\").getcwd()}'/>",
+        '<link name="$(env NO_SUCH_VARIABLE)"/>',
+        f'<link name="{"$" * 10_000}"/>',
+        "<link",
+    ],
+)
+def test_what_cannot_be_expanded_is_told_in_one_line(tmp_path: Path, body: str) -> None:
+    path = write(tmp_path, body + '<xacro:if value="1"/>')
+    with pytest.raises(OutsideError, match="cannot be expanded: ") as caught:
+        description_content(path)
+    assert "\n" not in str(caught.value)
+
+
+def macros(depth: int) -> str:
+    """Macros each of which calls the next one twice."""
+    calls = (
+        f'<xacro:macro name="m{k}" params=""><xacro:m{k + 1}/><xacro:m{k + 1}/></xacro:macro>'
+        for k in range(depth)
+    )
+    last = f'<xacro:macro name="m{depth}" params=""><link name="l"/></xacro:macro>'
+    return f"{''.join(calls)}{last}<xacro:m0/>"
+
+
+MEMORY, DEPTH, TIME = "needs too much memory", "nested too deeply", "takes longer than 5 s"
+UNBOUNDED = {
+    "text": ("<link name=\"${'x' * 10**10}\"/>", MEMORY),
+    "list": ('<link name="${len([0 for k in python.range(10**12)])}"/>', MEMORY),
+    "recursion": (
+        '<xacro:macro name="a" params=""><xacro:a/></xacro:macro><xacro:a/>',
+        DEPTH + r".*\(macro a\)",
+    ),
+    "include": ('<xacro:include filename="arm.urdf.xacro"/>', DEPTH),
+    "elements": ("<a>" * 20_000 + "${1}" + "</a>" * 20_000, DEPTH),
+    "long": ("<link name=\"${'x' * 2**25}\"/>", "expands to more than 16 MiB"),
+    "power": ('<link name="${10**10**10}"/>', TIME),
+    "evaluated power": ('<link name="$(eval 10**10**10)"/>', TIME),
+    "sum": ('<link name="${python.sum(python.range(10**12))}"/>', TIME),
+    "calls": (macros(40), f"{TIME}|{MEMORY}"),
+    "expressions": ('<link name="' + "${1}" * 500_000 + '"/>', TIME),
+}
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, marks=pytest.mark.slow if TIME in words and kind != "sum" else ())
+        for kind, (_, words) in UNBOUNDED.items()
+    ],
+)
+def test_an_expansion_without_end_is_ended(tmp_path: Path, kind: str) -> None:
+    body, words = UNBOUNDED[kind]
+    path = write(tmp_path, body + '<xacro:if value="1"/>')
+    with pytest.raises(OutsideError, match=words):
+        description_content(path)
+
+
+def test_an_expansion_that_took_too_long_is_not_begun_again(tmp_path: Path) -> None:
+    path = write(tmp_path, UNBOUNDED["sum"][0])
+    first, second = (_refusal(path) for _ in range(2))
+    assert first[0] == second[0]
+    assert second[1] < 1.0
+
+
+def _refusal(path: Path) -> tuple[str, float]:
+    """The message, and the time it took [s], of this process and those it started."""
+    before = os.times()
+    with pytest.raises(OutsideError) as caught:
+        description_content(path)
+    spent = sum(os.times()[:4]) - sum(before[:4])
+    return str(caught.value), spent
+
+
+ESCAPED = "python.vars(python.type)['__subclasses__'](python.type(1).mro()[1])"
+
+
+def test_an_expression_that_finds_a_way_out_does_nothing(tmp_path: Path) -> None:
+    """xacro's own guard looks at names only, and not at those within comprehensions."""
+    target = tmp_path / "written"
+    found = f"[c for c in {ESCAPED} if c.__name__ == '_wrap_close']"
+    deed = f"[c.__init__.__globals__['system']('touch {target}') for c in {found}]"
+    with pytest.raises(OutsideError, match="does more than compute"):
+        description_content(write(tmp_path, f'<link name="${{{deed}}}"/>'))
+    assert not target.exists()
+
+
+def test_a_missing_optional_include_is_looked_for_again(tmp_path: Path) -> None:
+    body = '<xacro:include filename="more.xacro" optional="true"/><link name="base"/>'
+    path = write(tmp_path, body)
+    assert b"tool" not in description_content(path)
+    write(tmp_path, '<link name="tool"/>', "more.xacro")
+    assert b"tool" in description_content(path)
+
+
+@pytest.mark.parametrize("name", ["values.yaml", "/dev/zero"])
+def test_values_are_read_through_the_door(tmp_path: Path, name: str) -> None:
+    (tmp_path / "values.yaml").write_text("link: base")
+    path = write(tmp_path, f"<link name=\"${{xacro.load_yaml('{name}')['link']}}\"/>")
+    if name == "values.yaml":
+        assert b'name="base"' in description_content(path)
+    else:
+        with pytest.raises(OutsideError, match=r"includes zero, which .*it is a device"):
+            description_content(path)
+
+
+def test_generated_urdfs_that_keep_the_namespace_are_read_as_they_are(tmp_path: Path) -> None:
+    path = write(tmp_path, '<link name="base"/>', "arm.urdf")
+    assert not is_xacro(path.read_bytes())
+    assert description_content(path) == path.read_bytes()
+
+
+def test_an_included_pipe_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    path = tmp_path / "arm.xacro"
+    path.write_text(
+        '<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+        '<xacro:include filename="pipe"/><link name="${1 + 1}"/></robot>'
+    )
+    with pytest.raises(OutsideError, match="it is a pipe"):
+        description_content(path)

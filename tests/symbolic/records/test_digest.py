@@ -1,0 +1,138 @@
+"""The digest follows the content of every named file, and nothing else."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from symbolic.read.cell import load
+from symbolic.records import Mesh, Workcell
+from tests.symbolic.read.samples import GOFA, sample_data, write
+
+COLLISION_BOX = '<geometry><box size="0.161 0.093 0.707"/></geometry>'
+FILES = (
+    "cell.toml",
+    "arm.urdf",
+    "packages/own/link.stl",
+    "shapes/stored.stl",
+    "shapes/tool.stl",
+)
+
+
+def make_cell(folder: Path) -> Path:
+    """A cell whose URDF, environment and tool all name meshes."""
+    folder.mkdir()
+    for name in FILES[2:]:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        trimesh.creation.box((0.1, 0.1, 0.1)).export(folder / name)
+    urdf = GOFA.read_text(encoding="utf-8")
+    assert COLLISION_BOX in urdf
+    mesh = '<geometry><mesh filename="package://own/link.stl"/></geometry>'
+    (folder / "arm.urdf").write_text(urdf.replace(COLLISION_BOX, mesh), encoding="utf-8")
+    data = sample_data()
+    for robot in data["robots"]:
+        robot |= {"urdf": "arm.urdf", "package_dirs": ["packages"]}
+    data["environment"].append({"name": "stored", "kind": "mesh", "path": "shapes/stored.stl"})
+    data["robots"][1]["tool"].append(
+        {"name": "hose", "kind": "mesh", "path": "shapes/tool.stl", "scale": 0.5}
+    )
+    return write(folder, data)
+
+
+def test_meshes_are_found(tmp_path: Path) -> None:
+    cell = load(make_cell(tmp_path / "cell"))
+    stored = cell.environment[-1].shape
+    assert isinstance(stored, Mesh)
+    assert stored.path == tmp_path / "cell" / "shapes" / "stored.stl"
+    assert stored.scale.tolist() == [1.0, 1.0, 1.0]
+    hose = cell.robots[1].tool[-1].shape
+    assert isinstance(hose, Mesh)
+    assert hose.scale.tolist() == [0.5, 0.5, 0.5]
+    assert cell.robots[0].package_dirs == (tmp_path / "cell" / "packages",)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_digest_changes_with_each_file(tmp_path: Path, name: str) -> None:
+    path = make_cell(tmp_path / "cell")
+    before = load(path).digest
+    changed = tmp_path / "cell" / name
+    if changed.suffix == ".stl":
+        trimesh.creation.box((0.1, 0.1, 0.11)).export(changed)
+    else:
+        comment = "\n<!-- -->\n" if changed.suffix == ".urdf" else "\n# \n"
+        changed.write_text(changed.read_text(encoding="utf-8") + comment, encoding="utf-8")
+    assert load(path).digest != before
+
+
+def test_digest_does_not_depend_on_the_place(tmp_path: Path) -> None:
+    path = make_cell(tmp_path / "cell")
+    shutil.copytree(tmp_path / "cell", tmp_path / "elsewhere")
+    assert load(tmp_path / "elsewhere" / "cell.toml").digest == load(path).digest
+
+
+def test_swapped_meshes_are_another_cell(tmp_path: Path) -> None:
+    path = make_cell(tmp_path / "cell")
+    shapes = tmp_path / "cell" / "shapes"
+    trimesh.creation.icosphere(radius=0.1).export(shapes / "tool.stl")
+    before = load(path).digest
+    (shapes / "tool.stl").rename(shapes / "other.stl")
+    (shapes / "stored.stl").rename(shapes / "tool.stl")
+    (shapes / "other.stl").rename(shapes / "stored.stl")
+    assert load(path).digest != before
+
+
+def changed_cells(cell: Workcell) -> dict[str, Workcell]:
+    """The cell with one value changed in memory."""
+    first, second = cell.robots
+    nearer = replace(first, T_world_base=first.T_world_base + 1e-12)
+    return {
+        "name": replace(cell, name="other"),
+        "time law": replace(cell, task=replace(cell.task, time_law="ramped")),
+        "samples": replace(cell, task=replace(cell.task, samples=cell.task.samples + 1)),
+        "mass": replace(cell, payload=replace(cell.payload, mass=11.0)),
+        "base": replace(cell, robots=(nearer, second)),
+        "order": replace(cell, robots=(second, first)),
+        "environment": replace(cell, environment=cell.environment[:-1]),
+        "tolerance": replace(cell, collision=replace(cell.collision, tolerance=1e-3)),
+    }
+
+
+def test_a_cell_changed_in_memory_is_another_cell(tmp_path: Path) -> None:
+    cell = load(make_cell(tmp_path / "cell"))
+    digests = {name: changed.digest for name, changed in changed_cells(cell).items()}
+    assert all(len(digest) == 64 for digest in digests.values()), digests
+    assert len({cell.digest, *digests.values()}) == 1 + len(digests)
+
+
+def test_the_same_change_is_the_same_cell_anywhere(tmp_path: Path) -> None:
+    path = make_cell(tmp_path / "cell")
+    shutil.copytree(tmp_path / "cell", tmp_path / "elsewhere")
+    here, there = (
+        changed_cells(load(tmp_path / name / path.name)) for name in ("cell", "elsewhere")
+    )
+    assert [cell.digest for cell in here.values()] == [cell.digest for cell in there.values()]
+
+
+def test_a_change_that_is_taken_back_is_none(tmp_path: Path) -> None:
+    cell = load(make_cell(tmp_path / "cell"))
+    changed = replace(cell, task=replace(cell.task, samples=11))
+    assert replace(changed, task=cell.task).digest == cell.digest
+    copied = replace(
+        cell.payload, mass=float(str(cell.payload.mass)), size=cell.payload.size.copy()
+    )
+    assert replace(cell, payload=copied).digest == cell.digest
+
+
+def test_files_that_were_not_read_identify_nothing(tmp_path: Path) -> None:
+    path = make_cell(tmp_path / "cell")
+    cell = load(path)
+    first, second = cell.robots
+    other = replace(first, urdf=path.parent / "other.urdf")
+    assert replace(cell, robots=(other, second)).digest == ""
+    argued = replace(first, xacro_arguments=(("size", "2"),))
+    assert replace(cell, robots=(argued, second)).digest == ""
+    assert replace(cell, reading=None).digest == ""
