@@ -48,9 +48,9 @@ def sliding(contact: Contact, way: float) -> Array:
     """
     if contact.half_sides is None:
         r, angle = np.meshgrid((np.arange(200) + 0.5) / 200, np.arange(256) * 2.0 * np.pi / 256)
-        r, angle = r.ravel(), angle.ravel()
-        points = contact.patch_radius * np.column_stack([r * np.cos(angle), r * np.sin(angle)])
-        weight = r / r.sum()
+        at = np.stack([r * np.cos(angle), r * np.sin(angle)], axis=-1)
+        points = contact.patch_radius * at.reshape(-1, 2)
+        weight = r.ravel() / r.sum()
     else:
         x, y = contact.half_sides
         along = (np.arange(160) + 0.5) / 80 - 1.0
@@ -200,7 +200,7 @@ def test_it_is_the_least_force_that_holds(
         if left.min() < 0.0:
             return False
         carried = [float(capacity[i](np.sqrt(left[i]), solved[2 * i : 2 * i + 2])) for i in (0, 1)]
-        return sum(carried) >= abs(solved[4])
+        return bool(sum(carried) >= abs(solved[4]))
 
     low, high = 0.0, 1e4
     if not holds(high):
