@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 NAMES = [str(path.relative_to(ROOT)) for path in DOCUMENTS]
 
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
@@ -97,9 +97,17 @@ def test_what_is_broken_would_be_found(tmp_path: Path) -> None:
 
 
 def test_the_index_lists_every_page() -> None:
-    index = (ROOT / "docs" / "README.md").read_text("utf-8")
-    pages = {path.name for path in ROOT.glob("docs/*.md")} - {"README.md"}
-    assert pages <= set(LINK.findall(index))
+    docs = ROOT / "docs"
+    pages = {path.relative_to(docs).as_posix() for path in docs.glob("**/*.md")} - {"README.md"}
+    assert pages <= set(LINK.findall((docs / "README.md").read_text("utf-8")))
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("docs/measured/")])
+def test_a_measurement_has_its_date_and_its_command(name: str) -> None:
+    text = (ROOT / name).read_text("utf-8")
+    assert re.search(r"\n\n20\d\d-\d\d-\d\d[ .]", text)
+    assert re.search(r"^    python ", text, flags=re.MULTILINE)
+    assert re.search(r"^\|", text, flags=re.MULTILINE)
 
 
 QUESTION = re.compile(r"^\| (.*\*\*(.+?)\*\*.*\?) \| `([^`]+)` \|$", flags=re.MULTILINE)
