@@ -1,4 +1,4 @@
-"""What a correct implementation of Coello's MOPSO reaches on analytic problems."""
+"""Figures that a correct implementation of Coello's MOPSO reaches on analytic problems."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Verdict = Literal["inside", "better", "worse"]
 
 @dataclass(frozen=True)
 class Band:
-    """What a correct MOPSO reaches on average, see `BAND_SOURCE`.
+    """Average figures of a correct MOPSO, see `BAND_SOURCE`.
 
     Attributes:
         hypervolume, igd: means over `BAND_SEEDS` seeds.

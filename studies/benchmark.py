@@ -1,4 +1,4 @@
-"""What one candidate costs: compiled, interpreted and written plainly.
+"""Cost of one candidate: compiled, interpreted and written plainly.
 
 `python -m studies.benchmark [WORKCELL]` measures milliseconds per candidate on one core, in the
 thread's own processor time, so that waiting for a busy machine does not count. The three ways take

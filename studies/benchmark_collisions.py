@@ -1,4 +1,4 @@
-"""What a whole candidate costs with collisions, on what a search evaluates and on random ones.
+"""Cost of a whole candidate with collisions, for candidates of a search and for random ones.
 
 The compiled way is the evaluator that the searches call, with batches of a search's population.
 The plain way is the tests' reference: every pair of every sample goes to FCL.
@@ -26,7 +26,7 @@ from symbolic.functions import cell_functions
 from symbolic.records import Workcell
 
 EVALUATIONS = 1000
-"""Of the NSGA-II search whose candidates are timed."""
+"""Evaluations of the NSGA-II search whose candidates are timed."""
 
 POPULATION = GeneticSettings().population
 """Candidates per batch."""

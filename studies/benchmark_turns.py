@@ -46,7 +46,7 @@ def interleaved(
 
 
 def _seconds(evaluate: Evaluate, x: Array, first: int, count: int) -> float:
-    """Per call, of so many of x one after the other."""
+    """Seconds per call for `count` rows of x one after the other."""
     start = time.thread_time()
     for k in range(first, first + count):
         evaluate(x[k % len(x)])

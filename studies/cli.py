@@ -23,7 +23,7 @@ from symbolic.errors import SettingsError
 _DEFAULT = CampaignSettings()
 
 QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 2
-"""Of a small but complete study."""
+"""Evaluations and replicas of a small but complete study."""
 
 
 class Parser(argparse.ArgumentParser):

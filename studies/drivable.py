@@ -44,7 +44,7 @@ class ReplicaFront:
 
     @property
     def label(self) -> str:
-        """Of the algorithm, and whether polished."""
+        """Title of the algorithm, and whether polished."""
         return title(self.algorithm) + (POLISHED if self.polished else "")
 
     @property

@@ -1,4 +1,4 @@
-"""What can go wrong with reports."""
+"""Errors of reports."""
 
 from symbolic.errors import DualArmError
 

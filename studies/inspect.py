@@ -29,7 +29,7 @@ _IN_THE_WAY = {
     "reach": "Robots that do not reach first",
 }
 MOST_TOLD = 10
-"""Of what is in the way, so much is told."""
+"""Most obstacles that are told."""
 
 PROGRAM = "python -m studies.inspect"
 

@@ -1,4 +1,4 @@
-"""What there is to know of a workcell before a study; `studies.inspect` prints it."""
+"""An inspection of a workcell before a study; `studies.inspect` prints it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Branch:
 
 @dataclass(frozen=True)
 class Optimum:
-    """What a short polish of the hand-made trajectory leads to.
+    """Outcome of a short polish of the hand-made trajectory.
 
     Attributes:
         solutions: of the polished front.
@@ -63,7 +63,7 @@ class Optimum:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What the program prints.
+    """Everything that the program prints.
 
     Attributes:
         name: of the workcell.

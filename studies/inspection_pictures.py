@@ -1,4 +1,4 @@
-"""What `studies.inspect` draws: the cell, what arms reach, who meets whom, the carry to play."""
+"""Pictures of `studies.inspect`: the cell, the arms' reach, collisions, the carry to play."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a cell's limits on jerk cost the selected carries of a drivable experiment."""
+"""Cost of a cell's limits on jerk for the selected carries of a drivable experiment."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOTE = (
 
 @dataclass(frozen=True)
 class JerkCosts:
-    """Of several carries.
+    """Cost of limits on jerk for several carries.
 
     Attributes:
         label: whose they are.
@@ -41,7 +41,7 @@ class JerkCosts:
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """Of a table with `HEAD`."""
+        """Cells of a row of the table with `HEAD`."""
         return (
             self.label,
             str(self.carries),

@@ -1,4 +1,4 @@
-"""What every program has in common: how it ends, and what it says beside its results."""
+"""Common parts of every program: how it ends, and its messages beside the results."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
 
 @dataclass(frozen=True)
 class _Request:
-    """A carry to recommend, in so many threads: those of the workers, which wait meanwhile."""
+    """A carry to recommend, with the threads of the workers, which wait meanwhile."""
 
     root: Path
     wish: ho.Wish
@@ -157,7 +157,7 @@ def recommend_from(
 
 
 def _price(carry: ho.Carry, seed: int, threads: int) -> StoredPrice | None:
-    """What robustness costs the recommended carry; None where no set leaves friction and patches,
+    """Cost of robustness for the recommended carry; None where no set leaves friction and patches,
     and where the pads cannot hold whatever happens."""
     try:
         model = robust_model(carry.workcell)

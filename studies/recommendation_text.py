@@ -18,7 +18,7 @@ EXPORT_FORM = "ros2"
 
 @dataclass(frozen=True)
 class RecommendationText:
-    """What a study opens with.
+    """The opening text of a study.
 
     Attributes:
         headline: the carry in one line.
@@ -98,7 +98,7 @@ def export_command(path: Path, force: float) -> str:
 
 
 def _jerk(jerk: StoredJerk) -> str:
-    """What the cell's limits on jerk cost."""
+    """Cost of the cell's limits on jerk."""
     if jerk.status != TimingStatus.OK:
         return f"not found: {jerk.status}"
     return (

@@ -47,7 +47,7 @@ class Replica:
 
 
 def locks(task: Task, count: int) -> tuple[tuple[float, ...], ...]:
-    """A grid of at least so many positions of the redundant joints, the middles of its cells."""
+    """A grid of at least `count` positions of the redundant joints, the middles of its cells."""
     sides = max(ceil(count ** (1.0 / len(task.redundant)) - 1e-9), 1)
     shares = (np.arange(sides) + 0.5) / sides
     values = [

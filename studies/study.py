@@ -43,7 +43,7 @@ from symbolic.records import Workcell
 
 @dataclass(frozen=True)
 class StudySettings:
-    """What is made of a search's results.
+    """Settings of the parts of a study after its search.
 
     Attributes:
         polish: how fronts are polished, None for not at all.

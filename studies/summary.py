@@ -96,7 +96,7 @@ def front_indicators(
 def polished_figures(
     polished: PolishedReplica, reference: Array, selected: Selected | None, file: str | None
 ) -> PolishedFigures:
-    """What the polish made of a replica: indicators, selected solution, and what it took."""
+    """A polished replica: indicators, selected solution, and effort."""
     indicators = front_indicators(polished.objectives, reference, selected, file)
     return PolishedFigures(**indicators, **vars(polished.figures))
 

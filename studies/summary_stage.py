@@ -38,7 +38,7 @@ from studies.summary import (
 from symbolic.array import Array
 
 PERCENTILES = (25.0, 50.0, 75.0, 100.0)
-"""Of the attainment surfaces, in percent of the replicas."""
+"""Percentiles of the attainment surfaces, in percent of the replicas."""
 
 
 def summary_stage() -> Stage:

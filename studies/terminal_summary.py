@@ -225,7 +225,7 @@ def _over_replicas(algorithms: Mapping[str, AlgorithmFigures]) -> str:
 
 
 def _polish(algorithms: Mapping[str, AlgorithmFigures]) -> str:
-    """What the polish made of the fronts; nothing without one."""
+    """Table of the polished fronts; nothing without a polish."""
     head = ["median", "HV before", "HV after", "better in", "points", "widest gap %"]
     rows = [[*head, "above static %", "payload kg", "seconds", "= evaluations"]]
     for name, entry in algorithms.items():

@@ -46,10 +46,10 @@ WIDER, MORE_BISECTIONS = 1.62, 6
 """Upper end for what slips at the usual one, and what is as exact there."""
 
 PRESSED_SHARE = 0.97
-"""Of the force that holds, pressed all along to see where the box slips first."""
+"""Share of the holding force that is pressed all along to see where the box slips first."""
 
 TILT_STIFFNESS = 300.0
-"""Of pads that the planned moments drive [N m/rad]."""
+"""Tilt stiffness of pads that the planned moments drive [N m/rad]."""
 
 
 @dataclass(frozen=True)

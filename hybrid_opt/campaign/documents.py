@@ -110,7 +110,7 @@ class FrontPoint:
 
 @dataclass(frozen=True)
 class PolishEffort:
-    """What a polish took and how well it went.
+    """Effort and success of a polish.
 
     Attributes:
         attempts: solves.

@@ -26,13 +26,13 @@ _LONGEST_LINE = 1_000_000
 
 _ROOM = 2**24
 _BYTES_PER_NUMBER = 2
-"""A file may hold so many numbers, and one more for so many of its bytes: zeros can be packed much
-tighter, but what a search evaluates holds more digits than zeros."""
+"""A file may hold `_ROOM` numbers, and one more per `_BYTES_PER_NUMBER` of its bytes. Zeros can be
+packed much tighter, but evaluated candidates hold more digits than zeros."""
 
 
 @dataclass(frozen=True)
 class EvaluationTable:
-    """What a file of evaluated candidates holds.
+    """The content of a file of evaluated candidates.
 
     Attributes:
         evaluations: every candidate in the order of evaluation.

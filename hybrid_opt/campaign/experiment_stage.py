@@ -17,8 +17,8 @@ from symbolic.read.cell_files import drivable_files, unpack_cell
 
 
 def drivable_settings(settings: CampaignSettings) -> CampaignSettings:
-    """Of the drivable experiment beside another one: the same but for what is minimised, durations
-    and forces of the kind that the other one minimises."""
+    """Settings of the drivable experiment beside another one: the same but for the objectives,
+    durations and forces of the kind that the other one minimises."""
     return replace(settings, objectives=force_kind(settings.objectives).drivable)
 
 

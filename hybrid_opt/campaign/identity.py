@@ -1,4 +1,4 @@
-"""What a campaign's results depend on; only equal identities may share a results folder."""
+"""Identity of a campaign: all that its results depend on; a results folder has only one."""
 
 from __future__ import annotations
 

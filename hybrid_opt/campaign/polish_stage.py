@@ -164,7 +164,7 @@ def _from_block(block: bytes, request: PolishRequest) -> PolishOutcome | Lost:
 
 @dataclass(frozen=True)
 class PolishedReplica:
-    """What the polish made of one replica's front; arrays are read-only.
+    """One replica's polished front; arrays are read-only.
 
     Attributes:
         x: (k, n_var) non-dominated decision vectors, by increasing first objective.

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from tqdm import tqdm
 
 Advance = Callable[[int], None]
-"""Tells that so many more units are done."""
+"""Tells how many more units are done."""
 
 _QUIET_SECONDS = 10.0
 """Between lines where the terminal is none, as in a log."""

@@ -15,7 +15,7 @@ from symbolic.array import Array
 
 @dataclass(frozen=True)
 class StoredWish:
-    """What was asked for: at most one of duration [s], force [N] and payload [kg]."""
+    """The wish: at most one of duration [s], force [N] and payload [kg]."""
 
     duration: float | None
     force: float | None
@@ -89,7 +89,7 @@ class ForceTable:
 
 @dataclass(frozen=True)
 class StoredPrice:
-    """What it costs the recommended carry to hold in every case of a set.
+    """Cost for the recommended carry to hold in every case of a set.
 
     Attributes:
         stated: whether the workcell states the set; else it is a usual one.

@@ -1,4 +1,4 @@
-"""What a campaign computes, and where its randomness comes from."""
+"""Settings of a campaign, and the source of its randomness."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIZE_KEYS = ("population", "swarm", "batch")
 
 @dataclass(frozen=True)
 class CampaignSettings:
-    """What decides a campaign's results, besides the workcell.
+    """Everything that decides a campaign's results, besides the workcell.
 
     Attributes:
         algorithms: names known to `hybrid_opt.metaheuristics`, each once.

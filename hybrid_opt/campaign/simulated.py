@@ -14,12 +14,12 @@ from hybrid_opt.witness.account import Account
 from symbolic.array import Array
 
 MOST_SAMPLES = 240
-"""Of the forces that are stored."""
+"""Most samples of the forces that are stored."""
 
 
 @dataclass(frozen=True)
 class StoredSimulation:
-    """What the simulated cell says of one carry.
+    """One carry in the simulated cell.
 
     Attributes:
         label: of the carry.

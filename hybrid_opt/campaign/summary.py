@@ -100,7 +100,7 @@ class FrontFigures:
 
 @dataclass(frozen=True)
 class PolishedFigures(PolishEffort, FrontFigures):
-    """What the polish made of a replica's front, and what it took."""
+    """A replica's polished front, and the effort."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class ReplicaFigures(FrontFigures):
 
 @dataclass(frozen=True)
 class PolishedStatistics:
-    """What the polish made of an algorithm's fronts, over the replicas."""
+    """An algorithm's polished fronts, over the replicas."""
 
     statistics: Mapping[str, Statistics]
     hypervolume_gain: Statistics
@@ -197,7 +197,7 @@ class StoredBound:
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the bounds of the decision variables do to the best fronts of all replicas.
+    """Bounds of the decision variables on which members of the best fronts lie.
 
     Attributes:
         solutions: members of these fronts, polished where they were.

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 def carry_text(carry: Carry) -> str:
-    """What a carry prints."""
+    """Text of a carry."""
     return "\n".join([heading(carry), *lines(figures(carry))])
 
 
 def carry_html(carry: Carry) -> str:
-    """What a notebook shows."""
+    """HTML of a carry for a notebook."""
     still = float(static_hold(carry.workcell).normal_force.max())
     time = carry.time - carry.time[0]
     series = [

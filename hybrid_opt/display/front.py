@@ -20,12 +20,12 @@ MAX_CLOUD = 1500
 
 
 def front_text(front: Front) -> str:
-    """What a front prints."""
+    """Text of a front."""
     return "\n".join([heading(front), *lines(figures(front))])
 
 
 def front_html(front: Front) -> str:
-    """What a notebook shows."""
+    """HTML of a front for a notebook."""
     picture = _picture(front) if len(front) and front.objectives.shape[1] >= 2 else ""
     return f"<div><p>{html.escape(heading(front))}</p>{table(figures(front))}{picture}</div>"
 

@@ -11,7 +11,7 @@ import numpy as np
 from symbolic.array import Array
 
 WIDTH, HEIGHT = 520, 320
-"""Of a plot [px]."""
+"""Size of a plot [px]."""
 
 LEFT, RIGHT, TOP, BOTTOM = 70, 14, 30, 46
 """Margins around the axes [px]."""

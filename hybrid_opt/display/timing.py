@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def timing_text(timing: Timing) -> str:
-    """What a timing prints."""
+    """Text of a timing."""
     return "\n".join([heading(timing), *lines(limit_use(timing))])
 
 
 def timing_html(timing: Timing) -> str:
-    """What a notebook shows."""
+    """HTML of a timing for a notebook."""
     carry = "" if timing.carry is None else carry_html(timing.carry)
     return f"<div><p>{html.escape(heading(timing))}</p>{table(limit_use(timing))}{carry}</div>"
 

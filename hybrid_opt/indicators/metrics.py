@@ -16,7 +16,7 @@ from symbolic.array import Array
 Mask = NDArray[np.bool_]
 
 REFERENCE_POINT = (1.1, 1.1)
-"""Of the hypervolume, in normalised objectives (the paper's)."""
+"""Reference point of the hypervolume, in normalised objectives (the paper's)."""
 
 
 def normalise(objectives: ArrayLike, ideal: ArrayLike, nadir: ArrayLike) -> Array:
@@ -38,7 +38,7 @@ def normalise(objectives: ArrayLike, ideal: ArrayLike, nadir: ArrayLike) -> Arra
 def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Mask:
     """(n,) mask of the feasible points that no feasible point dominates.
 
-    Of equal points the first is kept. A point with a NaN or infinite objective is never in.
+    The first of equal points is kept. A point with a NaN or infinite objective is never in.
 
     Args:
         objectives: (n, n_obj).

@@ -68,7 +68,7 @@ class Selected:
 
     @cached_property
     def mean_excess_above_static(self) -> float:
-        """Of the mean of both peaks above that of the static hold [%]."""
+        """Excess of the mean of both peaks over that of the static hold [%]."""
         return self.carry.mean_excess_above_static
 
     @property

@@ -1,4 +1,4 @@
-"""What stiffness makes of forces: arms that track positions, and arms that do not start together.
+"""How stiffness changes forces: arms that track positions, and arms that do not start together.
 
 An arm that tracks positions presses by aiming into the box; its stiffness k at the pad turns the
 penetration into force. Both arms hold the box in series, so that a relative displacement d of the
@@ -22,7 +22,7 @@ STIFFNESSES = (2e3, 1e4, 5e4, 2e5, 1e6)
 """From a soft Cartesian impedance to a stiff industrial arm [N/m]."""
 
 POSITION_ERROR = 1e-4
-"""Of each arm [m]."""
+"""Position error of each arm [m]."""
 
 TRACKED = 0.05
 """Share of the force by which it may miss its reference and count as tracked."""
@@ -41,7 +41,7 @@ _BISECTIONS = 16
 
 @dataclass(frozen=True)
 class PositionControl:
-    """What position control makes of the forces at one stiffness.
+    """Forces under position control at one stiffness.
 
     Attributes:
         stiffness: of each arm at its pad [N/m].
@@ -69,7 +69,7 @@ class PositionControl:
 
 @dataclass(frozen=True)
 class Skew:
-    """What a delay of one arm does while the box is held, at one stiffness.
+    """Effect of a delay of one arm while the box is held, at one stiffness.
 
     Attributes:
         delay: [s].
@@ -96,7 +96,7 @@ class Skew:
 
 
 def position_control(job: Job, stiffness: float) -> PositionControl:
-    """What arms of a stiffness [N/m] that track positions make of a job's forces.
+    """A job's forces where arms of a stiffness [N/m] track positions.
 
     Raises:
         SettingsError: the stiffness is not positive.
@@ -117,7 +117,7 @@ def force_margin(job: Job) -> float:
 
 
 def skewed(job: Job, delay: float, stiffness: float) -> Skew:
-    """What happens while the box is held if either arm is late: the worse of both.
+    """Effect of either arm being late while the box is held: the worse of both.
 
     Pads and box as springs, quasi-static: the pads' relative displacement along the normal changes
     the squeeze, the one across it has to be borne by friction as well.

@@ -12,7 +12,7 @@ from symbolic.array import Array
 from symbolic.records import Workcell
 
 EVERY = 10
-"""Every so many samples of a straight motion are judged."""
+"""Stride of the samples of a straight motion that are judged."""
 
 
 def what_blocks(

@@ -46,7 +46,7 @@ from symbolic.records import Handling, Workcell
 from symbolic.records.task import extended_waypoints
 
 PATH_SAMPLES = 201
-"""Of the carry's joints, from which Newton's method reaches every place between."""
+"""Samples of the carry's joints; Newton's method reaches every place between them."""
 
 _SAME_POSTURE = 7
 """Decimals of joint positions [rad, m] within which carries end in the same posture."""
@@ -69,7 +69,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Around:
-    """What happens around carries that begin and end alike, and what judges them."""
+    """The phases around carries that begin and end alike, and their judges."""
 
     before: tuple[_Part, ...]
     after: tuple[_Part, ...]

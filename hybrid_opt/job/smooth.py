@@ -28,7 +28,7 @@ WIDEST = 1.0
 """Largest width that may be asked for [s]."""
 
 STEP = 5e-4
-"""Of the averaging [s]."""
+"""Time step of the averaging [s]."""
 
 EVERY = 4
 """Steps of the averaging between two samples of the carry."""
@@ -40,7 +40,7 @@ _SLOWER = (0.95, 0.5)
 """Factors tried as the lower end of the search for one, the mildest first."""
 
 _RESOLUTION = 1e-4
-"""Of the factor by which a timing is slowed."""
+"""Resolution of the factor by which a timing is slowed."""
 
 _UNUSED = 1e-4
 """Share of the limit used most that may be left unused."""
@@ -121,7 +121,7 @@ class _Driven:
 
 
 def _fastest(driven: Callable[[float], _Driven]) -> _Driven:
-    """What is driven with the largest factor up to 1 that holds the limits.
+    """The motion with the largest factor up to 1 that holds the limits.
 
     Raises:
         JobError: none does that is not below half.

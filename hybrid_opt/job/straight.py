@@ -23,7 +23,7 @@ SAMPLES = 401
 """Samples of a phase."""
 
 STEP = 0.005
-"""Of Newton's method from place to place along a line [m]."""
+"""Step of Newton's method from place to place along a line [m]."""
 
 TICK = 0.008
 """Phases last a whole number of these [s], so that controllers of 125, 250, 500 and 1000 Hz meet
@@ -53,13 +53,13 @@ class Straight:
 
     @property
     def length(self) -> float:
-        """Of the longest way [m]."""
+        """Length of the longest way [m]."""
         ways = np.concatenate([self.box[None], self.held])
         return float(np.linalg.norm((ways[:, 1] - ways[:, 0])[:, :3], axis=1).max())
 
     @property
     def box_length(self) -> float:
-        """Of the box's way [m]."""
+        """Length of the box's way [m]."""
         return float(np.linalg.norm((self.box[1] - self.box[0])[:3]))
 
     def at(self, share: Array) -> tuple[Array, Array, Array]:
@@ -131,7 +131,7 @@ def followed(
     """
 
     def share(way: Array) -> Array:
-        """Of the line, where this share of it lies behind when one begins at the known end."""
+        """Share of the line from its start; `way` is counted from the known end."""
         return 1.0 - way if at_end else way
 
     ways, passed = np.linspace(0.0, 1.0, int(np.ceil(line.length / STEP)) + 1), [known]

@@ -35,7 +35,7 @@ def job_text(job: Job) -> str:
 
 
 def position_text(found: Sequence[PositionControl]) -> str:
-    """What position control makes of the forces, by stiffness."""
+    """Forces under position control, by stiffness."""
     rows = [
         [
             f"{each.stiffness:g}",
@@ -51,7 +51,7 @@ def position_text(found: Sequence[PositionControl]) -> str:
 
 
 def skew_text(found: Sequence[Skew]) -> str:
-    """What a late arm does, by delay: the worse of both."""
+    """Effect of a late arm, by delay: the worse of both."""
     rows = [
         [
             f"{1e3 * each.delay:g}",

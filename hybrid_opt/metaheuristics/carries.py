@@ -34,7 +34,7 @@ class SearchSettings:
 
 @dataclass(frozen=True)
 class SearchedCarries:
-    """What a search evaluated, in order, with its front certified.
+    """All candidates of a search, in order, with its front certified.
 
     Attributes:
         evaluations: every candidate.

@@ -1,4 +1,4 @@
-"""What every algorithm here promises beyond pymoo: an exact budget and finite fronts."""
+"""Promises of every algorithm here beyond pymoo: an exact budget and finite fronts."""
 
 from __future__ import annotations
 

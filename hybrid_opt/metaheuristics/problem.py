@@ -22,7 +22,7 @@ violated all the time."""
 
 
 class Evaluator(Protocol):
-    """What the search needs of an evaluator, see
+    """Interface of an evaluator for the search, see
     `hybrid_opt.evaluate.evaluation.CandidateEvaluator`."""
 
     objective_names: tuple[str, ...]

@@ -48,7 +48,7 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What a search did.
+    """Record of a search.
 
     Attributes:
         evaluated: every point, without limit; fronts and metrics are computed from it.

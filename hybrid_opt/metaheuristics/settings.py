@@ -20,7 +20,7 @@ def _require_whole(algorithm: str, name: str, value: int, low: int, high: int) -
 
 @dataclass(frozen=True)
 class GeneticSettings:
-    """Of NSGA-II and SMS-EMOA.
+    """Settings of NSGA-II and SMS-EMOA.
 
     Attributes:
         population: points per generation; at 1000 evaluations 40 does better than 100.
@@ -49,7 +49,10 @@ class GeneticSettings:
 
 @dataclass(frozen=True)
 class MopsoSettings:
-    """Of MOPSO; the defaults except the swarm are those of the 2002 and 2004 papers.
+    """Settings of MOPSO; the defaults except the swarm are those of the 2002 and 2004 papers.
+
+    Constriction coefficients (inertia 0.7298, both pulls 1.496) are far worse at 1000 evaluations
+    (shifted ZDT1: IGD 0.91).
 
     Attributes:
         swarm: particles.
@@ -84,7 +87,7 @@ class MopsoSettings:
 
 @dataclass(frozen=True)
 class RandomSettings:
-    """Of uniform random search. batch: points per evaluation call."""
+    """Settings of uniform random search. batch: points per evaluation call."""
 
     batch: int = 100
 

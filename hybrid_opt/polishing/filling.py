@@ -4,7 +4,8 @@ What a gap between neighbours is worth is the root of the area between them that
 win, in units of the front's extent; along flat tails, where that is next to nothing, at least a
 share of its length. In the widest gap a point is found by Pascoletti and Serafini's method, along
 the diagonal through a point beside a neighbour that is nearly there: a continuation along the
-front, each attempt the corrector of the last.
+front, each attempt the corrector of the last. Sequential quadratic programming from a neighbour's
+solution and multipliers finds the same points in about three times the time.
 """
 
 from __future__ import annotations

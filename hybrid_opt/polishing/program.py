@@ -13,7 +13,8 @@ target's anchor, span, direction, offset and cost,
 That covers the scalarisation of Pascoletti and Serafini (direction of ones), the epsilon
 constraint (a zero in the direction) and normal boundary intersection (the normal as direction).
 Values and derivatives are put together here, in NumPy, from batches over samples and places:
-another set of rows costs no more than choosing them.
+another set of rows costs no more than choosing them. Joints as variables with closure constraints
+lead to the same optima and take four times as long.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ ABOVE_STILL = (1.02, 1.04, 1.06, 1.08, 1.12, 1.2)
 """Forces of the table over that of holding the payload level and still."""
 
 MEMBERS = 24
-"""Of a front that are timed, evenly spread over it."""
+"""Members of a front that are timed, evenly spread over it."""
 
 
 def level_force(workcell: Workcell, kind: ForceKind) -> float:

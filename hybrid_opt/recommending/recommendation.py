@@ -27,7 +27,7 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 
 HAND_MADE = "hand-made"
-"""What the workcell file's own trajectory is called."""
+"""Name of the workcell file's own trajectory."""
 
 LEAST_ROOM = 0.1
 """Margins below this share of a centimetre, or of a tenth of a coefficient, are warned of."""
@@ -176,7 +176,7 @@ def _driven(cell: Cell, x: Array, wanted: Iterable[Choice]) -> tuple[Choice, Tim
 
 
 def _commanded(carry: Carry) -> tuple[Commanded, tuple[str, ...]]:
-    """What to press with, and what speaks against it."""
+    """The forces to press with, and warnings about them."""
     doubts = []
     try:
         found = commanded(carry)
@@ -198,7 +198,7 @@ def _commanded(carry: Carry) -> tuple[Commanded, tuple[str, ...]]:
 
 
 def _warnings(beside: Iterable[Rival], timing: Timing, force: float) -> Iterator[str]:
-    """What speaks against the recommended carry."""
+    """Warnings about the recommended carry."""
     for rival in beside:
         if rival.duration_at_force < timing.duration * (1.0 - BETTER):
             yield (

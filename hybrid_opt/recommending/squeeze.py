@@ -13,7 +13,7 @@ from symbolic.array import Array
 
 @dataclass(frozen=True)
 class Commanded:
-    """What to press with.
+    """The forces to press with.
 
     Attributes:
         peak: (2,) largest normal force to command of each robot [N].

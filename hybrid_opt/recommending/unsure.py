@@ -1,4 +1,4 @@
-"""What to press with if friction, mass or centre of mass are less sure than the cell says."""
+"""Forces to press with if friction, mass or centre of mass are less sure than stated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a user asks of the carry to run."""
+"""A user's wish for the carry to run."""
 
 from __future__ import annotations
 

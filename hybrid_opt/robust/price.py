@@ -1,4 +1,4 @@
-"""What it costs to be sure: forces against the size of a set, and the largest that arms allow."""
+"""The price of robustness: forces against the size of a set, and the largest that arms allow."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CASES = 100_000
 """Random cases that every priced carry is held against."""
 
 SAMPLES = 100
-"""Of a carry that are looked at, those of its largest forces besides."""
+"""Samples of a carry that are judged, beside those of its largest forces."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def robust_price(
     cases: int = CASES,
     threads: int = 1,
 ) -> RobustPrice:
-    """What robustness against the workcell's set costs a carry; against `USUAL` without one.
+    """The cost of robustness against the workcell's set for a carry; against `USUAL` without one.
 
     Args:
         model: of the carry's workcell.

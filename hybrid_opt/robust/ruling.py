@@ -47,8 +47,9 @@ class RulingCases:
 
 
 def felt_share(difference: Array, uncertainty: Uncertainty) -> Array:
-    """Of differences of leading and commanded force under the largest mass what the leading arm
-    feels at most: all of it, or where it is relieved by it, what the least mass leaves."""
+    """Largest share that the leading arm feels of differences between leading and commanded force
+    under the largest mass: all of one that loads it, the least mass's share of one that relieves
+    it."""
     lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
     return np.where(difference > 0.0, 1.0, lightest)
 

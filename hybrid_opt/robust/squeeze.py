@@ -93,7 +93,7 @@ class Squeeze:
 
 
 def chosen_squeeze(workcell: Workcell, settings: SqueezeSettings) -> Squeeze:
-    """What the settings mean for a workcell."""
+    """The settings applied to a workcell."""
     factor, uncertainty = settings.factor, None
     if factor is None and not workcell.uncertainty.is_empty:
         uncertainty = workcell.uncertainty

@@ -51,7 +51,7 @@ _KEYS = {"format", "version", "decision", "start", "figures", "provenance", "cel
 
 @dataclass(frozen=True)
 class StoredTrajectory:
-    """What a trajectory file holds.
+    """The content of a trajectory file.
 
     Attributes:
         x: (n_var,) decision vector.

@@ -1,4 +1,4 @@
-"""What people ask about a trajectory's timing, each as one function."""
+"""Questions about a trajectory's timing, one function each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What timing says of one trajectory as one record: stored in `timing/*.json`, printed as JSON."""
+"""All timings of one trajectory as one record: stored in `timing/*.json`, printed as JSON."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class StoredTiming:
 
 @dataclass(frozen=True)
 class StoredJerk:
-    """What limits on jerk make of a carry, see `hybrid_opt.timing.records.JerkTiming`.
+    """A carry's timing within limits on jerk, see `hybrid_opt.timing.records.JerkTiming`.
 
     Attributes:
         status: of its timing.

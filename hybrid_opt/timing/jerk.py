@@ -45,7 +45,7 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 
 PIECES = 60
-"""Of the spline of squared speeds."""
+"""Pieces of the spline of squared speeds."""
 
 POINTS = 4
 """Per piece, at which limits are imposed."""

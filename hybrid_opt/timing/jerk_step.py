@@ -15,7 +15,7 @@ from symbolic.array import Array
 from symbolic.records.quantities import GRAVITY
 
 LEAST_SHARE = 0.05
-"""Of its last value that a coefficient keeps at least."""
+"""Least share of its last value that a coefficient keeps."""
 
 
 NEAR = 0.6

@@ -34,7 +34,7 @@ OUTCOMES = (
     TimingStatus.NOT_CONVERGED,
     TimingStatus.SOLVER_FAILED,
 )
-"""What its statuses mean."""
+"""Meanings of its statuses."""
 
 
 def passes_function(

@@ -1,4 +1,4 @@
-"""What is wrong with a path before any timing: no motion, an arm that cannot follow it."""
+"""Reasons why a path has no timing at all: no motion, an arm that cannot follow it."""
 
 from __future__ import annotations
 

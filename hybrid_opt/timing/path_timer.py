@@ -133,8 +133,8 @@ class PathTimer:
         return self._passes is not None
 
     def path_limits(self, x: Array) -> dict[str, Array]:
-        """Of waypoints (n, n_var) the outputs of `symbolic.limits.path_function` and
-        `limits`, at both ends and in the middle of every interval."""
+        """Outputs of `symbolic.physics.path_limits.path_function` and `limits` for waypoints
+        (n, n_var), at both ends and in the middle of every interval."""
         paths = self._path.batch(np.ascontiguousarray(x, dtype=float), threads=self._threads)
         shapes = zip(self._limits.input_names, self._limits.input_shapes, strict=True)
         samples = [paths[name].reshape(-1, *shape) for name, shape in shapes]
@@ -301,7 +301,7 @@ def _rows_of(paths: dict[str, Array], rows: list[int]) -> dict[str, Array]:
 
 
 def from_time_path(model: TimingModel, timing: Timing, limits: TimingLimits) -> PathTiming:
-    """What `time_path` found, as a `PathTiming`."""
+    """The answer of `time_path` as a `PathTiming`."""
     force, robust = np.full(2, np.nan), None
     if timing.carry is not None:
         force = timing.carry.peak_normal_force

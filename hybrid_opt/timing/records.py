@@ -14,7 +14,7 @@ from symbolic.records import Workcell
 
 
 class TimingStatus(StrEnum):
-    """What came out of timing a path."""
+    """The outcome of timing a path."""
 
     OK = "ok"
     EXCEEDED = "limits exceeded"

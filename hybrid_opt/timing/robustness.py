@@ -135,7 +135,7 @@ class _Judge:
         self._radius = np.array([contact.patch_radius for contact in model.workcell.contacts])
 
     def failure(self, friction: Array, centre: Array) -> str:
-        """What is exceeded most, or '' where everything holds."""
+        """Name of the limit that is exceeded most, or '' where everything holds."""
         load = self._model.uncertain_load(self._carry, friction, centre)
         torque = contact_torque(self.workcell, self._wrench_torque, load) + self._own_torque
         reference = self.workcell.task.reference_force

@@ -1,4 +1,4 @@
-"""What the simulated cell says of one carry: from which force on it holds, and how it presses."""
+"""One carry in the simulated cell: from which force on it holds, and how it presses."""
 
 from __future__ import annotations
 

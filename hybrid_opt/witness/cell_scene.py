@@ -33,8 +33,8 @@ from symbolic.records import Workcell
 from symbolic.records.quantities import GRAVITY
 
 SOFTNESS = "0.7 0.7 0.001"
-"""Of contacts: at 0.7 MuJoCo's regularisation lets a pad give by some hundredths of a millimetre.
-Much stiffer ones lose contact for single steps where accelerations jump."""
+"""Softness of contacts: at 0.7 MuJoCo's regularisation lets a pad give by some hundredths of a
+millimetre. Much stiffer ones lose contact for single steps where accelerations jump."""
 
 SOLID = 'contype="2" conaffinity="0"'
 UNTOUCHED = 'contype="0" conaffinity="0"'

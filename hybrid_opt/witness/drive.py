@@ -1,4 +1,4 @@
-"""What drives the witness: the box's planned motion and the force to press with, per time step."""
+"""The drive of the witness: the box's planned motion and the pressing force, per time step."""
 
 from __future__ import annotations
 

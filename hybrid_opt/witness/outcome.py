@@ -1,4 +1,4 @@
-"""What a simulation showed, and the least force with which it shows a box that stays."""
+"""Outcome of a simulation, and the least force with which the box stays."""
 
 from __future__ import annotations
 

@@ -106,8 +106,8 @@ class Pads:
         return less
 
     def _contacts(self) -> tuple[Indices, NDArray[np.bool_], Indices, Array]:
-        """Of the pads' active contacts: the pad (n,), whether it is the first body (n,), the first
-        of three rows among the constraints (n,), the contact's axes as rows (n, 3, 3)."""
+        """The pads' active contacts: the pad (n,), whether it is the first body (n,), the first of
+        three rows among the constraints (n,), the contact's axes as rows (n, 3, 3)."""
         contact = self._data.contact
         sides = self._pad_of_geom[contact.geom]
         pad = sides.max(axis=1)

@@ -1,4 +1,4 @@
-"""What a simulated cell is told: where its joints have to be, how hard its pads have to press."""
+"""References of a simulated cell: where its joints have to be, how hard its pads press."""
 
 from __future__ import annotations
 
@@ -218,7 +218,7 @@ def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
 
 
 def _press_torque(robot: Robot, contact: Contact, pushed: Array, q: Array) -> Array:
-    """Of a force (3,) along the first pad's axes; several pads press alike."""
+    """Joint torques of a force (3,) along the first pad's axes; several pads press alike."""
     T_flange_box = robot.T_flange_pad @ inverse(contact.T_box_pad)
     pads = [T_flange_box @ pad.T_box_pad for pad in contact.further]
     places = np.mean([robot.T_flange_pad, *pads], axis=0)

@@ -35,7 +35,7 @@ TILT_DAMPING_TIME = 2e-3
 """Damping of a pad's tilt over its stiffness [s]."""
 
 POINT_RADIUS = 2e-3
-"""Of the spheres [m]."""
+"""Radius of the spheres [m]."""
 
 PLATE_REACH, PLATE_THICKNESS = 3.0, 0.01
 """Half the side of a plate under a pad over the patch's radius, and its thickness [m]."""

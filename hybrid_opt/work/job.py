@@ -1,4 +1,4 @@
-"""What all who carry out independent work agree on.
+"""Interface of independent work: jobs, executors, ledgers.
 
 A job makes a context once per worker (say, the loaded evaluator) and answers one request at a time
 with it. While it works it may emit messages. Answers do not depend on who works, or in which
@@ -33,7 +33,7 @@ KILLED, SILENT = "killed", "timeout"
 
 @dataclass(frozen=True)
 class Job(Generic[Context, Request, Answer]):
-    """What to do; both functions can be pickled.
+    """Work to do; both functions can be pickled.
 
     Attributes:
         make_context: called once per worker.
@@ -193,7 +193,7 @@ class Attempted:
 
 
 def attempt(call: Callable[[], Any]) -> Attempted:
-    """What comes of a call, whatever it is."""
+    """Outcome of a call, a result or a failure."""
     try:
         return Attempted("answer", call())
     except DualArmError as error:

@@ -53,7 +53,7 @@ def warm_up(*modules: str) -> None:
 
 
 def local_executor(jobs: int) -> Executor:
-    """Who works in so many processes of this machine; 0 for one per core."""
+    """An executor with this number of processes on this machine; 0 for one per core."""
     return LocalExecutor(jobs or available_cores())
 
 

@@ -22,5 +22,5 @@ def one_thread() -> AbstractContextManager[object]:
 
 @lru_cache(maxsize=1)
 def _controller(modules: int) -> ThreadpoolController:
-    """Of the libraries that so many imported modules brought along: to look for them takes 4 ms."""
+    """Controller of the libraries loaded with this number of modules: a new one takes 4 ms."""
     return ThreadpoolController()

@@ -1,4 +1,4 @@
-"""Polish a front with IPOPT, and see what each attempt became."""
+"""Polish a front, and see what each attempt became."""
 
 import numpy as np
 

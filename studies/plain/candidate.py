@@ -21,7 +21,7 @@ from symbolic.robot.arm import REACH_TOLERANCE
 
 @dataclass(frozen=True)
 class PlainCandidate:
-    """What the plain reference says about a candidate.
+    """Verdict of the plain reference on a candidate.
 
     Attributes:
         outputs: every output of the symbolic evaluator by name, samples in rows.

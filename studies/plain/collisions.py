@@ -28,7 +28,7 @@ PAYLOAD = "payload"
 
 @dataclass(frozen=True)
 class PlainCollisions:
-    """What FCL says about the samples of a candidate.
+    """FCL's verdict on the samples of a candidate.
 
     Attributes:
         colliding: (n,) samples in which some pair collides.

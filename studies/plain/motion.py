@@ -16,7 +16,7 @@ from symbolic.records import Task
 from symbolic.records.poses import Orientation
 
 NODES = 14
-"""Of Gauss's quadrature: exact to rounding up to a full turn."""
+"""Nodes of Gauss's quadrature: exact to rounding up to a full turn."""
 
 
 def waypoints(task: Task, x: Array) -> Array:

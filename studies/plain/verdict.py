@@ -15,7 +15,7 @@ from symbolic.records import Workcell
 
 @dataclass(frozen=True)
 class PlainVerdict:
-    """What the plain reference says about a candidate with collisions.
+    """Verdict of the plain reference on a candidate with collisions.
 
     Attributes:
         candidate: everything but the collisions.

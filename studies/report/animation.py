@@ -24,14 +24,14 @@ from symbolic.geometry.pairs import CellGeometry
 
 FRAMES_PER_SECOND = 15
 SIZE = (6.4, 4.0)
-"""Of a frame [inch]."""
+"""Size of a frame [inch]."""
 
 DPI = 100
 HOLD_SECONDS = 0.7
 """The last frame stays so long before a GIF begins anew."""
 
 COLOURS = 128
-"""Of a GIF's palette."""
+"""Colours of a GIF's palette."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,10 +52,10 @@ from symbolic.records.task import initial_decision
 
 INITIAL_LABEL = "hand-made"
 CURVE_POINTS = 12
-"""Of duration against force limit."""
+"""Points of the curve of duration against force limit."""
 
 REACH_SEED = 0
-"""Of the postures that the reach is drawn from; no result depends on it."""
+"""Seed of the postures that the reach is drawn from; no result depends on it."""
 
 
 def gather(results: CampaignResults, executor: Executor | None = None) -> ReportData:

@@ -222,7 +222,7 @@ def _limits(cell: ho.Cell, x: Array) -> ho.TimingLimits:
 
 
 def _values(cell: ho.Cell, judged: ho.Carry, timing: ho.Timing) -> str:
-    """What a trajectory is named by: what is minimised, forces and times with their units."""
+    """Title of a trajectory: its objectives, forces and times with their units."""
     if cell.workcell.task.time_law == "optimal":
         if timing.carry is not None:
             return f"{timing.duration:.2f} s, {timing.peak_force:.2f} N"

@@ -1,4 +1,4 @@
-"""What the page's scripts need: trajectories, pictures of fronts and shapes as JSON values."""
+"""Data for the page's scripts: trajectories, pictures of fronts and shapes as JSON values."""
 
 from __future__ import annotations
 

@@ -147,6 +147,6 @@ def _fronts(algorithm: AlgorithmRuns) -> list[tuple[str, Front, bool]]:
 
 
 def spread(count: int, most: int) -> Sequence[int]:
-    """At most so many of `count` rows, both ends among them."""
+    """At most `most` of `count` rows, both ends among them."""
     rows = np.linspace(0, count - 1, min(count, most)).round().astype(int)
     return [int(row) for row in np.unique(rows)]

@@ -82,7 +82,7 @@ def limits(points: Array) -> list[list[float]]:
 
 
 def drive_look(points: Array, always: Array) -> Array:
-    """Of points (k, 2) of force and duration those that the first look shows.
+    """Points (k, 2) of force and duration that the first look shows.
 
     Both ends of a drivable front are long and flat: forces next to that of holding still, and
     durations next to the shortest. Neither is to squash what lies between.

@@ -35,10 +35,10 @@ _PLAN = View(np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), "y [m]", "x 
 """From above, the front below."""
 
 HATCHES = ("////", "\\\\\\\\")
-"""Of the regions that the pads reach."""
+"""Hatches of the regions that the pads reach."""
 
 SHARES = (0.0, 0.33, 0.66, 1.0)
-"""Of a carry's duration, as in the paper's Figures 14 and 15."""
+"""Shares of a carry's duration, as in the paper's Figures 14 and 15."""
 
 
 def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) -> Figure:

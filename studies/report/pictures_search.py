@@ -61,7 +61,7 @@ def histories(data: ReportData) -> Figure:
 
 
 def infeasibility(data: ReportData) -> Figure:
-    """What made candidates infeasible: the share of every constraint, and where on the path."""
+    """Reasons of infeasible candidates: the share of every constraint, and where on the path."""
     figure = new_figure(FULL_WIDTH, 0.46 * FULL_WIDTH)
     left, right = figure.subplots(1, 2)
     pooled = []

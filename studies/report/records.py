@@ -1,4 +1,4 @@
-"""What a report shows, gathered once and frozen. Figures and tables are functions of it."""
+"""Content of a report, gathered once and frozen. Figures and tables are functions of it."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class AlgorithmRuns:
 
 @dataclass(frozen=True)
 class TimedSelection:
-    """What real timing makes of one selected trajectory.
+    """One selected trajectory under a timing that robots can drive.
 
     Attributes:
         label: whose it is.
@@ -148,7 +148,7 @@ class DrivableFront:
 
 @dataclass(frozen=True)
 class DrivableReport:
-    """What a report shows of the drivable experiment.
+    """The drivable experiment in a report.
 
     Attributes:
         workcell: the cell under the time law 'optimal'.

@@ -61,7 +61,7 @@ class LineStyle:
 
 
 HAND_MADE = LineStyle("#555555", ":", "s", "....")
-"""Of the hand-made trajectory."""
+"""Style of the hand-made trajectory."""
 
 SERIES = (
     LineStyle("#0072B2", "-", "o", ""),
@@ -70,10 +70,10 @@ SERIES = (
     LineStyle("#CC79A7", (0, (5, 1, 1, 1, 1, 1)), "v", "\\\\\\\\"),
     LineStyle("#D55E00", (0, (1, 1)), "P", "++++"),
 )
-"""Of the algorithms in order (Okabe and Ito's colours: apart for the colour-blind and in grey)."""
+"""Styles of the algorithms in order (Okabe and Ito's colours, distinct for the colour-blind)."""
 
 ARMS = ("#3b6ea8", "#a8733b")
-"""Of the two robots in pictures of the cell."""
+"""Colours of the two robots in pictures of the cell."""
 
 PAYLOAD = "#c9a227"
 OBSTACLE = "#9aa3ab"

@@ -182,7 +182,7 @@ def rank_tests(data: ReportData) -> Table:
 
 
 def simulation(data: ReportData) -> Table:
-    """What the simulated cell says of the selected carries."""
+    """The selected carries in the simulated cell."""
     return Table(
         "simulation",
         "The selected carries in the simulated cell.",

@@ -55,7 +55,7 @@ def robust_price(data: ReportData, price: StoredPrice) -> Table:
 
 
 def limits_on_jerk(costs: Sequence[JerkCosts]) -> Table:
-    """What the cell's limits on jerk cost the selected drivable carries."""
+    """Cost of the cell's limits on jerk for the selected drivable carries."""
     rows = tuple(each.cells for each in costs)
     return Table(
         "jerk", "What limits on jerk cost the selected drivable carries.", HEAD, rows, NOTE

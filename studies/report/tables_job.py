@@ -14,7 +14,7 @@ LIMITS = (
     "payload velocity",
     "payload acceleration",
 )
-"""Of which every phase states its use."""
+"""Limits of which every phase states its use."""
 
 
 def phases(jobs: Sequence[DrawnJob], robots: tuple[str, str]) -> Table:

@@ -8,7 +8,8 @@ step aims at the central path's place of a smaller weight, to second order by wh
 to weight zero leaves out. It starts within the cones, the load balanced, and takes some six steps;
 at most `STEPS`, each of which is passed over once the weight is small enough, so that the whole is
 one expression and compiles. The wrench of the last contact is what the others leave, so that
-6 (k - 1) components are free.
+6 (k - 1) components are free. Starts from a neighbouring sample's solution take more steps where
+several candidates run in lanes, and some never arrive.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ the pose by the implicit function, and a row c(pose, q) has the derivatives
 where pose stands for the extended pose and F for as many equations as there are joints: six hold
 the box, one more ties each redundant joint to its value. They hold at a solution of F only: no
 derivative is taken through Newton's steps, so the joints only need to be right, not differentiable.
+CasADi's own implicit function (`rootfinder`) agrees, but takes three times as long for a Hessian.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Quadratic programs of a step: solved, checked, and how a Lagrangian is made convex.
 
 What the interior-point method of `interior` answers is checked by its residuals. Where they are too
-large, which is rare, the solver Clarabel is asked.
+large, which is rare, the solver Clarabel is asked; for all programs it takes four times as long.
 """
 
 from __future__ import annotations

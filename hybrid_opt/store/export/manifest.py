@@ -1,4 +1,4 @@
-"""What a bundle says of itself."""
+"""The manifest: a bundle's description of itself."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def phase_documents(job: Job) -> list[dict[str, Any]]:
 
 
 def warnings_of(job: Job) -> list[str]:
-    """What an engineer should know before this job runs."""
+    """Warnings that an engineer should read before this job runs."""
     cell, found = job.workcell, []
     peak, rated = job.peak_normal_force, cell.task.reference_force
     for robot, force, most in zip(cell.robots, peak, rated, strict=True):

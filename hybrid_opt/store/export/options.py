@@ -1,4 +1,4 @@
-"""What decides a bundle beside the job itself."""
+"""Options that decide a bundle beside the job itself."""
 
 from __future__ import annotations
 

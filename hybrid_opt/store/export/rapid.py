@@ -21,7 +21,7 @@ from symbolic.records.poses import inverse
 
 TASKS = ("T_ROB1", "T_ROB2")
 TWO_ARMED_TASKS = ("T_ROB_L", "T_ROB_R")
-"""Of two robots, and of the two seven-axis arms of a YuMi."""
+"""Task names of two robots, and of the two seven-axis arms of a YuMi."""
 
 EXTRA = 2
 """Along the chain, the joint of a seven-axis arm that ABB counts as the seventh, `eax_a`."""

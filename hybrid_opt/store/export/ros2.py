@@ -21,11 +21,11 @@ from symbolic.array import Array
 from symbolic.records.poses import box_rotation
 
 UPDATE_RATE = 1000
-"""Of the controller manager [Hz]."""
+"""Update rate of the controller manager [Hz]."""
 
 PATH_TOLERANCE = 0.02
 GOAL_TOLERANCE = 0.002
-"""Of every joint [rad]."""
+"""Tolerances of every joint on the path and at the goal [rad]."""
 
 GOAL_TIME = 0.5
 """How much later than planned a goal may be reached [s]."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from hybrid_opt.store.export.options import BundleOptions
 
 SKEW = 0.01
-"""What two controllers with clocks of their own are expected to keep to [s]."""
+"""Largest start skew expected of two controllers with clocks of their own [s]."""
 
 
 @dataclass(frozen=True)

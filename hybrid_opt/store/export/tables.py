@@ -22,7 +22,7 @@ _JOINT_QUANTITIES = (
     ("q_second", "acceleration", "rad/s^2", "m/s^2"),
     ("effort", "effort", "N m", "N"),
 )
-"""Of `SampledJob`, with the files' words, and units of joints that turn and that slide."""
+"""Fields of `SampledJob`, the files' words for them, units of joints that turn and that slide."""
 
 
 def csv_text(sampled: SampledJob) -> str:

@@ -23,14 +23,14 @@ from symbolic.errors import SettingsError
 from symbolic.records.poses import inverse
 
 CYCLE = 0.002
-"""Of an e-series controller [s]."""
+"""Cycle of an e-series controller [s]."""
 
 MAX_POINTS = 20_000
 START_TOLERANCE = 0.02
 """How far an arm may be from the first position [rad]; farther, the program ends."""
 
 LOOKAHEAD, GAIN = 0.1, 300
-"""Of servoj: [s], and its proportional gain."""
+"""Look-ahead time [s] and proportional gain of servoj."""
 
 FORCE_EVERY = 0.04
 """Time between two force references [s]."""
