@@ -101,7 +101,7 @@ def with_collisions(
 
 
 def over_paper(times: Mapping[str, Array]) -> dict[str, float]:
-    """What the joint allocation's candidates cost over the same ones under the paper's, where that
+    """Cost of the joint allocation's candidates over the same ones under the paper's, where that
     was measured."""
     if "paper" not in times:
         return {}

@@ -1,4 +1,4 @@
-"""Where a study's time goes: core-seconds by part of search, polish and timing.
+"""The time of a study: core-seconds by part of search, polish and timing.
 
 Everything runs in this process, one after the other, under Python's profiler, on functions that are
 compiled before. What Python's functions and the libraries' own ones take themselves is summed up

@@ -248,7 +248,7 @@ def polish_settings(
 
 
 def wish(options: argparse.Namespace) -> Wish:
-    """What the options ask of the recommended carry.
+    """The wish for the recommended carry in the options.
 
     Raises:
         SettingsError: more than one of them is given.

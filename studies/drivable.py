@@ -116,7 +116,7 @@ def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
 
 
 def drivable_root(root: Path, workcell: Workcell, objectives: Sequence[str]) -> Path:
-    """Where the drivable experiment of a study lies: in a folder inside, unless it is the only one.
+    """Folder of a study's drivable experiment: one inside, unless it is the only experiment.
 
     Args:
         root: the study's results folder.

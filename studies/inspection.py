@@ -173,7 +173,7 @@ def inspect(
 
 
 def _explained(cell: Cell, candidates: dict[str, Array]) -> dict[str, Explanation]:
-    """What is in the way of those that fail, by their names."""
+    """Explanations of the trajectories that fail, by their names."""
     found = {}
     for name, x in candidates.items():
         for explanation in explain(cell.evaluator, cell.evaluate(x)):

@@ -31,7 +31,7 @@ class RecommendationText:
     warnings: tuple[str, ...]
 
     def terminal(self) -> str:
-        """For a terminal."""
+        """Text for a terminal."""
         width = max(len(heading) for heading, _ in self.facts)
         lines = [self.headline]
         lines += [f"  {heading:<{width}}  {text}" for heading, text in self.facts]
@@ -123,7 +123,7 @@ def _rival(rival: StoredRival, found: StoredRecommendation) -> str:
 
 
 def _robust(price: StoredPrice) -> str:
-    """What the set costs, how much more of it the arms allow, and what random cases say."""
+    """Cost of the set, the largest multiple of it that the arms allow, and random cases."""
     named = "[uncertainty]" if price.stated else "a usual set"
     plan, sure = (max(values) for values in (price.peak[0], price.commanded))
     allowed = (

@@ -93,7 +93,7 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
 
 
 def _paths_beside(folder: CampaignFolder) -> Array:
-    """What a study's first experiment ended with, in whose folder the drivable one lies."""
+    """Paths that a study's first experiment ended with; the drivable one lies in its folder."""
     return known_paths(folder.root.parent)
 
 

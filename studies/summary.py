@@ -186,7 +186,7 @@ def campaign_summary(
 
 
 def bounds_of(workcell: Workcell, x: Array) -> Bounds:
-    """What the bounds do to the solutions (k, n_var) of the best fronts."""
+    """Bounds that solutions (k, n_var) of the best fronts lie on."""
     found = binding_bounds(workcell.task, x)
     return Bounds(len(x), tuple(StoredBound(**vars(bound)) for bound in found))
 

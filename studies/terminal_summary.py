@@ -22,7 +22,7 @@ TITLES = {
 
 @dataclass(frozen=True)
 class PaperFigures:
-    """What the paper's text states of an algorithm on its rack; its tables are not reproduced.
+    """Figures of the paper's text for an algorithm on its rack; its tables are not reproduced.
 
     Attributes:
         feasible: feasible candidates of 1000 (Section 7).
@@ -98,7 +98,7 @@ def terminal_summary(
 
 
 def bounds_sentence(bounds: Bounds) -> str:
-    """Which bounds of the variables the best fronts lie on, and what follows from that."""
+    """Bounds of the variables that the best fronts lie on, and the consequence."""
     if not bounds.solutions:
         return ""
     head = f"Bounds of the variables at the {bounds.solutions} members of the best fronts"

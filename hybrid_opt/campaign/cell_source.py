@@ -1,4 +1,4 @@
-"""A workcell as a value that goes to any process or machine, and what is made of it there."""
+"""A workcell as a value that goes to any process or machine, and resources made from it there."""
 
 from __future__ import annotations
 
@@ -31,6 +31,6 @@ class PackedCell:
         return cls(json.dumps(cell_to_json(files)))
 
     def make(self, of_workcell: Callable[[Workcell], Made]) -> Made:
-        """What a function makes of the workcell, whose files exist only as long as it runs."""
+        """Result of a function of the workcell, whose files exist only as long as it runs."""
         with TemporaryDirectory() as folder:
             return of_workcell(unpack_cell(cell_from_json(json.loads(self.text)), Path(folder)))

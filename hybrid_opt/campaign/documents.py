@@ -23,7 +23,7 @@ StageStatus = Literal["running", "done", "outdated"]
 
 @dataclass(frozen=True)
 class StoredCell:
-    """Which workcell a campaign searched.
+    """The workcell of a campaign.
 
     Attributes:
         name: for people.

@@ -53,7 +53,7 @@ class ExecutionSettings:
 
 
 def executor_for(execution: ExecutionSettings) -> Executor:
-    """Who does the work that the settings ask for."""
+    """The executor that the settings ask for."""
     if execution.executor == "dask":
         assert execution.scheduler is not None
         return DaskExecutor(execution.scheduler, environment(), environment)

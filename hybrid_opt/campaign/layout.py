@@ -1,4 +1,4 @@
-"""Where what lies in a results folder."""
+"""Paths in a results folder."""
 
 from __future__ import annotations
 

@@ -50,8 +50,9 @@ from symbolic.errors import OutsideError
 from symbolic.records import Workcell
 
 JUDGING_SECONDS = 540.0
-"""What an attempt may take besides one solve, or the front before the first one. An idle core needs
-ten seconds; the clock is the wall's, and machines with twenty times more work were seen."""
+"""Time that an attempt may take besides one solve, or the front before the first one. An idle
+core needs ten seconds; the clock is the wall's, and machines with twenty times more work were
+seen."""
 
 KEPT_FRONTS = 64
 """Documents that are remembered by their content: a study's stages read its fronts again and

@@ -215,7 +215,7 @@ class StoredRecommendation:
 
 @dataclass(frozen=True)
 class Told:
-    """What a study says of a recommendation besides: the attributes of those names there."""
+    """Further statements about a recommendation: the attributes of those names there."""
 
     source: str
     file: str

@@ -1,4 +1,4 @@
-"""simulated/*.json as records: what the simulated cell says of a study's carries."""
+"""simulated/*.json as records: a study's carries in the simulated cell."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class StoredSimulation:
 
     @property
     def threshold(self) -> float:
-        """In the middle of both multiples, NaN where there is none."""
+        """Middle of both multiples, NaN where there is none."""
         return (self.slips + self.holds) / 2.0
 
     @property
@@ -83,7 +83,7 @@ class StoredSimulation:
 
 @dataclass(frozen=True)
 class Whose:
-    """What is simulated, as the attributes of those names in `StoredSimulation`."""
+    """A simulation, as the attributes of those names in `StoredSimulation`."""
 
     label: str
     trajectory: str
@@ -140,7 +140,7 @@ def stored_simulation(found: Account, whose: Whose) -> StoredSimulation:
 
 
 def read_simulations(root: Path) -> tuple[StoredSimulation, ...]:
-    """What was simulated of a study's carries, in the order of their files.
+    """Simulations of a study's carries, in the order of their files.
 
     Raises:
         ResultsError: a file is damaged.

@@ -74,7 +74,7 @@ def _path(folder: CampaignFolder, stage: Stage) -> Path:
 
 
 def _marker(folder: CampaignFolder, stage: Stage) -> StageMark | None:
-    """What is remembered of a stage; None where it never began."""
+    """The marker of a stage; None where it never began."""
     path = _path(folder, stage)
     return (
         read_record(StageMark, path, "delete it to run the stage again") if path.exists() else None

@@ -31,7 +31,7 @@ FRONT, CLOUD, REST = "#b00020", "#9aa3ab", "#1f2933"
 
 @dataclass(frozen=True)
 class Series:
-    """What is drawn: points (n, 2) as a line or as marks.
+    """A drawn series: points (n, 2) as a line or as marks.
 
     Attributes:
         label: in the legend, '' for none.

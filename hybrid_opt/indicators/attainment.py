@@ -1,4 +1,4 @@
-"""Empirical attainment surfaces: what a share of the replicas reached or bettered.
+"""Empirical attainment surfaces: objectives that a share of the replicas reached or bettered.
 
 Source: Fonseca, Guerreiro, Lopez-Ibanez and Paquete 2011, through moocore's `eaf`.
 """

@@ -1,4 +1,4 @@
-"""Which bounds of the decision variables solutions lie on.
+"""Bounds of the decision variables that solutions lie on.
 
 A bound that an optimum lies on may have decided it: wider ones might allow better carries. One that
 none lies on decided nothing but where the search looked.

@@ -113,7 +113,7 @@ class JobCollisions:
         return Standing(_lowered(pose, found), found, tuple(names))
 
     def checker(self, places: Sequence[Standing]) -> CollisionChecker:
-        """What judges a job whose box stands at these places before and after the carry."""
+        """The checker of a job whose box stands at these places before and after the carry."""
         task = self._workcell.task
         poses = tuple(Waypoint(place.pose, place.pose) for place in places)
         contacts = tuple(

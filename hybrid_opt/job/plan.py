@@ -193,7 +193,7 @@ class JobModel:
         return found
 
     def _around(self, carry: Carry, handling: Handling) -> _Around:
-        """What happens around a carry; known where another one has the same ends."""
+        """The phases around a carry, computed once for carries with the same ends."""
         pose, q = carry.pose[[0, -1]], carry.q[[0, -1]].round(_SAME_POSTURE)
         key = handling, pose.tobytes() + q.tobytes()
         if key not in self._known:
@@ -203,7 +203,7 @@ class JobModel:
         return self._known[key]
 
     def _handling(self, pose: Array, known: Array, handling: Handling) -> _Around:
-        """What moves before a carry, in order, and after it.
+        """The moving phases before a carry, in order, and after it.
 
         Args:
             pose: (2, 6) of the box where the carry begins and ends.

@@ -3,8 +3,8 @@
 Time-optimal timings switch accelerations in no time, and begin and end with one. No controller
 follows that. Here the path parameter as a function of time, u(t), is averaged over a short window
 with a smooth kernel: box and arms stay on the very same path, begin and end at rest also in their
-accelerations, and the jerk is bounded by the jumps over the width. What then exceeds a limit, since
-speeds are passed a little earlier or later, is mended by slowing down uniformly.
+accelerations, and the jerk is bounded by the jumps over the width. Where a limit is then exceeded,
+since speeds are passed a little earlier or later, the motion is slowed down uniformly.
 """
 
 from __future__ import annotations

@@ -96,7 +96,7 @@ def pad_line(
 def lines_around(
     workcell: Workcell, handling: Handling, stands: tuple[Array, Array], pose: Array
 ) -> tuple[list[Straight], list[Straight]]:
-    """What moves straight before a carry and after it, either list from the carry outwards.
+    """Straight motions before a carry and after it, either list from the carry outwards.
 
     Args:
         handling: how; the workcell's own or another.
@@ -233,7 +233,7 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
 
 
 def standing_still(motion: PhaseMotion, sample: int, duration: float) -> PhaseMotion:
-    """What a motion is at one sample, held for a duration [s]."""
+    """The state of a motion at one sample, held for a duration [s]."""
     k = sample % len(motion.time)
 
     def still(values: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Which carry to run: chosen from a drivable front, held against the hand-made one, explained.
+"""The carry to run: chosen from a drivable front, compared with the hand-made one, explained.
 
 wish: what a user asks for. driven_paths: paths that are timed anew at any force or duration.
 choice: the carry that a wish names, the knee of the front without one. rival: another path at the

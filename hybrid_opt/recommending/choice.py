@@ -41,7 +41,7 @@ def force_for_payload(workcell: Workcell, payload: float) -> float:
 
 
 def choices(workcell: Workcell, paths: DrivenPaths, points: Array, wish: Wish) -> Iterator[Choice]:
-    """What answers a wish, best first.
+    """Answers to a wish, best first.
 
     Args:
         workcell: the cell.

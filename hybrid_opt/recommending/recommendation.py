@@ -215,7 +215,7 @@ def _warnings(beside: Iterable[Rival], timing: Timing, force: float) -> Iterator
 
 
 def _too_long(wish: Wish, jerk: JerkTiming | None) -> Iterator[str]:
-    """That limits on jerk take longer than was wished for."""
+    """A warning where limits on jerk take longer than was wished for."""
     if jerk is not None and wish.duration is not None:
         duration = jerk.timing.duration
         if duration > wish.duration * (1.0 + BETTER):
@@ -226,7 +226,7 @@ def _too_long(wish: Wish, jerk: JerkTiming | None) -> Iterator[str]:
 
 
 def _without_room(margins: Iterable[Margin]) -> Iterator[str]:
-    """What the carry has no room for at all."""
+    """Warnings about margins that are used up."""
     tight = [
         margin
         for margin in margins
@@ -240,5 +240,5 @@ def _without_room(margins: Iterable[Margin]) -> Iterator[str]:
 
 
 def _whole(margin: Margin) -> float:
-    """What a margin is compared with: a tenth of a coefficient, a length of a centimetre."""
+    """Scale of a margin: a tenth of a coefficient, a length of a centimetre."""
     return 1e-2 if margin.unit == "m" else 0.1 * margin.nominal

@@ -39,7 +39,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class Reference:
-    """What rivals are held against.
+    """The recommended carry and its front, for comparison with rivals.
 
     Attributes:
         front: the paths of the front.

@@ -1,5 +1,4 @@
-"""What single cases ask for, compiled: of two round pads that face one another, and of pads
-anywhere."""
+"""Forces that single cases ask for, compiled: for two facing round pads, and for pads anywhere."""
 
 from __future__ import annotations
 
@@ -78,7 +77,7 @@ class CaseForces:
         return np.asarray(found.ravel() > 0.0, dtype=np.bool_)
 
     def leading_share(self, leader: int) -> float:
-        """What the leading robot presses more for each newton more that is commanded."""
+        """Rise of the leading robot's force per newton of the commanded one."""
         if self.workcell.has_facing_pads:
             return 1.0
         normals = self._squeeze_normals

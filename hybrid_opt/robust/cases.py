@@ -1,4 +1,4 @@
-"""Cases of what is not exactly known: the worst ones, and random ones.
+"""Cases of an uncertainty set: the worst ones, and random ones.
 
 Which are worst follows from the least squeeze that a case asks for:
 

@@ -1,4 +1,4 @@
-"""Which of the worst cases decide what both robots press with."""
+"""The worst cases that decide both robots' forces."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from symbolic.records import Uncertainty
 
 @dataclass(frozen=True)
 class RulingCases:
-    """Which of the worst cases decide the forces; n samples.
+    """The worst cases that decide the forces; n samples.
 
     Attributes:
         leader: index of the arm that keeps its place.

@@ -1,7 +1,7 @@
 """How hard to press, over time: normal forces to command, at least what holds the box, smooth.
 
 With N_1 - N_2 fixed by the motion, the force of one arm decides both: the leading arm keeps its
-place and feels what follows, the other is force-controlled (`hybrid_opt.robust`). What is commanded
+place and feels what follows, the other is force-controlled (`hybrid_opt.robust`). Force
 beyond the plan presses both pads against one another and moves nothing.
 
 The plan may assume pads that choose their pressure. What is commanded always holds pads that press

@@ -24,7 +24,7 @@ MOST_BYTES = 512 * outside.MEBIBYTE
 
 RESUME = "make room and continue with --resume"
 AGAIN = "make room and try again"
-"""What to do about a full disk: for a study's own files, and for any other."""
+"""Advice about a full disk: for a study's own files, and for any other."""
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 

@@ -145,7 +145,7 @@ def write_trajectory(
 
 
 def _standing_still(workcell: Workcell) -> tuple[Array, ...]:
-    """What a candidate takes besides x: under 'optimal' a timing, which the start
+    """Inputs of a candidate besides x: under 'optimal' a timing, which the start
     postures do not depend on."""
     if workcell.task.time_law != "optimal":
         return ()

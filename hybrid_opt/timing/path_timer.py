@@ -1,4 +1,4 @@
-"""Timings of many paths of one workcell, in compiled code: what a search can afford.
+"""Timings of many paths of one workcell, in compiled code, fast enough for a search.
 
 The method is that of `hybrid_opt.timing.solve` without its linear programs over all intervals; see
 docs/timing.md. A carry is not built: `drive_path` recomputes one for a timing found here.

@@ -1,6 +1,6 @@
 """How much a carry could bear: heavier payloads, less friction, wrong centres of mass.
 
-All functions are pure and judge a `Carry`, so under the search's timing as under a real one.
+All functions are pure and judge a `Carry`, under the search's timing or under a drivable one.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ LEAST_SPEED = 0.98
 
 @dataclass
 class _State:
-    """What the iteration carries from one linear problem to the next.
+    """State of the iteration between one linear problem and the next.
 
     Attributes:
         cuts: supporting lines of convex limits.

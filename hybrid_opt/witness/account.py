@@ -35,7 +35,7 @@ class Pressed:
 
 @dataclass(frozen=True, eq=False)
 class Account:
-    """What was simulated of one carry.
+    """Simulations of one carry.
 
     Attributes:
         threshold: the least multiple of the planned forces that holds; None where there is none

@@ -30,7 +30,7 @@ LOOKED_AT = 5e-3
 
 @dataclass(frozen=True)
 class ArmOutcome(Outcome):
-    """What one simulation of a whole cell showed, at n moments; the slip only while it is held.
+    """Outcome of one simulation of a whole cell, at n moments; the slip only while it is held.
 
     Attributes:
         normal_force, normal_force_reference: (n, 2) measured and commanded [N].

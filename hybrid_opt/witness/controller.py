@@ -44,7 +44,7 @@ class ArmState:
 
 @dataclass(frozen=True, eq=False)
 class ArmCommand:
-    """What one arm is told at one moment.
+    """References of one arm at one moment.
 
     Attributes:
         effort: (n_joints,) to feed forward [N m].

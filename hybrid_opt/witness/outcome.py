@@ -18,7 +18,7 @@ BEGINS = 0.1
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one simulation showed, at n moments.
+    """Outcome of one simulation, at n moments.
 
     Attributes:
         factor: multiple of the pressing force.
@@ -61,7 +61,7 @@ class Threshold(Generic[Shown]):
 
     @property
     def factor(self) -> float:
-        """In the middle of both."""
+        """Middle of both multiples."""
         return (self.slips.factor + self.holds.factor) / 2.0
 
 

@@ -49,7 +49,7 @@ class Pads:
         return force
 
     def mend_contacts(self) -> None:
-        """What the contacts are to become in this step, all accelerations included.
+        """Contacts of this step, all accelerations included.
 
         MuJoCo takes J dv/dt for the acceleration of the box over a pad, which has dJ/dt v besides:
         some tenths of m/s^2 where arms swing. Contacts that do not know it creep by millimetres

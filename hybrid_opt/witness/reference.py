@@ -40,7 +40,7 @@ class JointMotion:
 
 @dataclass(frozen=True, eq=False)
 class BoxJob:
-    """What is to happen to the box.
+    """The job of the box.
 
     Attributes:
         start: (6,) its pose at first.

@@ -35,7 +35,7 @@ from hybrid_opt.work.job import (
 from symbolic.errors import SettingsError
 
 CONNECT_SECONDS = 15.0
-"""So long the scheduler, and then a first worker, may take to answer."""
+"""Time that the scheduler, and then a first worker, may take to answer."""
 
 LOST_SECONDS = 10.0
 """After so long without its scheduler the work is given up."""
@@ -44,7 +44,7 @@ _TICK = 1.0
 """Longest wait for news [s]."""
 
 _CONNECTED = "running"
-"""What Dask calls a client that has its scheduler."""
+"""Dask's name for a client that has its scheduler."""
 
 _contexts = threading.local()
 

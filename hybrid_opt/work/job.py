@@ -25,7 +25,7 @@ AnswerIn = TypeVar("AnswerIn", contravariant=True)
 Emit = Callable[[bytes], None]
 
 MAX_DEATHS = 3
-"""So often may workers die over one request, with no message in between, before it is lost."""
+"""Deaths of workers over one request, with no message in between, after which it is lost."""
 
 KILLED, SILENT = "killed", "timeout"
 """Why a request is lost: its workers died, or it said nothing for too long."""
@@ -169,7 +169,7 @@ def answer_all(
 
 @dataclass(frozen=True)
 class Attempted:
-    """What came of a request on a worker; failures are texts, as not every exception can be
+    """Outcome of a request on a worker; failures are texts, as not every exception can be
     pickled.
 
     Attributes:

@@ -216,7 +216,7 @@ _server = multiprocessing.get_context("forkserver")
 
 @contextmanager
 def _shielded() -> Iterator[None]:
-    """What is started in the `with` block is not reached by Ctrl-C.
+    """Ctrl-C does not reach processes that are started in the `with` block.
 
     It is sent to the whole group, but the parent alone decides what it means. The mask is
     inherited, so that it holds from a process's first moment.

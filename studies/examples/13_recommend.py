@@ -1,4 +1,4 @@
-"""Which carry to run: drivable ones are searched for, and one of them is recommended."""
+"""Search for drivable carries, and have one of them recommended."""
 
 import numpy as np
 

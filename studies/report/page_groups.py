@@ -118,7 +118,7 @@ def curves(data: ReportData) -> Iterator[tuple[DrawnCarry, str, LineStyle, Array
 
 
 def _source(data: ReportData, carry: DrawnCarry) -> str:
-    """Whose a trajectory is: of which algorithm and replica, where it is no hand-made one."""
+    """Source of a trajectory: algorithm and replica, where it is no hand-made one."""
     for algorithm in data.algorithms:
         if carry is algorithm.best:
             return f"{carry.label}, replica {algorithm.shown.replica}: least force"

@@ -212,7 +212,7 @@ class ReportData:
 
     @property
     def force_kind(self) -> ForceKind:
-        """Which forces limits, and so the drivable fronts, are about."""
+        """Kind of forces that limits and drivable fronts are about."""
         return force_kind(self.objectives)
 
     @property

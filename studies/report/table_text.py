@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 NOTHING = "–"
-"""Where there is no figure."""
+"""Text of a missing figure."""
 
 
 @dataclass(frozen=True)

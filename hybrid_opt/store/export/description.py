@@ -26,7 +26,7 @@ STATES = ("position", "velocity", "effort")
 
 
 def prefixes(workcell: Workcell) -> tuple[str, str]:
-    """What stands before the names of each robot's links and joints."""
+    """Prefixes of the names of each robot's links and joints."""
     if one_machine(workcell.robots):
         return "", ""
     first, second = (robot_prefix(robot.name) for robot in workcell.robots)

@@ -1,4 +1,4 @@
-"""Whose arms a workcell has, as far as their descriptions tell; languages that fit no other's."""
+"""Makers of a workcell's arms, as far as descriptions tell; languages that fit no other maker's."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def require_axes(workcell: Workcell, language: str, allowed: Sequence[int] = (SI
 
 
 def _named(robot: Robot) -> str:
-    """What a description says of its make, in small letters, words apart."""
+    """Words about the make in a description, in small letters."""
     words = [robot.urdf.name, *robot_urdf(robot).links]
     words += [value for _, value in robot.xacro_arguments]
     return " ".join(words).lower().replace("_", " ")

@@ -98,7 +98,7 @@ class _Recording:
         self._boxes = box_placement(self._cell.task.orientation, sampled.pose)
 
     def messages(self, k: int, stamp: dict[str, int]) -> Iterator[Message]:
-        """Those of sample k."""
+        """Messages of sample k."""
         sampled = self._sampled
         if k == 0:
             text = description(self._cell, sampled.q[0])

@@ -1,4 +1,4 @@
-"""Where a carry comes from, and the name that its bundles get from that."""
+"""Origin of a carry, and the name that its bundles get from it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DIGEST_LENGTH = 8
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a carry comes from.
+    """Origin of a carry.
 
     Attributes:
         study: name of the study or, without one, of the workcell.
