@@ -2,8 +2,8 @@
 
 The balanced carry has the least mean of both robots' peak normal forces. Where one robot can
 relieve the other at no cost, a polished front is flat: many points have the same mean to five
-digits. The most even of such points is selected, which leaves most room for payload. Drivable fronts
-reach down to forces at which a carry hardly moves; their knee is selected.
+digits. The most even of such points is selected, which leaves most room for payload. Drivable
+fronts reach down to forces at which a carry hardly moves; their knee is selected.
 """
 
 from __future__ import annotations
