@@ -1,1 +1,1 @@
-"""Polishing of Pareto fronts with IPOPT on the smooth problem. docs/polish.md explains it."""
+"""Polishing of Pareto fronts by nonlinear programming. docs/polish.md explains it."""

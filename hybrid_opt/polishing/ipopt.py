@@ -20,7 +20,7 @@ OPTIONS: dict[str, Any] = {
     "ipopt.sb": "yes",
     "print_time": False,
     # A metaheuristic's point is near the solution but has no multipliers: a small barrier, little
-    # push off the bounds (docs/polish.md has the comparison).
+    # push off the bounds.
     "ipopt.bound_push": 1e-4,
     "ipopt.bound_frac": 1e-4,
     "ipopt.slack_bound_push": 1e-4,

@@ -6,7 +6,7 @@ from hybrid_opt.polishing.settings import DrivableSettings, FillSettings, Polish
 
 DRIVABLE_ATTEMPTS = 10
 """At a drivable front. With seven, replicas of the rack differ by 1.1 % at 55 N, with ten by 0.4 %
-(docs/drivable.md)."""
+(docs/measured/drivable-rack.md)."""
 
 
 def usual_settings(time_law: str) -> PolishSettings:

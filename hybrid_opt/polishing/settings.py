@@ -1,4 +1,4 @@
-"""Everything that decides what a polish finds. docs/polish.md has what was measured with others.
+"""Everything that decides what a polish finds. docs/polish.md explains it.
 
 Widths along the path are in its parameter (the whole path is 1), distances in metres, steps in
 halves of the decision variables' ranges: none of them changes its meaning with the samples.
