@@ -16,7 +16,7 @@ def usual_settings(time_law: str) -> PolishSettings:
 
 def quick_settings() -> PolishSettings:
     """Settings of a small study: a third as many points from fewer attempts, and a shorter
-    tournament, after which one replica of eight stayed in a slower basin (docs/drivable.md)."""
+    tournament, after which one replica of eight stayed in a slower basin."""
     return PolishSettings(
         attempts=2,
         fill=FillSettings(solved=16, members=16),
