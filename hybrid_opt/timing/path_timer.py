@@ -133,7 +133,7 @@ class PathTimer:
         return self._passes is not None
 
     def path_limits(self, x: Array) -> dict[str, Array]:
-        """Outputs of `symbolic.physics.path_limits.path_function` and `limits` for waypoints
+        """Outputs of `symbolic.limits.path_function` and `limits` for waypoints
         (n, n_var), at both ends and in the middle of every interval."""
         paths = self._path.batch(np.ascontiguousarray(x, dtype=float), threads=self._threads)
         shapes = zip(self._limits.input_names, self._limits.input_shapes, strict=True)

@@ -4,7 +4,8 @@ For any unit vector u, two convex bodies are at least  min_A u.x - max_B u.x  ap
 across u separates them). The bound of a pair is the largest such gap over a few directions:
 the axes of the environment's box, of the payload, and the world's. In an arm's own pairs, and
 against round shapes of the environment, chains of spheres are used instead, or as well.
-Positive means surely free by that distance; anything else means nothing.
+Positive means surely free by that distance; anything else means nothing. All fifteen axes of box
+against box cost more than the FCL calls that they save.
 """
 
 from __future__ import annotations

@@ -1,6 +1,10 @@
-"""Closed meshes cut into few convex pieces that fill them well.
+"""Triangle meshes as convex pieces whose union contains them.
 
-CoACD and V-HACD remesh or voxelise first and promise no containment.
+A watertight component is cut by planes where that makes the hulls of its parts markedly
+smaller. The hull of a part contains the part's surface and, with the cut's outline, the cap
+that closes it: so the union of the hulls contains the solid. A component with holes has no
+inside; its whole hull is used, with a warning. CoACD and V-HACD remesh or voxelise first and
+promise no containment.
 """
 
 from __future__ import annotations
