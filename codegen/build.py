@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from codegen.cache import FORMAT, Cache, digest, source_digest
 from codegen.compilation import Source, compile_source, load_compiled
-from codegen.compiler import Compiler, find_compiler
+from codegen.compiler import Compiler, find_compiler, interruptible, stop_if_interrupted
 from codegen.function import NumericFunction, available_cores
 from codegen.interpreted import InterpretedFunction, warn_interpreted
 from codegen.signature import Signature
@@ -117,7 +117,7 @@ def build(
     if compiler is None:
         return _interpreted(functions)
     cache = cache or Cache()
-    with ThreadPoolExecutor(jobs or available_cores()) as pool:
+    with ThreadPoolExecutor(jobs or available_cores()) as pool, interruptible():
         futures = {}
         with _MAKING:
             # The longest first: none is left to run alone in the end.
@@ -181,6 +181,7 @@ def load_or_build(
         found = _load_set(key, lanes, compiler, cache)
         if found is None:
             with _MAKING:
+                stop_if_interrupted()
                 functions = make()
             found = build_set(key, functions, cache, levels=levels, lanes=lanes).functions
         return found
@@ -212,7 +213,7 @@ def load_or_compile(
         return next(iter(found.values()))
     signature, text = make()
     source = Source(signature, 0, text, len(text), None)
-    with ThreadPoolExecutor(1) as pool:
+    with ThreadPoolExecutor(1) as pool, interruptible():
         function, entry, _ = compile_source(source, compiler, cache, 3, pool.submit).result()
     cache.write_record(_set_key(key, 1, compiler), {"members": {signature.name: entry.key}})
     return function

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -62,6 +64,45 @@ MOST_SECONDS = 1200.0
 """After so long a compiler counts as hung [s]; sources here take it seconds, at most minutes."""
 
 _CORES = threading.BoundedSemaphore(available_cores())
+
+_AT_WORK: set[subprocess.Popen[str]] = set()
+_BEGINNING = threading.Lock()
+_INTERRUPTED = threading.Event()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Where Ctrl-C ends the `with` block, all compilers of this process end, and none begins.
+
+    They begin again with what the main thread wants compiled next.
+    """
+    if threading.current_thread() is threading.main_thread():
+        _INTERRUPTED.clear()
+    try:
+        yield
+    except KeyboardInterrupt:
+        with _BEGINNING:
+            _INTERRUPTED.set()
+            for process in _AT_WORK:
+                _end(process)
+        raise
+
+
+def stop_if_interrupted() -> None:
+    """What is begun in a thread ends where what it was begun for was interrupted.
+
+    Raises:
+        KeyboardInterrupt: it was, see `interruptible`.
+    """
+    if _INTERRUPTED.is_set():
+        raise KeyboardInterrupt
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """End a compiler with what it started."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+
 
 _OTHER_COMPILER = "name another one in the environment variable CC"
 
@@ -118,25 +159,38 @@ class Compiler:
         # The compiler's own temporary files stay in the build folder and go away with it.
         environment = os.environ | {"TMPDIR": str(source.parent), "LC_ALL": "C"}
         try:
-            done = subprocess.run(
-                command,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                text=True,
-                errors="replace",
-                timeout=MOST_SECONDS,
-                check=False,
-            )
+            with _BEGINNING:
+                stop_if_interrupted()
+                # In a group of its own: Ctrl-C is for this process, which ends its compilers.
+                process = subprocess.Popen(
+                    command,
+                    env=environment,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                    errors="replace",
+                    process_group=0,
+                )
+                _AT_WORK.add(process)
         except OSError as error:
             raise CodegenError(f"the C compiler {self.command[0]} cannot run: {error}") from error
-        except subprocess.TimeoutExpired as error:
-            raise CodegenError(
-                f"the C compiler {self.command[0]} took longer than {MOST_SECONDS:g} s over "
-                f"{source.name} and was ended; {_OTHER_COMPILER}"
-            ) from error
-        if done.returncode != 0:
-            raise CodegenError(_failure(self.command[0], source, done))
+        with process:
+            try:
+                said = process.communicate(timeout=MOST_SECONDS)[1]
+            except subprocess.TimeoutExpired as error:
+                raise CodegenError(
+                    f"the C compiler {self.command[0]} took longer than {MOST_SECONDS:g} s over "
+                    f"{source.name} and was ended; {_OTHER_COMPILER}"
+                ) from error
+            finally:
+                with _BEGINNING:
+                    _AT_WORK.discard(process)
+                if process.returncode is None:
+                    _end(process)
+        if process.returncode != 0:
+            stop_if_interrupted()
+            raise CodegenError(_failure(self.command[0], source, process.returncode, said))
         if not result.is_file() or result.stat().st_size == 0:
             raise CodegenError(
                 f"the C compiler {self.command[0]} reported success but made no library of "
@@ -213,16 +267,17 @@ def _ask(command: tuple[str, ...], *arguments: str) -> str | None:
     return said.stdout + said.stderr if said.returncode == 0 else None
 
 
-def _failure(compiler: str, source: Path, done: subprocess.CompletedProcess[str]) -> str:
-    if done.returncode < 0:
+def _failure(compiler: str, source: Path, code: int, said: str) -> str:
+    if code < 0:
         return (
-            f"the C compiler {compiler} was ended by signal {-done.returncode} at {source.name}; "
+            f"the C compiler {compiler} was ended by signal {-code} at {source.name}; "
             "if memory ran out, build fewer functions at once"
         )
-    lines = [line for line in done.stderr.splitlines() if "error" in line or "No space" in line]
-    said = (lines or done.stderr.splitlines() or ["no message"])[0].strip()
+    every = said.splitlines()
+    lines = [line for line in every if "error" in line or "No space" in line]
+    first = (lines or every or ["no message"])[0].strip()
     return (
-        f"the C compiler {compiler} failed at {source.name}: {said}; make sure that it compiles a "
+        f"the C compiler {compiler} failed at {source.name}: {first}; make sure that it compiles a "
         f"C file with math.h (packages such as build-essential or gcc and libc-dev), or "
         f"{_OTHER_COMPILER}"
     )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from importlib.metadata import version
 
 from codegen.cache import Cache, source_digest
-from codegen.compiler import find_compiler
+from codegen.compiler import find_compiler, interruptible
 from codegen.errors import CodegenError
+from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.polishing import compiled_interior, compiled_rows
@@ -19,8 +20,14 @@ from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PATH_INTERVALS
 from symbolic.errors import DualArmError
 
+Maker = Callable[[], object]
+"""Loads or builds functions."""
 
-def build_study(cell: Cell, polish: bool = True, drivable: bool = True) -> None:
+_TICK = 1.0
+"""The time that is gone is told anew so often [s]."""
+
+
+def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: bool = True) -> None:
     """Load or build the functions of a study, all compilers side by side.
 
     What a polish compiles when its solves first ask for it, rows of arms' clearances, is not among
@@ -29,6 +36,7 @@ def build_study(cell: Cell, polish: bool = True, drivable: bool = True) -> None:
 
     Args:
         cell: read from a file.
+        progress: where to show it.
         polish: whether fronts are polished.
         drivable: whether carries are also searched for as robots drive them.
     """
@@ -43,23 +51,44 @@ def build_study(cell: Cell, polish: bool = True, drivable: bool = True) -> None:
     # What drives has the longest functions.
     cells = [cell.drivable(), cell] if drivable and not _driven(cell) else [cell]
     makers = [make for each in cells for make in _makers(each, polish)]
+    failures = build_all(makers, progress)
+    if not any(isinstance(failure, CodegenError) for failure in failures):
+        cache.write_record(key, {"built": True})
+
+
+def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]:
+    """Load or build functions side by side; what cannot be built is left to who asks for it.
+
+    Ctrl-C ends all compilers and loses nothing that is compiled; the threads that make expressions
+    are not waited for.
+
+    Returns:
+        Why some were not built.
+    """
     # Each waits for its compilers most of the time; expressions are made by one after the other.
-    with ThreadPoolExecutor(len(makers)) as pool:
-        futures = [pool.submit(make) for make in makers]
+    pool = ThreadPoolExecutor(len(makers))
+    try:
+        with interruptible(), progress.stage("compiling", len(makers), "sets", delay=_TICK) as told:
+            futures = [pool.submit(make) for make in makers]
+            left = set(futures)
+            while left:
+                done, left = wait(left, _TICK, FIRST_COMPLETED)
+                told(len(done))
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
     failures = [failure for future in futures if (failure := future.exception()) is not None]
     for failure in failures:
         # What a cell cannot have is told by who needs it.
         if not isinstance(failure, DualArmError):
             raise failure
-    if not any(isinstance(failure, CodegenError) for failure in failures):
-        cache.write_record(key, {"built": True})
+    return [failure for failure in failures if isinstance(failure, DualArmError)]
 
 
 def _driven(cell: Cell) -> bool:
     return cell.workcell.task.time_law == "optimal"
 
 
-def _makers(cell: Cell, polish: bool) -> Iterator[Callable[[], object]]:
+def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     compiled, workcell, cache = cell.compiled, cell.workcell, cell.compiled.cache
     polished = polish and workcell.has_facing_pads
     if _driven(cell):

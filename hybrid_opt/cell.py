@@ -23,6 +23,7 @@ from hybrid_opt.evaluate.objectives import (
     ForceKind,
     Objective,
     force_kind,
+    select_objectives,
 )
 from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
 from symbolic.array import Array
@@ -66,10 +67,14 @@ class Cell:
         Args:
             objectives: what searches minimise: names of `OBJECTIVES`, or records of one's own.
             threads: for the evaluation of candidates; has no influence on results.
+
+        Raises:
+            SettingsError: an objective is unknown, or given twice.
         """
         self.workcell = workcell
         self.compiled = CompiledCell(workcell)
         self.threads = threads
+        select_objectives(objectives)
         self._objectives = tuple(objectives)
         self._folder: TemporaryDirectory[str] | None = None
 
@@ -84,7 +89,9 @@ class Cell:
 
         Raises:
             WorkcellError: the file is wrong; the message lists every problem.
+            SettingsError: an objective is unknown, or given twice.
         """
+        select_objectives(objectives)
         return cls(load(Path(path)), objectives, threads)
 
     def with_start_branches(self, branches: tuple[int, int]) -> Cell:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from hybrid_opt.front import Front
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from hybrid_opt.polishing.polisher import polisher_for
 from hybrid_opt.polishing.presets import usual_settings
+from hybrid_opt.polishing.records import PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
@@ -60,6 +61,7 @@ def polish(
     rng: np.random.Generator,
     settings: PolishSettings | None = None,
     paths: Sequence[Carry | Array] = (),
+    told: Callable[[PolishOutcome], None] = lambda outcome: None,
 ) -> Front:
     """Improve a front: both peak forces with an interior-point method, or, under the time law
     'optimal', path and speed profile together.
@@ -70,6 +72,7 @@ def polish(
         paths: carries of the cell whose paths are known to be good, or their decision vectors,
             with or without a force limit; under the time law 'optimal' only. The front is nowhere
             behind them. The hand-made path always takes part.
+        told: takes the outcome of every attempt as it ends.
 
     Raises:
         SettingsError: the cell's objectives are not those of the polish, or a path does not fit.
@@ -90,7 +93,7 @@ def polish(
                 f"{task.n_var} with a force limit"
             )
     beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
-    done = polisher.polish(front.x, rng, paths=beside)
+    done = polisher.polish(front.x, rng, emit=told, paths=beside)
     title = f"{front.title}, polished"
     return Front(cell, title, done.x, done.objectives, front.evaluations, done)
 

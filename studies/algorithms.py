@@ -21,7 +21,7 @@ from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_
 from hybrid_opt.metaheuristics import Evaluated, analytic_problems
 from hybrid_opt.metaheuristics.analytic_problems import AnalyticProblem
 from studies.algorithm_bands import BAND_POPULATION, BAND_SOURCE, BANDS, Band, Verdict, judge
-from studies.program import add_verbose, carried_out, run_program
+from studies.program import Parser, add_verbose, carried_out, run_program
 from studies.text_table import number, text_table
 from symbolic.errors import SettingsError
 
@@ -257,7 +257,7 @@ def _cells(score: Score) -> tuple[str, ...]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=PROGRAM,
         description="Compare search algorithms on analytic problems with known fronts.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,

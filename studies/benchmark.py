@@ -40,7 +40,7 @@ from studies.benchmark_text import report
 from studies.benchmark_turns import Evaluate, interleaved, progress, summary
 from studies.plain.candidate import PlainEvaluator
 from studies.plain.verdict import PlainJudge
-from studies.program import add_verbose, carried_out, run_program
+from studies.program import Parser, add_verbose, carried_out, run_program
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=PROGRAM,
         description="Milliseconds per candidate: compiled, interpreted and written plainly.",
     )

@@ -7,31 +7,25 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn, get_args
+from typing import get_args
 
 from hybrid_opt import metaheuristics
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.execution import ExecutorName
+from hybrid_opt.campaign.experiment_stage import drivable_settings
 from hybrid_opt.campaign.settings import FirstGeneration
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.metaheuristics.problem import ConstraintHandling
 from hybrid_opt.polishing.presets import DRIVABLE_ATTEMPTS, quick_settings
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
+from studies.program import Parser
 from symbolic.errors import SettingsError
 
 _DEFAULT = CampaignSettings()
 
 QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 2
 """Evaluations and replicas of a small but complete study."""
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser that says in one line what is wrong with a command."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print the message and end the program with code 2."""
-        self.exit(2, f"{self.prog}: {message}; see --help\n")
 
 
 def campaign_parser(program: str, description: str, output: str) -> Parser:
@@ -42,7 +36,7 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         description: what it does.
         output: the results folder where none is given, for the help.
     """
-    parser = Parser(prog=program, description=description, allow_abbrev=False)
+    parser = Parser(prog=program, description=description)
     search = parser.add_argument_group("search (decides the results)")
     search.add_argument(
         "--quick",
@@ -50,6 +44,13 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         help=f"a small but complete study: {QUICK_REPLICAS} replicas of {QUICK_EVALUATIONS} "
         "evaluations where no other numbers are given, polished to a third as many points in fewer "
         "attempts, its pictures as PNG only (default: off)",
+    )
+    search.add_argument(
+        "--recommend-only",
+        action="store_true",
+        help="only what the carry to run needs: the drivable search, one replica of one algorithm "
+        "where no other numbers are given, its polish and the recommendation; no experiment of the "
+        "paper, no pictures (default: off)",
     )
     search.add_argument(
         "--evaluations",
@@ -147,12 +148,22 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
     )
     work = parser.add_argument_group("work (does not change the results)")
     work.add_argument(
-        "--output", type=Path, metavar="DIR", help=f"results folder (default: {output})"
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help=f"results folder (default: {output}, "
+        "with --recommend-only its name ends in -recommended)",
     )
     work.add_argument(
         "--resume",
         action="store_true",
         help="continue what the results folder holds (default: refuse to touch it)",
+    )
+    work.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="remove the results that the folder holds and begin anew (default: refuse to touch "
+        "it)",
     )
     work.add_argument(
         "--jobs",
@@ -208,6 +219,9 @@ def campaign_settings(
     Args:
         objectives: what is minimised where the options do not say.
 
+    Returns:
+        Those of the drivable experiment where only a recommendation is asked for.
+
     Raises:
         SettingsError: a value is not allowed.
     """
@@ -216,8 +230,10 @@ def campaign_settings(
         evaluations = QUICK_EVALUATIONS if options.quick else _DEFAULT.evaluations
     if replicas is None:
         replicas = QUICK_REPLICAS if options.quick else _DEFAULT.replicas
-    return CampaignSettings(
-        algorithms=_once(options.algorithm, _DEFAULT.algorithms),
+        replicas = 1 if options.recommend_only else replicas
+    usual = _DEFAULT.algorithms[: 1 if options.recommend_only else None]
+    settings = CampaignSettings(
+        algorithms=_once(options.algorithm, usual),
         evaluations=evaluations,
         replicas=replicas,
         seed=options.seed,
@@ -226,6 +242,7 @@ def campaign_settings(
         first_generation=options.first_generation,
         populations=tuple(options.population or ()),
     )
+    return drivable_settings(settings) if options.recommend_only else settings
 
 
 def polish_settings(
@@ -272,6 +289,7 @@ def execution_settings(options: argparse.Namespace, output: Path) -> ExecutionSe
         executor=options.executor,
         scheduler=options.scheduler,
         resume=options.resume,
+        overwrite=options.overwrite,
     )
 
 

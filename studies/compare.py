@@ -1,13 +1,13 @@
 """Compare two campaigns: `python -m studies.compare RUN_A RUN_B`.
 
 Prints, per algorithm that both ran, medians and quartiles of every figure over the replicas, an
-exact Mann-Whitney test with its effect size, and what differs between the two configurations.
-Indicators that depend on a reference front are computed anew against the union of both.
+exact Mann-Whitney test with its effect size, and what differs between the two configurations;
+where both have them, also of the polished fronts and of the drivable experiments. Indicators that
+depend on a reference front are computed anew against the union of both.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt.campaign.layout import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
 from hybrid_opt.campaign.summary import CampaignSummary
@@ -24,7 +25,7 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
 from hybrid_opt.store.json_records import to_json
-from studies.program import add_verbose, carried_out, run_program
+from studies.program import Parser, add_verbose, carried_out, run_program
 from studies.summary import LEAST_TESTED, reference_front
 from studies.terminal_summary import title
 from studies.text_table import number, text_table
@@ -35,8 +36,14 @@ PROGRAM = "python -m studies.compare"
 SEARCHED = ("feasible_share", "non_dominated", "hypervolume", "igd", "spacing")
 """Figures computed anew from the stored candidates."""
 
+OF_FRONTS = SEARCHED[1:]
+"""Those of them that a polished front has as well."""
+
 STORED = ("mean_excess_above_static", "payload_limit", "seconds")
 """Figures taken from summary.json."""
+
+POLISHED = "polished_"
+"""In front of the figures of polished fronts."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,7 @@ class CampaignComparison:
         differences: configuration key, first and second value.
         figures: of the algorithms that both ran.
         only: per campaign the algorithms that the other lacks.
+        drivable: their drivable experiments, None where one has none beside its first.
     """
 
     runs: tuple[str, str]
@@ -74,6 +82,7 @@ class CampaignComparison:
     differences: tuple[tuple[str, str, str], ...]
     figures: tuple[ComparedFigure, ...]
     only: tuple[tuple[str, ...], tuple[str, ...]]
+    drivable: CampaignComparison | None = None
 
 
 def compare(first: Path, second: Path) -> CampaignComparison:
@@ -86,10 +95,7 @@ def compare(first: Path, second: Path) -> CampaignComparison:
     folders = (first, second)
     runs = tuple(read_campaign(folder) for folder in folders)
     summaries = tuple(read_summary(folder) for folder in folders)
-    for run in runs:
-        for replica in run.replicas:
-            # Told if it is damaged, as a later look at the same results would.
-            read_polished(run.root, replica, run.workcell)
+    polished = tuple(_polished(run) for run in runs)
     if runs[0].objectives != runs[1].objectives:
         raise ResultsError(
             f"{first} minimises {', '.join(runs[0].objectives)}, {second} "
@@ -98,12 +104,15 @@ def compare(first: Path, second: Path) -> CampaignComparison:
     shared = [name for name in runs[0].algorithms if name in runs[1].algorithms]
     if not shared:
         raise ResultsError(f"{first} and {second} have no algorithm in common")
-    reference = reference_front([replica.front for run in runs for replica in run.replicas])
+    every = [replica.front for run in runs for replica in run.replicas]
+    every += [front for fronts in polished for front in fronts.values()]
+    reference = reference_front(every)
     figures = [
         figure
         for name in shared
-        for figure in _algorithm_figures(name, (runs[0], runs[1]), summaries, reference)
+        for figure in _algorithm_figures(name, runs, summaries, polished, reference)
     ]
+    both = all((folder / DRIVABLE / SUMMARY).exists() for folder in folders)
     return CampaignComparison(
         (str(first), str(second)),
         runs[0].workcell.digest == runs[1].workcell.digest,
@@ -112,44 +121,69 @@ def compare(first: Path, second: Path) -> CampaignComparison:
         tuple(  # type: ignore[arg-type]
             tuple(name for name in run.algorithms if name not in shared) for run in runs
         ),
+        compare(first / DRIVABLE, second / DRIVABLE) if both else None,
     )
+
+
+def _polished(run: CampaignResults) -> dict[tuple[str, int], Array]:
+    """Objectives of a campaign's polished fronts, by algorithm and replica."""
+    found = {}
+    for replica in run.replicas:
+        polished = read_polished(run.root, replica, run.workcell)
+        if polished is not None:
+            found[replica.algorithm, replica.replica] = polished.objectives
+    return found
 
 
 def _algorithm_figures(
     name: str,
-    runs: tuple[CampaignResults, CampaignResults],
+    runs: Sequence[CampaignResults],
     summaries: Sequence[CampaignSummary],
+    polished: Sequence[Mapping[tuple[str, int], Array]],
     reference: Array,
 ) -> list[ComparedFigure]:
-    columns = [[_searched(replica, reference) for replica in run.of(name)] for run in runs]
-    stored = [list(map(vars, summary.algorithms[name].replicas)) for summary in summaries]
-    compared = []
-    for figure in (*SEARCHED, *STORED):
-        rows = columns if figure in SEARCHED else stored
-        values = [np.array([row[figure] for row in side], dtype=float) for side in rows]
-        known = all(np.isfinite(side).any() and len(side) >= LEAST_TESTED for side in values)
-        labels = ("first", "second")
-        compared.append(
-            ComparedFigure(
-                name,
-                figure,
-                summarise(values[0]),
-                summarise(values[1]),
-                rank_test(values[0], values[1], labels) if known else None,
-            )
-        )
-    return compared
+    sides = []
+    for run, summary, fronts in zip(runs, summaries, polished, strict=True):
+        stored = summary.algorithms[name].replicas
+        values = {figure: [float(getattr(one, figure)) for one in stored] for figure in STORED}
+        values |= _columns([_searched(replica, reference) for replica in run.of(name)])
+        better = [one.polished for one in stored if one.polished is not None]
+        known = [front for (algorithm, _), front in fronts.items() if algorithm == name]
+        if better and known:
+            values |= _columns([_of_front(front, reference) for front in known], POLISHED)
+            values |= {
+                POLISHED + figure: [float(getattr(one, figure)) for one in better]
+                for figure in STORED
+            }
+        sides.append(values)
+    order = [prefix + figure for prefix in ("", POLISHED) for figure in (*SEARCHED, *STORED)]
+    return [
+        _compared(name, figure, *(np.array(side[figure]) for side in sides))
+        for figure in order
+        if all(figure in side for side in sides)
+    ]
+
+
+def _compared(name: str, figure: str, first: Array, second: Array) -> ComparedFigure:
+    known = all(np.isfinite(side).any() and len(side) >= LEAST_TESTED for side in (first, second))
+    test = rank_test(first, second, ("first", "second")) if known else None
+    return ComparedFigure(name, figure, summarise(first), summarise(second), test)
+
+
+def _columns(rows: Sequence[Mapping[str, float]], prefix: str = "") -> dict[str, list[float]]:
+    return {prefix + figure: [row[figure] for row in rows] for figure in rows[0]}
 
 
 def _searched(replica: Replica, reference: Array) -> dict[str, float]:
-    front = replica.front
-    return {
-        "feasible_share": metrics.feasible_share(replica.evaluations.feasible),
-        "non_dominated": float(len(front)),
-        "hypervolume": metrics.hypervolume(front, metrics.reference_point(reference.shape[1])),
-        "igd": metrics.igd(front, reference),
-        "spacing": metrics.spacing(front),
-    }
+    share = metrics.feasible_share(replica.evaluations.feasible)
+    return {"feasible_share": share, **_of_front(replica.front, reference)}
+
+
+def _of_front(front: Array, reference: Array) -> dict[str, float]:
+    """`OF_FRONTS` of a front (k, n_obj)."""
+    volume = metrics.hypervolume(front, metrics.reference_point(reference.shape[1]))
+    found = (float(len(front)), volume, metrics.igd(front, reference), metrics.spacing(front))
+    return dict(zip(OF_FRONTS, found, strict=True))
 
 
 def _with_holm(figures: list[ComparedFigure]) -> tuple[ComparedFigure, ...]:
@@ -209,6 +243,8 @@ def as_text(found: CampaignComparison) -> str:
     lines.append(
         "A12: chance that A has the larger figure. Exact Mann-Whitney tests from five replicas on."
     )
+    if found.drivable is not None:
+        lines += ["", "The drivable experiments", "", as_text(found.drivable)]
     return "\n".join(lines)
 
 
@@ -220,7 +256,7 @@ def _spread(summary: Summary) -> str:
 @carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
-    parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
+    parser = Parser(prog=PROGRAM, description=__doc__)
     parser.add_argument("first", type=Path, metavar="RUN_A", help="a results folder")
     parser.add_argument("second", type=Path, metavar="RUN_B", help="another results folder")
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")

@@ -36,8 +36,7 @@ from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.store.json_records import to_json
-from studies.cli import Parser
-from studies.program import add_verbose, carried_out, run_program
+from studies.program import Parser, add_verbose, carried_out, run_program
 from studies.reference_front import ReferenceFront, read_reference_front
 from studies.terminal_summary import title
 from studies.text_table import number, text_table
@@ -259,7 +258,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog=PROGRAM,
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("results", type=Path, metavar="RESULTS", help="folder of a polished study")
     parser.add_argument(

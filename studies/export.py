@@ -32,7 +32,7 @@ from hybrid_opt.timing import (
 )
 from hybrid_opt.timing.model import TimingModel
 from studies.options import add_leader
-from studies.program import program_of, run_program
+from studies.program import Parser, program_of, run_program
 from symbolic.errors import SettingsError
 
 PROGRAM = "python -m studies.export"
@@ -41,7 +41,7 @@ TIMINGS = ("closest", "fastest", "force")
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=PROGRAM,
         description="Plan the whole job around a stored trajectory (approach, press, lift, carry, "
         "set down, release, retreat) and write it as one bundle with a manifest, in a folder of "

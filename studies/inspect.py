@@ -13,15 +13,16 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.carry import Judgement
-from studies.inspection import Branch, Inspection, Optimum, inspect
+from studies.inspection import Inspection, Optimum
+from studies.inspection_branches import Branch
 from studies.options import seed, whole
-from studies.program import add_verbose, carried_out, run_program
-from symbolic.read.cell import load
+from studies.program import Parser, add_verbose, carried_out, load_workcell, run_program
 
 _IN_THE_WAY = {
     "pairs": "Pairs that collide first",
@@ -34,55 +35,56 @@ MOST_TOLD = 10
 PROGRAM = "python -m studies.inspect"
 
 
-def as_text(found: Inspection, pairs: bool = False) -> str:
-    """An inspection for people.
+def told(found: Inspection, pairs: bool = False) -> Iterator[str]:
+    """An inspection for people, in lines that come as soon as they are known.
 
     Args:
         pairs: whether every pair of bodies is listed.
     """
-    lines = [found.name, ""]
-    lines += [f"  {heading}: {text}" for heading, text in found.facts.items()]
-    lines += ["", "Postures at the start, best first (* used), along the hand-made trajectory"]
-    for robot, branches in found.branches.items():
-        lines.append(f"  {robot}")
-        lines += [f"  {'*' if b.chosen else ' '} {_branch_text(b)}" for b in branches]
+    yield from (found.name, "")
+    yield from (f"  {heading}: {text}" for heading, text in found.facts.items())
     still = ", ".join(f"{force:.2f}" for force in found.static_normal_force)
     share = ", ".join(f"{value:.4f}" for value in found.static_objectives)
-    lines += [
-        "",
+    yield ""
+    yield (
         f"At rest, level: normal forces {still} N, objectives {share}; payload at the reference "
-        f"force {found.static_payload_limit:.2f} kg",
-        f"Hand-made trajectory: {_judged_text(found.initial)}",
-        *_why(found, "initial"),
-        f"Straight line: {_judged_text(found.straight_line)}",
-        *_why(found, "straight_line"),
-        "",
+        f"force {found.static_payload_limit:.2f} kg"
+    )
+    found.build()
+    yield f"Hand-made trajectory: {_judged_text(found.initial)}"
+    yield from _why(found, "initial")
+    yield f"Straight line: {_judged_text(found.straight_line)}"
+    yield from _why(found, "straight_line")
+    yield from ("", "Postures at the start, best first (* used), along the hand-made trajectory")
+    for robot, branches in found.branches.items():
+        yield f"  {robot}"
+        yield from (f"  {'*' if b.chosen else ' '} {_branch_text(b)}" for b in branches)
+    yield ""
+    yield (
         f"{found.candidates} random candidates within the bounds (seed {found.seed}): "
-        f"{100.0 * found.feasible_share:.1f} % feasible",
-    ]
-    lines += [
-        f"  {name.replace('_', ' ')}: {count} ({100.0 * count / found.candidates:.1f} %)"
-        for name, count in found.infeasible_by_reason.items()
-    ]
-    if found.optimum is not None:
-        lines += ["", *_optimum_lines(found.optimum)]
+        f"{100.0 * found.feasible_share:.1f} % feasible"
+    )
+    for name, count in found.infeasible_by_reason.items():
+        yield f"  {name.replace('_', ' ')}: {count} ({100.0 * count / found.candidates:.1f} %)"
     for heading, title in _IN_THE_WAY.items():
         counts = list(found.in_the_way[heading].items())[:MOST_TOLD]
         if counts:
-            lines += ["", f"{title}, in {found.explained_candidates} of the infeasible ones:"]
-            lines += [f"  {name}: {count}" for name, count in counts]
+            yield from ("", f"{title}, in {found.explained_candidates} of the infeasible ones:")
+            yield from (f"  {name}: {count}" for name, count in counts)
     checked, left_out = len(found.active_pairs), len(found.excluded_pairs)
-    lines += ["", f"Collision pairs: {checked} checked, {left_out} left out"]
+    yield ""
+    yield f"Collision pairs: {checked} checked, {left_out} left out" + (
+        "" if pairs else " (--pairs lists them, and why)"
+    )
     if pairs:
-        lines += [f"  {first} – {second}" for first, second in found.active_pairs]
-        lines += [f"  {first} – {second}: {why}" for first, second, why in found.excluded_pairs]
-    else:
-        lines[-1] += " (--pairs lists them, and why)"
+        yield from (f"  {first} – {second}" for first, second in found.active_pairs)
+        yield from (f"  {first} – {second}: {why}" for first, second, why in found.excluded_pairs)
+    if found.optimum is not None:
+        yield from ("", *_optimum_lines(found.optimum))
     if found.files:
-        lines += ["", "Pictures: " + ", ".join(found.files)]
+        yield from ("", "Pictures: " + ", ".join(found.files))
     if found.view:
-        lines += ["", f"View: {found.view} (open it in a browser)"]
-    return "\n".join(lines)
+        yield from ("", f"View: {found.view} (open it in a browser)")
 
 
 def _why(found: Inspection, name: str) -> list[str]:
@@ -124,7 +126,7 @@ def _judged_text(judgement: Judgement) -> str:
 @carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
-    parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
+    parser = Parser(prog=PROGRAM, description=__doc__)
     parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
     parser.add_argument(
         "--candidates",
@@ -159,15 +161,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_verbose(parser)
     options = parser.parse_args(arguments)
     output = options.output or Path("inspect") / options.workcell.stem
-    found = inspect(
-        load(options.workcell),
+    found = Inspection(
+        load_workcell(options.workcell),
         options.candidates,
         options.seed,
         None if options.no_pictures else output,
         options.polish,
         output / "view.html" if options.view else None,
     )
-    print(json.dumps(asdict(found), indent=2) if options.json else as_text(found, options.pairs))
+    found.progress = Progress()
+    if options.json:
+        found.build()
+        print(json.dumps(found.document(), default=asdict, indent=2))
+    else:
+        for line in told(found, options.pairs):
+            print(line, flush=True)
     return 0
 
 

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import hybrid_opt as ho
-from hybrid_opt.carry import Judgement
+from hybrid_opt.building import Maker, build_all
+from hybrid_opt.campaign.progress import Progress
+from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.bounds import BindingBound, binding_bounds
+from studies.inspection_branches import Branch, branches_of
 from studies.inspection_pictures import draw, show
 from symbolic.array import Array
-from symbolic.cell_model import CellModel, own_pairs
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 from symbolic.records.task import straight_line
-from symbolic.robot.branches import StartBranch, initial_poses
 
 EXPLAINED = 200
 """Most infeasible candidates that are looked at closer."""
@@ -27,23 +31,6 @@ EXPLAINED = 200
 POLISH_ATTEMPTS = 10
 """Solves of the short polish: the trajectory itself, then ends, middle and gaps of what it
 becomes."""
-
-
-@dataclass(frozen=True)
-class Branch:
-    """A posture of one arm at the start and the least margins of the hand-made trajectory from
-    there; see `symbolic.robot.branches.StartBranch`. The clearance is measured by FCL, 0 where
-    bodies intersect and None where nothing can collide. Joints that slide are in mm, others in deg;
-    `limit_margins` holds the least distance to a limit of either kind by its unit."""
-
-    joints: tuple[float, ...]
-    joint_units: tuple[str, ...]
-    kept_samples: int
-    clearance_mm: float | None
-    limit_margins: dict[str, float]
-    manipulability: float
-    least_manipulability: float
-    chosen: bool
 
 
 @dataclass(frozen=True)
@@ -61,177 +48,216 @@ class Optimum:
     problem: str = ""
 
 
-@dataclass(frozen=True)
 class Inspection:
-    """Everything that the program prints.
+    """What there is to know of a cell; each part is worked out when it is first asked for.
 
     Attributes:
-        name: of the workcell.
-        facts: what is in the file, by heading.
-        branches: per robot's name its postures at the start, best first.
-        static_normal_force: of both robots, the level payload at rest [N].
-        static_objectives: the same over the reference forces.
-        static_payload_limit: payload that reaches the reference force at rest [kg].
-        initial, straight_line: verdicts on the hand-made trajectory and on the straight line.
-        explained: by 'initial' and 'straight_line' what is in the way of them, where they fail.
-        candidates: random candidates judged.
+        candidates: random candidates to judge.
         seed: of their randomness.
-        feasible_share: of them.
-        infeasible_by_reason: of them, by the constraint violated first.
-        explained_candidates: infeasible ones of them that were looked at closer.
-        in_the_way: of these, how often each pair of bodies, joint and robot is in the way first.
-        optimum: a short polish, None where none was asked for.
-        active_pairs: pairs of bodies that are checked.
-        excluded_pairs: pairs that are not, and why.
-        files: pictures written.
-        view: the page that shows the hand-made trajectory, '' where none was asked for.
+        progress: where to show what takes long; nowhere unless another one is set.
     """
 
-    name: str
-    facts: dict[str, str]
-    branches: dict[str, tuple[Branch, ...]]
-    static_normal_force: tuple[float, ...]
-    static_objectives: tuple[float, ...]
-    static_payload_limit: float
-    initial: Judgement
-    straight_line: Judgement
-    explained: dict[str, str]
-    candidates: int
-    seed: int
-    feasible_share: float
-    infeasible_by_reason: dict[str, int]
-    explained_candidates: int
-    in_the_way: dict[str, dict[str, int]]
-    optimum: Optimum | None
-    active_pairs: tuple[tuple[str, str], ...]
-    excluded_pairs: tuple[tuple[str, str, str], ...]
-    files: tuple[str, ...]
-    view: str
+    def __init__(
+        self,
+        workcell: Workcell,
+        candidates: int,
+        seed: int,
+        output: Path | None,
+        polish: bool = False,
+        view: Path | None = None,
+    ) -> None:
+        """Nothing is worked out yet.
+
+        Args:
+            workcell: the cell.
+            candidates: random ones to judge, at least 1.
+            seed: of their randomness.
+            output: folder for the pictures, None to draw none.
+            polish: whether to polish the hand-made trajectory shortly, to see which bounds bind.
+            view: file for a page that shows the hand-made trajectory, None for none.
+
+        Raises:
+            SettingsError: no candidates.
+        """
+        if candidates < 1:
+            raise SettingsError(f"--candidates is {candidates}; at least 1 is needed")
+        self.candidates, self.seed = candidates, seed
+        self._cell, self._output, self._polish, self._view = Cell(workcell), output, polish, view
+        self.progress = Progress(shown=False)
+
+    @property
+    def name(self) -> str:
+        """Of the workcell."""
+        return self._cell.workcell.name
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What is in the file, by heading."""
+        return _facts(self._cell.workcell)
+
+    def build(self) -> None:
+        """Compile what is not compiled yet; what cannot be is told by who needs it."""
+        makers: list[Maker] = [lambda: self._cell.evaluator]
+        if self._polish:
+            makers.append(lambda: self._cell.polish_functions)
+        build_all(makers, self.progress)
+
+    @cached_property
+    def branches(self) -> dict[str, tuple[Branch, ...]]:
+        """Per robot's name its postures at the start, best first."""
+        robots = self._cell.workcell.robots
+        return {robot.name: branches_of(self._cell, i) for i, robot in enumerate(robots)}
+
+    @property
+    def static_normal_force(self) -> tuple[float, ...]:
+        """Of both robots, the level payload at rest [N]."""
+        return tuple(self._cell.static_hold.normal_force.tolist())
+
+    @property
+    def static_objectives(self) -> tuple[float, ...]:
+        """The same over the reference forces."""
+        force = self._cell.static_hold.normal_force
+        return tuple((force / self._cell.workcell.task.reference_force).tolist())
+
+    @property
+    def static_payload_limit(self) -> float:
+        """Payload that reaches the reference force at rest [kg]."""
+        return self._cell.static_hold.payload_limit
+
+    @property
+    def initial(self) -> Judgement:
+        """The verdict on the hand-made trajectory."""
+        return _judged(self._carries["initial"])
+
+    @property
+    def straight_line(self) -> Judgement:
+        """The verdict on the straight line."""
+        return _judged(self._carries["straight_line"])
+
+    @cached_property
+    def _carries(self) -> dict[str, Carry]:
+        line = straight_line(self._cell.workcell.task)
+        return {
+            "initial": self._cell.carry(self._cell.initial),
+            "straight_line": self._cell.carry(line),
+        }
+
+    @cached_property
+    def _explained(self) -> dict[str, Explanation]:
+        """What is in the way of those that fail, by their names."""
+        found = {}
+        for name, carry in self._carries.items():
+            for explanation in explain(self._cell.evaluator, self._cell.evaluate(carry.x)):
+                found[name] = explanation
+        return found
+
+    @property
+    def explained(self) -> dict[str, str]:
+        """By 'initial' and 'straight_line' what is in the way of them, where they fail."""
+        return {name: str(why) for name, why in self._explained.items()}
+
+    @cached_property
+    def _found(self) -> Evaluations:
+        rng = np.random.default_rng(self.seed)
+        return self._cell.evaluate(self._cell.random(self.candidates, rng))
+
+    @property
+    def feasible_share(self) -> float:
+        """Of the random candidates."""
+        return float(self._found.feasible.mean())
+
+    @property
+    def infeasible_by_reason(self) -> dict[str, int]:
+        """Of them, by the constraint violated first."""
+        return self._found.infeasible_by_reason
+
+    @property
+    def _failed(self) -> Evaluations:
+        return self._found[~self._found.feasible][:EXPLAINED]
+
+    @property
+    def explained_candidates(self) -> int:
+        """Infeasible ones of them that were looked at closer."""
+        return len(self._failed)
+
+    @cached_property
+    def in_the_way(self) -> dict[str, dict[str, int]]:
+        """Of these, how often each pair of bodies, joint and robot is in the way first."""
+        return frequent(explain(self._cell.evaluator, self._failed))
+
+    @cached_property
+    def optimum(self) -> Optimum | None:
+        """A short polish, None where none was asked for."""
+        return _optimum(self._cell, self.progress) if self._polish else None
+
+    @property
+    def active_pairs(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of bodies that are checked."""
+        return self._cell.geometry.pair_names
+
+    @property
+    def excluded_pairs(self) -> tuple[tuple[str, str, str], ...]:
+        """Pairs that are not, and why."""
+        geometry = self._cell.geometry
+        names = [body.name for body in geometry.bodies]
+        return tuple((names[p.first], names[p.second], p.reason) for p in geometry.excluded)
+
+    @cached_property
+    def files(self) -> tuple[str, ...]:
+        """Pictures written.
+
+        Raises:
+            SettingsError: the folder cannot be made.
+        """
+        if self._output is None:
+            return ()
+        self.progress.note("drawing pictures (--no-pictures leaves them out)")
+        return draw(self._cell, self._carries, self._explained, self._output)
+
+    @cached_property
+    def view(self) -> str:
+        """The page that shows the hand-made trajectory, '' where none was asked for.
+
+        Raises:
+            DualArmError: it cannot be written.
+        """
+        if self._view is None:
+            return ""
+        return show(self._carries["initial"], self._explained.get("initial"), self._view)
+
+    def document(self) -> dict[str, Any]:
+        """All of it as JSON values; records are left to `dataclasses.asdict`."""
+        public = [name for name, part in vars(Inspection).items() if _is_part(name, part)]
+        return {name: getattr(self, name) for name in ("candidates", "seed", *public)}
 
 
-def inspect(
-    workcell: Workcell,
-    candidates: int,
-    seed: int,
-    output: Path | None,
-    polish: bool = False,
-    view: Path | None = None,
-) -> Inspection:
-    """Look at a workcell.
-
-    Args:
-        workcell: the cell.
-        candidates: random ones to judge, at least 1.
-        seed: of their randomness.
-        output: folder for the pictures, None to draw none.
-        polish: whether to polish the hand-made trajectory shortly, to see which bounds bind.
-        view: file for a page that shows the hand-made trajectory, None for none.
-
-    Raises:
-        SettingsError: no candidates.
-        DualArmError: the cell cannot be modelled, or the folder not written.
-    """
-    if candidates < 1:
-        raise SettingsError(f"--candidates is {candidates}; at least 1 is needed")
-    cell = Cell(workcell)
-    model = cell.compiled.model
-    found = cell.evaluate(cell.random(candidates, np.random.default_rng(seed)))
-    hold = cell.static_hold
-    geometry = model.geometry
-    names = [body.name for body in geometry.bodies]
-    initial = cell.carry(cell.initial)
-    line = cell.carry(straight_line(workcell.task))
-    assert initial.judgement is not None
-    assert line.judgement is not None
-    failed = found[~found.feasible][:EXPLAINED]
-    explained = _explained(cell, {"initial": initial.x, "straight_line": line.x})
-    carries = {"initial": initial, "straight_line": line}
-    return Inspection(
-        name=workcell.name,
-        facts=_facts(workcell),
-        branches={robot.name: _branches(cell, model, i) for i, robot in enumerate(workcell.robots)},
-        static_normal_force=tuple(hold.normal_force.tolist()),
-        static_objectives=tuple((hold.normal_force / workcell.task.reference_force).tolist()),
-        static_payload_limit=hold.payload_limit,
-        initial=initial.judgement,
-        straight_line=line.judgement,
-        explained={name: str(why) for name, why in explained.items()},
-        candidates=candidates,
-        seed=seed,
-        feasible_share=float(found.feasible.mean()),
-        infeasible_by_reason=found.infeasible_by_reason,
-        explained_candidates=len(failed),
-        in_the_way=frequent(explain(cell.evaluator, failed)),
-        optimum=_optimum(cell) if polish else None,
-        active_pairs=geometry.pair_names,
-        excluded_pairs=tuple(
-            (names[p.first], names[p.second], p.reason) for p in geometry.excluded
-        ),
-        files=() if output is None else draw(cell, carries, explained, output),
-        view="" if view is None else show(initial, explained.get("initial"), view),
-    )
+def _is_part(name: str, part: object) -> bool:
+    return isinstance(part, property | cached_property) and not name.startswith("_")
 
 
-def _explained(cell: Cell, candidates: dict[str, Array]) -> dict[str, Explanation]:
-    """Explanations of the trajectories that fail, by their names."""
-    found = {}
-    for name, x in candidates.items():
-        for explanation in explain(cell.evaluator, cell.evaluate(x)):
-            found[name] = explanation
-    return found
+def _judged(carry: Carry) -> Judgement:
+    assert carry.judgement is not None, "carries of a cell are judged"
+    return carry.judgement
 
 
-def _optimum(cell: Cell) -> Optimum:
+def _optimum(cell: Cell, progress: Progress) -> Optimum:
     """A short polish of the hand-made trajectory, and the bounds that bind where it ends."""
     verdicts = cell.evaluate(cell.initial)
     if not verdicts.feasible.all():
         return Optimum(0, (), "the hand-made trajectory, its start, is infeasible")
+    progress.note("polishing the hand-made trajectory shortly (--no-polish leaves it out)")
     try:
-        front = ho.polish(
-            cell,
-            Front.of_search(cell, "hand-made", verdicts),
-            rng=np.random.default_rng(0),
-            settings=ho.PolishSettings(attempts=POLISH_ATTEMPTS),
-        )
+        with progress.stage("short polish", POLISH_ATTEMPTS, "attempts") as advance:
+            front = ho.polish(
+                cell,
+                Front.of_search(cell, "hand-made", verdicts),
+                rng=np.random.default_rng(0),
+                settings=ho.PolishSettings(attempts=POLISH_ATTEMPTS),
+                told=lambda outcome: advance(1),
+            )
     except SettingsError as error:
         return Optimum(0, (), str(error))
     return Optimum(len(front), binding_bounds(cell.workcell.task, front.x))
-
-
-def _branches(cell: Cell, model: CellModel, arm: int) -> tuple[Branch, ...]:
-    return tuple(_branch(cell, model, arm, branch) for branch in model.branches[arm])
-
-
-def _branch(cell: Cell, model: CellModel, arm: int, branch: StartBranch) -> Branch:
-    robot, units = cell.workcell.robots[arm], np.where(model.robots[arm].turning, "deg", "mm")
-    factor = np.where(units == "deg", np.degrees(1.0), 1e3)
-    path = branch.path[: max(branch.kept, 1)]
-    room = np.minimum(path - robot.position_lower, robot.position_upper - path).min(axis=0) * factor
-    return Branch(
-        joints=tuple((branch.q * factor).round(2).tolist()),
-        joint_units=tuple(units.tolist()),
-        kept_samples=branch.kept,
-        clearance_mm=_clearance_mm(cell, arm, branch),
-        limit_margins={str(unit): float(room[units == unit].min()) for unit in np.unique(units)},
-        manipulability=branch.manipulability,
-        least_manipulability=cell.workcell.robots[arm].min_manipulability,
-        chosen=bool(np.allclose(branch.q, model.start[arm])),
-    )
-
-
-def _clearance_mm(cell: Cell, arm: int, branch: StartBranch) -> float | None:
-    """FCL's least distance of one arm from all but the other along the samples that it keeps."""
-    checker, kept = cell.evaluator.checker, max(branch.kept, 1)
-    own = own_pairs(cell.geometry, arm)
-    if not own:
-        return None
-    pose = np.ascontiguousarray(initial_poses(cell.workcell)[:kept])
-    path = np.ascontiguousarray(branch.path[:kept])
-    absent = np.zeros((kept, cell.geometry.arms[1 - arm].joints))
-    joints = (path, absent) if arm == 0 else (absent, path)
-    bounds = np.full((kept, len(cell.geometry.active)), np.inf)
-    bounds[:, own] = checker.bounds(pose, *joints)[:, own]
-    return 1e3 * checker.min_distance(pose, joints[0], joints[1], bounds)[0]
 
 
 def _facts(workcell: Workcell) -> dict[str, str]:

@@ -5,18 +5,68 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import shlex
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import wraps
-from typing import Protocol, TextIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TextIO
 
-from symbolic.errors import DualArmError, DualArmWarning
+from symbolic import outside
+from symbolic.errors import DualArmError, DualArmWarning, OutsideError, WorkcellError
+from symbolic.records.problems import suggestion
+
+if TYPE_CHECKING:
+    from symbolic.records import Workcell
 
 BAD_INPUT = 2
 INTERRUPTED = 130
 
 VERBOSE = "--verbose"
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that says in one line what is wrong with a command, and what may be meant."""
+
+    def __init__(self, *, prog: str, description: str | None, **more: Any) -> None:
+        """Take what `argparse.ArgumentParser` takes; options are not abbreviated."""
+        super().__init__(prog=prog, description=description, allow_abbrev=False, **more)
+
+    def error(self, message: str) -> NoReturn:
+        """Print the message and end the program with code 2."""
+        head, _, words = message.partition("unrecognized arguments: ")
+        known = self._option_string_actions if not head else ()
+        meant = [
+            suggestion(word.partition("=")[0], known)
+            for word in words.split()
+            if word.startswith("-")
+        ]
+        self.exit(BAD_INPUT, f"{self.prog}: {message}{''.join(meant)}; see --help\n")
+
+
+def load_workcell(path: Path) -> Workcell:
+    """The workcell that a program is given.
+
+    Raises:
+        WorkcellError: with all problems of the file; of a problem file, what completes it.
+    """
+    from symbolic.read.cell import load
+
+    try:
+        return load(path)
+    except WorkcellError as error:
+        with suppress(OutsideError):
+            content = outside.read_bytes(outside.resolved(path), outside.WORKCELL_BYTES)
+            task = outside.toml_tables(content).get("task")
+            if isinstance(task, dict) and task.keys().isdisjoint({"waypoints", "initial"}):
+                raise DualArmError(
+                    f"{error}\nIt has no carry yet; a workcell with one is made of such a problem "
+                    f"file by: python -m studies.propose {shlex.quote(str(path))}"
+                ) from error
+        raise
 
 
 class Main(Protocol):
@@ -49,9 +99,12 @@ def run_program(main: Callable[[], int]) -> int:
     try:
         code = main()
         sys.stdout.flush()
+        if code == INTERRUPTED:
+            _leave()
         return code
     except KeyboardInterrupt:
         print("\ninterrupted", file=sys.stderr)
+        _leave()
         return INTERRUPTED
     except BrokenPipeError:
         # Whoever read the output has enough; the interpreter is not to flush it again.
@@ -70,6 +123,15 @@ def run_program(main: Callable[[], int]) -> int:
         name = f"{error.filename}: " if error.filename else ""
         print(f"{name}{error.strerror or error}", file=sys.stderr)
         return BAD_INPUT
+
+
+def _leave() -> None:
+    """End at once where threads are at work, for which the interpreter would wait: what they make
+    is of no use any more. Files are replaced in one step, so that none is left half written."""
+    main = threading.main_thread()
+    if any(not each.daemon for each in threading.enumerate() if each is not main):
+        sys.stderr.flush()
+        os._exit(INTERRUPTED)
 
 
 def carry_out(program: str, work: Callable[[], int], interrupted: str = "interrupted") -> int:

@@ -8,7 +8,6 @@ search can start with.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +18,7 @@ import numpy as np
 import hybrid_opt as ho
 from studies import BEGUN
 from studies.options import number, seed
-from studies.program import add_verbose, carried_out, run_program
+from studies.program import Parser, add_verbose, carried_out, run_program
 from symbolic.errors import SettingsError
 from symbolic.replacing import replace_file
 
@@ -44,7 +43,7 @@ def _teller(begun: float) -> Callable[[str], None]:
 @carried_out(PROGRAM, "interrupted; nothing was written")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
-    parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
+    parser = Parser(prog=PROGRAM, description=__doc__)
     parser.add_argument("problem", type=Path, metavar="PROBLEM", help="the problem file")
     parser.add_argument(
         "--output",

@@ -6,10 +6,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from hybrid_opt.campaign import Progress
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.errors import ResultsError
-from studies.cli import Parser, add_wishes, wish
-from studies.program import add_verbose, carried_out, run_program
+from studies.cli import add_wishes, wish
+from studies.program import Parser, add_verbose, carried_out, run_program
 from studies.recommendation_stage import recommend_from
 from studies.recommendation_text import recommendation_text
 
@@ -23,7 +24,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog=PROGRAM,
         description="Recommend a carry of a study's drivable fronts, and store its trajectory. The "
         "study's own recommendation stays as it is.",
-        allow_abbrev=False,
     )
     parser.add_argument("results", type=Path, metavar="RESULTS", help="results folder of a study")
     add_wishes(parser)
@@ -33,13 +33,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="FILE",
         help="the trajectory file (default: recommended-WISH.json in RESULTS)",
     )
+    parser.add_argument(
+        "--quiet", action="store_true", help="no progress on standard error (default: shown)"
+    )
     add_verbose(parser)
     options = parser.parse_args(arguments)
     wanted, root = wish(options), options.results
     named = "-".join(f"{name}-{value:g}" for name, value in wanted.given.items()) or "knee"
     path = options.output or root / f"recommended-{named}.json"
     robots = read_summary(root).robots
-    found = recommend_from(root, wanted, path)
+    found = recommend_from(root, wanted, path, Progress(not options.quiet))
     if found is None:
         raise ResultsError(f"{root}: its search found no drivable carry; run a longer one")
     print(recommendation_text(found, robots, str(root)).terminal())

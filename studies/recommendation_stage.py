@@ -12,6 +12,7 @@ import hybrid_opt as ho
 from codegen.function import available_cores
 from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Progress, Stage
 from hybrid_opt.campaign.layout import RECOMMENDATION, RECOMMENDED, STAGES
+from hybrid_opt.campaign.progress import Advance
 from hybrid_opt.campaign.recommended import (
     ForceTable,
     StoredDurations,
@@ -56,27 +57,25 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
     """The stage that writes `recommended.json`, a trajectory file, and `recommendation.json`."""
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        with progress.stage("recommendation", 1, "carry") as advance:
-            request = _Request(folder.root, wish, folder.execution.jobs)
-            (found,) = answer_all(
-                _executor(folder.execution), Job(_nothing, _recommended), [request]
-            )
-            if found is None:  # also after an earlier attempt that was interrupted
-                (folder.root / RECOMMENDATION).unlink(missing_ok=True)
-            else:
-                write_json(folder.root / RECOMMENDATION, to_json(found))
-            advance(1)
+        request = _Request(folder.root, wish, folder.execution.jobs, progress)
+        (found,) = answer_all(_executor(folder.execution), Job(_nothing, _recommended), [request])
+        if found is None:  # also after an earlier attempt that was interrupted
+            (folder.root / RECOMMENDATION).unlink(missing_ok=True)
+        else:
+            write_json(folder.root / RECOMMENDATION, to_json(found))
 
     return Stage("recommendation", run, dict(wish.given))
 
 
 @dataclass(frozen=True)
 class _Request:
-    """A carry to recommend, with the threads of the workers, which wait meanwhile."""
+    """A carry to recommend, in so many threads: those of the workers, which wait meanwhile. The
+    worker itself shows the progress: it alone knows how much there is to do."""
 
     root: Path
     wish: ho.Wish
     threads: int
+    progress: Progress
 
 
 def _executor(execution: ExecutionSettings) -> Executor:
@@ -92,7 +91,7 @@ def _nothing() -> None:
 
 def _recommended(_: None, request: _Request, emit: Emit) -> StoredRecommendation | None:
     path = request.root / RECOMMENDED
-    return recommend_from(request.root, request.wish, path, request.threads)
+    return recommend_from(request.root, request.wish, path, request.progress, request.threads)
 
 
 def read_recommendation(root: Path) -> StoredRecommendation | None:
@@ -109,7 +108,7 @@ def read_recommendation(root: Path) -> StoredRecommendation | None:
 
 
 def recommend_from(
-    root: Path, wish: ho.Wish, path: Path, threads: int = 0
+    root: Path, wish: ho.Wish, path: Path, progress: Progress, threads: int = 0
 ) -> StoredRecommendation | None:
     """Recommend a carry of a study's drivable fronts, and store it.
 
@@ -117,6 +116,7 @@ def recommend_from(
         root: the results folder, its drivable experiment done.
         wish: what is asked for.
         path: the trajectory file to write.
+        progress: where to show it.
         threads: in which carries are timed, 0 for one per core; has no influence on what is found.
 
     Returns:
@@ -134,7 +134,14 @@ def recommend_from(
     cell = ho.Cell(drivable.results.workcell, drivable.results.objectives, threads)
     alone = is_drivable(campaign.workcell, campaign.objectives)
     others = {} if alone else least_force(campaign)
-    found = ho.recommend(cell, drivable.x, wish, others)
+    # The choice, the table's rows and the price.
+    steps = 3 + len(others) + len(drivable.fronts)
+    with progress.stage("recommendation", steps, "steps") as advance:
+        found = ho.recommend(cell, drivable.x, wish, others)
+        advance(1)
+        durations = _force_table(cell, drivable, others, found, advance)
+        price = _price(found.carry, campaign.configuration.settings.seed, threads)
+        advance(1)
     source = drivable.sources[found.member]
     provenance = {
         "recommended": str(wish),
@@ -150,8 +157,8 @@ def recommend_from(
         file=file,
         export=export_command(Path(file), found.force),
         considered=len(drivable.x),
-        durations=_force_table(cell, drivable, others, found),
-        price=_price(found.carry, campaign.configuration.settings.seed, threads),
+        durations=durations,
+        price=price,
     )
     return stored_recommendation(found, told)
 
@@ -168,17 +175,22 @@ def _price(carry: ho.Carry, seed: int, threads: int) -> StoredPrice | None:
 
 
 def _force_table(
-    cell: ho.Cell, drivable: DrivableFronts, others: Mapping[str, Array], found: Recommendation
+    cell: ho.Cell,
+    drivable: DrivableFronts,
+    others: Mapping[str, Array],
+    found: Recommendation,
+    advance: Advance,
 ) -> ForceTable:
     """Every front's durations at the same forces, that of the recommended carry among them."""
     task = cell.workcell.task
     forces = np.unique(np.append(table_forces(cell.workcell, cell.force_kind), found.force))
 
     def durations(paths: Array) -> Array:
-        if len(paths) == 0:
-            return np.full(len(forces), np.inf)
-        driven = DrivenPaths.of(cell, paths)
-        return front_durations(driven, forces)
+        least = np.full(len(forces), np.inf)
+        if len(paths):
+            least = front_durations(DrivenPaths.of(cell, paths), forces)
+        advance(1)
+        return least
 
     paths = {HAND_MADE: cell.initial[: task.n_path]} | dict(others)
     rows = [_row(label, [durations(path[None])]) for label, path in paths.items()]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation, StoredRival
+from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation, StoredRival, set_text
 from hybrid_opt.timing.document import StoredJerk
 from hybrid_opt.timing.records import TimingStatus
 from symbolic.array import Array
@@ -134,7 +134,7 @@ def _robust(price: StoredPrice) -> str:
     if not price.largest_factor:
         allowed = "not even the nominal case"
     return (
-        f"{sure:.1f} N hold in every case of {named} ({price.text}), "
+        f"{sure:.1f} N hold in every case of {named} ({set_text(price)}), "
         f"{_percent(sure / plan)} against the nominal case; the reference forces allow {allowed}; "
         f"{price.failing or 'none'} of {price.cases} random cases "
         f"{'slip' if price.failing != 1 else 'slips'}"

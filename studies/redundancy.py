@@ -6,7 +6,6 @@ positions within their bounds, with the same number of evaluations each.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -22,10 +21,9 @@ from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.locked import LockedEvaluator
 from hybrid_opt.indicators.metrics import front_rows, hypervolume
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
-from studies.program import add_verbose, carried_out, run_program
+from studies.program import Parser, add_verbose, carried_out, load_workcell, run_program
 from studies.text_table import counted
 from symbolic.errors import SettingsError
-from symbolic.read.cell import load
 from symbolic.records import Task
 
 PROGRAM = "python -m studies.redundancy"
@@ -104,7 +102,7 @@ def as_text(found: Sequence[Replica]) -> str:
 @carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
-    parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
+    parser = Parser(prog=PROGRAM, description=__doc__)
     parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
     for name, value, meaning in (
         ("locks", 16, "constant positions, at least"),
@@ -119,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if min(options.locks, options.replicas, options.evaluations) < 1 or options.seed < 0:
         raise SettingsError("allowed are whole numbers from 1, seeds from 0")
-    cell = Cell(load(options.workcell))
+    cell = Cell(load_workcell(options.workcell))
     counts = (options.locks, options.replicas, options.evaluations, options.seed)
     found = compare(cell, *counts)
     print(json.dumps([asdict(one) for one in found]) if options.json else as_text(found))

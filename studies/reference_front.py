@@ -31,11 +31,10 @@ from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
 from hybrid_opt.work.job import Emit, Job, answer_all
 from hybrid_opt.work.processes import local_executor
 from studies.options import seed, whole
-from studies.program import add_verbose, carried_out, run_program
+from studies.program import Parser, add_verbose, carried_out, load_workcell, run_program
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell
 from symbolic.records.task import initial_decision
 
@@ -167,7 +166,7 @@ def read_reference_front(path: Path) -> ReferenceFront:
 @carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=PROGRAM,
         description="Compute the reference front of a workcell.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
@@ -189,7 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"--starts {options.starts} --attempts {options.attempts} --seed {options.seed}"
     )
     front = compute_reference_front(
-        CandidateEvaluator(load(options.workcell)),
+        CandidateEvaluator(load_workcell(options.workcell)),
         options.starts,
         options.attempts,
         np.random.default_rng(options.seed),

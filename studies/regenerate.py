@@ -15,7 +15,7 @@ import numpy as np
 from codegen.build import Build, FunctionReport, build_set
 from codegen.cache import Cache
 from codegen.check import Agreement, compare
-from studies.program import add_verbose, program_of, run_program
+from studies.program import Parser, add_verbose, program_of, run_program
 from studies.text_table import text_table
 
 PROGRAM = "python -m studies.regenerate"
@@ -24,7 +24,7 @@ DISAGREES = 1
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=PROGRAM,
         description="Generate the functions of a workcell as C, compile them and keep them in the "
         "cache (DUAL_ARM_CACHE, by default in the user's cache folder).",
@@ -68,10 +68,11 @@ def _run(options: argparse.Namespace) -> int:
     seconds: float | None = None
     if options.study and options.workcell is not None:
         from hybrid_opt.building import build_study
+        from hybrid_opt.campaign.progress import Progress
         from hybrid_opt.cell import Cell
 
         begin = time.perf_counter()
-        build_study(Cell.load(options.workcell))
+        build_study(Cell.load(options.workcell), Progress())
         seconds = time.perf_counter() - begin
     elif options.workcell is not None:
         from hybrid_opt.compiled_cell import EVALUATOR_LANES, EVALUATORS, CompiledCell

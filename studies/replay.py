@@ -14,7 +14,7 @@ from hybrid_opt.store.replay import Replay, replay
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing import timed_trajectory
 from hybrid_opt.timing.document import timing_document
-from studies.program import add_verbose, program_of, run_program
+from studies.program import Parser, add_verbose, program_of, run_program
 from studies.text_table import text_table
 from studies.timing_text import timing_text
 
@@ -24,7 +24,7 @@ EXIT_DIFFERENT = 1
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=PROGRAM,
         description="Re-evaluate a stored trajectory from its file alone and compare its figures, "
         "and time it for real robots (studies.export writes it for them). Exit code 1 where a "

@@ -1,4 +1,4 @@
-"""Run a whole study of a workcell, see `studies.study`."""
+"""Run a whole study of a workcell: `python -m studies.run WORKCELL`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from studies.program import add_verbose, carry_out, run_program
+from studies.program import add_verbose, carry_out, load_workcell, run_program
 from studies.workers import start_workers
 
 PAGE = "report.html"
@@ -30,6 +30,7 @@ def main(
     start_workers(arguments)
     # Imported only now: meanwhile the server of the workers loads much of the same.
     from hybrid_opt.campaign import Progress
+    from hybrid_opt.cell import Cell
     from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, FORCE_PAIRS, PAPER_OBJECTIVES
     from hybrid_opt.polishing.presets import usual_settings
     from hybrid_opt.witness.outcome import mujoco_module
@@ -43,7 +44,6 @@ def main(
     from studies.drivable import is_drivable
     from studies.report.stage import add_report_options, follow_report_options
     from studies.study import StudySettings, run_study
-    from symbolic.read.cell import load
 
     description = "Search for the least-force carries of a dual-arm workcell."
     output = f"results/{'WORKCELL' if workcell is None else workcell.stem}"
@@ -52,7 +52,7 @@ def main(
     if workcell is None:
         parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
     add_verbose(parser)
-    again = [part for part in arguments if part != "--resume"]
+    again = [part for part in arguments if part not in ("--resume", "--overwrite")]
     command = " ".join([program, shlex.join([*again, "--resume"])])
 
     def work() -> int:
@@ -60,25 +60,30 @@ def main(
         if options.simulate:
             mujoco_module()  # told before hours of work
         path: Path = options.workcell if workcell is None else workcell
-        cell = load(path)
+        cell = load_workcell(path)
+        if options.recommend_only:
+            drivable = Cell(cell).drivable()  # keeps the file of its workcell
+            cell = drivable.workcell
         driven = cell.task.time_law == "optimal"
         settings = campaign_settings(options, DRIVABLE_OBJECTIVES if driven else PAPER_OBJECTIVES)
         alone = is_drivable(cell, settings.objectives)
         polishable = alone or (not driven and settings.objectives in FORCE_PAIRS)
-        execution = execution_settings(options, Path("results") / path.stem)
+        name = f"{path.stem}-recommended" if options.recommend_only else path.stem
+        execution = execution_settings(options, Path("results") / name)
         study = StudySettings(
             polish=polish_settings(options, polishable, usual_settings(cell.task.time_law)),
             drivable=options.drivable,
             drivable_polish=polish_settings(options, True, usual_settings("optimal")),
             wish=wish(options),
             simulate=options.simulate,
-            report=options.report,
+            report=options.report and not options.recommend_only,
+            recommend_only=options.recommend_only,
             with_paper=bool(workcell),
             pdf=not options.quick,
         )
         print(run_study(cell, settings, execution, Progress(not options.quiet), study))
         print(f"\nResults: {execution.output}")
-        if options.report:
+        if study.report:
             print(f"Report: {execution.output / PAGE}")
         follow_report_options(execution.output, options)
         return 0

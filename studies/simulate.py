@@ -20,7 +20,7 @@ from hybrid_opt.witness.cell_scene import ArmSettings
 from hybrid_opt.witness.controller import CONTROLS
 from hybrid_opt.witness.scene import SimulationSettings
 from studies.options import add_leader, force, number, seed, whole
-from studies.program import program_of, run_program
+from studies.program import Parser, program_of, run_program
 from studies.simulate_arms import simulate_arms
 from studies.simulate_pads import simulate_pads
 from symbolic.array import Array
@@ -32,7 +32,7 @@ PADS = "pads"
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=PROGRAM,
         description="Drive a stored trajectory in MuJoCo, pressed with multiples of the planned "
         "normal forces: the least multiple that holds, when and where the box slips, and random "

@@ -12,6 +12,7 @@ from hybrid_opt.campaign import (
     ExecutionSettings,
     Progress,
     Stage,
+    check_stages,
     open_folder,
     run_stages,
     search_stage,
@@ -54,6 +55,7 @@ class StudySettings:
         report: whether figures, tables and the page are written.
         with_paper: whether the figures stand beside those that the paper states.
         pdf: whether pictures are also written as PDF.
+        recommend_only: whether nothing is made that the recommendation does not need.
     """
 
     polish: PolishSettings | None = None
@@ -64,6 +66,7 @@ class StudySettings:
     report: bool = True
     with_paper: bool = False
     pdf: bool = True
+    recommend_only: bool = False
 
 
 def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
@@ -84,7 +87,10 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
         every.append(drivable_stage(driven))
     if study.drivable:
         every.append(recommendation_stage(study.wish))
-    every += [summary_stage(), timing_stage(study.wish.force, last=alone)]
+    every.append(summary_stage())
+    if study.recommend_only:
+        return tuple(every)
+    every.append(timing_stage(study.wish.force, last=alone))
     if study.simulate:
         every.append(simulation_stage())
     if study.report:
@@ -123,22 +129,32 @@ def run_study(
         study = replace(study, polish=None)
     polish = study.polish if alone else study.drivable_polish
     if polish is not None and not is_polishable(cell.task):
-        progress.note("the drivable carries of this cell cannot be polished: search alone")
+        progress.note(
+            "the drivable carries of this cell are not polished, only searched: its task says "
+            f'allocation = "{cell.task.allocation}", and the polish of time and force knows '
+            'the allocation "paper" alone'
+        )
         study = replace(study, drivable_polish=None, polish=None if alone else study.polish)
-    progress.note("compiling what is not compiled yet")
-    build_study(
-        Cell(cell, settings.objectives),
-        polish=study.polish is not None or study.drivable_polish is not None,
-        drivable=study.drivable and not alone,
-    )
     with open_folder(settings, execution, cell) as folder:
         told = store_branches(folder.root, competition)
-        run_stages(folder, stages(study, alone), progress)
-        return told + study_text(folder.root, study.with_paper)
+        every = stages(study, alone)
+        check_stages(folder, every)
+        build_study(
+            Cell(cell, settings.objectives),
+            progress,
+            polish=study.polish is not None or study.drivable_polish is not None,
+            drivable=study.drivable and not alone,
+        )
+        run_stages(folder, every, progress)
+        return told + study_text(folder.root, study.with_paper, study.recommend_only)
 
 
-def study_text(root: Path, with_paper: bool) -> str:
+def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
     """The figures of a finished study for a terminal, the carry to run first.
+
+    Args:
+        with_paper: whether to print what the paper states.
+        brief: whether the carry to run is all that is told, where there is one.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -151,6 +167,8 @@ def study_text(root: Path, with_paper: bool) -> str:
     beside = (root / DRIVABLE / SUMMARY).exists()
     drivable = read_summary(root / DRIVABLE) if beside else None
     costs = jerk_text(jerk_costs(root / DRIVABLE if beside else root))
+    if words and brief:
+        return words
     told = terminal_summary(summary, with_paper, words, drivable, costs)
     simulations = read_simulations(root)
     return f"{told}\n\n{simulation_text(simulations)}" if simulations else told

@@ -21,9 +21,8 @@ from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.drive import drive_of, planned_moments
 from hybrid_opt.witness.scene import SimulationSettings
 from hybrid_opt.witness.simulate import Witness
-from studies.cli import Parser
 from studies.options import seed, whole
-from studies.program import program_of, run_program
+from studies.program import Parser, program_of, run_program
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
 

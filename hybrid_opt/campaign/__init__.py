@@ -5,7 +5,7 @@ from hybrid_opt.campaign.folder import CampaignFolder, open_folder
 from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.settings import CampaignSettings
-from hybrid_opt.campaign.stages import Stage, run_stages
+from hybrid_opt.campaign.stages import Stage, check_stages, run_stages
 
 __all__ = [
     "CampaignFolder",
@@ -13,6 +13,7 @@ __all__ = [
     "ExecutionSettings",
     "Progress",
     "Stage",
+    "check_stages",
     "executor_for",
     "open_folder",
     "run_stages",

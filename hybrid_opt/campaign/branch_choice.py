@@ -8,6 +8,7 @@ import numpy as np
 
 from hybrid_opt.branches import BranchCompetition, search_branches
 from hybrid_opt.campaign.execution import ExecutionSettings
+from hybrid_opt.campaign.folder import require_usable
 from hybrid_opt.campaign.layout import BRANCHES
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.cell import Cell
@@ -38,6 +39,7 @@ def decided_cell(
     if execution.resume and stored.exists():
         competition = read_record(BranchCompetition, stored, _ANEW)
     else:
+        require_usable(execution)
         cell = Cell(workcell, settings.objectives)
         rng = np.random.default_rng(settings.seed)
         competition = search_branches(cell, evaluations=SHARE * settings.evaluations, rng=rng)

@@ -26,6 +26,7 @@ class ExecutionSettings:
         executor: 'processes' of this machine, or 'dask' for a cluster.
         scheduler: address of the Dask scheduler, only with 'dask'.
         resume: continue what the results folder holds.
+        overwrite: remove what a study left in the results folder, and begin anew.
     """
 
     output: Path
@@ -33,6 +34,7 @@ class ExecutionSettings:
     executor: ExecutorName = "processes"
     scheduler: str | None = None
     resume: bool = False
+    overwrite: bool = False
 
     def __post_init__(self) -> None:
         """Check every value.
@@ -41,6 +43,8 @@ class ExecutionSettings:
             SettingsError: with the value, and what is allowed.
         """
         require_whole("jobs", self.jobs, 0, 4096)
+        if self.resume and self.overwrite:
+            raise SettingsError("--resume keeps results and --overwrite removes them: give one")
         if self.executor not in get_args(ExecutorName):
             raise SettingsError(
                 f"executor {self.executor!r}; known are {', '.join(get_args(ExecutorName))}"

@@ -34,11 +34,11 @@ def drivable_stage(stages: Sequence[Stage]) -> Stage:
     def run(folder: CampaignFolder, progress: Progress) -> None:
         root = folder.root / DRIVABLE
         resume = (root / CONFIGURATION).exists()
-        execution = replace(folder.execution, output=root, resume=resume)
+        execution = replace(folder.execution, output=root, resume=resume, overwrite=False)
         with TemporaryDirectory() as files:
             workcell = unpack_cell(drivable_files(folder.files), Path(files))
             settings = drivable_settings(folder.settings)
             with open_folder(settings, execution, workcell) as inner:
                 run_stages(inner, stages, Progress(progress.shown, DRIVABLE))
 
-    return Stage(DRIVABLE, run)
+    return Stage(DRIVABLE, run, {stage.name: dict(stage.settings) for stage in stages})

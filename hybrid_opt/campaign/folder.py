@@ -11,11 +11,11 @@ from pathlib import Path
 
 from hybrid_opt.campaign.execution import ExecutionSettings
 from hybrid_opt.campaign.identity import identity, require_equal
-from hybrid_opt.campaign.layout import CONFIGURATION, WORKCELL
+from hybrid_opt.campaign.layout import CONFIGURATION, STAGES, WORKCELL
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.files import locked, read_json, storing, write_json
+from hybrid_opt.store.files import LOCK, locked, read_json, storing, write_json
 from symbolic.read.cell import load
 from symbolic.read.cell_files import CellFiles, collect_cell, unpack_cell
 from symbolic.records import Workcell
@@ -61,9 +61,11 @@ def open_folder(
     with storing(root):
         root.mkdir(parents=True, exist_ok=True)
     with locked(root):
+        require_usable(execution)
+        if execution.overwrite:
+            _clear(root)
         configuration = root / CONFIGURATION
         exists = configuration.exists()
-        _check_use(root, exists, execution.resume)
         if exists:
             stored = read_json(configuration)
             digest = stored.get("workcell", {}).get("digest") if isinstance(stored, dict) else None
@@ -74,7 +76,7 @@ def open_folder(
             else:
                 raise ResultsError(
                     f"{root}: holds results of another workcell, or of this one before a change; "
-                    "choose another --output"
+                    f"{_ELSEWHERE}"
                 )
         copy = _stored_cell(root, files)
         if not exists:
@@ -82,19 +84,46 @@ def open_folder(
         yield CampaignFolder(root, settings, execution, Cell(copy, settings.objectives), files)
 
 
-def _check_use(root: Path, exists: bool, resume: bool) -> None:
-    if exists and not resume:
-        raise ResultsError(
-            f"{root}: holds a campaign already; continue it with --resume, or choose another "
-            "--output"
-        )
-    strays = [entry.name for entry in root.iterdir() if entry.name not in (".lock", WORKCELL)]
+def require_usable(execution: ExecutionSettings) -> None:
+    """Refuse a results folder that may not be worked in, before any work.
+
+    Raises:
+        ResultsError: it holds a campaign that is neither to be continued nor overwritten, or
+            something else.
+    """
+    root = execution.output
+    if (root / CONFIGURATION).exists():
+        if not (execution.resume or execution.overwrite):
+            raise ResultsError(
+                f"{root}: holds a campaign already; continue it with --resume, or {_ELSEWHERE}"
+            )
+        return
+    entries = root.iterdir() if root.is_dir() else ()
+    strays = [entry.name for entry in entries if entry.name != WORKCELL]
     strays = [name for name in strays if not name.startswith(".")]
-    if not exists and strays:
+    if strays:
         raise ResultsError(
             f"{root}: is no results folder, but not empty ({', '.join(sorted(strays)[:3])}); "
             "choose another --output"
         )
+
+
+_ELSEWHERE = "choose another --output, or remove those results with --overwrite"
+
+
+def _clear(root: Path) -> None:
+    """Remove all that a results folder holds.
+
+    Marks of what is done go first and the configuration last: whatever moment ends it, nothing
+    looks done that is not there, and the folder can be overwritten again.
+    """
+    order = {STAGES: 0, CONFIGURATION: 2}
+    with storing(root):
+        for entry in sorted(root.iterdir(), key=lambda entry: order.get(entry.name, 1)):
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            elif entry.name != LOCK:
+                entry.unlink()
 
 
 def _stored_cell(root: Path, files: CellFiles) -> Workcell:
@@ -110,7 +139,5 @@ def _stored_cell(root: Path, files: CellFiles) -> Workcell:
             sync_folder(root)
     workcell = load(folder / files.workcell)
     if workcell.digest != files.digest:
-        raise ResultsError(
-            f"{folder}: was changed after the campaign began; choose another --output"
-        )
+        raise ResultsError(f"{folder}: was changed after the campaign began; {_ELSEWHERE}")
     return workcell

@@ -71,7 +71,8 @@ def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:
         listed = "\n".join(f"  - {line}" for line in differences)
         raise ResultsError(
             f"{where}: holds results of something else, and they are never mixed; choose another "
-            f"--output, or repeat the command with what they were made with:\n{listed}"
+            "--output, remove them with --overwrite, or repeat the command with what they were "
+            f"made with:\n{listed}"
         )
 
 

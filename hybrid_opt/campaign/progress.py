@@ -28,7 +28,9 @@ class Progress:
         self.of = of
 
     @contextmanager
-    def stage(self, title: str, total: int, unit: str, done: int = 0) -> Iterator[Advance]:
+    def stage(
+        self, title: str, total: int, unit: str, done: int = 0, delay: float = 0.0
+    ) -> Iterator[Advance]:
         """A line for the time of the `with` block.
 
         Args:
@@ -36,6 +38,7 @@ class Progress:
             total: units in all.
             unit: what is counted.
             done: units that an earlier attempt did.
+            delay: what is over sooner is not shown [s].
         """
         bar = tqdm(
             total=total,
@@ -44,6 +47,8 @@ class Progress:
             unit=f" {unit}",
             file=sys.stderr,
             mininterval=0.2 if sys.stderr.isatty() else _QUIET_SECONDS,
+            miniters=0,  # to tell of nothing new tells how long it has been going on
+            delay=delay,
             dynamic_ncols=True,
             disable=not self.shown,
             bar_format="{desc}: {n_fmt} of {total_fmt}{unit} [{elapsed} gone, {remaining} left]",

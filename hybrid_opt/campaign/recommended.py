@@ -11,6 +11,7 @@ from hybrid_opt.robust.price import RobustPrice
 from hybrid_opt.store.json_records import Figure
 from hybrid_opt.timing.document import StoredJerk
 from symbolic.array import Array
+from symbolic.records import Uncertainty
 
 
 @dataclass(frozen=True)
@@ -118,17 +119,17 @@ class StoredPrice:
     failing: Count
     closest: float
 
-    @property
-    def text(self) -> str:
-        """The set in words."""
-        parts = [
-            f"friction off by {100.0 * self.friction:g} %" if self.friction else "",
-            f"mass by {100.0 * self.mass:g} %" if self.mass else "",
-            _width("centre of mass", 1e3 * self.centre_of_mass, "mm"),
-            f"pads by {1e3 * self.pad_position:g} mm" if self.pad_position else "",
-            _width("disturbance", self.disturbance, "m/s^2"),
-        ]
-        return ", ".join(part for part in parts if part)
+
+def set_text(found: StoredPrice | Uncertainty) -> str:
+    """A set of uncertain quantities in words."""
+    parts = [
+        f"friction off by {100.0 * found.friction:g} %" if found.friction else "",
+        f"mass by {100.0 * found.mass:g} %" if found.mass else "",
+        _width("centre of mass", 1e3 * found.centre_of_mass, "mm"),
+        f"pads by {1e3 * found.pad_position:g} mm" if found.pad_position else "",
+        _width("disturbance", found.disturbance, "m/s^2"),
+    ]
+    return ", ".join(part for part in parts if part)
 
 
 def _width(name: str, values: Array, unit: str) -> str:

@@ -48,8 +48,7 @@ def run_stages(folder: CampaignFolder, stages: Sequence[Stage], progress: Progre
         ResultsError: a stage began with other settings.
         DualArmError: what a stage raises.
     """
-    for stage in stages:
-        _check_settings(folder, stage)
+    check_stages(folder, stages)
     for number, stage in enumerate(stages):
         marker = _marker(folder, stage)
         if _is_done(marker) and stage.whole(folder):
@@ -89,10 +88,17 @@ def _mark(folder: CampaignFolder, stage: Stage, status: StageStatus, seconds: fl
     write_json(_path(folder, stage), to_json(StageMark(status, dict(stage.settings), seconds)))
 
 
-def _check_settings(folder: CampaignFolder, stage: Stage) -> None:
-    marker = _marker(folder, stage)
-    if marker is not None and marker.settings != dict(stage.settings):
-        raise ResultsError(
-            f"{folder.root}: the stage '{stage.name}' was run with {marker.settings}, now asked "
-            f"for is {dict(stage.settings)}; choose another --output"
-        )
+def check_stages(folder: CampaignFolder, stages: Sequence[Stage]) -> None:
+    """Refuse stages that began with other settings, before any work.
+
+    Raises:
+        ResultsError: one did.
+    """
+    for stage in stages:
+        marker = _marker(folder, stage)
+        if marker is not None and marker.settings != dict(stage.settings):
+            raise ResultsError(
+                f"{folder.root}: the stage '{stage.name}' was run with {marker.settings}, now "
+                f"asked for is {dict(stage.settings)}; choose another --output, or begin anew with "
+                "--overwrite"
+            )

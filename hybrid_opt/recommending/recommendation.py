@@ -32,6 +32,10 @@ HAND_MADE = "hand-made"
 LEAST_ROOM = 0.1
 """Margins below this share of a centimetre, or of a tenth of a coefficient, are warned of."""
 
+SHORTENED = 4
+"""So often a wish for a duration is answered, each time by a shorter carry, until one keeps to it
+within the cell's limits on jerk as well."""
+
 TRIED = 8
 """Answers to a wish that are held against the independent timing before giving up."""
 
@@ -93,11 +97,7 @@ class Recommendation:
                 f"  within the limits on jerk: {self.jerk.timing.duration:.3f} s "
                 f"({100.0 * self.jerk.cost:+.1f} %)"
             )
-        lines += [
-            f"  {rival.label}: {rival.duration_at_force:.3f} s at the same force, "
-            f"{rival.force_at_duration:.2f} N in the same time"
-            for rival in self.rivals
-        ]
+        lines += [f"  {rival}" for rival in self.rivals]
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
 
 
@@ -133,12 +133,11 @@ def recommend(
     paths = DrivenPaths.of(cell, x[:, :-1])
     members = paths.timings(x[:, -1])
     points = np.array([[member.duration, member.limited_force] for member in members])
-    choice, timing = _driven(cell, x, choices(cell.workcell, paths, points, wish))
+    choice, timing, jerk = _answer(cell, x, paths, points, wish)
     assert timing.carry is not None, "the timing respects every limit"
     named = {HAND_MADE: cell.initial[:-1]} | dict(others or {})
     reference = Reference(paths, choice.index, choice.force, comparison_forces(points))
     beside = rivals(cell, named, reference)
-    jerk = drive_with_jerk(cell.timing_model, timing.carry.x)
     forces = limited_force(timing.carry, cell.workcell, timing.limits)
     margins = robustness_margins(cell.timing_model, timing.carry)
     squeeze, doubt = _commanded(timing.carry)
@@ -161,6 +160,37 @@ def recommend(
             *doubt,
         ),
     )
+
+
+def _answer(
+    cell: Cell, x: Array, paths: DrivenPaths, points: Array, wish: Wish
+) -> tuple[Choice, Timing, JerkTiming | None]:
+    """What answers a wish, and its timing within the cell's limits on jerk, which keeps to a wish
+    for a duration as well where any path does."""
+    found, asked = None, wish
+    for _ in range(SHORTENED):
+        try:
+            choice, timing = _driven(cell, x, choices(cell.workcell, paths, points, asked))
+        except SettingsError:
+            if found is None:
+                raise
+            break  # no path is as much faster as the limits on jerk take longer
+        assert timing.carry is not None, "the timing respects every limit"
+        jerk = drive_with_jerk(cell.timing_model, timing.carry.x)
+        found = choice, timing, jerk
+        if jerk is None or asked.duration is None or not _exceeds(wish, jerk):
+            break
+        assert wish.duration is not None, "a duration is asked for where it is wished for"
+        asked = Wish(duration=asked.duration * wish.duration / jerk.timing.duration)
+    assert found is not None, "the first round found it or raised"
+    return found
+
+
+def _exceeds(wish: Wish, jerk: JerkTiming) -> bool:
+    """Whether limits on jerk take longer than was wished for."""
+    if wish.duration is None or not jerk.timing.ok:
+        return False
+    return jerk.timing.duration > wish.duration * (1.0 + BETTER)
 
 
 def _driven(cell: Cell, x: Array, wanted: Iterable[Choice]) -> tuple[Choice, Timing]:
@@ -215,14 +245,12 @@ def _warnings(beside: Iterable[Rival], timing: Timing, force: float) -> Iterator
 
 
 def _too_long(wish: Wish, jerk: JerkTiming | None) -> Iterator[str]:
-    """A warning where limits on jerk take longer than was wished for."""
-    if jerk is not None and wish.duration is not None:
-        duration = jerk.timing.duration
-        if duration > wish.duration * (1.0 + BETTER):
-            yield (
-                f"within the limits on jerk it takes {duration:.3f} s instead of "
-                f"{wish.duration:g} s; wish for {wish.duration * wish.duration / duration:.2f} s"
-            )
+    """That limits on jerk take longer than was wished for."""
+    if jerk is not None and _exceeds(wish, jerk):
+        yield (
+            f"within the limits on jerk it takes {jerk.timing.duration:.3f} s instead of "
+            f"{wish.duration:g} s, and no other carry of the front was found to take less"
+        )
 
 
 def _without_room(margins: Iterable[Margin]) -> Iterator[str]:

@@ -19,7 +19,7 @@ FORCES = 12
 """Limits at which a front is held against a rival."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Rival:
     """A path driven as fast as the same limits allow.
 
@@ -35,6 +35,14 @@ class Rival:
     duration_at_force: float
     force_at_duration: float
     faster_between: tuple[float, float] | None = None
+
+    def __repr__(self) -> str:
+        force, time = "cannot move with so little force", "is never so fast"
+        if np.isfinite(self.duration_at_force):
+            force = f"{self.duration_at_force:.3f} s at the same force"
+        if np.isfinite(self.force_at_duration):
+            time = f"{self.force_at_duration:.2f} N in the same time"
+        return f"{self.label}: {force}, {time}"
 
 
 @dataclass(frozen=True)

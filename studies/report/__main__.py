@@ -5,14 +5,13 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from hybrid_opt.campaign import Progress
 from hybrid_opt.work.processes import warm_up
-from studies.program import add_verbose, carried_out, run_program
+from studies.program import Parser, add_verbose, carried_out, run_program
 from studies.report.stage import add_report_options, follow_report_options, rewrite
 
 PROGRAM = "python -m studies.report"
@@ -21,7 +20,7 @@ PROGRAM = "python -m studies.report"
 @carried_out(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns the exit code."""
-    parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__, allow_abbrev=False)
+    parser = Parser(prog=PROGRAM, description=__doc__)
     parser.add_argument("results", type=Path, metavar="RESULTS", help="results folder of a study")
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     parser.add_argument(

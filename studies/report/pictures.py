@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
+from hybrid_opt.campaign.recommended import set_text
 from studies.report import (
     pictures_carry,
     pictures_cell,
@@ -173,7 +174,7 @@ def _price_picture(data: ReportData) -> Iterator[ReportPicture]:
         yield ReportPicture(
             "robust_price",
             "The price of robustness: largest normal forces of the recommended carry that hold in "
-            f"every case of {whose} ({price.text}), times a factor.",
+            f"every case of {whose} ({set_text(price)}), times a factor.",
             lambda: pictures_robust.robust_price(data, price),
         )
 

@@ -72,17 +72,23 @@ def joint_torques(data: ReportData) -> Figure:
     figure = new_figure(FULL_WIDTH, 0.98 * FULL_WIDTH)
     panels = figure.subplots(2, 2, subplot_kw={"projection": "polar"})
     limit = np.concatenate([robot.torque_max for robot in data.workcell.robots])
-    first = len(data.workcell.robots[0].torque_max)
-    for row, (text, own) in enumerate((("contact wrench alone", False), ("with the arm", True))):
+    split = [len(data.workcell.robots[0].torque_max)]
+    kinds = (("contact wrench alone", "contact_torque"), ("with the arm", "torque"))
+    uses = {
+        (row, carry.label): np.split(torque_use(limit, getattr(carry.timed, name)), split)
+        for row, (_, name) in enumerate(kinds)
+        for carry, _ in styled(data)
+    }
+    # One scale for all panels, so that they can be compared.
+    top = max(float(use.max()) for both in uses.values() for use in both)
+    for row, (text, _) in enumerate(kinds):
         for i, robot in enumerate(data.workcell.robots):
             axes = panels[row, i]
-            own_joints = slice(0, first) if i == 0 else slice(first, None)
             joints = len(robot.torque_max)
             angles = np.linspace(0.0, 2.0 * np.pi, joints + 1)
             most = np.zeros(joints)
             for carry, look in styled(data):
-                torque = carry.timed.torque if own else carry.timed.contact_torque
-                use = torque_use(limit, torque)[own_joints]
+                use = uses[row, carry.label][i]
                 most = np.maximum(most, use)
                 axes.plot(
                     angles,
@@ -95,7 +101,7 @@ def joint_torques(data: ReportData) -> Figure:
                 )
             axes.set_xticks(angles[:-1], [f"joint {j + 1}" for j in range(joints)])
             axes.tick_params(axis="x", pad=4)
-            _label_rings(axes, most)
+            _label_rings(axes, most, top)
             letter = "abcd"[2 * row + i]
             axes.set_title(f"({letter}) {shortened(robot.name)!r}: {text} [% of maximum]", pad=12)
     handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -103,10 +109,10 @@ def joint_torques(data: ReportData) -> Figure:
     return figure
 
 
-def _label_rings(axes: Axes, most: Array) -> None:
-    """Round values on the rings, written between the two neighbouring joints that leave most
-    room: most (n,) is the largest use of each [%]."""
-    rings = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(0.0, 1.02 * float(most.max()))
+def _label_rings(axes: Axes, most: Array, top: float) -> None:
+    """Round values up to `top` [%] on the rings, written between the two neighbouring joints that
+    leave most room: most (n,) is the largest use of each [%]."""
+    rings = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(0.0, 1.02 * top)
     axes.set_ylim(0.0, rings[-1])
     axes.set_yticks(rings[1:-1], [f"{ring:g} %" for ring in rings[1:-1]], va="center", ha="center")
     step = 360.0 / len(most)

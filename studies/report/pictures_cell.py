@@ -139,7 +139,8 @@ def motion_sequence(geometry: CellGeometry, carry: DrawnCarry, columns: int = 2)
 
 
 def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, str, object], ...]) -> Figure:
-    """Paths of the box centre: y-z, x-y and oblique (paper Figure 13).
+    """Paths of the box centre (paper Figure 13): in the two planes of the world in which they are
+    largest, so that a plane that they hardly leave is seen edge-on once, and obliquely.
 
     Args:
         carries: trajectory, colour and line style of each.
@@ -148,12 +149,12 @@ def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, str, object],
     points = np.concatenate([carry.timed.pose[:, :3] for carry, _, _ in carries])
     half = geometry.workcell.payload.size / 2.0
     near = box_corners(points.min(axis=0) - half, points.max(axis=0) + half)
-    views = (FRONT, _PLAN, ISOMETRIC)
+    chosen = planes(points)
+    views = (*(view for view, _ in chosen), ISOMETRIC)
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     panels = figure.subplots(1, 3, width_ratios=[aspect(view, near) for view in views])
-    for axes, view, letter, text in zip(
-        panels, views, "abc", ("y–z plane", "x–y plane", "oblique"), strict=True
-    ):
+    texts = (*(text for _, text in chosen), "oblique")
+    for axes, view, letter, text in zip(panels, views, "abc", texts, strict=True):
         draw_cell(axes, cell, view, *_start(carries[0][0]), hidden=("box", "link"))
         for carry, colour, line in carries:
             draw_path(
@@ -167,6 +168,14 @@ def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, str, object],
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
     return figure
+
+
+def planes(points: Array) -> tuple[tuple[View, str], tuple[View, str]]:
+    """The two planes of the world, with their names, in which points (n, 3) take most room."""
+    extent = np.ptp(points, axis=0)
+    every = (("y–z plane", FRONT, 0), ("x–z plane", SIDE, 1), ("x–y plane", _PLAN, 2))
+    first, second, _ = sorted(every, key=lambda plane: float(extent[plane[2]]))
+    return (first[1], first[0]), (second[1], second[0])
 
 
 def sample_at(carry: DrawnCarry, shares: Array) -> list[int]:

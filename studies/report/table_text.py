@@ -6,7 +6,12 @@ import csv
 import html
 import io
 import math
+import re
 from dataclasses import dataclass
+from functools import partial
+
+LONG = 30
+"""Characters of a cell from which on it takes several lines."""
 
 NOTHING = "–"
 """Text of a missing figure."""
@@ -29,6 +34,12 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     note: str
 
+    @property
+    def words(self) -> tuple[bool, ...]:
+        """Of every column, whether it holds words, which begin at the left; others hold figures."""
+        columns = zip(*self.rows, strict=True) if self.rows else [()] * len(self.header)
+        return tuple(k == 0 or not any(map(_is_figure, column)) for k, column in enumerate(columns))
+
     def csv(self) -> str:
         """Comma-separated values, without title and note."""
         text = io.StringIO()
@@ -39,13 +50,14 @@ class Table:
 
     def markdown(self) -> str:
         """A Markdown table with title and note."""
-        lines = [self.header, tuple(["---"] + ["---:"] * (len(self.header) - 1)), *self.rows]
+        rule = tuple("---" if word else "---:" for word in self.words)
+        lines = [self.header, rule, *self.rows]
         body = "\n".join("| " + " | ".join(_markdown(cell) for cell in row) + " |" for row in lines)
         return f"**{_markdown(self.title)}**\n\n{body}\n\n{_markdown(self.note)}\n"
 
     def latex(self) -> str:
         """A LaTeX table with booktabs rules."""
-        columns = "l" + "r" * (len(self.header) - 1)
+        columns = "".join("l" if word else "r" for word in self.words)
         rows = [" & ".join(_latex(cell) for cell in row) + r" \\" for row in self.rows]
         head = " & ".join(_latex(cell) for cell in self.header) + r" \\"
         return "\n".join(
@@ -67,9 +79,10 @@ class Table:
 
     def html(self) -> str:
         """An HTML table; every text is escaped."""
-        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in self.header)
+        head = "".join(map(partial(_html_cell, "th"), self.header, self.words))
         body = "".join(
-            "<tr>" + "".join(_html_cell(cell) for cell in row) + "</tr>" for row in self.rows
+            f"<tr>{''.join(map(partial(_html_cell, 'td'), row, self.words))}</tr>"
+            for row in self.rows
         )
         return (
             f"<h3>{html.escape(self.title)}</h3><div class='scroll'><table><thead><tr>{head}</tr>"
@@ -85,9 +98,15 @@ def number(value: float | None, digits: int = 2) -> str:
     return f"{value:z.{digits}f}"
 
 
-def _html_cell(cell: str) -> str:
-    kind = " class='text'" if len(cell) > 40 else ""
-    return f"<td{kind}>{html.escape(cell)}</td>"
+def _is_figure(cell: str) -> bool:
+    """Whether a cell is a figure, with what belongs to it."""
+    return len(cell) <= LONG and re.match(r"[-+\N{MINUS SIGN}]?\.?\d", cell) is not None
+
+
+def _html_cell(kind: str, cell: str, word: bool) -> str:
+    classes = " ".join(["word"] * word + ["long"] * (len(cell) > LONG))
+    named = f" class='{classes}'" if classes else ""
+    return f"<{kind}{named}>{html.escape(cell)}</{kind}>"
 
 
 def _markdown(text: str) -> str:

@@ -23,6 +23,9 @@ from studies.simulation_text import HEADINGS, MEANING, simulation_rows
 from studies.terminal_summary import PAPER
 from studies.text_table import counted
 
+MOST_BOUNDS = 8
+"""Bounds of one experiment that are listed."""
+
 
 def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
     """All tables of a report.
@@ -202,6 +205,7 @@ def bounds(data: ReportData) -> Table:
     for name, found in experiments:
         if not found.binding:
             rows.append((name, "none", NOTHING, f"0 of {found.solutions}"))
+        often = sorted(found.binding, key=lambda bound: -bound.solutions)
         rows += [
             (
                 name,
@@ -209,13 +213,17 @@ def bounds(data: ReportData) -> Table:
                 f"{bound.value:g}",
                 f"{bound.solutions} of {found.solutions}",
             )
-            for bound in found.binding
+            for bound in often[:MOST_BOUNDS]
         ]
+        if left := often[MOST_BOUNDS:]:
+            fewer = f"at most {left[0].solutions} of {found.solutions}"
+            rows.append((name, f"and {counted(len(left), 'further bound')}", NOTHING, fewer))
     return Table(
         "bounds",
         "Bounds of the variables that members of the best fronts lie on.",
         ("experiment", "bound", "value [m, rad]", "members"),
         tuple(rows),
-        "All replicas, polished fronts where there are any. A bound that many lie on may have "
+        "All replicas, polished fronts where there are any; most members first, all bounds are in "
+        "summary.json. A bound that many lie on may have "
         "decided them: wider ones might allow better carries.",
     )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation
+from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation, set_text
 from studies.jerk_costs import HEAD, NOTE, JerkCosts
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
@@ -47,8 +47,8 @@ def robust_price(data: ReportData, price: StoredPrice) -> Table:
         "The price of robustness of the recommended carry.",
         ("times the set", f"peak, {left} [N]", f"peak, {right} [N]"),
         rows,
-        f"The set{'' if price.stated else ', a usual one'}: {price.text}. The first robot leads, "
-        "the force of the second is commanded. The reference forces allow "
+        f"The set{'' if price.stated else ', a usual one'}: {set_text(price)}. The first robot "
+        "leads, the force of the second is commanded. The reference forces allow "
         f"{largest} times the set. Of {price.cases} random cases of the set {price.failing} slip "
         f"under its forces; the hardest needs {100.0 * price.closest:.2f} % of them.",
     )

@@ -8,6 +8,7 @@ import pytest
 
 from codegen.compiler import Compiler
 from hybrid_opt.building import build_study
+from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.polishing.polisher import polisher_for
@@ -20,7 +21,7 @@ RACK = Path("studies/workcells/rack.toml")
 
 @pytest.mark.slow
 def test_nothing_is_compiled_after_everything_was_built(monkeypatch: pytest.MonkeyPatch) -> None:
-    build_study(Cell.load(RACK))
+    build_study(Cell.load(RACK), Progress(shown=False))
 
     def refuse(self: Compiler, *given: object, **more: object) -> None:
         raise AssertionError(f"compiles {given[0]}")
@@ -32,4 +33,4 @@ def test_nothing_is_compiled_after_everything_was_built(monkeypatch: pytest.Monk
         assert TimingModel(each.compiled).joint_names
         assert JobCollisions(each.compiled).geometry.active
         assert CaseForces(each.workcell).workcell is each.workcell
-    build_study(Cell.load(RACK))
+    build_study(Cell.load(RACK), Progress(shown=False))

@@ -43,6 +43,13 @@ def polished() -> ho.Front:
     return ho.polish(cell(), front(), rng=rng, settings=ho.PolishSettings(attempts=2))
 
 
+def test_an_unknown_objective_is_refused_where_a_cell_is_loaded() -> None:
+    with pytest.raises(SettingsError, match="unknown objective speed; known are peak_force_1"):
+        ho.Cell.load(RACK, ["speed"])
+    with pytest.raises(SettingsError, match="each once"):
+        ho.Cell(ho.Cell.load(RACK).workcell, ["duration", "duration"])
+
+
 def test_known_paths_are_refused_where_they_take_no_part() -> None:
     with pytest.raises(SettingsError, match=r"Cell\.drivable\(\)"):
         ho.polish(cell(), front(), rng=np.random.default_rng(1), paths=[cell().initial])

@@ -12,8 +12,8 @@ import pytest
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import REASONS
-from studies.inspect import as_text
-from studies.inspection import inspect
+from studies.inspect import told
+from studies.inspection import Inspection
 from studies.plain.verdict import PlainJudge
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
@@ -70,8 +70,8 @@ def test_verdicts_are_those_of_the_plain_cell(described: Cell, plain: CellModel)
 
 @pytest.mark.slow
 def test_an_inspection_tells_of_it(described: Cell, tmp_path: Path) -> None:
-    found = inspect(described.workcell, 40, 1, None, view=tmp_path / "view.html")
-    text = as_text(found, pairs=True)
+    found = Inspection(described.workcell, 40, 1, None, view=tmp_path / "view.html")
+    text = "\n".join(told(found, pairs=True))
     assert "left/link_1 – left/link_4: disabled in gofa.srdf: Never" in text
     why = {frozenset(pair[:2]): pair[2] for pair in found.excluded_pairs}
     pair = frozenset(("right/grip_finger", "middle board"))

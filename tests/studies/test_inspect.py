@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,8 +17,8 @@ from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.indicators.bounds import BindingBound
 from studies import inspection
-from studies.inspect import as_text, main
-from studies.inspection import Inspection, Optimum, inspect
+from studies.inspect import main, told
+from studies.inspection import Inspection, Optimum
 from studies.inspection_pictures import show
 from studies.report.pictures_meeting import meeting_place
 from symbolic.read.cell import load
@@ -37,7 +36,7 @@ def transfer() -> Workcell:
 @pytest.fixture(scope="module")
 def found(transfer: Workcell, tmp_path_factory: pytest.TempPathFactory) -> Inspection:
     folder = tmp_path_factory.mktemp("pictures")
-    return inspect(transfer, 1500, 7, folder, view=folder / "new" / "view.html")
+    return Inspection(transfer, 1500, 7, folder, view=folder / "new" / "view.html")
 
 
 def test_the_second_cell_is_worth_searching(found: Inspection) -> None:
@@ -60,7 +59,7 @@ def test_the_second_cell_is_of_another_kind(transfer: Workcell) -> None:
 def test_counts_agree_with_the_evaluator(found: Inspection, transfer: Workcell) -> None:
     evaluator = CandidateEvaluator(transfer)
     x = np.random.default_rng(7).uniform(evaluator.lower, evaluator.upper, (500, evaluator.n_var))
-    again = inspect(transfer, 500, 7, None)
+    again = Inspection(transfer, 500, 7, None)
     verdicts = evaluator.evaluate(x)
     assert again.feasible_share == pytest.approx(verdicts.feasible.mean())
     for reason, count in again.infeasible_by_reason.items():
@@ -108,7 +107,7 @@ def test_the_view_plays_the_hand_made_trajectory(found: Inspection) -> None:
     assert "Transfer over a wall" in page
     assert '<div id="note"></div>' in page
     assert '"begin":0.0' in page
-    assert f"View: {found.view}" in as_text(found)
+    assert f"View: {found.view} (open it in a browser)" in told(found)
 
 
 def test_the_view_of_a_carry_that_fails_begins_there(
@@ -154,18 +153,45 @@ def test_the_straight_line_is_straight(transfer: Workcell) -> None:
 
 def test_tells_which_bounds_bind(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inspection, "POLISH_ATTEMPTS", 1)
-    found = inspect(load(RACK), 10, 1, None, polish=True)
+    found = Inspection(load(RACK), 10, 1, None, polish=True)
     assert found.optimum is not None
     assert found.optimum.solutions >= 1
     assert found.optimum.problem == ""
-    text = as_text(found)
-    assert "points of a short polish)" in text
+    assert "points of a short polish)" in "\n".join(told(found))
     bound = BindingBound("waypoint 2, yaw", "upper", 0.4, 3)
-    tight = as_text(replace(found, optimum=Optimum(5, (bound,))))
-    assert "upper bound of waypoint 2, yaw, 0.4: 3 of 5" in tight
-    assert "none binds" in as_text(replace(found, optimum=Optimum(5, ())))
-    lost = as_text(replace(found, optimum=Optimum(0, (), "its start is infeasible")))
-    assert "not known: its start is infeasible" in lost
+    for optimum, words in (
+        (Optimum(5, (bound,)), "upper bound of waypoint 2, yaw, 0.4: 3 of 5"),
+        (Optimum(5, ()), "none binds"),
+        (Optimum(0, (), "its start is infeasible"), "not known: its start is infeasible"),
+    ):
+        vars(found)["optimum"] = optimum
+        assert words in "\n".join(told(found))
+
+
+def test_verdicts_are_told_before_what_takes_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    def later(*given: object, **more: object) -> None:
+        raise AssertionError("too early")
+
+    for name in ("_optimum", "draw", "show", "frequent"):
+        monkeypatch.setattr(inspection, name, later)
+    found = Inspection(load(TRANSFER), 10, 1, Path("pictures"), polish=True, view=Path("view"))
+    lines: list[str] = []
+    with pytest.raises(AssertionError, match="too early"):
+        lines.extend(told(found))
+    text = "\n".join(lines)
+    for words in ("At rest, level", "trajectory: feasible", "Straight line: ", "% feasible"):
+        assert words in text
+
+
+def test_a_short_polish_tells_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(inspection, "POLISH_ATTEMPTS", 1)
+    assert main([str(RACK), "--candidates", "10", "--no-pictures"]) == 0
+    said = capsys.readouterr()
+    assert "short polish: 0 of 1 attempts" in said.err
+    assert "--no-polish leaves it out" in said.err
+    assert "points of a short polish)" in said.out
 
 
 def test_prints_text_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -121,6 +122,52 @@ def test_every_program_knows_verbose(name: str, capsys: pytest.CaptureFixture[st
     with pytest.raises(SystemExit):
         import_module(f"studies.{name}").main(["--help"])
     assert "--verbose" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "words"),
+    [
+        ("rack", ["--qick"], "--qick; did you mean '--quick'?; see --help"),
+        ("run", ["cell.toml", "--evaluation=5"], "did you mean '--evaluations'?"),
+        ("inspect", ["cell.toml", "--no-polsh"], "did you mean '--no-polish'?"),
+        ("recommend", ["results", "--force", "52"], "did you mean '--force-limit'?"),
+        ("replay", ["file.json", "--zzzzzz"], "--zzzzzz; see --help"),
+    ],
+)
+def test_a_mistyped_option_gets_a_suggestion(
+    name: str, arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        import_module(f"studies.{name}").main(arguments)
+    told = capsys.readouterr().err
+    assert end.value.code == 2
+    assert told.startswith(f"python -m studies.{name}: unrecognized arguments: ")
+    assert words in told
+    assert len(told.splitlines()) == 1
+
+
+def test_every_program_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    listing = import_module("studies.__main__")
+    assert listing.main([]) == 0
+    listed = capsys.readouterr().out.splitlines()[2:]
+    named = set(re.findall(r"`python -m (studies\.\w+)", (ROOT / "README.md").read_text()))
+    assert {line.split()[2] for line in listed} >= named | {"studies.report"}
+    assert all(len(line.split()) > 5 and len(line) < 140 for line in listed)
+    assert listing.main(["--help"]) == 0
+    assert capsys.readouterr().out.splitlines()[2:] == listed
+    assert listing.main(["rnu"]) == 2
+    assert "did you mean 'studies.run'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["run", "inspect"])
+def test_a_problem_file_names_the_program_for_it(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = ROOT / "studies" / "problems" / "past-a-post.toml"
+    assert import_module(f"studies.{name}").main([str(problem)]) == 2
+    told = capsys.readouterr().err
+    assert "contacts[0].xyz: is missing" in told
+    assert told.endswith(f"by: python -m studies.propose {problem}\n")
 
 
 def test_a_programs_name_stands_before_its_message(capsys: pytest.CaptureFixture[str]) -> None:

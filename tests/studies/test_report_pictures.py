@@ -17,6 +17,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from studies.report.pictures import ReportPicture, report_pictures
+from studies.report.pictures_cell import planes
 from studies.report.records import ReportData, Run
 from studies.report.style import ARMS, HAND_MADE, SERIES, in_style, save
 from symbolic.array import Array
@@ -107,6 +108,30 @@ def test_without_a_feasible_candidate_the_rest_is_drawn(data: ReportData) -> Non
     assert "fig07_fronts" not in names
     for entry in report_pictures(shown):
         assert entry.draw().axes
+
+
+def test_joint_torques_have_one_scale(drawn: Drawn) -> None:
+    panels = drawn["fig10_joint_torques"][1].get_axes()
+    assert len(panels) == 4
+    assert len({axes.get_ylim() for axes in panels}) == 1
+
+
+@pytest.mark.parametrize(
+    ("extent", "names"),
+    [
+        ((0.5, 0.01, 0.4), ("x–z plane", "x–y plane")),
+        ((0.02, 0.6, 0.4), ("y–z plane", "x–y plane")),
+        ((0.3, 0.6, 0.01), ("x–y plane", "y–z plane")),
+    ],
+)
+def test_paths_are_seen_edge_on_once_at_most(
+    extent: tuple[float, float, float], names: tuple[str, str]
+) -> None:
+    points = np.vstack([np.zeros(3), extent])
+    first, second = planes(points)
+    assert (first[1], second[1]) == names
+    seen = np.ptp(first[0].flat(points), axis=0)
+    np.testing.assert_allclose(np.sort(seen), np.sort(extent)[1:])
 
 
 def clipped(figure: Figure) -> list[str]:

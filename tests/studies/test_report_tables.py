@@ -13,7 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hybrid_opt.campaign.summary import StoredBound
 from studies.errors import ReportError
+from studies.report import tables
 from studies.report.look import BEGIN, END, insert_tables
 from studies.report.records import ReportData
 from studies.report.table_text import NOTHING, Table
@@ -61,6 +63,32 @@ def test_the_papers_figures_are_those_that_it_states(data: ReportData) -> None:
     assert chosen["NSGA-II, paper"][7] == "16.71"
     assert chosen["MOPSO, paper"][7] == "16.06"
     assert not any("paper" in row[0] for table in without for row in table.rows)
+
+
+def test_words_begin_at_the_left_and_figures_end_at_the_right(data: ReportData) -> None:
+    rows = (("a", "1.0 ± 2", "none", NOTHING), ("b", "-0.5", "upper, x", "\N{MINUS SIGN}3 of 4"))
+    table = Table("t", "title", ("who", "how much", "which", "of"), rows, "")
+    assert table.words == (True, False, True, False)
+    assert "| --- | ---: | --- | ---: |" in table.markdown()
+    assert r"\begin{tabular}{lrlr}" in table.latex()
+    assert "<th class='word'>which</th>" in table.html()
+    assert "<td class='word'>upper, x</td>" in table.html()
+    assert "<td>-0.5</td>" in table.html()
+    timing = named(report_tables(data, with_paper=False), "timing")
+    assert timing.words == (True, False, False, False, True, True)
+    assert tables.bounds(data).words[1]
+
+
+def test_the_bounds_that_matter_are_listed(data: ReportData) -> None:
+    def bound(k: int) -> StoredBound:
+        return StoredBound(f"waypoint {k}", "upper", 0.1, k)
+
+    many = replace(data.summary.bounds, solutions=40, binding=tuple(map(bound, range(1, 21))))
+    shown = replace(data, summary=replace(data.summary, bounds=many))
+    rows = [row for row in tables.bounds(shown).rows if row[0] == "search"]
+    assert [row[3] for row in rows[:2]] == ["20 of 40", "19 of 40"]
+    assert len(rows) == tables.MOST_BOUNDS + 1
+    assert rows[-1] == ("search", "and 12 further bounds", NOTHING, "at most 12 of 40")
 
 
 def test_every_row_fits_its_header(data: ReportData) -> None:

@@ -44,20 +44,25 @@ def test_tells_forces_price_and_check(tmp_path: Path, capsys: pytest.CaptureFixt
     planned, sure = (float(line.split()[-2]) for line in lines[-2:])
     assert planned < sure
     lines = lines[:-2]
-    nominal, robust = (np.array(line.split()[-4:-1:2], dtype=float) for line in lines[1:3])
+    nominal, robust = (np.array(line.split()[-4:-1:2], dtype=float) for line in lines[2:4])
     assert (robust > 1.1 * nominal).all()
-    assert lines[8].split()[-2:] == lines[1].split()[-4:-1:2]
     assert lines[9].split()[-2:] == lines[2].split()[-4:-1:2]
+    assert lines[10].split()[-2:] == lines[3].split()[-4:-1:2]
     assert "200 random cases (seed 1): all hold" in lines[-1]
 
 
-def test_without_uncertainty_the_least_forces_hold(
+def test_without_uncertainty_a_usual_set_is_taken_and_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([str(stored(tmp_path, "")), "--cases", "10", "--leader", "2"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert "arm 2 leads" in lines[0]
-    assert lines[1].split()[-4:] == lines[2].split()[-4:]
+    arguments = ["--cases", "10", "--points", "3", "--leader", "2"]
+    (tmp_path / "a").mkdir()
+    assert main([str(stored(tmp_path, "")), *arguments]) == 0
+    without = capsys.readouterr().out
+    assert "arm 2 leads" in without
+    assert "the set is a usual one, because the workcell states no [uncertainty]: fri" in without
+    assert "inf" not in without
+    assert main([str(stored(tmp_path / "a", TABLE)), *arguments]) == 0
+    assert capsys.readouterr().out.splitlines()[2:] == without.splitlines()[2:]
 
 
 def test_a_file_that_is_none_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -202,6 +202,7 @@ def test_interrupt_tells_how_to_go_on(tmp_path: Path) -> None:
         (["--population", "nsga3=4"], "unknown algorithm 'nsga3'"),
         (["--executor", "dask"], "needs a scheduler's address"),
         (["--jobs", "-2"], "jobs is -2"),
+        (["--resume", "--overwrite"], "--resume keeps results and --overwrite removes them"),
     ],
 )
 def test_wrong_options_get_one_message(

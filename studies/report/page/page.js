@@ -5,9 +5,13 @@
   const $ = (id) => document.getElementById(id);
   const FORCE = 7 + data.joints[0] + data.joints[1];
   const COLUMNS = { time: 0, pose: 1, q: 7, force: FORCE, shift: FORCE + 2, width: FORCE + 4 };
-  const CONFIG = { responsive: true, displaylogo: false,
-    modeBarButtonsToRemove: ["lasso2d", "select2d", "autoScale2d"] };
-  const PLAIN = { responsive: true, displayModeBar: false };
+  /* Nothing of the page leaves the machine: no upload, no address that one could go to. */
+  const OWN = { responsive: true, displaylogo: false, showSendToCloud: false,
+    plotlyServerURL: "", showEditInChartStudio: false };
+  const CONFIG = { ...OWN,
+    modeBarButtonsToRemove: ["sendChartToCloud", "lasso2d", "select2d", "autoScale2d"] };
+  const PLAIN = { ...OWN, displayModeBar: false };
+  const STAR = "star", NEAR = 12;
   const FONT = { family: "system-ui, DejaVu Sans, sans-serif", size: 12 };
 
   function decode(text, Type) {
@@ -61,7 +65,10 @@
     view.lines.forEach((line) => traces.push({ type: "scatter", mode: "lines",
       name: plain(line.label), x: line.x, y: line.y, hoverinfo: "skip",
       line: { color: line.colour, dash: line.dash, width: 1.6 } }));
-    view.groups.forEach((group) => traces.push({ type: "scatter", mode: "markers",
+    /* What is recommended is drawn last, above all others. */
+    const ordered = [...view.groups].sort((a, b) =>
+      Number(a.symbol === STAR) - Number(b.symbol === STAR));
+    ordered.forEach((group) => traces.push({ type: "scatter", mode: "markers",
       name: plain(group.label), x: group.x, y: group.y, customdata: group.members,
       text: group.members.map((k) => plain(carries[k].label)),
       hovertemplate: "%{text}<extra></extra>",
@@ -71,7 +78,7 @@
     if (view.star) {
       traces.push({ type: "scatter", mode: "markers", name: view.star[2],
         x: [view.star[0]], y: [view.star[1]], hoverinfo: "name",
-        marker: { color: "#b00020", size: 13, symbol: "star" } });
+        marker: { color: "#1d2327", size: 11, symbol: "x-thin", line: { width: 2.5 } } });
     }
     traces.push({ type: "scatter", mode: "markers", name: "chosen", x: [], y: [],
       hoverinfo: "skip", showlegend: false,
@@ -115,6 +122,16 @@
       if (at >= 0) { place.x = [[group.x[at]]]; place.y = [[group.y[at]]]; }
     });
     Plotly.restyle("front-plot", place, [state.chosenTrace]);
+  }
+
+  /* The trajectory of a clicked point; where the star covers the point, the recommended one. */
+  function clicked(event) {
+    const point = event.points.find((p) => p.customdata !== undefined);
+    const star = data.views[state.view].groups.find((group) => group.symbol === STAR);
+    if (!point || !star) return point && point.customdata;
+    const across = point.xaxis.d2p(point.x) - point.xaxis.d2p(star.x[0]);
+    const along = point.yaxis.d2p(point.y) - point.yaxis.d2p(star.y[0]);
+    return Math.hypot(across, along) < NEAR ? star.members[0] : point.customdata;
   }
 
   function fillViews() {
@@ -189,8 +206,10 @@
     $("phase-section").hidden = !phases.length;
     const row = (cells, kind) => {
       const line = document.createElement("tr");
-      cells.forEach((text) => {
-        line.appendChild(document.createElement(kind)).textContent = text;
+      cells.forEach((text, i) => {
+        const made = line.appendChild(document.createElement(kind));
+        made.textContent = text;
+        if (i === cells.length - 1) made.className = "word";
       });
       return line;
     };
@@ -357,8 +376,8 @@
     fillViews();
     drawFront();
     $("front-plot").on("plotly_click", (event) => {
-      const point = event.points.find((p) => p.customdata !== undefined);
-      if (point) select(point.customdata);
+      const found = clicked(event);
+      if (found !== undefined) select(found);
     });
   } else {
     $("front-plot").remove();

@@ -61,6 +61,35 @@ def test_other_workcell_is_never_mixed(tmp_path: Path) -> None:
         pytest.fail("was opened")
 
 
+def test_results_are_overwritten_where_that_is_asked_for(tmp_path: Path) -> None:
+    root = tmp_path / "a"
+    with open_folder(SETTINGS, ExecutionSettings(root, 1), load(RACK)):
+        (root / "stages").mkdir()
+        (root / "stages" / "search.json").write_text("{}")
+        (root / "front.csv").write_text("")
+    other = replace(SETTINGS, seed=7)
+    with open_folder(
+        other, ExecutionSettings(root, 1, overwrite=True), load(changed_cell(tmp_path))
+    ):
+        assert sorted(entry.name for entry in root.iterdir()) == [
+            ".lock",
+            "configuration.json",
+            "workcell",
+        ]
+    assert json.loads((root / "configuration.json").read_text())["settings"]["seed"] == 7
+
+
+def test_what_is_no_results_folder_is_not_overwritten(tmp_path: Path) -> None:
+    kept = tmp_path / "thesis.tex"
+    kept.write_text("years of work")
+    with (
+        pytest.raises(ResultsError, match=r"is no results folder, but not empty \(thesis.tex\)"),
+        open_folder(SETTINGS, ExecutionSettings(tmp_path, 1, overwrite=True), load(RACK)),
+    ):
+        pytest.fail("was opened")
+    assert kept.read_text() == "years of work"
+
+
 @pytest.mark.parametrize("key", ["numpy", "sources"])
 def test_other_software_is_never_mixed(tmp_path: Path, key: str) -> None:
     execution = ExecutionSettings(tmp_path, 1, resume=True)

@@ -12,6 +12,7 @@ from hybrid_opt.recommending.choice import force_for_payload
 from hybrid_opt.recommending.driven_paths import DrivenPaths
 from hybrid_opt.recommending.force_table import front_durations, spread_members, table_forces
 from hybrid_opt.recommending.recommendation import HAND_MADE
+from hybrid_opt.recommending.rival import Rival
 from hybrid_opt.recommending.unsure import usual_doubts
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -128,6 +129,33 @@ def test_a_carry_without_room_for_errors_is_warned_of(drivable: ho.Cell, front: 
     assert bool(warned) == (room < 1e-3)
     gentle = ho.recommend(drivable, front.x, ho.Wish(force=50.5))
     assert not any("no room" in text for text in gentle.warnings)
+
+
+def test_a_wish_for_a_duration_is_kept_within_limits_on_jerk(
+    drivable: ho.Cell, front: ho.Front
+) -> None:
+    """The rack limits jerk, and its carries are driven within these limits."""
+    unlimited = ho.recommend(drivable, front.x, ho.Wish(force=60.0))
+    asked = 1.1 * unlimited.timing.duration
+    found = ho.recommend(drivable, front.x, ho.Wish(duration=asked))
+    assert found.wish.duration == asked
+    assert found.jerk is not None
+    assert found.jerk.timing.duration <= asked * 1.001
+    assert found.jerk.timing.duration > 0.97 * asked  # nothing is given away
+    assert not any("limits on jerk" in text for text in found.warnings)
+    shortest = ho.recommend(drivable, front.x, ho.Wish(force=drivable.workcell.task.force_limit[1]))
+    hardly = ho.recommend(drivable, front.x, ho.Wish(duration=1.025 * shortest.timing.duration))
+    assert any("no other carry of the front" in text for text in hardly.warnings)
+
+
+def test_what_a_rival_cannot_is_told_in_words() -> None:
+    inf = float("inf")
+    assert str(Rival("hand-made", inf, inf)) == (
+        "hand-made: cannot move with so little force, is never so fast"
+    )
+    assert str(Rival("hand-made", 2.0, 55.0)) == (
+        "hand-made: 2.000 s at the same force, 55.00 N in the same time"
+    )
 
 
 def test_wishes_that_nothing_answers_say_what_is_possible(
