@@ -92,9 +92,16 @@ class TimingModel:
 
         A path is mostly asked for several times in a row: the last one is remembered.
 
+        Args:
+            x: (n_var,) decision vector, or the (n_path,) free waypoints alone, which then get the
+                highest force limit: it moves nothing.
+
         Raises:
             SettingsError: x has the wrong shape or is not finite.
         """
+        task = self.workcell.task
+        if np.shape(x) == (task.n_path,) and task.n_path < task.n_var:
+            x = np.append(x, task.force_limit[1])
         x = self._checked(x)
         if self._latest is None or not np.array_equal(self._latest.x, x):
             self._latest = self._path_motion(x.copy())
@@ -188,6 +195,11 @@ class TimingModel:
             ),
             judgement=None,
         )
+
+    def still(self, motion: PathMotion) -> Carry:
+        """The carry that stands still at every sample of `motion`."""
+        zero = np.zeros(len(motion.parameter))
+        return self.carry(motion, zero, zero, zero)
 
     def drive_limits(self, force: float) -> TimingLimits:
         """The limits of drivable carries whose force limit this is [N], one of robust forces where

@@ -18,7 +18,7 @@ from hybrid_opt.robust.path_force import robust_path
 from hybrid_opt.timing.model import TimingModel, joint_names
 from hybrid_opt.timing.passes import KINDS, OUTCOMES, passes_function
 from hybrid_opt.timing.path_check import LEAST_LENGTH, arm_checks
-from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.records import Place, TimingLimits, TimingStatus
 from hybrid_opt.timing.robust_timer import CUTS, RestForce, RobustPasses
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.timing.use import limited_force
@@ -126,6 +126,8 @@ class PathTimer:
         functions = compiled.functions("path limits", make, str(intervals), lanes=lanes)
         self._path, self._limits = functions["path"], functions["sample_limits"]
         self._passes = passes_function(compiled, intervals)
+        # Made here: the cell's files may be gone when the first path is timed.
+        self._model = TimingModel(compiled, intervals) if self._passes is None else None
 
     @property
     def compiled(self) -> bool:
@@ -184,13 +186,9 @@ class PathTimer:
         they are given."""
         found = list(self.failures(paths) if failures is None else failures)
         rows = [row for row, failure in enumerate(found) if failure is None]
-        if rows and self._passes is None:
-            timings = [
-                from_time_path(self._model, time_path(self._model, x[r], limits[r]), limits[r])
-                for r in rows
-            ]
-            for row, timing in zip(rows, timings, strict=True):
-                found[row] = timing
+        if self._model is not None:
+            for row in rows:
+                found[row] = from_time_path(self._model, x[row], limits[row])
             return [timing for timing in found if timing is not None]
         for robust in (False, True):
             some = [row for row in rows if limits[row].robust is robust]
@@ -233,10 +231,6 @@ class PathTimer:
         passes = passes_function(self._compiled, self.intervals, CUTS)
         assert passes is not None, "asked for where the passes are compiled"
         return RobustPasses(passes, robust_path(self.workcell), self.intervals)
-
-    @cached_property
-    def _model(self) -> TimingModel:
-        return TimingModel(self._compiled, self.intervals)
 
     def _path_failure(self, paths: dict[str, Array], row: int) -> PathTiming | None:
         """Why a path cannot be timed at all."""
@@ -300,13 +294,16 @@ def _rows_of(paths: dict[str, Array], rows: list[int]) -> dict[str, Array]:
     return {name: values[rows] for name, values in paths.items()}
 
 
-def from_time_path(model: TimingModel, timing: Timing, limits: TimingLimits) -> PathTiming:
-    """The answer of `time_path` as a `PathTiming`."""
-    force, robust = np.full(2, np.nan), None
-    if timing.carry is not None:
-        force = timing.carry.peak_normal_force
+def from_time_path(model: TimingModel, x: Array, limits: TimingLimits) -> PathTiming:
+    """The answer of `time_path` for a path (n_path,), as a `PathTiming`."""
+    timing = time_path(model, x, limits)
+    force, robust, carry = np.full(2, np.nan), None, timing.carry
+    if timing.status is TimingStatus.INFEASIBLE_AT_REST:
+        carry = model.still(model.path_motion(x))
+    if carry is not None:
+        force = carry.peak_normal_force
         if limits.robust:
-            robust = limited_force(timing.carry, model.workcell, limits).max(axis=0)
+            robust = limited_force(carry, model.workcell, limits).max(axis=0)
     speed = np.zeros(0) if timing.grid_speed is None else timing.grid_speed
     return PathTiming(
         status=timing.status,

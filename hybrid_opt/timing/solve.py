@@ -64,7 +64,7 @@ def time_path(
     """The fastest timing from rest to rest within the workcell's and the given limits.
 
     Args:
-        x: (n_var,) decision vector.
+        x: (n_var,) decision vector, or its free waypoints (n_path,).
         motion: the path's geometry, where it is known already.
 
     Raises:
@@ -84,9 +84,7 @@ def _failure_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimit
 
     Otherwise one exists: slow enough, every quantity is as close to its value at rest as wanted.
     """
-    still = np.zeros(len(motion.parameter))
-    carry = model.carry(motion, still, still, still)
-    use = limit_use(carry, model.workcell, limits, model.joint_names)
+    use = limit_use(model.still(motion), model.workcell, limits, model.joint_names)
     excess = worst(use)
     if excess.ratio < 1.0 - 1e-6:
         return None

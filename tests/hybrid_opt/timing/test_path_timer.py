@@ -194,8 +194,8 @@ def test_paths_that_fail_before_any_timing() -> None:
 
 @pytest.mark.filterwarnings("ignore:no C compiler")
 def test_without_a_compiler_time_path_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    limits = TimingLimits(force=1.05 * STATIC)
-    compiled = timer_of(hand_cell(), 30).time(initial(), limits)
+    limits, less = TimingLimits(force=1.05 * STATIC), TimingLimits(force=0.5 * STATIC)
+    compiled, still = timer_of(hand_cell(), 30).time_all(np.array([initial()] * 2), [limits, less])
     monkeypatch.setenv("CC", "no-such-compiler")
     timer = timer_of(hand_cell(), 30)
     assert not timer.compiled
@@ -203,6 +203,9 @@ def test_without_a_compiler_time_path_answers(monkeypatch: pytest.MonkeyPatch) -
     assert found.ok
     assert found.duration == pytest.approx(compiled.duration, rel=2e-3)
     np.testing.assert_allclose(found.peak_force, compiled.peak_force, rtol=1e-3)
+    refused = timer.time(initial(), less)
+    assert refused.status is still.status is TimingStatus.INFEASIBLE_AT_REST
+    np.testing.assert_allclose(refused.peak_force, still.peak_force, rtol=1e-3)
 
 
 def test_misuse_is_refused() -> None:

@@ -1,0 +1,55 @@
+"""Small drivable searches of every cell that ships, here and in a worker."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hybrid_opt as ho
+from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.evaluations_file import decode
+from hybrid_opt.campaign.replica import CellEvaluatorSource, ReplicaRequest, run_replica
+from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.work.job import Job, answer_all
+from hybrid_opt.work.processes import ProcessExecutor
+from symbolic.workcell.cell_files import collect_cell
+from tests.symbolic.workcell.samples import RACK
+
+CELLS = sorted(RACK.parent.glob("*.toml"))
+EVALUATIONS = 6
+
+
+@pytest.mark.parametrize("path", CELLS, ids=[path.stem for path in CELLS])
+def test_every_cell_that_ships_is_searched(path: Path) -> None:
+    cell = ho.Cell.load(path).drivable()
+    rng = np.random.default_rng(1)
+    front = ho.search(cell, "nsga2", evaluations=EVALUATIONS, rng=rng)
+    found = front.evaluations
+    assert found is not None
+    assert len(found.x) == EVALUATIONS
+    np.testing.assert_array_equal(found.x[0], cell.initial)
+    assert found.feasible[0]
+    duration, force = found.objectives[0]
+    assert 0.0 < duration < np.inf
+    limit = cell.initial[-1] / cell.workcell.task.reference_force.max()
+    assert 0.0 < force <= limit * (1.0 + 1e-3)
+
+
+def test_a_worker_elsewhere_searches_without_the_cells_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the joint allocation paths are timed one by one, which reads the robots' files."""
+    cell = ho.Cell.load(RACK.with_name("drum.toml")).drivable()
+    source = CellEvaluatorSource(PackedCell.of(collect_cell(cell.workcell)), DRIVABLE_OBJECTIVES)
+    settings = CampaignSettings(("random",), EVALUATIONS, 1, objectives=DRIVABLE_OBJECTIVES)
+    request = ReplicaRequest(settings, "random", 0, cell.initial)
+    monkeypatch.chdir(tmp_path)
+    (answer,) = answer_all(ProcessExecutor(1), Job(source, run_replica), [request])
+    found = decode(answer.evaluations, tmp_path).evaluations
+    assert len(found.x) == EVALUATIONS
+    expected = cell.evaluate(found.x)
+    np.testing.assert_array_equal(found.objectives, expected.objectives)
+    assert np.isfinite(found.objectives).all()
