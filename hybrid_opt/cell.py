@@ -25,7 +25,7 @@ from hybrid_opt.evaluate.objectives import (
     force_kind,
     select_objectives,
 )
-from hybrid_opt.evaluate.static_hold import StaticHold, static_hold
+from hybrid_opt.evaluate.static_hold import StaticHold, require_hold, static_hold, unheld
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.read.cell import load
@@ -157,6 +157,20 @@ class Cell:
     def static_hold(self) -> StaticHold:
         """The forces of holding the payload level and still."""
         return static_hold(self.workcell)
+
+    @cached_property
+    def unheld(self) -> str:
+        """Why the payload cannot be held still, and what would do; '' where it can."""
+        return unheld(self.workcell) or unheld(self.workcell, self.evaluator)
+
+    def require_hold(self) -> None:
+        """Refuse a payload that cannot be held still; what needs no compiled code is asked first.
+
+        Raises:
+            WorkcellError: it cannot; the text says what is needed, allowed, and what would do.
+        """
+        require_hold(self.workcell)
+        require_hold(self.workcell, self.evaluator)
 
     @property
     def geometry(self) -> CellGeometry:

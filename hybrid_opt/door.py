@@ -46,7 +46,9 @@ def search(
 
     Raises:
         SettingsError: an unknown algorithm or a value that is not allowed.
+        WorkcellError: the payload cannot be held still, so that there is nothing to search for.
     """
+    cell.require_hold()
     settings = settings or SearchSettings()
     if settings.initial is None and algorithm != "random":
         settings = replace(settings, initial=cell.initial[None])

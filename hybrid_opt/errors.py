@@ -23,6 +23,10 @@ class WitnessError(DualArmError):
     """The simulator is missing, or cannot answer what it was asked."""
 
 
+class NoCarryError(ResultsError):
+    """A study found no carry to recommend; the text says why."""
+
+
 class JobError(DualArmError):
     """The box cannot be gripped, lifted, set down or let go as the workcell asks."""
 

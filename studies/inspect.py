@@ -50,6 +50,8 @@ def told(found: Inspection, pairs: bool = False) -> Iterator[str]:
         f"At rest, level: normal forces {still} N, objectives {share}; payload at the reference "
         f"force {found.static_payload_limit:.2f} kg"
     )
+    if found.unheld:
+        yield f"Infeasible, whatever the path: {found.unheld}"
     found.build()
     yield f"Hand-made trajectory: {_judged_text(found.initial)}"
     yield from _why(found, "initial")

@@ -125,6 +125,11 @@ class Inspection:
         return self._cell.static_hold.payload_limit
 
     @property
+    def unheld(self) -> str:
+        """Why the payload cannot be held still, and what would do; '' where it can."""
+        return self._cell.unheld
+
+    @property
     def initial(self) -> Judgement:
         """The verdict on the hand-made trajectory."""
         return _judged(self._carries["initial"])

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from hybrid_opt.campaign import Progress
 from hybrid_opt.campaign.results import read_summary
-from hybrid_opt.errors import ResultsError
 from studies.cli import add_wishes, wish
 from studies.program import Parser, add_verbose, carried_out, run_program
 from studies.recommendation_stage import recommend_from
@@ -43,8 +42,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     path = options.output or root / f"recommended-{named}.json"
     robots = read_summary(root).robots
     found = recommend_from(root, wanted, path, Progress(not options.quiet))
-    if found is None:
-        raise ResultsError(f"{root}: its search found no drivable carry; run a longer one")
     print(recommendation_text(found, robots, str(root)).terminal())
     return 0
 

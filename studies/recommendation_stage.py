@@ -1,4 +1,4 @@
-"""The stage that picks the carry to run from the drivable fronts."""
+"""The stage that picks the carry to run from the drivable fronts, or says why there is none."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import numpy as np
 import hybrid_opt as ho
 from codegen.function import available_cores
 from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Progress, Stage
-from hybrid_opt.campaign.layout import RECOMMENDATION, RECOMMENDED, STAGES
+from hybrid_opt.campaign.layout import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
 from hybrid_opt.campaign.progress import Advance
 from hybrid_opt.campaign.recommended import (
     ForceTable,
+    NoRecommendation,
     StoredDurations,
     StoredPrice,
     StoredRecommendation,
@@ -22,7 +23,10 @@ from hybrid_opt.campaign.recommended import (
     stored_price,
     stored_recommendation,
 )
-from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.errors import NoCarryError
+from hybrid_opt.evaluate.evaluations import concatenated
+from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.recommending.driven_paths import DrivenPaths
 from hybrid_opt.recommending.force_table import (
     front_durations,
@@ -54,15 +58,17 @@ from symbolic.errors import SettingsError
 
 
 def recommendation_stage(wish: ho.Wish) -> Stage:
-    """The stage that writes `recommended.json`, a trajectory file, and `recommendation.json`."""
+    """The stage that writes `recommended.json`, a trajectory file, and `recommendation.json`, or
+    `no-recommendation.json`."""
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
         request = _Request(folder.root, wish, folder.execution.jobs, progress)
         (found,) = answer_all(_executor(folder.execution), Job(_nothing, _recommended), [request])
-        if found is None:  # also after an earlier attempt that was interrupted
-            (folder.root / RECOMMENDATION).unlink(missing_ok=True)
-        else:
-            write_json(folder.root / RECOMMENDATION, to_json(found))
+        none = isinstance(found, NoRecommendation)
+        written, other = (NO_RECOMMENDATION, RECOMMENDATION)[:: 1 if none else -1]
+        # Also after an earlier attempt that was interrupted.
+        (folder.root / other).unlink(missing_ok=True)
+        write_json(folder.root / written, to_json(found))
 
     return Stage("recommendation", run, dict(wish.given))
 
@@ -89,27 +95,31 @@ def _nothing() -> None:
     """A recommendation needs nothing but its folder."""
 
 
-def _recommended(_: None, request: _Request, emit: Emit) -> StoredRecommendation | None:
+def _recommended(_: None, request: _Request, emit: Emit) -> StoredRecommendation | NoRecommendation:
     path = request.root / RECOMMENDED
-    return recommend_from(request.root, request.wish, path, request.progress, request.threads)
+    try:
+        return recommend_from(request.root, request.wish, path, request.progress, request.threads)
+    except NoCarryError as error:
+        return NoRecommendation(str(error))
 
 
-def read_recommendation(root: Path) -> StoredRecommendation | None:
-    """The recommendation in a results folder, None where there is none.
+def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation | None:
+    """The recommendation in a results folder, or why it has none; None where it was not asked.
 
     Raises:
         ResultsError: it is damaged.
     """
-    path = root / RECOMMENDATION
-    if not path.exists():
-        return None
     remedy = f"delete {STAGES}/recommendation.json in its folder and continue with --resume"
-    return read_record(StoredRecommendation, path, remedy)
+    if (root / RECOMMENDATION).exists():
+        return read_record(StoredRecommendation, root / RECOMMENDATION, remedy)
+    if (root / NO_RECOMMENDATION).exists():
+        return read_record(NoRecommendation, root / NO_RECOMMENDATION, remedy)
+    return None
 
 
 def recommend_from(
     root: Path, wish: ho.Wish, path: Path, progress: Progress, threads: int = 0
-) -> StoredRecommendation | None:
+) -> StoredRecommendation:
     """Recommend a carry of a study's drivable fronts, and store it.
 
     Args:
@@ -120,18 +130,19 @@ def recommend_from(
         threads: in which carries are timed, 0 for one per core; has no influence on what is found.
 
     Returns:
-        What is said of it; None where no drivable carry was found.
+        What is said of it.
 
     Raises:
+        NoCarryError: no drivable carry was found; the text says why.
         SettingsError: no carry can do what is wished for.
         ResultsError: the folder is not complete or damaged, or the file cannot be written.
     """
     campaign = read_campaign(root)
     drivable = drivable_fronts(drivable_root(root, campaign.workcell, campaign.objectives))
-    if len(drivable.x) == 0:
-        return None
     threads = threads or available_cores()
     cell = ho.Cell(drivable.results.workcell, drivable.results.objectives, threads)
+    if len(drivable.x) == 0:
+        raise NoCarryError(_why_none(cell, drivable.results))
     alone = is_drivable(campaign.workcell, campaign.objectives)
     others = {} if alone else least_force(campaign)
     # The choice, the table's rows and the price.
@@ -161,6 +172,23 @@ def recommend_from(
         price=price,
     )
     return stored_recommendation(found, told)
+
+
+def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
+    """What stopped the candidates of an experiment, and its hand-made trajectory."""
+    found = concatenated([replica.evaluations for replica in results.replicas])
+    stopped = ", ".join(
+        f"{name.replace('_', ' ')} {100.0 * count / len(found):.1f} %"
+        for name, count in found.infeasible_by_reason.items()
+    )
+    told = f"none of {len(found)} drivable candidates is feasible ({stopped})"
+    limits = cell.timing_model.drive_limits(float(cell.initial[-1]))
+    timing = ho.time_path(cell, cell.initial, limits)
+    if not timing.ok:
+        return f"{told}; the hand-made trajectory cannot be driven: {timing.reason}"
+    why = explain(cell.evaluator, cell.evaluate(cell.initial))
+    hand_made = f"; the hand-made trajectory: {why[0]}" if why else ""
+    return f"{told}{hand_made}; a longer search or wider bounds may find one"
 
 
 def _price(carry: ho.Carry, seed: int, threads: int) -> StoredPrice | None:

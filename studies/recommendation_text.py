@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation, StoredRival, set_text
+from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.timing.document import StoredJerk
 from hybrid_opt.timing.records import TimingStatus
 from symbolic.array import Array
@@ -36,6 +37,20 @@ class RecommendationText:
         lines = [self.headline]
         lines += [f"  {heading:<{width}}  {text}" for heading, text in self.facts]
         return "\n".join(lines + [f"  WARNING: {text}" for text in self.warnings])
+
+
+def study_words(summary: CampaignSummary, folder: str) -> RecommendationText | None:
+    """What a study opens with: the carry to run, or why there is none; None where nothing is known
+    of either.
+
+    Args:
+        folder: as for `recommendation_text`.
+    """
+    if summary.recommendation is not None:
+        return recommendation_text(summary.recommendation, summary.robots, folder)
+    if not summary.no_recommendation:
+        return None
+    return RecommendationText("No carry is recommended", (("why", summary.no_recommendation),), ())
 
 
 def recommendation_text(

@@ -24,6 +24,7 @@ from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.campaign.simulated import read_simulations
 from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.static_hold import require_hold
 from hybrid_opt.polishing.drivable.point import is_polishable
 from hybrid_opt.polishing.front import knows_forces
 from hybrid_opt.polishing.settings import PolishSettings
@@ -31,7 +32,7 @@ from hybrid_opt.recommending.wish import Wish
 from studies.drivable import is_drivable, known_paths
 from studies.jerk_costs import jerk_costs, jerk_text
 from studies.recommendation_stage import recommendation_stage
-from studies.recommendation_text import recommendation_text
+from studies.recommendation_text import study_words
 from studies.report.stage import report_stage
 from studies.simulation_stage import simulation_stage
 from studies.simulation_text import simulation_text
@@ -40,6 +41,9 @@ from studies.terminal_summary import terminal_summary
 from studies.timing_stage import timing_stage
 from symbolic.array import Array
 from symbolic.records import Workcell
+
+NOT_ASKED = "drivable carries were not searched for (--no-drivable)"
+"""Why a study without them recommends none."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,7 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
         every.append(drivable_stage(driven))
     if study.drivable:
         every.append(recommendation_stage(study.wish))
-    every.append(summary_stage())
+    every.append(summary_stage("" if study.drivable else NOT_ASKED))
     if study.recommend_only:
         return tuple(every)
     every.append(timing_stage(study.wish.force, last=alone))
@@ -122,6 +126,7 @@ def run_study(
     Raises:
         DualArmError: the workcell, a setting or the results folder is wrong, or work failed.
     """
+    require_hold(workcell)  # before any work
     cell, competition = decided_cell(workcell, settings, execution)
     alone = is_drivable(cell, settings.objectives)
     if not alone and not knows_forces(cell, settings.objectives):
@@ -139,12 +144,14 @@ def run_study(
         told = store_branches(folder.root, competition)
         every = stages(study, alone)
         check_stages(folder, every)
+        whole = Cell(cell, settings.objectives)
         build_study(
-            Cell(cell, settings.objectives),
+            whole,
             progress,
             polish=study.polish is not None or study.drivable_polish is not None,
             drivable=study.drivable and not alone,
         )
+        whole.require_hold()
         run_stages(folder, every, progress)
         return told + study_text(folder.root, study.with_paper, study.recommend_only)
 
@@ -160,15 +167,13 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
         ResultsError: the folder is not complete or damaged.
     """
     summary = read_summary(root)
-    found = summary.recommendation
-    words = (
-        "" if found is None else recommendation_text(found, summary.robots, str(root)).terminal()
-    )
+    words = study_words(summary, str(root))
     beside = (root / DRIVABLE / SUMMARY).exists()
     drivable = read_summary(root / DRIVABLE) if beside else None
     costs = jerk_text(jerk_costs(root / DRIVABLE if beside else root))
-    if words and brief:
-        return words
-    told = terminal_summary(summary, with_paper, words, drivable, costs)
+    carry = "" if words is None else words.terminal()
+    if carry and brief:
+        return carry
+    told = terminal_summary(summary, with_paper, carry, drivable, costs)
     simulations = read_simulations(root)
     return f"{told}\n\n{simulation_text(simulations)}" if simulations else told

@@ -19,6 +19,7 @@ from hybrid_opt.campaign.layout import (
     selected_file,
 )
 from hybrid_opt.campaign.polish_stage import read_polished
+from hybrid_opt.campaign.recommended import NoRecommendation
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.summary import ReplicaFigures
 from hybrid_opt.indicators.attainment import attainment_surfaces
@@ -41,12 +42,20 @@ PERCENTILES = (25.0, 50.0, 75.0, 100.0)
 """Percentiles of the attainment surfaces, in percent of the replicas."""
 
 
-def summary_stage() -> Stage:
-    """The stage that computes the figures of a finished search."""
-    return Stage("summary", _run)
+def summary_stage(not_asked: str = "") -> Stage:
+    """The stage that computes the figures of a finished search.
+
+    Args:
+        not_asked: why the study recommends no carry, where it was not asked for one.
+    """
+
+    def run(folder: CampaignFolder, progress: Progress) -> None:
+        _run(folder, progress, not_asked)
+
+    return Stage("summary", run)
 
 
-def _run(folder: CampaignFolder, progress: Progress) -> None:
+def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
     results = read_campaign(folder.root)
     evaluator = folder.cell.evaluator
     polished = {
@@ -84,10 +93,13 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
         for front in [polished[replica.algorithm, replica.replica]]
     ]
     _store_hand_made(folder)
+    found = read_recommendation(folder.root)
+    reason = found.reason if isinstance(found, NoRecommendation) else ""
     summary = replace(
         campaign_summary(results, reference, folder.cell.static_hold, entries),
         bounds=bounds_of(folder.workcell, np.concatenate(best)),
-        recommendation=read_recommendation(folder.root),
+        recommendation=None if isinstance(found, NoRecommendation) else found,
+        no_recommendation=reason if found else not_asked,
     )
     write_json(folder.root / SUMMARY, to_json(summary))
 

@@ -17,6 +17,7 @@ POLISHED_SUFFIX = "-polished"
 DRIVABLE = "drivable"
 RECOMMENDED = "recommended.json"
 RECOMMENDATION = "recommendation.json"
+NO_RECOMMENDATION = "no-recommendation.json"
 SIMULATED = "simulated"
 HAND_MADE = "hand-made.json"
 

@@ -1,4 +1,4 @@
-"""recommendation.json as records: the carry to run, as a study stores it."""
+"""recommendation.json as records: the carry to run, as a study stores it, or why there is none."""
 
 from __future__ import annotations
 
@@ -212,6 +212,13 @@ class StoredRecommendation:
     def limited_force(self) -> Array:
         """(2,) largest of them of each robot [N]."""
         return self.peak_force if self.robust_force is None else self.robust_force
+
+
+@dataclass(frozen=True)
+class NoRecommendation:
+    """no-recommendation.json: why a study has no carry to run."""
+
+    reason: str
 
 
 @dataclass(frozen=True)

@@ -218,6 +218,8 @@ class CampaignSummary:
     Attributes:
         robots: their names, in the order of all pairs.
         recommendation: the carry to run, None where the study has none.
+        no_recommendation: why it has none, '' where it has one or where the study is part of
+            another, which recommends.
     """
 
     workcell: StoredCell
@@ -232,6 +234,7 @@ class CampaignSummary:
     tests: tuple[StoredTest, ...]
     bounds: Bounds = NO_BOUNDS
     recommendation: StoredRecommendation | None = None
+    no_recommendation: str = ""
 
     def __post_init__(self) -> None:
         """Refuse what does not belong together."""

@@ -1,16 +1,33 @@
-"""The forces of holding the payload still, which no carry can stay far below, and what a force
-says of the payload that could be carried."""
+"""Holding the payload still: the forces it takes, which no carry can stay far below, what they say
+of the payload that could be carried, and whether robots and pads can do it at all."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+import casadi as ca
 import numpy as np
 
 from hybrid_opt.per_workcell import kept_per_workcell
 from symbolic.array import Array
-from symbolic.contact.load import load_function
+from symbolic.contact.load import LOAD_OUTPUTS, paper_load_function, uncertain_load_function
+from symbolic.errors import WorkcellError
 from symbolic.records import Workcell
+from symbolic.records.poses import box_rotation
+from symbolic.records.quantities import FRICTION
+from symbolic.robot.arm import joint_torque
+from symbolic.robot.model import RobotModel, build_robot_model
+
+if TYPE_CHECKING:
+    from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+
+ROUNDING = 1e-6
+"""Share by which a limit may be exceeded that is met exactly."""
+
+STEPS = 24
+"""Bisections for the mass or the friction that would do."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +55,9 @@ def static_hold(workcell: Workcell) -> StaticHold:
 
 
 def _static_hold(workcell: Workcell) -> StaticHold:
-    function = load_function(workcell)
-    outputs = function(pose=np.zeros(6), rate=np.zeros(6), second_rate=np.zeros(6))
-    normal = np.array(outputs["normal_force"], dtype=float).reshape(2)
-    whole = np.linalg.norm(np.array(outputs["contact_force"], dtype=float).reshape(2, 3), axis=1)
+    outputs = still_load(workcell, np.zeros(6))
+    normal = outputs["normal_force"]
+    whole = np.linalg.norm(outputs["contact_force"].reshape(2, 3), axis=1)
     for force in (normal, whole):
         force.setflags(write=False)
     return StaticHold(normal, whole, payload_limit(workcell, whole))
@@ -71,3 +87,230 @@ def payload_limit(workcell: Workcell, contact_force: Array) -> float:
         contact_force: (2,) peak magnitudes of the whole forces, with the workcell's own mass [N].
     """
     return float(mass_at_reference(workcell, contact_force).min())
+
+
+_load_of = kept_per_workcell(uncertain_load_function)
+
+
+def still_load(
+    workcell: Workcell, pose: Array, friction: float = 1.0, function: ca.Function | None = None
+) -> dict[str, Array]:
+    """What the contacts have to bear while the payload stands still in a pose, the only place that
+    says which normal forces that takes.
+
+    Args:
+        pose: (6,) of the box [m, rad].
+        friction: factor on both coefficients.
+        function: another `symbolic.physics.payload_load.uncertain_load_function` than the cell's.
+
+    Returns:
+        `symbolic.physics.payload_load.LOAD_OUTPUTS`, flat.
+    """
+    coefficients = [friction * contact.friction for contact in workcell.contacts]
+    centre = workcell.payload.centre_of_mass
+    found = (function or _load_of(workcell))(pose, np.zeros(6), np.zeros(6), coefficients, centre)
+    return {
+        name: np.array(value, dtype=float).reshape(-1)
+        for name, value in zip(LOAD_OUTPUTS, found, strict=True)
+    }
+
+
+@dataclass(frozen=True)
+class StillUse:
+    """What standing still at one end of the path asks of a limit.
+
+    Attributes:
+        quantity: what is limited.
+        whose: the robot, or robot/joint.
+        where: 'start' or 'goal'.
+        needed, allowed: [unit].
+    """
+
+    quantity: str
+    whose: str
+    where: str
+    needed: float
+    allowed: float
+    unit: str
+
+    @property
+    def share(self) -> float:
+        """Of the limit."""
+        return self.needed / self.allowed
+
+    @property
+    def exceeded(self) -> bool:
+        """Whether the limit does not allow it."""
+        return self.share > 1.0 + ROUNDING
+
+    def __str__(self) -> str:
+        return (
+            f"{self.whose} needs a {self.quantity} of {self.needed:.4g} {self.unit} at the "
+            f"{self.where}, allowed are {self.allowed:.4g} {self.unit}"
+        )
+
+
+NORMAL, WHOLE = "normal force", "force in all"
+PRESSURE, TORQUE = "shift of the pressure", "joint torque"
+
+
+def unheld(workcell: Workcell, evaluator: CandidateEvaluator | None = None) -> str:
+    """Why the payload cannot be held still at the start or the goal, and what would do; '' where
+    it can.
+
+    Normal forces and whole forces are held against the reference forces, which are what the robots
+    may carry, shifts of the pressure against the patches where they are a limit.
+
+    Args:
+        workcell: the cell.
+        evaluator: of the cell; with it joint torques count as well, in the postures that the
+            hand-made trajectory begins and ends with.
+
+    Raises:
+        RobotModelError: a URDF does not give an arm.
+    """
+    still = _Still(workcell, [] if evaluator is None else _ends(evaluator))
+    exceeded = still.exceeded()
+    if not exceeded:
+        return ""
+    worst: dict[tuple[str, str], StillUse] = {}
+    for use in sorted(exceeded, key=lambda use: -use.share):
+        worst.setdefault((use.quantity, use.whose), use)
+    told = "; ".join(str(use) for use in worst.values())
+    return f"it cannot be held still: {told}. {still.remedy(exceeded)}"
+
+
+def require_hold(workcell: Workcell, evaluator: CandidateEvaluator | None = None) -> None:
+    """Refuse a cell whose payload cannot be held still, see `unheld`.
+
+    Raises:
+        WorkcellError: it cannot.
+    """
+    told = unheld(workcell, evaluator)
+    if told:
+        raise WorkcellError(str(workcell.source), (f"payload: {told}",))
+
+
+def _ends(evaluator: CandidateEvaluator) -> list[tuple[Array, Array]]:
+    """Both arms' joints at the start and the goal of the hand-made trajectory; those that are
+    reached."""
+    from symbolic.records.decision import initial_decision
+
+    outputs = evaluator.outputs(initial_decision(evaluator.workcell.task)[None])
+    return [
+        (outputs["q_1"][0, sample], outputs["q_2"][0, sample])
+        for sample in (0, -1)
+        if not (outputs["lost_1"][0, sample] or outputs["lost_2"][0, sample])
+    ]
+
+
+class _Still:
+    """A payload at rest at both ends of its path, with other masses and friction as well."""
+
+    def __init__(self, workcell: Workcell, postures: list[tuple[Array, Array]]) -> None:
+        ends = (workcell.task.waypoints[0].lower, workcell.task.waypoints[-1].lower)
+        self._workcell = workcell
+        self._poses = dict(zip(("start", "goal"), ends, strict=True))
+        self._postures = dict(zip(self._poses, postures, strict=False))
+        self._models: list[RobotModel] = []
+        if postures:
+            self._models = [build_robot_model(robot) for robot in workcell.robots]
+
+    def exceeded(
+        self, mass: float = 1.0, friction: float = 1.0, function: ca.Function | None = None
+    ) -> list[StillUse]:
+        """The limits that are exceeded with other factors on mass and friction."""
+        found = []
+        for where, pose in self._poses.items():
+            load = still_load(self._workcell, pose, friction, function)
+            uses = [*self._contact_uses(where, load, mass), *self._torques(where, load, mass)]
+            found += [use for use in uses if use.exceeded]
+        return found
+
+    def _contact_uses(self, where: str, load: dict[str, Array], mass: float) -> Iterator[StillUse]:
+        workcell = self._workcell
+        whole = np.linalg.norm(load["contact_force"].reshape(2, 3), axis=1)
+        for i, robot in enumerate(workcell.robots):
+            allowed = float(workcell.task.reference_force[i])
+            normal = mass * float(load["normal_force"][i])
+            # Where a pad presses too hard already, its whole force says nothing new.
+            name, force = (NORMAL, normal) if normal > allowed else (WHOLE, mass * float(whole[i]))
+            yield StillUse(name, robot.name, where, force, allowed, "N")
+            if workcell.task.allocation == "paper":  # the joint one presses harder instead
+                shift, radius = float(load["pressure_shift"][i]), workcell.contacts[i].patch_radius
+                yield StillUse(PRESSURE, robot.name, where, 1e3 * shift, 1e3 * radius, "mm")
+
+    def _torques(self, where: str, load: dict[str, Array], mass: float) -> Iterator[StillUse]:
+        """The most used joint of each arm, where its posture is known."""
+        workcell = self._workcell
+        rotation = ca.DM(box_rotation(workcell.task.orientation, self._poses[where]))
+        for i, q in enumerate(self._postures.get(where, ())):
+            robot, model = workcell.robots[i], self._models[i]
+            zero, wrench = np.zeros(len(q)), ca.DM(load[f"wrench_{i + 1}"])
+            contact, jacobian = workcell.contacts[i], model.jacobian(q)
+            held = joint_torque(robot, contact, jacobian, rotation, wrench)
+            torque = np.abs(np.array(model.inverse_dynamics(q, zero, zero) + mass * held)).ravel()
+            joint = int(np.argmax(torque / robot.torque_max))
+            whose, most = f"{robot.name}/{model.joint_names[joint]}", robot.torque_max[joint]
+            unit = "N m" if model.turning[joint] else "N"
+            yield StillUse(TORQUE, whose, where, float(torque[joint]), float(most), unit)
+
+    def remedy(self, exceeded: list[StillUse]) -> str:
+        """Which mass, friction or patch would do, each with all else as it is."""
+        ways = []
+        if any(use.quantity != PRESSURE for use in exceeded):
+            ways = [way for way in (self._mass(), self._friction(), self._patch()) if way]
+        found = [" or ".join(ways)] if ways else []
+        if any(use.quantity == PRESSURE for use in exceeded):
+            most = max(use.needed for use in exceeded if use.quantity == PRESSURE)
+            found.append(f'patches of at least {most:.1f} mm radius or allocation = "joint"')
+        if not found:
+            return "No mass, friction or patch alone would do"
+        return f"This would do: {', and '.join(found)}"
+
+    def _mass(self) -> str:
+        factor = _nearest(self._bears, 1.0, 0.0)
+        if factor is None:
+            return ""
+        mass = np.floor(1e3 * self._workcell.payload.mass * factor) / 1e3
+        return f"a mass of at most {mass:g} kg" if mass > 0.0 else ""
+
+    def _friction(self) -> str:
+        coefficients = [contact.friction for contact in self._workcell.contacts]
+        factor = _nearest(
+            lambda factor: self._bears(friction=factor), 1.0, FRICTION.high / max(coefficients)
+        )
+        if factor is None:
+            return ""
+        rounded = [np.ceil(1e3 * factor * value) / 1e3 for value in sorted({*coefficients})]
+        wanted = " and ".join(f"{value:g}" for value in rounded)
+        return f"friction of at least {wanted}"
+
+    def _patch(self) -> str:
+        """The patches with which the joint allocation need not press harder for the moments."""
+        workcell = self._workcell
+        if workcell.task.allocation == "paper" or not workcell.has_facing_pads:
+            return ""
+        function = paper_load_function(workcell)
+        if not self._bears(function=function):
+            return ""
+        loads = [still_load(workcell, pose, function=function) for pose in self._poses.values()]
+        most = max(float(load["pressure_shift"].max()) for load in loads)
+        return f"patches of at least {1e3 * most:.1f} mm radius"
+
+    def _bears(
+        self, mass: float = 1.0, friction: float = 1.0, function: ca.Function | None = None
+    ) -> bool:
+        """Whether forces and torques are within their limits."""
+        exceeded = self.exceeded(mass, friction, function)
+        return all(use.quantity == PRESSURE for use in exceeded)
+
+
+def _nearest(enough: Callable[[float], bool], here: float, far: float) -> float | None:
+    """The factor nearest to one that fails which is enough, None where even the far one is not."""
+    if not enough(far):
+        return None
+    for _ in range(STEPS):
+        middle = (here + far) / 2.0
+        here, far = (here, middle) if enough(middle) else (middle, far)
+    return far

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.errors import ProposalError
+from hybrid_opt.evaluate.static_hold import require_hold
 from hybrid_opt.proposing.document import merged
 from hybrid_opt.proposing.holding import HoldQuery, HoldSearch, find_holds
 from hybrid_opt.proposing.judge import judge_of
@@ -51,10 +52,11 @@ def prepare(
 
     Raises:
         ProposalError: an arm cannot hold the box at start and goal; the text says why.
-        WorkcellError: the problem is wrong.
+        WorkcellError: the problem is wrong, or no arms could hold the payload still.
     """
     given = merged(given, redundancy(problem, problem.workcell(given)))
     workcell = problem.workcell(given)
+    require_hold(workcell)
     start, goal = problem.poses
     judge = judge_of(build_geometry(workcell))
     blocked = box_blocked(judge, start, goal)

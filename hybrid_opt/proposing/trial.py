@@ -13,6 +13,7 @@ from hybrid_opt.carry import Judgement
 from hybrid_opt.evaluate.certification import LostPathError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
+from hybrid_opt.evaluate.static_hold import unheld
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
 from symbolic.functions import cell_functions, motion_function
@@ -82,8 +83,13 @@ class Trial:
         return outputs["q_1"][0, 0], outputs["q_2"][0, 0]
 
     def verdict(self) -> tuple[Judgement, str]:
-        """Whether the proposed carry is feasible, certified between its samples, and if not why."""
-        return self.verdict_on(self.initial)
+        """Whether the proposed carry is feasible, certified between its samples and held still at
+        both ends, and if not why."""
+        judgement, why = self.verdict_on(self.initial)
+        told = unheld(self.workcell, self.evaluator) if judgement.feasible else ""
+        return (
+            (replace(judgement, feasible=False, reason="hold"), told) if told else (judgement, why)
+        )
 
     def certain(self, x: Array) -> bool:
         """Whether a decision vector (n_var,) is feasible, between its samples too."""

@@ -18,7 +18,7 @@ from typing import Any
 from hybrid_opt.display.scene import embedded_json, scene_js, three_js
 from hybrid_opt.store.json_records import to_json
 from studies.errors import ReportError
-from studies.recommendation_text import recommendation_text
+from studies.recommendation_text import study_words
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
 from studies.text_table import counted
@@ -112,10 +112,9 @@ IN_FOLDER = {"file": "file, beside this page", "export": "export, from this fold
 
 def _recommendation(data: ReportData) -> str:
     """The words that the terminal opens with, too."""
-    found = data.summary.recommendation
-    if found is None:
+    words = study_words(data.summary, "")
+    if words is None:
         return ""
-    words = recommendation_text(found, data.summary.robots, "")
     facts = "".join(
         f"<dt>{html.escape(IN_FOLDER.get(heading, heading))}</dt>"
         f"<dd>{_monospaced(heading, text)}</dd>"

@@ -1,0 +1,159 @@
+"""Payloads that cannot be held still: found before any work, with what would do, by every door."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hybrid_opt as ho
+from hybrid_opt.evaluate.static_hold import still_load, unheld
+from hybrid_opt.timing.model import TimingModel
+from studies import inspect, propose, run
+from studies.inspection import inspect as inspected
+from studies.program import BAD_INPUT
+from symbolic.errors import WorkcellError
+from symbolic.workcell.file import load
+from symbolic.workcell.records import Workcell
+from tests.hybrid_opt.proposing.problems import shipped_problem
+from tests.symbolic.cells import RACK
+
+GRAVITY = 9.81
+CELLS = sorted(RACK.parent.glob("*.toml"))
+
+
+def changed(name: str, folder: Path, **values: float) -> Path:
+    """A shipped cell with other values of some keys."""
+    path = RACK.with_name(f"{name}.toml")
+    text = path.read_text().replace("../robots", str(RACK.parents[1] / "robots"))
+    for key, value in values.items():
+        text, count = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
+        assert count
+    other = folder / path.name
+    other.write_text(text)
+    return other
+
+
+def told(text: str, what: str) -> float:
+    """A number of the remedy."""
+    found = re.search(rf"{what} ([\d.]+)", text)
+    assert found is not None, text
+    return float(found[1])
+
+
+@pytest.fixture
+def slippery(tmp_path: Path) -> Path:
+    """20 kg at friction 0.1: 981 N at rest, eight times the reference force."""
+    return changed("rack", tmp_path, mass=20.0, friction=0.1)
+
+
+@pytest.mark.parametrize("path", CELLS, ids=[path.stem for path in CELLS])
+def test_every_cell_that_ships_can_be_held(path: Path) -> None:
+    assert unheld(load(path)) == ""
+
+
+def test_the_forces_are_those_of_a_level_box() -> None:
+    cell = load(RACK)
+    for friction in (1.0, 0.5, 0.1):
+        load_at = still_load(cell, np.zeros(6), friction)
+        needed = cell.payload.mass * GRAVITY / (2.0 * friction * cell.contacts[0].friction)
+        np.testing.assert_allclose(load_at["normal_force"], needed, rtol=1e-3)
+
+
+def test_needed_allowed_and_remedies_are_told(slippery: Path, tmp_path: Path) -> None:
+    why = unheld(load(slippery))
+    assert "left needs a normal force of 981 N at the start, allowed are 117.7 N" in why
+    assert "right needs" in why
+    mass, friction = told(why, "mass of at most"), told(why, "friction of at least")
+    for lighter in (mass, 1.01 * mass):
+        enough = unheld(load(changed("rack", tmp_path, mass=lighter, friction=0.1))) == ""
+        assert enough is (lighter == mass)
+    for rougher in (friction, 0.99 * friction):
+        enough = unheld(load(changed("rack", tmp_path, mass=20.0, friction=rougher))) == ""
+        assert enough is (rougher == friction)
+
+
+def test_the_whole_force_is_the_arms_payload(tmp_path: Path) -> None:
+    """At mu = 1 a robot bears 12 kgf in all at 16.97 kg, though it presses with less."""
+    assert unheld(load(changed("rack", tmp_path, mass=16.9))) == ""
+    why = unheld(load(changed("rack", tmp_path, mass=17.0)))
+    assert "left needs a force in all of" in why
+    assert told(why, "mass of at most") == pytest.approx(16.97, abs=0.01)
+
+
+def test_a_patch_that_would_do_is_told(tmp_path: Path) -> None:
+    why = unheld(load(changed("transfer", tmp_path, patch_radius=0.005)))
+    assert "shift of the pressure of 10 mm" in why
+    radius = 1e-3 * told(why, "patches of at least")
+    assert unheld(load(changed("transfer", tmp_path, patch_radius=1.001 * radius))) == ""
+    assert unheld(load(changed("transfer", tmp_path, patch_radius=0.98 * radius))) != ""
+
+
+def test_the_joint_allocation_tells_a_patch_that_presses_less(tmp_path: Path) -> None:
+    path = changed("transfer", tmp_path, patch_radius=0.003)
+    text = path.read_text().replace("[task]", '[task]\nallocation = "joint"')
+    path.write_text(text)
+    needed = float(still_load(load(path), np.zeros(6))["normal_force"].max())
+    path.write_text(re.sub(r"^reference_force = .*$", "reference_force = 75.0", text, flags=re.M))
+    assert needed > 75.0
+    radius = 1e-3 * told(unheld(load(path)), "patches of at least")
+    path.write_text(path.read_text().replace("patch_radius = 0.003", f"patch_radius = {radius}"))
+    assert unheld(load(path)) == ""
+
+
+def test_a_joint_that_is_too_weak_is_told() -> None:
+    """Held against the timing model's own torques of standing still."""
+    cell = ho.Cell.load(RACK)
+    model = TimingModel(cell.compiled)
+    still = model.still(model.path_motion(cell.initial))
+    ends = np.abs(still.torque)[[0, -1]]
+    limit = np.concatenate([robot.torque_max for robot in cell.workcell.robots])
+    share = float((ends / limit).max())
+    assert cell.unheld == ""
+
+    def limited(factor: float) -> Workcell:
+        robots = [replace(r, torque_max=factor * r.torque_max) for r in cell.workcell.robots]
+        return replace(cell.workcell, robots=(robots[0], robots[1]))
+
+    assert unheld(limited(1.001 * share), cell.evaluator) == ""
+    why = unheld(limited(0.999 * share), cell.evaluator)
+    end, joint = np.unravel_index(int((ends / limit).argmax()), ends.shape)
+    assert "joint torque" in why
+    assert f"of {ends[end, joint]:.4g} N m at the {('start', 'goal')[end]}" in why
+    assert unheld(limited(0.999 * share)) == ""  # postures are not known
+
+
+def test_no_search_begins(slippery: Path) -> None:
+    cell = ho.Cell.load(slippery)
+    with pytest.raises(WorkcellError, match="payload: it cannot be held still"):
+        ho.search(cell, "random", evaluations=1, rng=np.random.default_rng(1))
+
+
+def test_no_study_begins(
+    slippery: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "results"
+    assert run.main([str(slippery), "--output", str(output), "--quick", "--jobs", "1"]) == BAD_INPUT
+    said = capsys.readouterr()
+    assert "it cannot be held still" in said.err
+    assert "compiling" not in said.err
+    assert said.out == ""
+    assert not output.exists()
+
+
+def test_the_inspection_says_infeasible(slippery: Path) -> None:
+    found = inspected(load(slippery), 1, 1, None)
+    assert f"Infeasible, whatever the path: {found.unheld}" in inspect.as_text(found)
+    assert "981 N" in found.unheld
+
+
+def test_no_workcell_is_proposed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = shipped_problem("rack", tmp_path)
+    text = path.read_text()
+    path.write_text(re.sub(r"^friction = .*$", "friction = 0.1", text, flags=re.MULTILINE))
+    assert propose.main([str(path), "--quiet"]) == BAD_INPUT
+    assert "it cannot be held still" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*proposed*"))
