@@ -5,9 +5,9 @@ import numpy as np
 import hybrid_opt as ho
 
 rng = np.random.default_rng(1)
-cell = ho.Cell.load("studies/workcells/rack.toml")
+cell = ho.Cell.load("studies/workcells/rack.toml").drivable()
 front = ho.search(cell, "nsga2", evaluations=1000, rng=rng)
 front = ho.polish(cell, front, rng=rng)
-carry = front.balanced()
-timing = ho.time_path(cell, carry, ho.TimingLimits(force=52.0))
-ho.export(timing, "ros2", "out/")
+found = ho.recommend(cell, front.x)
+print(found)
+ho.export(found.timing, "ros2", "out/")

@@ -22,7 +22,7 @@ SMALL = {
     ),
     "curve_points=5": "curve_points=2",
 }
-"""What makes an example small enough for a test."""
+"""What makes the examples after the first small enough for a test."""
 
 TEN_LINES = 12
 """Lines that the way from a file to a robot's trajectory may take, imports included."""
@@ -51,7 +51,9 @@ def test_it_runs(
     (tmp_path / "studies").symlink_to(ROOT / "studies")
     monkeypatch.chdir(tmp_path)
     code = path.read_text("utf-8")
-    for full, small in SMALL.items():
+    for full, small in (
+        SMALL.items() if path != EXAMPLES[0] else ()
+    ):  # README's: as they are printed
         code = code.replace(full, small)
     exec(compile(code, str(path), "exec"), {"__name__": "__main__"})
     assert capsys.readouterr().out or list((tmp_path / "out").iterdir())

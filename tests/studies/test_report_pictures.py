@@ -10,6 +10,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.axes._base import _AxesBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -67,12 +68,13 @@ def visible_texts(figure: Figure) -> list[Text]:
     """Texts that are shown, without tick labels outside of their axis' limits."""
     texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip()]
     hidden: set[Text] = set()
-    for axes in figure.findobj(Axes):
+    # A second scale beside a panel is no `Axes`, but what both are.
+    for axes in figure.findobj(_AxesBase):
         if not axes.axison:
             hidden |= {*axes.get_xticklabels(), *axes.get_yticklabels()}
             hidden |= {axes.xaxis.label, axes.yaxis.label}
             continue
-        if axes.name != "rectilinear":
+        if getattr(axes, "name", "rectilinear") != "rectilinear":
             continue
         for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
             low, high = sorted(limits)
@@ -153,6 +155,26 @@ def test_a_clipped_label_would_be_found() -> None:
     figure.subplots().set_ylabel("a label that is longer than the figure is high [N m]")
     FigureCanvasAgg(figure).draw()  # type: ignore[no-untyped-call]
     assert len(clipped(figure)) == 1
+
+
+@pytest.mark.parametrize("top", [12.5, 13.0, 14.5, 15.0, 15.3])
+def test_a_label_beyond_a_second_scale_is_not_drawn(top: float) -> None:
+    """Whatever the forces are: Matplotlib makes ticks beyond both ends, and draws none of them."""
+    figure = Figure(figsize=(4.0, 2.0), layout="constrained")
+    axes = figure.subplots()
+    axes.set_ylim(8.0, top)
+    second = axes.secondary_yaxis("right", functions=(lambda v: 9.81 * v, lambda v: v / 9.81))
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    assert clipped(figure) == []
+    figure.set_layout_engine(None)
+    shown = np.array(canvas.buffer_rgba())
+    beyond = [label for label in second.get_yticklabels() if label not in visible_texts(figure)]
+    assert beyond
+    for label in beyond:
+        label.set_visible(False)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    np.testing.assert_array_equal(np.array(canvas.buffer_rgba()), shown)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
 import os
 import re
@@ -17,12 +18,15 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign.results import read_campaign, read_summary
+from hybrid_opt.errors import NoCarryError
 from hybrid_opt.indicators import metrics
+from hybrid_opt.recommending.wish import Wish
 from hybrid_opt.store.replay import replay
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.document import read_timing
 from studies import rack, recommend, run
 from studies.cli import campaign_parser, campaign_settings
+from studies.recommendation_stage import recommend_from
 from studies.recommendation_text import recommendation_text
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
@@ -150,7 +154,9 @@ def test_a_stored_study_can_be_repeated_from_its_own_workcell(
     arguments = [cell, "--output", str(tmp_path / "b"), *SMALL, "--no-drivable", "--no-report"]
     arguments += ["--quiet"]
     assert run.main(arguments) == 0
-    assert capsys.readouterr().err == ""
+    told = capsys.readouterr()
+    assert told.err == ""
+    assert "drivable carries were not searched for (--no-drivable)" in told.out
     for name in ("mopso", "nsga2"):
         file = f"replicas/{name}/01/evaluations.csv.gz"
         assert (tmp_path / "b" / file).read_bytes() == (root / file).read_bytes()
@@ -248,6 +254,26 @@ def test_a_cell_whose_own_law_is_optimal_has_one_experiment(
     printed = capsys.readouterr().out
     assert "within jerk limits" in printed
     assert re.search(r"limits on jerk +carries +without", printed)
+
+
+def test_a_study_without_a_recommendation_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Force limits that are below what holds the box still leave no drivable carry."""
+    cell = unpack_cell(drivable_files(collect_cell(load(Path(CELL)))), tmp_path / "cell").source
+    cell.write_text(cell.read_text().replace("[task]", "[task]\nforce_limit = [20.0, 30.0]"))
+    root = tmp_path / "results"
+    options = ["--algorithm", "random", "--evaluations", "4", "--replicas", "1", "--jobs", "1"]
+    options += ["--no-polish", "--quiet", "--output", str(root)]
+    assert run.main([str(cell), *options]) == 0
+    summary = read_summary(root)
+    assert summary.recommendation is None
+    assert "none of 4 drivable candidates is feasible" in summary.no_recommendation
+    assert re.search(r"standing still already uses 16\d\.\d % of", summary.no_recommendation)
+    assert f"why  {summary.no_recommendation}" in capsys.readouterr().out
+    assert html.escape(summary.no_recommendation) in (root / run.PAGE).read_text()
+    with pytest.raises(NoCarryError, match="none of 4"):
+        recommend_from(root, Wish(), tmp_path / "carry.json")
 
 
 def test_help_explains_every_option_with_its_default() -> None:

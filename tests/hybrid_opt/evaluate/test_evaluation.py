@@ -22,6 +22,7 @@ from symbolic.cell_model import build_cell_model
 from symbolic.functions import CONSTRAINTS
 from symbolic.read.cell import load
 from symbolic.records import CollisionSettings, Uncertainty, Workcell
+from symbolic.records.task import initial_decision
 from tests.hybrid_opt.collision.test_checker import checker_of, resting_cell
 from tests.symbolic.cells import RACK
 from tests.symbolic.geometry.collision_cells import geometry_of, random_configurations
@@ -73,6 +74,9 @@ def assert_agrees(evaluations: Evaluations, k: int, expected: PlainVerdict) -> N
 def test_verdicts_are_those_of_the_plain_reference(path: Path, n: int) -> None:
     ours, plain = evaluator(path), judge(path)
     x = candidates(ours.workcell, n, 61, 1.0)
+    # Whether one of a few random ones is feasible depends on the start branches, and these, where
+    # several are as good, on the machine's arithmetic; the hand-made one is on every machine.
+    x[0] = initial_decision(ours.workcell.task)
     evaluations = ours.evaluate(x)
     for k in range(n):
         assert_agrees(evaluations, k, plain(x[k]))
