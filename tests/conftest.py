@@ -1,8 +1,10 @@
-"""Settings for the whole test suite: on CI, property tests draw the same examples every time."""
+"""Settings for the whole test suite: on CI, property tests draw the same examples every time, and
+Ctrl-C reaches the programs that tests start."""
 
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,10 @@ from codegen.cache import Cache
 settings.register_profile("local", deadline=None, print_blob=True)
 settings.register_profile("ci", settings.get_profile("local"), derandomize=True, database=None)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell that starts pytest in the background has it ignore Ctrl-C, which children inherit.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

@@ -79,13 +79,13 @@ class StoredJerk:
     Attributes:
         status: of its timing.
         duration: [s].
-        without: the same without limits on jerk [s].
+        without: the same without limits on jerk [s]; NaN, as the duration, where there is no timing.
         joint_use, payload_use: largest jerks over their limits.
     """
 
     status: str
     duration: Figure
-    without: float
+    without: Figure
     joint_use: Figure
     payload_use: Figure
 

@@ -15,6 +15,7 @@ import pytest
 from codegen.build import build
 from codegen.cache import Cache, digest
 from codegen.errors import CodegenError
+from tests.fuzz.promises import soon
 
 KEY = digest("fault")
 ASKED = '#!/bin/sh\ncase "$*" in -v|*" -E "*) exec gcc "$@" ;; esac\n'
@@ -61,10 +62,8 @@ def test_a_compiler_that_hangs_is_ended(
 ) -> None:
     monkeypatch.setattr("codegen.compiler.MOST_SECONDS", 0.5)
     compiler(tmp_path, monkeypatch, "exec sleep 60\n")
-    start = time.monotonic()
-    with pytest.raises(CodegenError, match=r"took longer than 0\.5 s over square\.c"):
+    with soon(), pytest.raises(CodegenError, match=r"took longer than 0\.5 s over square\.c"):
         build(square(), cache)
-    assert time.monotonic() - start < 30.0
 
 
 def test_a_misspelt_compiler_is_told(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:

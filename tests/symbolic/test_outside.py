@@ -6,7 +6,6 @@ import json
 import math
 import os
 import socket
-import time
 import tomllib
 from contextlib import suppress
 from pathlib import Path
@@ -18,6 +17,7 @@ from hypothesis import strategies as st
 
 from symbolic import outside
 from symbolic.errors import OutsideError
+from tests.fuzz.promises import soon
 
 MOST = 1000
 
@@ -65,11 +65,9 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
             (tmp_path / ("x" * 5000), "File name too long"),
             (tmp_path / "a\0b", "null byte"),
         ]
-        start = time.monotonic()
         for path, words in odd:
-            with pytest.raises(OutsideError, match=rf"cannot be read \(.*{words}"):
+            with soon(), pytest.raises(OutsideError, match=rf"cannot be read \(.*{words}"):
                 outside.read_bytes(path, MOST)
-        assert time.monotonic() - start < 5.0
     for path in (tmp_path / "loop", tmp_path / "gone", tmp_path / ("x" * 5000)):
         with pytest.raises(OutsideError, match="cannot be read"):
             outside.resolved(path)
@@ -164,10 +162,8 @@ def test_whole_surrogate_pairs_and_escaped_ones_are_text() -> None:
     ],
 )
 def test_other_toml_is_refused(content: bytes, words: str) -> None:
-    start = time.monotonic()
-    with pytest.raises(OutsideError, match=words):
+    with soon(), pytest.raises(OutsideError, match=words):
         outside.toml_tables(content)
-    assert time.monotonic() - start < 10.0
 
 
 def test_toml_comes_in_as_a_plain_reader_has_it() -> None:

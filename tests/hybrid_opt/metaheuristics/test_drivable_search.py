@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from symbolic.workcell.cell_files import collect_cell
 
 import hybrid_opt as ho
 from hybrid_opt.campaign.cell_source import PackedCell
@@ -15,7 +16,6 @@ from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.work.job import Job, answer_all
 from hybrid_opt.work.processes import ProcessExecutor
-from symbolic.workcell.cell_files import collect_cell
 from tests.symbolic.workcell.samples import RACK
 
 CELLS = sorted(RACK.parent.glob("*.toml"))

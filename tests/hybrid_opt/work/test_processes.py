@@ -16,6 +16,7 @@ import pytest
 from hybrid_opt.errors import WorkerError
 from hybrid_opt.work.job import KILLED, MAX_DEATHS, SILENT, Job, answer_all
 from hybrid_opt.work.processes import LocalExecutor, ProcessExecutor, local_executor
+from tests.fuzz.promises import soon
 from tests.hybrid_opt.work import jobs
 from tests.hybrid_opt.work.jobs import Kept, run
 
@@ -52,12 +53,11 @@ def test_a_request_that_kills_its_workers_is_lost_and_no_other() -> None:
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_hung_request_is_given_up_and_no_other(processes: int) -> None:
-    begin = time.monotonic()
     executor = LocalExecutor(processes)
-    found = run(executor, jobs.moody, ["hang", "a"], patience=0.3, instead="instead")
+    with soon():
+        found = run(executor, jobs.moody, ["hang", "a"], patience=0.3, instead="instead")
     assert found.answers == ["instead", "a"]
     assert found.losses == [(0, SILENT)]
-    assert time.monotonic() - begin < 20.0
 
 
 def test_only_what_must_be_given_up_needs_a_process_of_its_own() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 import zipfile
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from symbolic.errors import CollisionModelError
 from symbolic.geometry.hulls import CollisionModelWarning, convex_pieces
 from symbolic.geometry.pieces import Hull
 from symbolic.read.meshes import MOST_FACES
+from tests.fuzz.promises import soon
 from tests.robots import ur10_urdf
 
 MESHES = ur10_urdf().parents[1] / "meshes" / "ur10" / "collision"
@@ -159,10 +159,8 @@ def test_more_than_can_be_worked_with_is_told_at_once(
     tmp_path: Path, count: int, message: str
 ) -> None:
     write_loose(tmp_path / "loose.stl", count)
-    start = time.monotonic()
-    with pytest.raises(CollisionModelError, match=rf"loose\.stl: {message}.*simplify"):
+    with soon(), pytest.raises(CollisionModelError, match=rf"loose\.stl: {message}.*simplify"):
         convex_pieces(tmp_path / "loose.stl", ONES)
-    assert time.monotonic() - start < 20.0
 
 
 @pytest.mark.parametrize("name", ["mesh.zip", "mesh.stl", "mesh.ply", "mesh.glb"])
@@ -216,10 +214,9 @@ def test_entities_are_not_hidden_by_an_encoding(tmp_path: Path, encoding: str) -
 def test_a_text_without_end_is_not_read(tmp_path: Path, name: str, begin: str, piece: str) -> None:
     path = tmp_path / name
     path.write_text(begin + piece * 1_600_000)
-    start = time.process_time()
-    with pytest.raises(CollisionModelError, match=r"enormous mesh, more than \d+ (words|elements)"):
+    refused = r"enormous mesh, more than \d+ (words|elements)"
+    with soon(), pytest.raises(CollisionModelError, match=refused):
         convex_pieces(path, ONES)
-    assert time.process_time() - start < 2.0
 
 
 def test_a_pipe_is_no_mesh(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from hypothesis import strategies as st
 from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
 from symbolic.records import Workcell
+from tests.fuzz.promises import soon
 from tests.symbolic.read.problem_cases import CASES, put
 from tests.symbolic.read.samples import GOFA, RACK, sample_data, write
 
@@ -102,9 +102,8 @@ def test_thousands_of_bodies_are_told_at_once(tmp_path: Path) -> None:
 
 def test_thousands_of_unknown_keys_are_counted(tmp_path: Path) -> None:
     data = sample_data() | {f"unknown_{k}": 1 for k in range(20_000)}
-    start = time.monotonic()
-    found = problems_of(write(tmp_path, data))
-    assert time.monotonic() - start < 10.0
+    with soon():
+        found = problems_of(write(tmp_path, data))
     assert len(found) == 11
     assert found[-1] == "file: 19990 further unknown keys"
 

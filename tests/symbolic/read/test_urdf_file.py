@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from symbolic.errors import UrdfError
 from symbolic.read.arms import arm_model, link_frame, reduced_model
 from symbolic.read.urdf import MOST_LINKS, UrdfMesh, parse_urdf, read_urdf
 from symbolic.records import Box, Cylinder
+from tests.fuzz.promises import soon
 from tests.robots import GOFA_URDF, robot_record, ur10_urdf
 from tests.symbolic.read.urdf_cases import CASES, LOOP
 
@@ -122,10 +122,8 @@ def test_a_long_chain_is_refused_and_does_not_crash(tmp_path: Path) -> None:
     assert reduced_model(read_urdf(path)).njoints == 1
     for links, words in ((MOST_LINKS + 1, "has 501 links"), (50_000, "more than 100000 elements")):
         path.write_text(chain(links))
-        start = time.monotonic()
-        with pytest.raises(UrdfError, match=words):
+        with soon(), pytest.raises(UrdfError, match=words):
             reduced_model(read_urdf(path))
-        assert time.monotonic() - start < 10.0
 
 
 def test_nothing_is_said_on_the_terminal(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
