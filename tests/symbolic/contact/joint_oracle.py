@@ -40,12 +40,29 @@ def least_wrenches(case: Case, squeeze: bool = False) -> Array:
     Raises:
         AssertionError: what the solver says does not hold.
     """
-    rough = _solve(case, float(np.abs(case.force).max()), squeeze)
+    return _refined(case, squeeze)[0]
+
+
+def least_squeeze_within(case: Case) -> tuple[float, float]:
+    """The least N_1 + N_2 [N], and by how much the solver may be off. How far that is
+    depends on the machine's arithmetic, where its last steps fail.
+
+    Raises:
+        AssertionError: what the solver says does not hold.
+    """
+    wrenches, unsure = _refined(case, True)
+    return float(wrenches[0, 2] - wrenches[1, 2]), unsure
+
+
+def _refined(case: Case, squeeze: bool) -> tuple[Array, float]:
+    rough, _ = _solve(case, float(np.abs(case.force).max()), squeeze)
     return _solve(case, float(np.abs(rough[:, :3]).max()), squeeze)
 
 
-def _solve(case: Case, size: float, squeeze: bool) -> Array:
-    """The wrenches, from a program whose unknowns are about one if forces are about `size`."""
+def _solve(case: Case, size: float, squeeze: bool) -> tuple[Array, float]:
+    """The wrenches, from a program whose unknowns are about one if forces are about `size`, and by
+    how much what is minimised may be off: the duality gap, and what balance and cones miss times
+    their multipliers (weak duality)."""
     unit = case.radius.max()
     eye, none = np.eye(3), np.zeros((3, 3))
     turn = [_cross_matrix(arm) / unit for arm in case.arms]
@@ -55,6 +72,8 @@ def _solve(case: Case, size: float, squeeze: bool) -> Array:
     cones = [np.column_stack([cone_matrix(case, i, one) for one in np.eye(14)]) for i in (0, 1)]
     forces = np.array([1.0, 1, 1, 0, 0, 0] * 2 + [0, 0])
     normals = np.array([0.0, 0, 1, 0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0])
+    matrix = np.vstack([rows, *(-cone for cone in cones)])
+    bound = np.concatenate([right, np.zeros(42)])
     options = clarabel.DefaultSettings()
     options.verbose = False
     # What it can reach; "almost solved" then means to its reduced tolerances.
@@ -62,8 +81,8 @@ def _solve(case: Case, size: float, squeeze: bool) -> Array:
     solution = clarabel.DefaultSolver(
         sparse.csc_matrix(np.diag(0.0 * forces if squeeze else forces)),
         normals if squeeze else 0.0 * normals,
-        sparse.csc_matrix(np.vstack([rows, *(-cone for cone in cones)])),
-        np.concatenate([right, np.zeros(42)]),
+        sparse.csc_matrix(matrix),
+        bound,
         [clarabel.ZeroConeT(6), clarabel.PSDTriangleConeT(6), clarabel.PSDTriangleConeT(6)],
         options,
     ).solve()
@@ -71,7 +90,9 @@ def _solve(case: Case, size: float, squeeze: bool) -> Array:
     assert str(solution.status) in ("Solved", "AlmostSolved"), solution.status
     assert np.abs(rows @ x - right).max() < 5e-7 * max(1.0, float(np.abs(x).max()))
     wrenches: Array = size * x[:12].reshape(2, 6) * np.repeat([1.0, unit], 3)
-    return wrenches
+    multipliers, missed = np.array(solution.z), matrix @ x + np.array(solution.s) - bound
+    gap = abs(solution.obj_val - solution.obj_val_dual)
+    return wrenches, size * (gap + float(np.abs(multipliers) @ np.abs(missed)))
 
 
 def cone_matrix(case: Case, i: int, x: Array) -> Array:

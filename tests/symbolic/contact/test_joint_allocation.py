@@ -12,9 +12,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from symbolic.array import Array
+from symbolic.contact.central_path import FINAL_WEIGHT, NEAR
 from symbolic.contact.facing import JointAllocation, allocate_jointly, balance_of, least_squeeze
 from symbolic.contact.paper import allocate
-from tests.symbolic.contact.joint_oracle import Case, least_wrenches
+from tests.symbolic.contact.joint_oracle import Case, least_squeeze_within, least_wrenches
+
+GAP = 6.0 * NEAR * FINAL_WEIGHT
+"""Share by which a found effort may exceed the least one: both patches' degrees times the weight at
+which the steps end."""
+
+SAME = 2.0 * np.sqrt(GAP)
+"""Largest difference of forces that are found for one case in two ways, as a share of their length.
+
+Half the squared length is strongly convex with modulus one: what is within `GAP` of its least value
+is within the root of that, as a share, of the place of it. Most differ by a hundredth of that."""
 
 REGIMES = (
     "patch suffices",
@@ -219,7 +230,7 @@ def test_exchanging_the_contacts_exchanges_the_forces(seed: int) -> None:
         )
     )[0]
     here = held(case)[0]
-    np.testing.assert_allclose(there[::-1] * turn, here, atol=1e-5 * np.sqrt(effort(here)))
+    np.testing.assert_allclose(there[::-1] * turn, here, atol=SAME * np.sqrt(effort(here)))
 
 
 @given(seed=st.integers(0, 2**31))
@@ -238,7 +249,8 @@ def test_derivatives_are_those_of_the_forces(seed: int) -> None:
         return [np.array(value) for value in values]
 
     value, jacobian = at(np.zeros(6))
-    np.testing.assert_allclose(value[:, 0], held(case)[0][:, 2], atol=1e-5 * np.abs(value).max())
+    forces = held(case)[0]
+    np.testing.assert_allclose(value[:, 0], forces[:, 2], atol=SAME * np.sqrt(effort(forces)))
     size = max(1.0, float(np.abs(jacobian).max()))
     for k, direction in enumerate(1e-4 * np.eye(6)):
         difference = (at(direction)[0] - at(-direction)[0]) / 2e-4
@@ -260,8 +272,9 @@ def test_least_squeeze_agrees_with_clarabel() -> None:
         found: Array = np.array(
             SQUEEZE(case.force, case.moment, case.arms.T, case.friction, case.radius)
         )[2]
-        expected = least_wrenches(case, squeeze=True)[:, 2]
-        assert found[0] - found[1] == pytest.approx(expected[0] - expected[1], rel=1e-6)
+        expected, unsure = least_squeeze_within(case)
+        assert unsure < 1e-3 * expected
+        assert abs(found[0] - found[1] - expected) <= GAP * expected + unsure
         assert found.sum() == pytest.approx(case.force[2], abs=1e-9)
 
 
