@@ -17,11 +17,11 @@ from symbolic.errors import WorkcellError
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 from symbolic.records.quantities import FRICTION
-from symbolic.robot.arm import joint_torque
-from symbolic.robot.model import RobotModel, build_robot_model
+from symbolic.records.task import initial_decision
 
 if TYPE_CHECKING:
     from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+    from symbolic.robot.model import RobotModel
 
 ROUNDING = 1e-6
 """Share by which a limit may be exceeded that is met exactly."""
@@ -101,10 +101,10 @@ def still_load(
     Args:
         pose: (6,) of the box [m, rad].
         friction: factor on both coefficients.
-        function: another `symbolic.physics.payload_load.uncertain_load_function` than the cell's.
+        function: another `symbolic.contact.load.uncertain_load_function` than the cell's.
 
     Returns:
-        `symbolic.physics.payload_load.LOAD_OUTPUTS`, flat.
+        `symbolic.contact.load.LOAD_OUTPUTS`, flat.
     """
     coefficients = [friction * contact.friction for contact in workcell.contacts]
     centre = workcell.payload.centre_of_mass
@@ -194,8 +194,6 @@ def require_hold(workcell: Workcell, evaluator: CandidateEvaluator | None = None
 def _ends(evaluator: CandidateEvaluator) -> list[tuple[Array, Array]]:
     """Both arms' joints at the start and the goal of the hand-made trajectory; those that are
     reached."""
-    from symbolic.records.decision import initial_decision
-
     outputs = evaluator.outputs(initial_decision(evaluator.workcell.task)[None])
     return [
         (outputs["q_1"][0, sample], outputs["q_2"][0, sample])
@@ -214,6 +212,9 @@ class _Still:
         self._postures = dict(zip(self._poses, postures, strict=False))
         self._models: list[RobotModel] = []
         if postures:
+            # Not imported at the top: what asks for forces alone needs no Pinocchio.
+            from symbolic.robot.model import build_robot_model
+
             self._models = [build_robot_model(robot) for robot in workcell.robots]
 
     def exceeded(
@@ -242,6 +243,8 @@ class _Still:
 
     def _torques(self, where: str, load: dict[str, Array], mass: float) -> Iterator[StillUse]:
         """The most used joint of each arm, where its posture is known."""
+        from symbolic.robot.arm import joint_torque
+
         workcell = self._workcell
         rotation = ca.DM(box_rotation(workcell.task.orientation, self._poses[where]))
         for i, q in enumerate(self._postures.get(where, ())):

@@ -79,7 +79,7 @@ class StoredJerk:
     Attributes:
         status: of its timing.
         duration: [s].
-        without: the same without limits on jerk [s]; NaN, as the duration, where there is no timing.
+        without: the same without limits on jerk [s]; both NaN where there is no timing.
         joint_use, payload_use: largest jerks over their limits.
     """
 

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from symbolic.workcell.file import load
-from symbolic.workcell.records import Workcell
 
 import hybrid_opt as ho
 from hybrid_opt.evaluate.static_hold import still_load, unheld
@@ -18,6 +16,8 @@ from studies import inspect, propose, run
 from studies.inspection import inspect as inspected
 from studies.program import BAD_INPUT
 from symbolic.errors import WorkcellError
+from symbolic.read.cell import load
+from symbolic.records import Workcell
 from tests.hybrid_opt.proposing.problems import shipped_problem
 from tests.symbolic.cells import RACK
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from symbolic.workcell.cell_files import collect_cell
 
 import hybrid_opt as ho
 from hybrid_opt.campaign.cell_source import PackedCell
@@ -16,7 +15,8 @@ from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.work.job import Job, answer_all
 from hybrid_opt.work.processes import ProcessExecutor
-from tests.symbolic.workcell.samples import RACK
+from symbolic.read.cell_files import collect_cell
+from tests.symbolic.read.samples import RACK
 
 CELLS = sorted(RACK.parent.glob("*.toml"))
 EVALUATIONS = 6
