@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -157,24 +158,36 @@ def test_a_clipped_label_would_be_found() -> None:
     assert len(clipped(figure)) == 1
 
 
+def _newtons(force: Any) -> Any:
+    return 9.81 * force
+
+
+def _kilograms(force: Any) -> Any:
+    return force / 9.81
+
+
+def _pixels(canvas: FigureCanvasAgg) -> Array:
+    return np.array(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+
+
 @pytest.mark.parametrize("top", [12.5, 13.0, 14.5, 15.0, 15.3])
 def test_a_label_beyond_a_second_scale_is_not_drawn(top: float) -> None:
     """Whatever the forces are: Matplotlib makes ticks beyond both ends, and draws none of them."""
     figure = Figure(figsize=(4.0, 2.0), layout="constrained")
     axes = figure.subplots()
     axes.set_ylim(8.0, top)
-    second = axes.secondary_yaxis("right", functions=(lambda v: 9.81 * v, lambda v: v / 9.81))
+    second = axes.secondary_yaxis("right", functions=(_newtons, _kilograms))
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
     assert clipped(figure) == []
     figure.set_layout_engine(None)
-    shown = np.array(canvas.buffer_rgba())
+    shown = _pixels(canvas)
     beyond = [label for label in second.get_yticklabels() if label not in visible_texts(figure)]
     assert beyond
     for label in beyond:
         label.set_visible(False)
     canvas.draw()  # type: ignore[no-untyped-call]
-    np.testing.assert_array_equal(np.array(canvas.buffer_rgba()), shown)
+    np.testing.assert_array_equal(_pixels(canvas), shown)
 
 
 @pytest.mark.parametrize("name", NAMES)
