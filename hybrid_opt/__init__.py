@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from hybrid_opt.job.records import Job
     from hybrid_opt.metaheuristics.carries import SearchSettings
     from hybrid_opt.polishing.settings import PolishSettings
-    from hybrid_opt.proposing.proposal import Proposal, propose
-    from hybrid_opt.proposing.settings import ProposeSettings
+    from hybrid_opt.proposing.proposal import Proposal, ProposeSettings, propose
     from hybrid_opt.recommending.recommendation import Recommendation, recommend
     from hybrid_opt.recommending.wish import Wish
     from hybrid_opt.robust.squeeze import SqueezeSettings
@@ -92,7 +91,7 @@ _HOMES = {
     "Origin": "hybrid_opt.store.export.origin",
     "PolishSettings": "hybrid_opt.polishing.settings",
     "Proposal": "hybrid_opt.proposing.proposal",
-    "ProposeSettings": "hybrid_opt.proposing.settings",
+    "ProposeSettings": "hybrid_opt.proposing.proposal",
     "SqueezeSettings": "hybrid_opt.robust.squeeze",
     "Recommendation": "hybrid_opt.recommending.recommendation",
     "SearchSettings": "hybrid_opt.metaheuristics.carries",

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import sys
-import time
 from types import TracebackType
-
-BEGUN = time.monotonic()
-"""When the first of the programs' modules was imported [s]."""
 
 
 def _tell(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

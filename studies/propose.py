@@ -9,14 +9,13 @@ search can start with.
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 import hybrid_opt as ho
-from studies import BEGUN
+from hybrid_opt.proposing.proposal import worked
 from studies.options import number, seed
 from studies.program import Parser, add_verbose, carried_out, run_program
 from symbolic.errors import SettingsError
@@ -24,17 +23,14 @@ from symbolic.replacing import replace_file
 
 PROGRAM = "python -m studies.propose"
 
-_BEGUN = BEGUN if __name__ == "__main__" else None
-"""When the process began, where it is this program's own [s]: imports count."""
-
 
 def _teller(begun: float) -> Callable[[str], None]:
-    """Prints what is being done and when, every word once in a row."""
+    """Prints what is being done and after how much work, every word once in a row."""
     last = [""]
 
     def tell(text: str) -> None:
         if text != last[0]:
-            print(f"{time.monotonic() - begun:6.1f} s  {text}", file=sys.stderr, flush=True)
+            print(f"{worked() - begun:6.1f} s  {text}", file=sys.stderr, flush=True)
             last[0] = text
 
     return tell
@@ -61,7 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         type=number(1.0, 1e6),
         default=ho.ProposeSettings().seconds,
         metavar="S",
-        help="seconds that it may take, its start included (default: %(default)g)",
+        help="seconds that it may work, its start included, whatever else the machine does "
+        "(default: %(default)g)",
     )
     parser.add_argument(
         "--seed", type=seed, default=1, metavar="N", help="of its randomness (default: 1)"
@@ -77,8 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise SettingsError(
             f"{output.parent} is no folder; make it, or name another one by --output"
         )
-    begun = time.monotonic() if _BEGUN is None else _BEGUN
-    left = max(options.time - (time.monotonic() - begun), 1.0)
+    begun = 0.0 if __name__ == "__main__" else worked()  # of a process of its own imports count
+    left = max(options.time - (worked() - begun), 1.0)
     proposal = ho.propose(
         problem,
         rng=np.random.default_rng(options.seed),

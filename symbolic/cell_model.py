@@ -67,17 +67,20 @@ def build_cell_bodies(workcell: Workcell) -> CellBodies:
     return CellBodies(workcell, (first, second), build_geometry(workcell))
 
 
-def build_cell_model(workcell: Workcell) -> CellModel:
+def build_cell_model(workcell: Workcell, bodies: CellBodies | None = None) -> CellModel:
     """Read the robots, list all start branches and choose one per arm.
 
     The workcell's `start_branch` picks from the ranked branches; -1 stands for the best.
+
+    Args:
+        bodies: of the same cell, if they are known; its path may be another one.
 
     Raises:
         RobotModelError: a URDF does not give an arm.
         CollisionModelError: a collision shape is unusable.
         WorkcellError: an arm cannot reach the start, or a chosen branch does not exist.
     """
-    bodies = build_cell_bodies(workcell)
+    bodies = bodies or build_cell_bodies(workcell)
     robots, geometry = bodies.robots, bodies.geometry
     clearance = bodies.screening["clearance"]
     branches = (

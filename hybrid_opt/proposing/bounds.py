@@ -34,6 +34,9 @@ STEPS = (0.8, 1.2)
 EMPTY_STEP = 0.5
 """The same where none is."""
 
+KEPT = (1.0, 0.75, 0.5)
+"""How near the carry is looked for to the one that bounds were asked for, from their middle."""
+
 CENTRING = 3
 """Times that bounds may move to where feasible candidates lie."""
 
@@ -43,13 +46,13 @@ class Bounds:
     """Bounds of a decision vector.
 
     Attributes:
-        centre: (n_var,) the carry that they surround.
+        carry: (n_var,) a feasible one within them, as near as may be to the one that was given.
         lower, upper: (n_var,) [m, rad].
         share: of random candidates that is feasible.
         candidates: by which it was measured.
     """
 
-    centre: Array
+    carry: Array
     lower: Array
     upper: Array
     share: float
@@ -80,18 +83,19 @@ class Sampling:
     out_of_time: Callable[[], bool]
 
 
-def find_bounds(centre: Array, sampling: Sampling) -> Bounds:
+def find_bounds(carry: Array, sampling: Sampling) -> Bounds:
     """Bounds around a feasible carry.
 
     Their common factor is bisected. In between they move to the middle of the feasible candidates
-    found, which makes room for wider ones.
+    found, which makes room for wider ones. The carry itself stays, if it is within them: where they
+    move to is longer.
 
     Args:
-        centre: (n_var,) feasible.
+        carry: (n_var,) feasible.
         sampling: how they are measured.
     """
     aim = float(np.sqrt(sampling.low * sampling.high))
-    scale = 0.5
+    scale, centre = 0.5, carry
     for _ in range(CENTRING):
         scale, good = _bisected(centre, scale, aim, sampling)
         if len(good) < 6 or sampling.out_of_time():
@@ -111,7 +115,11 @@ def find_bounds(centre: Array, sampling: Sampling) -> Bounds:
         step = EMPTY_STEP if share == 0.0 else STEPS[share > aim]
         scale = float(np.clip(step * scale, NARROWEST, WIDEST))
     scale, share, count = min(tried, key=lambda one: abs(np.log((one[1] + 1e-3) / aim)))
-    return Bounds(centre, *_box(centre, scale, sampling), share, count)
+    lower, upper = _box(centre, scale, sampling)
+    near = np.clip(carry, lower, upper)
+    between = (np.round(centre + keep * (near - centre), 4) for keep in KEPT)
+    found = next((x for x in between if sampling.certain(x)), centre)
+    return Bounds(found, lower, upper, share, count)
 
 
 def _bisected(centre: Array, scale: float, aim: float, sampling: Sampling) -> tuple[float, Array]:

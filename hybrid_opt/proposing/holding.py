@@ -13,8 +13,8 @@ from hybrid_opt.proposing.judge import PoseJudge
 from hybrid_opt.proposing.kinematics import (
     REACHED,
     ArmKinematics,
-    box_poses,
     box_to_last_joint,
+    guide,
     possible_spins,
     spun,
 )
@@ -31,9 +31,6 @@ SEARCH_STEPS = 50
 SEARCH_DAMPING = 1e-3
 """Of these steps."""
 
-GUIDE_POSES = 25
-"""Poses of a guide that postures are followed along."""
-
 GUIDES = np.array(
     [[0, 0, 0], [0, 0, 0.2], [0, 0, 0.4], [0.25, 0, 0], [-0.25, 0, 0], [0, 0.25, 0], [0, -0.25, 0]]
 )
@@ -47,6 +44,12 @@ SAME_REDUNDANT = 0.3
 
 SPIN_OF_FILE = 0.1
 """What it is worth to keep the spin of the file."""
+
+LENGTH_COST = 0.3
+"""What the way of the joints between start and goal costs, in a straight line [1/rad]."""
+
+ENOUGH_HOLDS = 96
+"""Ways to hold of one arm after which no further guide is tried: the first are the straightest."""
 
 MOST_HOLDS = 24
 """Ways to hold of one arm that are kept, the best first."""
@@ -138,10 +141,7 @@ def find_holds(
     hit = finder.colliding(query.start, q)
     q, which = q[~hit], which[~hit]
     found.free = len(q)
-    for spin, T in enumerate(T_box_joint):
-        rows = np.flatnonzero(which == spin)
-        if len(rows):
-            finder.lead(float(spins[spin]), T, q[rows])
+    finder.lead(spins[which], np.array(T_box_joint)[which], q)
     found.holds.sort(key=lambda hold: -hold.score)
     compared = kinematics.geometry.joints - spins_the_pad(query.workcell, arm, kinematics)
     found.holds = _diverse(found.holds, compared)[:MOST_HOLDS]
@@ -207,28 +207,36 @@ class _Finder:
                 self.found.pairs[pair] += 1
         return hit
 
-    def lead(self, spin: float, T_box_joint: Array, q: Array) -> None:
-        """Follow postures of one spin along guides to the goal; add those that arrive."""
+    def lead(self, spin: Array, T_box_joint: Array, q: Array) -> None:
+        """Follow postures (n, joints) along guides to the goal, until enough arrive; add those.
+
+        Args:
+            spin: (n,) of each [rad].
+            T_box_joint: (n, 4, 4) of each.
+        """
         start, goal = self.query.start, self.query.goal
         waiting = np.arange(len(q))
         for bow in GUIDES[: self.query.guides]:
-            if not len(waiting):
+            if not len(waiting) or len(self.found.holds) >= ENOUGH_HOLDS:
                 return
-            poses = box_poses(start, goal, GUIDE_POSES)
-            poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
-            targets = box_placement(self.query.workcell.task.orientation, poses) @ T_box_joint
+            orientation = self.query.workcell.task.orientation
+            T_world_box = box_placement(orientation, guide(start, goal, bow))
+            targets = T_world_box[:, None] @ T_box_joint[waiting]
             arrived, path, score = self._followed(targets, q[waiting])
-            if self.kinematics.redundant and len(arrived) < len(waiting):
-                also, other, scores = self._resolved(targets, q[waiting])
-                more = np.setdiff1d(also, arrived)
-                path[:, more], score[more] = other[:, more], scores[more]
-                arrived = np.union1d(arrived, more)
+            left = np.setdiff1d(np.arange(len(waiting)), arrived)
+            if self.kinematics.redundant and len(left):
+                also, path[:, left], score[left] = self._resolved(
+                    targets[:, left], q[waiting[left]]
+                )
+                arrived = np.union1d(arrived, left[also])
             hit = self.colliding(goal, path[-1, arrived])
             for at in arrived[~hit].tolist():
-                value = float(score[at]) + SPIN_OF_FILE * (spin == 0.0)
-                self.found.holds.append(Hold(spin, path[0, at], path[-1, at], value))
+                row = waiting[at]
+                value = float(score[at] + SPIN_OF_FILE * (spin[row] == 0.0))
+                hold = Hold(float(spin[row]), path[0, at], path[-1, at], value)
+                self.found.holds.append(hold)
             self.found.led += int((~hit).sum())
-            waiting = np.setdiff1d(waiting, waiting[arrived])
+            waiting = np.delete(waiting, arrived)
 
     def _followed(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """Rows that arrive, joint paths (m, n, joints) and scores (n,)."""
@@ -248,7 +256,7 @@ class _Finder:
         share = np.minimum(kept, until)
         self.found.kept = max(self.found.kept, float(share.max(initial=0)) / len(targets))
         arrived = np.flatnonzero(share == len(targets))
-        return arrived, path, self._score(room, measure)
+        return arrived, path, self._score(path, room, measure)
 
     def _resolved(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """As `_followed`, the redundant joints where the others are best off; only the ends count,
@@ -258,18 +266,19 @@ class _Finder:
         self.found.kept = max(self.found.kept, float(kept.max(initial=0)) / len(targets))
         fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= self._least)
         arrived = np.flatnonzero((kept == len(targets)) & fine)
-        return arrived, path, self._score(room, measure)
+        return arrived, path, self._score(path, room, measure)
 
     def _room(self, path: Array) -> Array:
         """(m, n) least distance to a joint limit of joint paths (m, n, joints)."""
         beyond = np.minimum(path - self.kinematics.lower, self.kinematics.upper - path)
         return np.asarray(beyond.min(axis=2))
 
-    def _score(self, room: Array, measure: Array) -> Array:
-        """(n,) how far from limits and singular postures."""
+    def _score(self, path: Array, room: Array, measure: Array) -> Array:
+        """(n,) how far from limits and singular postures, and how short between the ends."""
         comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
         away = np.minimum(measure.min(axis=0) / (4.0 * self._least), 1.0)
-        return np.asarray(comfort + away)
+        apart = np.linalg.norm(path[-1] - path[0], axis=1)
+        return np.asarray(comfort + away - LENGTH_COST * apart)
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:

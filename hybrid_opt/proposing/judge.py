@@ -1,4 +1,5 @@
-"""The collision checker, before anything is compiled: its bounds run in CasADi's interpreter."""
+"""Collisions before anything is compiled: of the box alone, and of the whole cell by the collision
+checker, whose bounds run in CasADi's interpreter."""
 
 from __future__ import annotations
 
@@ -13,14 +14,37 @@ from codegen.source import dense
 from hybrid_opt.collision.checker import CollisionChecker
 from symbolic.array import Array
 from symbolic.cell_model import own_pairs
+from symbolic.geometry.bodies import MeshReader, shape_pieces
 from symbolic.geometry.clearance import screening_functions
-from symbolic.geometry.pairs import CellGeometry
-from symbolic.records import PAYLOAD
+from symbolic.geometry.pairs import CellGeometry, coal_distance
+from symbolic.records import PAYLOAD, Workcell
+from symbolic.records.poses import box_placement
 from symbolic.robot.model import build_robot_model
 
 MARGINS = (0.01, 0.004, 0.0015, 0.0005, 0.0)
 """Clearances that a first path may keep beyond the cell's tolerance, the widest possible counts
 [m]."""
+
+
+class BoxAlone:
+    """The box among the environment, without the arms."""
+
+    def __init__(self, workcell: Workcell) -> None:
+        """Prepare their shapes."""
+        meshes = MeshReader()
+        self._orientation = workcell.task.orientation
+        self._box = shape_pieces(workcell.payload.solid, np.eye(4), PAYLOAD, meshes)
+        self._standing = [
+            shape_pieces(body.shape, body.pose, body.name, meshes) for body in workcell.environment
+        ]
+
+    def meets(self, path: Array) -> bool:
+        """Whether the box meets the environment at one of these poses (n, 6)."""
+        for T_world_box in box_placement(self._orientation, path):
+            box = tuple(piece.moved(T_world_box) for piece in self._box)
+            if any(coal_distance(box, pieces) <= 0.0 for pieces in self._standing):
+                return True
+        return False
 
 
 class PoseJudge:

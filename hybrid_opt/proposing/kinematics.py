@@ -29,6 +29,9 @@ TRACKING_STEPS = 4
 CENTRING = 0.03
 """Share of the way to the middle of their ranges that joints drift from pose to pose."""
 
+GUIDE_POSES = 25
+"""Poses of a guide that postures are followed along."""
+
 JUMP = 0.5
 """Largest change of a joint between poses of a path [rad]."""
 
@@ -155,26 +158,26 @@ class ArmKinematics:
             Joint paths (m, n, joints); of each posture the number of placements that it reached
             without a jump; manipulability (m, n).
         """
-        n, m = len(q), len(targets)
-        path, measure = np.empty((m, *q.shape)), np.zeros((m, n))
-        kept, alive = np.zeros(n, dtype=np.intp), np.ones(n, dtype=bool)
-        begin = q[:, list(self.redundant)].copy()
-        before, change = q, np.zeros_like(q)
+        m, n = len(targets), len(q)
+        path, measure = np.tile(q, (m, 1, 1)), np.zeros((m, n))
+        kept, alive = np.zeros(n, dtype=np.intp), np.arange(n)
+        change, redundant = np.zeros_like(q), list(self.redundant)
         for k, target in enumerate(targets):
+            before = path[max(k - 1, 0), alive]
             guess = before + change
             if ends is not None:
-                guess[:, list(self.redundant)] = begin + (ends - begin) * (k / max(m - 1, 1))
-            there = np.broadcast_to(target, (n, 4, 4))
+                begin = q[alive][:, redundant]
+                guess[:, redundant] = begin + (ends[alive] - begin) * (k / max(m - 1, 1))
+            there = np.broadcast_to(target, (n, 4, 4))[alive]
             found = (
                 self.track(before, there) if resolved else self.solve(guess, there, TRACKING_STEPS)
             )
             near = np.abs(found.q - before).max(axis=1) <= JUMP
-            alive &= (found.residual <= REACHED) & near
-            path[k] = np.where(alive[:, None], found.q, before)
-            kept += alive
-            measure[k] = found.manipulability
-            change = path[k] - before if k else change
-            before = path[k]
+            on = (found.residual <= REACHED) & near
+            alive, change = alive[on], found.q[on] - before[on] if k else change[on]
+            path[k:, alive] = found.q[on]
+            kept[alive] += 1
+            measure[k, alive] = found.manipulability[on]
         return path, kept, measure
 
     def central(self, path: Array) -> Array:
@@ -223,9 +226,11 @@ def possible_spins(contact: Contact, spins: Array) -> Array:
     return np.asarray(spins[np.abs(np.sin(spins)) < 1e-9])
 
 
-def box_poses(start: Array, goal: Array, steps: int) -> Array:
-    """(steps, 6) evenly from one pose to another."""
-    return np.linspace(start, goal, steps)
+def guide(start: Array, goal: Array, bow: Array) -> Array:
+    """(GUIDE_POSES, 6 + m) from one extended pose to another, bowing out by (3,) in the middle."""
+    poses = np.linspace(start, goal, GUIDE_POSES)
+    poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
+    return poses
 
 
 def _turns(axis: Array, angle: Array) -> Array:

@@ -1,20 +1,23 @@
-"""A collision-free path of the box with both arms: RRT-Connect of OMPL over the closed chain.
+"""A collision-free path of the box with both arms, over the closed chain.
 
-Kuffner and LaValle, ICRA 2000. The planner moves in the coordinates of the box path, which the
-spline joins later too, not in those of the joints: both arms' joints follow, branch and all, and
-are kept beside every pose that was reached. It is the only module that needs OMPL.
+First of straight motions alone: out of the start, over, into the goal. Where none is free,
+RRT-Connect of OMPL (Kuffner and LaValle, ICRA 2000) looks among all poses, from everything that
+straight motions out of start and goal lead to. Both move in the coordinates of the box path, which
+the spline joins later too, not in those of the joints: both arms' joints follow, branch and all,
+and are kept beside every pose that was reached. It is the only module that needs OMPL.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 
 from hybrid_opt.proposing.closed_chain import ClosedChain, Place, distance, levers, straight
+from hybrid_opt.proposing.judge import BoxAlone
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import POSE_SIZE
@@ -24,6 +27,15 @@ RETREAT = 0.6
 
 SHORT_RETREAT = 0.06
 """Shortest one that is of use [m]."""
+
+RETREAT_STOPS = 4
+"""Every so many configurations of a retreat the box may turn to the other end's."""
+
+STRAIGHT_TRIED = 100
+"""Straight motions of the box between two retreats that are tried with the arms."""
+
+BETWEEN = np.array([0.5, 0.25, 0.75, 0.375, 0.625, 0.125, 0.875])
+"""Where on them the box alone is looked at first."""
 
 REDUNDANT_ASIDE = 5.0
 """What redundant joints may stray by, in what the box may [rad/m]."""
@@ -110,33 +122,65 @@ def freedom(start: Array, goal: Array, stray: Stray, limits: Array) -> Freedom:
     return Freedom(start, np.column_stack(columns), *bounds, stray.range)
 
 
-@dataclass(frozen=True)
-class Budget:
-    """What may be spent on a path.
+Retreats = tuple[list[list[Place]], list[list[Place]]]
+"""From the start and from the goal, along the same directions: free configurations one after the
+other, the end itself first."""
 
-    Attributes:
-        places: configurations that may be looked at.
-        spent: whether to come to an end in any case.
-    """
 
-    places: int
-    spent: Callable[[], bool]
+def retreats(chain: ClosedChain, ends: tuple[Place, Place]) -> Retreats:
+    """Where straight motions out of start and goal lead, along the world's axes and between them:
+    out of a shelf, for instance."""
+    signs = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
+    found: Retreats = ([], [])
+    for way in signs[np.any(signs != 0.0, axis=1)]:
+        for end, place in enumerate(ends):
+            away = place.extended.copy()
+            away[:3] += RETREAT * way / np.linalg.norm(way)
+            path = straight(place.extended, away)
+            found[end].append([place, *chain.along(place, path[1:])])
+    return found
+
+
+def straight_path(chain: ClosedChain, out: Retreats, box: BoxAlone) -> list[Place] | None:
+    """Corners of the shortest free path found of a retreat, a straight motion, and the opposite of
+    a retreat along the same direction; None if none is free."""
+    ways: dict[tuple[bytes, bytes], tuple[float, list[Place]]] = {}
+    for first, last in zip(*out, strict=True):
+        for a, b in product(first[::RETREAT_STOPS], last[::RETREAT_STOPS]):
+            corners = [first[0], a, b, last[0]]
+            length = sum(distance(p.extended, q.extended) for p, q in pairwise(corners))
+            ways[a.extended.tobytes(), b.extended.tobytes()] = length, corners
+    tried = 0
+    for _, corners in sorted(ways.values(), key=lambda way: way[0]):
+        begin, end = corners[1].extended, corners[2].extended
+        if box.meets((begin + BETWEEN[:, None] * (end - begin))[:, :POSE_SIZE]):
+            continue
+        there = chain.reach(corners[1], end)
+        if there is not None and same(there, corners[2]):
+            return corners
+        tried += 1
+        if tried == STRAIGHT_TRIED:
+            break
+    return None
 
 
 def plan(
     chain: ClosedChain,
-    ends: tuple[Place, Place],
+    out: Retreats,
     room: Freedom,
-    budget: Budget,
+    *,
+    most: int,
+    out_of_time: Callable[[], bool],
     seed: int,
 ) -> list[Place] | None:
-    """Corners of a free path from the first configuration to the second, None if none is found.
+    """Corners of a free path from start to goal that RRT-Connect finds, None if it finds none.
 
     Args:
         chain: the arms in one way of holding.
-        ends: start and goal, both free.
+        out: where straight motions lead out of start and goal.
         room: where the path may go.
-        budget: what may be spent.
+        most: configurations that may be looked at.
+        out_of_time: whether to come to an end in any case.
         seed: of the planner's randomness, at least 1.
 
     Raises:
@@ -157,10 +201,11 @@ def plan(
     information.setup()
     problem = base.ProblemDefinition(information)
     goals = base.GoalStates(information)
-    last = chain.looked + budget.places
+    last = chain.looked + most
     ways: dict[tuple[float, ...], Place] = {}
-    for place, add in zip(ends, (problem.addStartState, goals.addState), strict=True):
-        for stop in (place, *retreats(chain, place, room)):
+    for ways_out, add in zip(out, (problem.addStartState, goals.addState), strict=True):
+        place = ways_out[0][0]
+        for stop in (place, *_usable([way[-1] for way in ways_out], place, room)):
             state = space.allocState()
             for k, value in enumerate(room.coordinates(stop.extended)):
                 state[k] = float(value)
@@ -172,7 +217,7 @@ def plan(
     planner.setRange(room.range)
     planner.setProblemDefinition(problem)
     planner.setup()
-    planner.solve(base.PlannerTerminationCondition(lambda: chain.looked >= last or budget.spent()))
+    planner.solve(base.PlannerTerminationCondition(lambda: chain.looked >= last or out_of_time()))
     if not problem.hasExactSolution():
         return None
     path = problem.getSolutionPath()
@@ -183,22 +228,15 @@ def plan(
     return [place for k, place in enumerate(found) if k == 0 or place is not found[k - 1]]
 
 
-def retreats(chain: ClosedChain, place: Place, room: Freedom) -> list[Place]:
-    """Where straight motions out of a configuration lead, along the world's axes and between them:
-    out of a shelf, for instance."""
-    found = []
-    signs = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
-    for way in signs[np.any(signs != 0.0, axis=1)]:
-        goal = place.extended.copy()
-        goal[:3] += RETREAT * way / np.linalg.norm(way)
-        path = straight(place.extended, goal)
-        last = [place, *chain.along(place, path[1:])][-1]
-        inside = room.coordinates(last.extended)
-        if distance(place.extended, last.extended) >= SHORT_RETREAT and bool(
-            np.all((inside >= room.lower) & (inside <= room.upper))
-        ):
-            found.append(last)
-    return found
+def _usable(stops: list[Place], place: Place, room: Freedom) -> list[Place]:
+    """Those that lie apart from an end and within the room."""
+    at = [room.coordinates(stop.extended) for stop in stops]
+    return [
+        stop
+        for stop, y in zip(stops, at, strict=True)
+        if distance(place.extended, stop.extended) >= SHORT_RETREAT
+        and bool(np.all((y >= room.lower) & (y <= room.upper)))
+    ]
 
 
 class _Known:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -139,8 +140,9 @@ class Problem:
         return self._draft(merged({"contacts": self.contacts}, changes or {}))
 
     def _draft(self, changes: dict[str, Any]) -> Workcell:
-        data = with_places(self.data, self.source.parent)
-        task = data["task"]
+        here = self.source.parent
+        data = merged(self.data, _with_paths(self.data, lambda name: str(here / name)))
+        task = data["task"] = dict(data["task"])
         if "waypoints" not in changes.get("task", {}):
             poses = np.array([task["start"], task["goal"]], dtype=float)
             task["waypoints"] = [
@@ -166,12 +168,13 @@ class Problem:
         Raises:
             SettingsError: the file is written in a way that cannot be completed.
         """
-        return completed(self.text, self.data, merged(self._moved(folder), changes))
+        here, there = self.source.parent, folder.resolve()
 
-    def _moved(self, folder: Path) -> dict[str, Any]:
-        """What keeps paths right in another folder."""
-        here = self.source.parent
-        return {} if folder.resolve() == here else _relative(self.data, here, folder.resolve())
+        def moved(name: str) -> str:
+            return name if os.path.isabs(name) else os.path.relpath(here / name, there)
+
+        paths = {} if there == here else _with_paths(self.data, moved)
+        return completed(self.text, self.data, merged(paths, changes))
 
 
 def read_problem(path: str | Path) -> Problem:
@@ -249,27 +252,28 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def with_places(data: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The tables with every path absolute that is relative to a folder."""
-    data = copy.deepcopy(data)
+def _with_paths(data: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
+    """Changes by which every path in the tables but those of packages is another."""
 
-    def placed(table: Any, key: str) -> None:
-        value = table.get(key) if isinstance(table, dict) else None
-        if isinstance(value, str) and not value.startswith(PACKAGE_SCHEME):
-            table[key] = str(folder / value)
+    def changed(table: Any, *keys: str) -> dict[str, Any]:
+        names = {key: table.get(key) for key in keys} if isinstance(table, dict) else {}
+        return {
+            key: change(name)
+            for key, name in names.items()
+            if isinstance(name, str) and not name.startswith(PACKAGE_SCHEME)
+        }
 
+    found: dict[str, Any] = {"robots": [], "payload": changed(data["payload"], "path")}
     for robot in data["robots"]:
-        placed(robot, "urdf")
-        placed(robot, "srdf")
-        folders = robot.get("package_dirs")
-        if isinstance(folders, list):
-            robot["package_dirs"] = [str(folder / str(entry)) for entry in folders]
-        for body in robot.get("tool", []):
-            placed(body, "path")
-    placed(data["payload"], "path")
-    for body in data.get("environment", []):
-        placed(body, "path")
-    return data
+        entry: dict[str, Any] = changed(robot, "urdf", "srdf")
+        if isinstance(robot.get("package_dirs"), list):
+            entry["package_dirs"] = [change(str(name)) for name in robot["package_dirs"]]
+        if isinstance(robot.get("tool"), list):
+            entry["tool"] = [changed(body, "path") for body in robot["tool"]]
+        found["robots"].append(entry)
+    if isinstance(data.get("environment"), list):
+        found["environment"] = [changed(body, "path") for body in data["environment"]]
+    return found
 
 
 def contact_points(
@@ -292,32 +296,3 @@ def contact_points(
     point = np.zeros(3)
     point[axis] = side * size[axis] / 2.0
     return [point.tolist(), (-point).tolist()]
-
-
-def _relative(data: dict[str, Any], here: Path, there: Path) -> dict[str, Any]:
-    """Changes by which relative paths lead from another folder to the same files."""
-
-    def moved(table: dict[str, Any], *keys: str) -> dict[str, Any]:
-        return {
-            key: os.path.relpath(here / table[key], there)
-            for key in keys
-            if isinstance(table.get(key), str)
-            and not table[key].startswith(PACKAGE_SCHEME)
-            and not os.path.isabs(table[key])
-        }
-
-    robots = []
-    for robot in data["robots"]:
-        entry: dict[str, Any] = moved(robot, "urdf", "srdf")
-        if "package_dirs" in robot:
-            entry["package_dirs"] = [
-                name if os.path.isabs(name) else os.path.relpath(here / name, there)
-                for name in robot["package_dirs"]
-            ]
-        if "tool" in robot:
-            entry["tool"] = [moved(body, "path") for body in robot["tool"]]
-        robots.append(entry)
-    found: dict[str, Any] = {"robots": robots, "payload": moved(data["payload"], "path")}
-    if "environment" in data:
-        found["environment"] = [moved(body, "path") for body in data["environment"]]
-    return found

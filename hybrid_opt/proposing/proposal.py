@@ -9,7 +9,8 @@ as it is read from the file.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,21 +21,22 @@ from hybrid_opt.carry import Judgement
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
+from hybrid_opt.proposing.closed_chain import Place
 from hybrid_opt.proposing.completion import Found, changes, decision_bounds
-from hybrid_opt.proposing.grasping import grasp_blocked
+from hybrid_opt.proposing.judge import BoxAlone
 from hybrid_opt.proposing.pairing import Pair
-from hybrid_opt.proposing.planner import Budget, Stray, freedom, plan
+from hybrid_opt.proposing.planner import Stray, freedom, plan, straight_path
 from hybrid_opt.proposing.problem import Problem, read_problem
-from hybrid_opt.proposing.reasons import no_path
-from hybrid_opt.proposing.settings import ProposeSettings
-from hybrid_opt.proposing.setup import Setup, prepare
-from hybrid_opt.proposing.trial import BranchLostError, Trial
-from hybrid_opt.proposing.via_points import MOST_VIA_POINTS, fit, shortened
+from hybrid_opt.proposing.setup import Setup, no_path, prepare
+from hybrid_opt.proposing.trial import BranchLostError, Trial, grasp_blocked
+from hybrid_opt.proposing.via_points import MOST_VIA_POINTS, fit, shortened, straightened
 from symbolic.array import Array
-from symbolic.errors import WorkcellError
+from symbolic.errors import SettingsError, WorkcellError
+from symbolic.records import Workcell
 
-ROUNDS = ((2000, 2), (6000, 6), (20000, 16), (60000, 24))
-"""Configurations that may be looked at for a path, and pairs of ways to hold that get so many."""
+ROUNDS = ((0, 4), (2000, 2), (6000, 6), (20000, 16), (60000, 24))
+"""Configurations that the planner may look at for a path, 0 for straight motions alone, and pairs
+of ways to hold that get so many."""
 
 STRAYS = (
     Stray(0.0, 0.15, 0.8),
@@ -52,11 +54,47 @@ FEW = 3
 LONG_TRIED = 2
 """Of those that need more, so many are judged."""
 
+LONGER = 2.5
+"""What is tried next where the time was too short, in that time."""
+
 PLANNING = 0.7
 """Share of the time after which no path is looked for any more."""
 
 SPINS = 12
 """Spins of a pad that are tried."""
+
+
+def worked() -> float:
+    """What this process and those that it waited for have worked so far [s]."""
+    spent = os.times()
+    return spent.user + spent.system + spent.children_user + spent.children_system
+
+
+@dataclass(frozen=True)
+class ProposeSettings:
+    """How a carry is looked for.
+
+    Attributes:
+        seconds: for all of it.
+        feasible: least and largest share of random candidates within the bounds that is feasible.
+        bases: whether the robots' bases are proposed too; of those in the file only the height
+            counts.
+        clock: what seconds are counted by.
+    """
+
+    seconds: float = 120.0
+    feasible: tuple[float, float] = (0.02, 0.20)
+    bases: bool = False
+    clock: Callable[[], float] = worked
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.seconds <= 1e6:
+            raise SettingsError(f"seconds: found {self.seconds:g}; allowed is 1 to 1e6")
+        low, high = self.feasible
+        if not 0.0 < low < high <= 1.0:
+            raise SettingsError(
+                f"feasible: found {low:g} and {high:g}; allowed are shares 0 < least < largest <= 1"
+            )
 
 
 @dataclass(frozen=True)
@@ -191,12 +229,12 @@ class _Search:
         if lazy.setup is None:
             return None
         for number, pair in enumerate(lazy.setup.pairs[:most]):
+            if self.too_late:
+                break
+            self.tell(f"paths of pair {number + 1} of {len(lazy.setup.pairs)}")
             long: list[Array] = []
-            for stray in STRAYS:
-                if self.too_late:
-                    break
-                self.tell(f"paths of pair {number + 1} of {len(lazy.setup.pairs)}")
-                via = self._via_points(lazy.setup, pair, stray, effort)
+            for corners in self._paths(lazy.setup, pair, effort):
+                via = None if corners is None else self._via_points(pair, corners)
                 if via is None:
                     continue
                 if len(via) > FEW:  # another path may do with fewer
@@ -220,27 +258,43 @@ class _Search:
         tried = next((lazy for lazy in setups if lazy.setup is not None), setups[0])
         if tried.setup is None and tried.problem:
             return ProposalError(f"{begin}: {tried.problem}")
-        ended = ", when it was too late for another path" if self.too_late else ""
         met = "" if tried.setup is None else no_path(tried.setup.pairs, self.refusals)
-        return ProposalError(f"{begin}{ended}: {met or 'no path was tried yet, give it more time'}")
+        if self.too_late:
+            more = f"{LONGER * self.settings.seconds:.0f}"
+            begin = f"{begin}, when it was out of time; try {more} s (--time {more})"
+        return ProposalError(f"{begin}: {met or 'no path was tried yet'}")
 
-    def _via_points(self, setup: Setup, pair: Pair, stray: Stray, effort: int) -> Array | None:
-        """The fewest via-points of a path in one way of holding, None where none are found."""
-        task = setup.workcell.task
-        ends = np.array([pair.start.extended, pair.goal.extended])
-        limits = [(joint.lower.min(), joint.upper.max()) for joint in task.redundant]
-        room = freedom(ends[0], ends[1], stray, np.array(limits).reshape(-1, 2))
-        seed = int(self.rng.integers(1, 2**31))
-        budget = Budget(effort, lambda: self.too_late)
-        corners = plan(pair.chain, (pair.start, pair.goal), room, budget, seed)
-        if corners is None:
-            return None
+    def _paths(self, setup: Setup, pair: Pair, effort: int) -> Iterator[list[Place] | None]:
+        """Corners of paths in one way of holding."""
+        if not effort:
+            yield straight_path(pair.chain, pair.retreats, BoxAlone(setup.workcell))
+            return
+        limits = [(joint.lower.min(), joint.upper.max()) for joint in setup.workcell.task.redundant]
+        for stray in STRAYS:
+            if self.too_late:
+                return
+            ends = pair.start.extended, pair.goal.extended
+            room = freedom(*ends, stray, np.array(limits).reshape(-1, 2))
+            seed = int(self.rng.integers(1, 2**31))
+            yield plan(
+                pair.chain,
+                pair.retreats,
+                room,
+                most=effort,
+                out_of_time=lambda: self.too_late,
+                seed=seed,
+            )
+
+    def _via_points(self, pair: Pair, corners: list[Place]) -> Array | None:
+        """The fewest via-points of a path, None where none are found."""
         self.tell("via-points")
         dense = shortened(pair.chain, corners, self.rng)
         for count in range(1, MOST_VIA_POINTS + 1):
             via = fit(pair.chain, dense, count, self.rng)
             if via is not None:
-                return np.asarray(np.round(via, 4))
+                whole = np.vstack([pair.start.extended, via, pair.goal.extended])
+                short = straightened(pair.chain, pair.start, whole, self.rng)
+                return np.asarray(np.round(short[1:-1], 4))
             if self.too_late:
                 break
         return None
@@ -253,12 +307,7 @@ class _Search:
         waypoints = np.vstack([ends[0], via, ends[1]])
         spins = (pair.holds[0].spin, pair.holds[1].spin)
         found = Found(setup.workcell, spins, (-1, -1), waypoints, setup.given)
-        begin = (pair.start.q[0], pair.start.q[1])
-        try:
-            trial = self._trial(found, begin)
-        except BranchLostError:
-            self.refusals.append("the start posture is not among the arm's start branches")
-            return None
+        trial = Trial(self._workcell(found), pair.start.q, named=False)
         judgement, why = trial.verdict()
         if not judgement.feasible:
             self.refusals.append(why)
@@ -266,10 +315,10 @@ class _Search:
         self.tell("bounds")
         # The verdict on the file takes about as long as this one did.
         bounds = self._bounds(trial, self.settings.seconds - 1.5 * (self.spent - begun))
-        moved = replace(found, branches=trial.branches, bounds=bounds).around(bounds.centre)
+        moved = replace(found, bounds=bounds).around(bounds.carry)
         self.tell("the evaluator's verdict on the file")
         try:
-            last = self._trial(moved, trial.start_of(bounds.centre))
+            last = Trial(self._workcell(moved), trial.start_of(bounds.carry), trial.bodies)
         except BranchLostError:
             self.refusals.append("the start posture is not among the arm's start branches")
             return None
@@ -289,8 +338,8 @@ class _Search:
             blocked,
         )
 
-    def _trial(self, found: Found, begin: tuple[Array, Array]) -> Trial:
-        return Trial(self.problem.workcell(changes(self.problem, found)), begin)
+    def _workcell(self, found: Found) -> Workcell:
+        return self.problem.workcell(changes(self.problem, found))
 
     def _bounds(self, trial: Trial, until: float) -> Bounds:
         """Bounds around a trial's carry, found by so many seconds from the beginning."""

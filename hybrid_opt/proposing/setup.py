@@ -1,29 +1,51 @@
-"""A problem made ready for a path: the cell's bodies, both arms' ways to hold, their pairs."""
+"""A problem made ready for a path: reach first, then both arms' ways to hold and their pairs;
+and, where one of these is missing, why."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.evaluate.static_hold import require_hold
+from hybrid_opt.evaluate.explanation import missing_reach
 from hybrid_opt.proposing.document import merged
-from hybrid_opt.proposing.holding import HoldQuery, HoldSearch, find_holds
-from hybrid_opt.proposing.judge import judge_of
-from hybrid_opt.proposing.kinematics import ArmKinematics
+from hybrid_opt.proposing.holding import SEARCH_DAMPING, HoldQuery, HoldSearch, find_holds
+from hybrid_opt.proposing.judge import PoseJudge, judge_of
+from hybrid_opt.proposing.kinematics import (
+    REACHED,
+    ArmKinematics,
+    box_to_last_joint,
+    possible_spins,
+    spun,
+)
 from hybrid_opt.proposing.pairing import Pair, ranked_pairs
 from hybrid_opt.proposing.problem import Problem
-from hybrid_opt.proposing.reasons import box_blocked, holds_missing, no_pair
 from symbolic.array import Array
 from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints
 from symbolic.records import Workcell
+from symbolic.records.poses import box_placement
 
 POSTURES = 200
-"""Random postures by which redundant joints are chosen."""
+"""Random postures by which redundant joints are chosen, and from which arms reach for the box."""
+
+REACH_STEPS = 40
+"""Newton steps from these."""
+
+NEAREST = 8
+"""Postures from which missing reach is measured, those that come nearest."""
+
+MISSING = 1e-3
+"""Reach that counts as missing [m]."""
+
+TOLD = 3
+"""So many pairs or joints are named."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +76,13 @@ def prepare(
         ProposalError: an arm cannot hold the box at start and goal; the text says why.
         WorkcellError: the problem is wrong, or no arms could hold the payload still.
     """
+    start, goal = problem.poses
     given = merged(given, redundancy(problem, problem.workcell(given)))
     workcell = problem.workcell(given)
     require_hold(workcell)
-    start, goal = problem.poses
+    lacking = reach_missing(workcell, (start, goal), spins)
+    if lacking:
+        raise ProposalError(lacking)
     judge = judge_of(build_geometry(workcell))
     blocked = box_blocked(judge, start, goal)
     if blocked:
@@ -119,3 +144,118 @@ def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> t
     others = [k for k in range(model.nq) if k not in forced]
     found = combinations(others, beyond - len(forced))
     return max((tuple(sorted((*forced, *more))) for more in found), key=condition)
+
+
+def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
+    """What the box alone meets at the start or the goal, '' where it meets nothing."""
+    found = []
+    for name, pose in (("start", start), ("goal", goal)):
+        for body, deep in judge.resting(pose):
+            told = f"payload meets {body} at the {name}"
+            allowed = "raise it, or let it rest there by [[task.allowed_contacts]]"
+            found.append(told if deep else f"{told}, by less than 1 mm: {allowed}")
+    return "; ".join(found)
+
+
+def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -> str:
+    """Which arm does not reach its contact at the start or the goal (6,) with any spin, and how
+    much it lacks; '' where both reach."""
+    found = []
+    for arm, (name, pose) in product((0, 1), zip(("start", "goal"), ends, strict=True)):
+        robot, contact = workcell.robots[arm], workcell.contacts[arm]
+        redundant = tuple(joint for joint, _ in workcell.task.redundant_of(arm))
+        kinematics = ArmKinematics.of(workcell, arm, redundant)
+        T_world_box = box_placement(workcell.task.orientation, pose)
+        held = [spun(contact, spin) for spin in possible_spins(contact, spins)]
+        T = [T_world_box @ box_to_last_joint(workcell, kinematics.geometry, c, arm) for c in held]
+        which = np.arange(POSTURES) % len(held)
+        low, high = np.maximum(kinematics.lower, -np.pi), np.minimum(kinematics.upper, np.pi)
+        q = np.random.default_rng(0).uniform(low, high, (POSTURES, len(low)))
+        near = kinematics.solve(q, np.array(T)[which], REACH_STEPS, SEARCH_DAMPING)
+        if near.residual.min() <= REACHED:
+            continue
+        missing = min(
+            missing_reach(robot, held[which[k]], T_world_box, np.clip(near.q[k], low, high))
+            for k in np.argsort(near.residual)[:NEAREST]
+        )
+        if missing > MISSING:
+            found.append(f"{robot.name} lacks {missing:.3f} m to its contact at the {name}")
+    return "; ".join(found)
+
+
+def holds_missing(query: HoldQuery, searches: Sequence[HoldSearch]) -> str:
+    """Why an arm has no way to hold the box, '' where both have one."""
+    found = [
+        _arm_missing(query, arm, search) for arm, search in enumerate(searches) if not search.holds
+    ]
+    return "; ".join(found)
+
+
+def _arm_missing(query: HoldQuery, arm: int, search: HoldSearch) -> str:
+    robot = query.workcell.robots[arm]
+    names = list(arm_model(robot).names)[1:]
+    if not search.within:
+        joints = ", ".join(names[joint] for joint, _ in search.joints.most_common(TOLD))
+        told = f"beyond limits are most often {joints}" if joints else "all are near singular"
+        return f"{robot.name} has no usable posture at the start: {told}"
+    if not search.free:
+        return (
+            f"{robot.name} collides at the start in every posture: {_pairs(search.pairs)}"
+            f"{_overlap_hint(search.pairs)}"
+        )
+    if search.pairs and search.kept >= 1.0:
+        return (
+            f"{robot.name} collides in every posture that leads from the start to the goal: "
+            f"{_pairs(search.pairs)}"
+        )
+    return (
+        f"{robot.name} follows at most {100.0 * search.kept:.0f} % of the way to the goal in any "
+        "posture within its limits and away from singular ones"
+    )
+
+
+def no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
+    """Which bodies of the two arms meet where each alone is free."""
+    met: Counter[tuple[str, str]] = Counter()
+    for end, pose in enumerate((query.start, query.goal)):
+        for a in searches[0].holds[:8]:
+            for b in searches[1].holds[:8]:
+                joints = [(hold.q_start, hold.q_goal)[end] for hold in (a, b)]
+                pair = judge.first_pair(pose, joints[0], joints[1])
+                if pair is not None:
+                    met[pair] += 1
+    return f"both arms' postures collide at the start or the goal: {_pairs(met)}"
+
+
+def no_path(pairs: Iterable[Pair], refusals: Sequence[str]) -> str:
+    """What the planner met most often, and what the evaluator said of its paths."""
+    met: Counter[tuple[str, str]] = Counter()
+    refused: Counter[str] = Counter()
+    for pair in pairs:
+        met += pair.chain.judge.met
+        refused += pair.chain.refused
+    told = []
+    if met:
+        told.append(f"most often in the way: {_pairs(met)}")
+    if refused:
+        told.append(", ".join(name for name, _ in refused.most_common(TOLD)))
+    if refusals:
+        (text, count), *_ = Counter(refusals).most_common(1)
+        told.append(f"the evaluator refused {len(refusals)} carries, {count} because {text}")
+    return "; ".join(told)
+
+
+def _pairs(met: Counter[tuple[str, str]]) -> str:
+    total = max(sum(met.values()), 1)
+    return ", ".join(
+        f"{' – '.join(pair)} ({100.0 * count / total:.0f} %)"
+        for pair, count in met.most_common(TOLD)
+    )
+
+
+def _overlap_hint(met: Counter[tuple[str, str]]) -> str:
+    """What may be done about links of one robot that meet in every posture."""
+    owners = [[name.partition("/")[0] for name in pair if "/" in name] for pair in met]
+    if not any(len(names) == 2 and names[0] == names[1] for names in owners):
+        return ""
+    return " (links that overlap by design are left out by srdf or [[collision.ignored]])"

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt.carry import Judgement
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.certification import LostPathError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.evaluate.static_hold import unheld
+from hybrid_opt.job.collisions import JobCollisions
+from hybrid_opt.job.ends import what_blocks
 from symbolic.array import Array
-from symbolic.cell_model import build_cell_model
+from symbolic.cell_model import CellBodies, CellModel, build_cell_bodies, build_cell_model
 from symbolic.functions import cell_functions, motion_function
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
 from symbolic.robot.branches import StartBranch
+
+if TYPE_CHECKING:
+    import casadi as ca
 
 SAME_BRANCH = 0.02
 """Largest difference of joints, full turns apart, of the posture that a path began with and the
@@ -43,26 +52,43 @@ class Trial:
     Attributes:
         workcell: the cell, its start branches as they were found.
         branches: per robot its start branch among the ranked ones.
+        bodies: what does not depend on the carry.
         model: its symbolic model.
         evaluator: what judges.
     """
 
-    def __init__(self, workcell: Workcell, start: tuple[Array, Array]) -> None:
+    def __init__(
+        self,
+        workcell: Workcell,
+        start: tuple[Array, Array],
+        bodies: CellBodies | None = None,
+        named: bool = True,
+    ) -> None:
         """Build the model and find the start branches.
 
         Args:
             start: postures (joints,) of both arms that the carry begins with.
+            bodies: of the same cell with another carry, if they are known.
+            named: whether `branches` are looked for; else they are -1 and the postures are taken as
+                they are.
 
         Raises:
             BranchLostError: a posture is not among the start branches.
             DualArmError: the cell cannot be modelled.
         """
-        model = build_cell_model(replace(workcell, start_branch=(-1, -1)))
-        found = [_branch(model.branches[i], start[i]) for i in (0, 1)]
-        self.branches = (found[0], found[1])
-        begin = [np.array(model.branches[i][found[i]].q) for i in (0, 1)]
-        self.workcell = replace(workcell, start_branch=self.branches)
-        self.model = model = replace(model, workcell=self.workcell, start=(begin[0], begin[1]))
+        workcell = replace(workcell, start_branch=(-1, -1))
+        self.bodies = bodies or build_cell_bodies(workcell)
+        if named:
+            model = build_cell_model(workcell, self.bodies)
+            found = [_branch(model.branches[i], start[i]) for i in (0, 1)]
+            begin = [np.array(model.branches[i][found[i]].q) for i in (0, 1)]
+            workcell = replace(workcell, start_branch=(found[0], found[1]))
+            model = replace(model, workcell=workcell, start=(begin[0], begin[1]))
+        else:
+            known = self.bodies
+            model = CellModel(workcell, known.robots, known.geometry, ((), ()), start)
+        vars(model)["screening"] = self.bodies.screening  # of the same bodies: not made again
+        self.workcell, self.model, self.branches = workcell, model, workcell.start_branch
         functions = {
             name: InterpretedFunction(dense(function))
             for name, function in cell_functions(model).items()
@@ -164,3 +190,33 @@ def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
     if not apart or apart[best] > SAME_BRANCH:
         raise BranchLostError
     return best
+
+
+class _InterpretedCell(CompiledCell):
+    """A cell of which nothing is compiled."""
+
+    def functions(
+        self,
+        name: str,
+        make: Callable[[CellModel], Mapping[str, ca.Function]],
+        *details: str,
+        lanes: int = 1,
+        levels: Mapping[str, int] | None = None,
+    ) -> dict[str, NumericFunction]:
+        return {
+            name: InterpretedFunction(dense(function))
+            for name, function in make(self.model).items()
+        }
+
+
+def grasp_blocked(trial: Trial) -> str:
+    """What is in the way of the pads' approach before a trial's carry or of their retreat after
+    it, lift and set-down included; '' where nothing is, or where there are no jobs of such pads."""
+    cell = trial.workcell
+    if not cell.has_facing_pads:
+        return ""
+    found = trial.evaluator.outputs(trial.initial[None])
+    q = np.hstack([found["q_1"][0], found["q_2"][0]])[[0, -1]]
+    collisions = JobCollisions(_InterpretedCell(cell, model=trial.model))
+    posture = trial.evaluator.functions["posture"]
+    return what_blocks(cell, collisions, posture, found["pose"][0][[0, -1]], q)

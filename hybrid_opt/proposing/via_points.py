@@ -7,13 +7,23 @@ from itertools import pairwise
 
 import numpy as np
 
-from hybrid_opt.proposing.closed_chain import STEP, ClosedChain, Place, distance, straight
+from hybrid_opt.proposing.closed_chain import (
+    STEP,
+    ClosedChain,
+    Place,
+    distance,
+    levers,
+    straight,
+)
 from hybrid_opt.proposing.planner import same
 from symbolic.array import Array
 from symbolic.path.spline import path_basis
 
-SHORTCUTS = 60
+SHORTCUTS = 80
 """Shortcuts of a path that are tried."""
+
+SHORTER = 0.99
+"""What a shortcut may leave of the length that it replaces, at most."""
 
 MOST_VIA_POINTS = 6
 """Via-points of a proposal; more make a search long."""
@@ -26,6 +36,18 @@ SHIFTS = 12
 
 SHIFT = 0.04
 """Their standard deviation [m], and in a turn counted by its lever."""
+
+STRAIGHTENED = 120
+"""Shifts of via-points that are tried to make a free spline shorter."""
+
+MEASURED = 24
+"""Places of a spline by which its length is compared before it is looked at for collisions."""
+
+
+def joint_length(places: Sequence[Place]) -> float:
+    """How far all joints go together, as the Euclidean length of their path [rad]."""
+    q = np.array([np.concatenate(place.q) for place in places])
+    return float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum())
 
 
 def shortened(
@@ -41,15 +63,15 @@ def shortened(
         first, last = sorted(rng.choice(len(dense), 2, replace=False).tolist())
         if last - first < 3:
             continue
-        old = sum(
-            distance(a.extended, b.extended)
-            for a, b in zip(dense[first:last], dense[first + 1 : last + 1], strict=True)
-        )
-        if distance(dense[first].extended, dense[last].extended) > 0.98 * old:
-            continue
-        new = _between(chain, dense[first], dense[last])
-        if new is not None:
-            dense[first + 1 : last + 1] = new
+        old = dense[first : last + 1]
+        path = straight(old[0].extended, old[-1].extended)
+        if rng.random() < 0.5:  # in one coordinate alone, the others go on as they do
+            path, column = np.array([place.extended for place in old]), rng.integers(path.shape[1])
+            path[:, column] = np.linspace(path[0, column], path[-1, column], len(path))
+        found = list(chain.along(old[0], path[1:]))
+        arrived = len(found) == len(path) - 1 and same(found[-1], old[-1])
+        if arrived and joint_length([old[0], *found]) < SHORTER * joint_length(old):
+            dense[first + 1 : last + 1] = found
     return dense
 
 
@@ -101,6 +123,43 @@ def fit(
         if free > most:
             best, most = waypoints, free
     return None
+
+
+def straightened(
+    chain: ClosedChain, start: Place, waypoints: Array, rng: np.random.Generator
+) -> Array:
+    """Waypoints (n, 6 + m) of a free spline on which the joints go less far than on the given one:
+    pulled in some coordinates towards the straight line, or shifted at random."""
+    share = np.linspace(0.0, 1.0, len(waypoints))[:, None]
+    line = waypoints[0] + share * (waypoints[-1] - waypoints[0])
+    shift, least = SHIFT, _length(chain, start, waypoints)
+    for k in range(STRAIGHTENED):
+        tried = waypoints.copy()
+        if k % 2:
+            pulled = rng.random(waypoints.shape[1]) < 0.5
+            tried[:, pulled] += rng.random() * (line - waypoints)[:, pulled]
+        else:
+            moved = rng.normal(0.0, shift, tried[1:-1].shape)
+            tried[1:-1] += moved / levers(waypoints.shape[1])
+        length = _length(chain, start, tried)
+        if length < least and free_share(chain, start, tried) == 1.0:
+            waypoints, least = tried, length
+            shift *= 1.5
+        else:
+            shift *= 0.95
+    return waypoints
+
+
+def _length(chain: ClosedChain, start: Place, waypoints: Array) -> float:
+    """How far the joints go along a spline [rad], whatever collides; infinite where it is lost."""
+    path = path_basis(len(waypoints), np.linspace(0.0, 1.0, MEASURED)).position @ waypoints
+    places = [start]
+    for extended in path[1:]:
+        place = chain.close(extended, places[-1].q)
+        if place is None:
+            return float("inf")
+        places.append(place)
+    return joint_length(places)
 
 
 def free_share(chain: ClosedChain, start: Place, waypoints: Array) -> float:

@@ -185,7 +185,7 @@ def main() -> None:
         path, begun = write_problem(cell, options.folder), time.monotonic()
         used = resource.getrusage(resource.RUSAGE_SELF).ru_utime
         try:
-            settings = ho.ProposeSettings(seconds=options.time, clock=time.process_time)
+            settings = ho.ProposeSettings(seconds=options.time)
             rng = np.random.default_rng(options.seed)
             found = ho.propose(path, rng=rng, settings=settings)
             path.with_name(f"cell{cell:02d}-proposed.toml").write_text(found.text(path.parent))

@@ -35,15 +35,18 @@ def test_the_wanted_share_of_candidates_is_feasible(n: int) -> None:
     assert 0.02 <= found.share <= 0.20
     fresh = np.random.default_rng(7).uniform(found.lower, found.upper, (20_000, n))
     assert 0.015 <= how.feasible(fresh).mean() <= 0.25
-    assert how.feasible(found.centre[None])[0]
-    assert np.all(found.lower < found.centre)
-    assert np.all(found.centre < found.upper)
+    assert how.feasible(found.carry[None])[0]
+    assert np.all(found.lower <= found.carry + 1e-4)
+    assert np.all(found.carry <= found.upper + 1e-4)
 
 
-def test_bounds_move_to_where_feasible_candidates_lie() -> None:
+def test_bounds_move_to_where_feasible_candidates_lie_and_the_carry_stays() -> None:
     edge = np.full(6, 0.3) - 0.45 / np.sqrt(6.0)
     found = find_bounds(edge, sampling(6, 2))
-    assert np.linalg.norm(found.centre - 0.3) < 0.7 * np.linalg.norm(edge - 0.3)
+    middle = (found.lower + found.upper) / 2.0
+    assert np.linalg.norm(middle - 0.3) < 0.7 * np.linalg.norm(edge - 0.3)
+    assert np.all((found.lower - 1e-4 <= found.carry) & (found.carry <= found.upper + 1e-4))
+    assert np.linalg.norm(found.carry - edge) < 0.7 * np.linalg.norm(middle - edge)
 
 
 def test_bounds_keep_to_limits() -> None:
@@ -57,8 +60,8 @@ def test_bounds_hold_a_carry_that_is_beyond_the_usual_limits() -> None:
     how = sampling(3, 4)
     how.limits[1] = 0.15
     found = find_bounds(np.full(3, 0.2), how)
-    assert np.all(found.lower <= found.centre)
-    assert np.all(found.upper >= found.centre)
+    assert np.all(found.lower <= found.carry)
+    assert np.all(found.upper >= found.carry)
 
 
 @pytest.mark.parametrize("calls", [0, 3, 6])
@@ -71,7 +74,7 @@ def test_when_time_is_up_the_best_bounds_so_far_are_taken(calls: int) -> None:
 
     found = find_bounds(np.full(6, 0.2), replace(how, out_of_time=out_of_time))
     assert found.candidates >= 32
-    assert how.feasible(found.centre[None])[0]
+    assert how.feasible(found.carry[None])[0]
 
 
 @pytest.mark.parametrize("pitch", [-3.0, 0.0, 1.4, 2.0, 3.1])

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid_opt.proposing.closed_chain import Place
+from hybrid_opt.proposing.closed_chain import Place, straight
+from hybrid_opt.proposing.judge import BoxAlone
 from hybrid_opt.proposing.kinematics import ArmKinematics, box_to_last_joint, spun
-from hybrid_opt.proposing.planner import Budget, Stray, freedom, plan
+from hybrid_opt.proposing.planner import Stray, freedom, plan, straight_path
 from hybrid_opt.proposing.problem import read_problem
 from hybrid_opt.proposing.setup import Setup, prepare
-from hybrid_opt.proposing.via_points import fit, free_share, shortened
+from hybrid_opt.proposing.via_points import fit, free_share, joint_length, shortened, straightened
+from symbolic.path.spline import path_basis
 from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.proposing.test_proposal import rack_problem
 
@@ -27,9 +29,8 @@ def rack(tmp_path_factory: pytest.TempPathFactory) -> Setup:
 def planned(setup: Setup, seed: int) -> list[Place]:
     pair = setup.pairs[0]
     ends = pair.start.extended, pair.goal.extended
-    budget = Budget(20_000, lambda: False)
     room = freedom(*ends, Stray(0.0, 0.15, 0.8), NO_LIMITS)
-    found = plan(pair.chain, (pair.start, pair.goal), room, budget, seed)
+    found = plan(pair.chain, pair.retreats, room, most=20_000, out_of_time=lambda: False, seed=seed)
     assert found is not None
     return found
 
@@ -53,6 +54,65 @@ def test_paths_hold_the_box_with_both_arms_and_are_free(rack: Setup) -> None:
         assert np.all(q <= rack.workcell.robots[arm].position_upper)
     q_1, q_2 = (np.array([place.q[arm] for place in path]) for arm in (0, 1))
     assert not pair.chain.judge.without_screening(poses, q_1, q_2).any()
+
+
+def test_straight_motions_lead_out_of_the_shelf_and_in_again(rack: Setup) -> None:
+    """Of three: away from the rack, up beside it, back; collisions are FCL's without screening."""
+    pair = rack.pairs[0]
+    corners = straight_path(pair.chain, pair.retreats, BoxAlone(rack.workcell))
+    assert corners is not None
+    out, over = (corners[k + 1].extended - corners[k].extended for k in (0, 1))
+    assert out[0] < -0.2
+    assert over[2] > 0.3
+    np.testing.assert_allclose(corners[-1].extended, pair.goal.extended)
+    path = shortened(pair.chain, corners, np.random.default_rng(0))
+    poses = np.array([place.extended for place in path])
+    q_1, q_2 = (np.array([place.q[arm] for place in path]) for arm in (0, 1))
+    assert not pair.chain.judge.without_screening(poses, q_1, q_2).any()
+
+
+def test_where_no_straight_motion_is_free_none_is_made_up(rack: Setup) -> None:
+    pair = rack.pairs[0]
+    ends = pair.start, pair.goal
+    alone = tuple([[end]] * len(ways) for end, ways in zip(ends, pair.retreats, strict=True))
+    assert straight_path(pair.chain, (alone[0], alone[1]), BoxAlone(rack.workcell)) is None
+
+
+def test_shortcuts_make_the_way_of_the_joints_shorter(rack: Setup) -> None:
+    """A path that wanders to both sides, on a task that is symmetric."""
+    pair = rack.pairs[0]
+    corners = straight_path(pair.chain, pair.retreats, BoxAlone(rack.workcell))
+    assert corners is not None
+    path = np.array([corner.extended for corner in corners])
+    path = np.insert(path, 2, (path[1] + path[2]) / 2.0, axis=0)
+    path[2, 1] += 0.08
+    wandering = [corners[0]]
+    for extended in path[1:]:
+        reached = pair.chain.reach(wandering[-1], extended)
+        assert reached is not None
+        wandering.append(reached)
+    dense = [wandering[0]]
+    for corner in wandering[1:]:
+        dense += pair.chain.along(dense[-1], straight(dense[-1].extended, corner.extended)[1:])
+    short = shortened(pair.chain, wandering, np.random.default_rng(0))
+    assert joint_length(short) < 0.95 * joint_length(dense)
+    assert max(abs(place.extended[1]) for place in short) < 0.04
+
+
+def test_a_spline_is_straightened_as_far_as_it_stays_free(rack: Setup) -> None:
+    pair, rng = rack.pairs[0], np.random.default_rng(0)
+    path = shortened(pair.chain, planned(rack, 1), rng)
+    found = [fit(pair.chain, path, count, rng) for count in (1, 2, 3, 4, 5)]
+    via = next(each for each in found if each is not None)
+    whole = np.vstack([pair.start.extended, via, pair.goal.extended])
+    short = straightened(pair.chain, pair.start, whole, rng)
+    np.testing.assert_array_equal(short[[0, -1]], whole[[0, -1]])
+    assert free_share(pair.chain, pair.start, short) == 1.0
+    lengths = []
+    for waypoints in (whole, short):
+        basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, 200)).position
+        lengths.append(joint_length(list(pair.chain.along(pair.start, basis @ waypoints))))
+    assert lengths[1] < 0.97 * lengths[0]
 
 
 def test_the_same_seed_gives_the_same_path(rack: Setup) -> None:
@@ -80,8 +140,8 @@ def test_what_may_be_spent_on_a_path_is_kept(rack: Setup) -> None:
     pair = rack.pairs[0]
     ends = pair.start.extended, pair.goal.extended
     room = freedom(*ends, Stray(0.0, 0.15, 0.8), NO_LIMITS)
-    budget = Budget(10**9, lambda: True)
-    assert plan(pair.chain, (pair.start, pair.goal), room, budget, 1) is None
+    out = pair.retreats
+    assert plan(pair.chain, out, room, most=10**9, out_of_time=lambda: True, seed=1) is None
 
 
 def test_a_tilted_path_may_turn_and_a_level_one_may_not() -> None:

@@ -78,7 +78,7 @@ def test_paths_lead_to_the_same_files_from_another_folder(tmp_path: Path) -> Non
 def test_what_is_wrong_is_told_with_its_key_and_the_file(
     changes: dict[str, Any], told: str, tmp_path: Path
 ) -> None:
-    path = rack_problem(tmp_path, changes)
+    path = rack_problem(tmp_path, {"task": changes})
     with pytest.raises(WorkcellError, match=told) as error:
         read_problem(path).workcell()
     assert str(path) in str(error.value)
