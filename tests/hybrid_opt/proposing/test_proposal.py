@@ -77,7 +77,13 @@ def test_comments_of_the_problem_stay(proposal: ho.Proposal, tmp_path: Path) -> 
     [
         ({"task": {"goal": [0.0, 0.0, 1.65, 0.0, 0.0, 0.0]}}, "goal"),
         ({"task": {"start": [0.35, 0.0, 0.745, 0.0, 0.0, 1.5]}}, "start"),
-        ({"payload": {"size": [0.3, 4.0, 0.25]}, "contacts": [{"xyz": None}, {"xyz": None}]}, ""),
+        (
+            {
+                "payload": {"size": [0.3, 4.0, 0.25]},
+                "contacts": [{"xyz": [0.0, 2.0, 0.0]}, {"xyz": [0.0, -2.0, 0.0]}],
+            },
+            "",
+        ),
     ],
 )
 def test_what_is_out_of_reach_or_too_wide_is_told_before_any_work(
@@ -95,14 +101,14 @@ def test_what_is_out_of_reach_or_too_wide_is_told_before_any_work(
     told = rf"(left|right) lacks 0\.\d+ m to its contact at the {end}"
     with pytest.raises(ProposalError, match=told):
         ho.propose(path, rng=np.random.default_rng(1))
-    assert worked() - begun < 5.0  # 0.4 on a core of 2026
+    assert worked() - begun < 5.0  # measured: 0.4
 
 
 def test_a_failure_for_lack_of_time_says_so_and_names_a_time_to_try(tmp_path: Path) -> None:
-    """A clock that goes on by a second with every look."""
+    """A clock that goes on by ten seconds with every look."""
     looks = itertools.count()
-    settings = ho.ProposeSettings(seconds=8.0, clock=lambda: float(next(looks)))
-    with pytest.raises(ProposalError, match=r"out of time; try 20 s \(--time 20\)"):
+    settings = ho.ProposeSettings(seconds=10.0, clock=lambda: 10.0 * next(looks))
+    with pytest.raises(ProposalError, match=r"out of time; try 25 s \(--time 25\)"):
         ho.propose(rack_problem(tmp_path), rng=np.random.default_rng(1), settings=settings)
 
 
