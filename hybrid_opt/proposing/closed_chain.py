@@ -169,11 +169,14 @@ class ClosedChain:
 
     def reach(self, begin: Place, extended: Array) -> Place | None:
         """The configuration at the end of a straight motion, None if it is not free."""
-        path = straight(begin.extended, extended)
-        last, count = begin, 0
-        for place in self.along(begin, path[1:]):
-            last, count = place, count + 1
-        return last if count == len(path) - 1 else None
+        found = self.way(begin, straight(begin.extended, extended))
+        return None if found is None else found[-1]
+
+    def way(self, begin: Place, path: Array) -> list[Place] | None:
+        """The configurations along a path (n, 6 + m) of extended poses from one of them on, None if
+        not all are free."""
+        found = [begin, *self.along(begin, path[1:])]
+        return found if len(found) == len(path) else None
 
     def _free(self, places: list[Place]) -> int:
         """How many of these are free before the first that is not."""

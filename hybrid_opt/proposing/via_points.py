@@ -56,7 +56,8 @@ def shortened(
     """A path without needless corners: places along it, `closed_chain.STEP` apart."""
     dense = [corners[0]]
     for corner in corners[1:]:
-        dense += _between(chain, dense[-1], corner) or [corner]
+        found = chain.way(dense[-1], straight(dense[-1].extended, corner.extended))
+        dense += found[1:] if found and same(found[-1], corner) else [corner]
     for _ in range(SHORTCUTS):
         if len(dense) < 4:
             break
@@ -68,18 +69,11 @@ def shortened(
         if rng.random() < 0.5:  # in one coordinate alone, the others go on as they do
             path, column = np.array([place.extended for place in old]), rng.integers(path.shape[1])
             path[:, column] = np.linspace(path[0, column], path[-1, column], len(path))
-        found = list(chain.along(old[0], path[1:]))
-        arrived = len(found) == len(path) - 1 and same(found[-1], old[-1])
-        if arrived and joint_length([old[0], *found]) < SHORTER * joint_length(old):
-            dense[first + 1 : last + 1] = found
+        found = chain.way(old[0], path)
+        arrived = found is not None and same(found[-1], old[-1])
+        if found and arrived and joint_length(found) < SHORTER * joint_length(old):
+            dense[first : last + 1] = found
     return dense
-
-
-def _between(chain: ClosedChain, first: Place, last: Place) -> list[Place] | None:
-    """Places after the first on the straight motion to the last; None if it is not free."""
-    path = straight(first.extended, last.extended)[1:]
-    found = list(chain.along(first, path))
-    return found if len(found) == len(path) and same(found[-1], last) else None
 
 
 def fit(
