@@ -79,7 +79,7 @@ class ProposeSettings:
         feasible: least and largest share of random candidates within the bounds that is feasible.
         bases: whether the robots' bases are proposed too; of those in the file only the height
             counts.
-        clock: what seconds are counted by.
+        clock: what seconds are counted by; other programs' work does not count.
     """
 
     seconds: float = 120.0
