@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.errors import ProposalError
-from hybrid_opt.evaluate.static_hold import require_hold
 from hybrid_opt.evaluate.explanation import missing_reach
+from hybrid_opt.evaluate.static_hold import require_hold
 from hybrid_opt.proposing.document import merged
 from hybrid_opt.proposing.holding import SEARCH_DAMPING, HoldQuery, HoldSearch, find_holds
 from hybrid_opt.proposing.judge import PoseJudge, judge_of

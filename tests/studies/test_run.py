@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
+from hybrid_opt.campaign import Progress
 from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.indicators import metrics
@@ -273,7 +274,7 @@ def test_a_study_without_a_recommendation_says_why(
     assert f"why  {summary.no_recommendation}" in capsys.readouterr().out
     assert html.escape(summary.no_recommendation) in (root / run.PAGE).read_text()
     with pytest.raises(NoCarryError, match="none of 4"):
-        recommend_from(root, Wish(), tmp_path / "carry.json")
+        recommend_from(root, Wish(), tmp_path / "carry.json", Progress(shown=False))
 
 
 def test_help_explains_every_option_with_its_default() -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from hybrid_opt.campaign import ExecutionSettings, Progress, Stage, open_folder, run_stages
+from hybrid_opt.campaign.recommended import StoredRecommendation
 from hybrid_opt.campaign.results import read_campaign
 from studies import recommend, run
 from studies.cli import campaign_parser, campaign_settings
@@ -94,7 +95,7 @@ def test_a_recommendation_alone_makes_nothing_else(
     assert "Report:" not in said.out
     assert re.search(r"recommendation: \d of \d steps \[", said.err)
     found = read_recommendation(root)
-    assert found is not None
+    assert isinstance(found, StoredRecommendation)
     assert max(found.peak_force) <= 60.0 * (1.0 + 1e-6)
     results = read_campaign(root)
     assert results.workcell.task.time_law == "optimal"

@@ -12,8 +12,9 @@ import pytest
 import hybrid_opt as ho
 from hybrid_opt.evaluate.static_hold import still_load, unheld
 from hybrid_opt.timing.model import TimingModel
-from studies import inspect, propose, run
-from studies.inspection import inspect as inspected
+from studies import propose, run
+from studies.inspect import told
+from studies.inspection import Inspection
 from studies.program import BAD_INPUT
 from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
@@ -145,8 +146,8 @@ def test_no_study_begins(
 
 
 def test_the_inspection_says_infeasible(slippery: Path) -> None:
-    found = inspected(load(slippery), 1, 1, None)
-    assert f"Infeasible, whatever the path: {found.unheld}" in inspect.as_text(found)
+    found = Inspection(load(slippery), 1, 1, None)
+    assert f"Infeasible, whatever the path: {found.unheld}" in told(found)
     assert "981 N" in found.unheld
 
 
