@@ -38,7 +38,7 @@ def changed(name: str, folder: Path, **values: float) -> Path:
     return other
 
 
-def told(text: str, what: str) -> float:
+def number(text: str, what: str) -> float:
     """A number of the remedy."""
     found = re.search(rf"{what} ([\d.]+)", text)
     assert found is not None, text
@@ -68,7 +68,7 @@ def test_needed_allowed_and_remedies_are_told(slippery: Path, tmp_path: Path) ->
     why = unheld(load(slippery))
     assert "left needs a normal force of 981 N at the start, allowed are 117.7 N" in why
     assert "right needs" in why
-    mass, friction = told(why, "mass of at most"), told(why, "friction of at least")
+    mass, friction = number(why, "mass of at most"), number(why, "friction of at least")
     for lighter in (mass, 1.01 * mass):
         enough = unheld(load(changed("rack", tmp_path, mass=lighter, friction=0.1))) == ""
         assert enough is (lighter == mass)
@@ -82,13 +82,13 @@ def test_the_whole_force_is_the_arms_payload(tmp_path: Path) -> None:
     assert unheld(load(changed("rack", tmp_path, mass=16.9))) == ""
     why = unheld(load(changed("rack", tmp_path, mass=17.0)))
     assert "left needs a force in all of" in why
-    assert told(why, "mass of at most") == pytest.approx(16.97, abs=0.01)
+    assert number(why, "mass of at most") == pytest.approx(16.97, abs=0.01)
 
 
 def test_a_patch_that_would_do_is_told(tmp_path: Path) -> None:
     why = unheld(load(changed("transfer", tmp_path, patch_radius=0.005)))
     assert "shift of the pressure of 10 mm" in why
-    radius = 1e-3 * told(why, "patches of at least")
+    radius = 1e-3 * number(why, "patches of at least")
     assert unheld(load(changed("transfer", tmp_path, patch_radius=1.001 * radius))) == ""
     assert unheld(load(changed("transfer", tmp_path, patch_radius=0.98 * radius))) != ""
 
@@ -100,7 +100,7 @@ def test_the_joint_allocation_tells_a_patch_that_presses_less(tmp_path: Path) ->
     needed = float(still_load(load(path), np.zeros(6))["normal_force"].max())
     path.write_text(re.sub(r"^reference_force = .*$", "reference_force = 75.0", text, flags=re.M))
     assert needed > 75.0
-    radius = 1e-3 * told(unheld(load(path)), "patches of at least")
+    radius = 1e-3 * number(unheld(load(path)), "patches of at least")
     path.write_text(path.read_text().replace("patch_radius = 0.003", f"patch_radius = {radius}"))
     assert unheld(load(path)) == ""
 
