@@ -1,7 +1,7 @@
 """How hard to press so that pads hold that press evenly, for every case of a set.
 
 The other forces of this package belong to pads that may choose their pressure
-(`symbolic.contact.facing`). Real pads do not: these forces are what is commanded at least
+(`symbolic.contact.grasp`). Real pads do not: these forces are what is commanded at least
 (`hybrid_opt.robust.squeeze`), by the soft-finger model (`symbolic.contact.soft_finger`).
 """
 

@@ -73,7 +73,7 @@ def closing_squeeze(contacts: Sequence[Contact]) -> Squeeze | None:
     return Squeeze(states, high)
 
 
-def is_closed(workcell: Workcell) -> bool:
+def has_force_closure(workcell: Workcell) -> bool:
     """Whether a workcell's pads hold its payload whatever the motion asks."""
     return _balanced_states(workcell.pads, SPARE_FRICTION) is not None
 

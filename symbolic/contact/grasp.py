@@ -1,14 +1,22 @@
-"""The least contact forces of pads anywhere on a payload: any normals, any of the patches.
+"""The least contact forces of pads on a payload: any normals, any of the patches.
 
-The least of the sum of all squared contact forces, as `symbolic.contact.facing` has it
-for pads that face one another. The method starts from an internal squeeze
+    minimise the sum of all |f_i|^2  subject to  the wrenches balance what the motion needs,
+                                                 each lies within its patch's cone
+
+(`symbolic.contact.central_path`), where the paper (Eqs. 38-42, 51-59) takes the least forces first
+and asks for the moment afterwards. The method starts from an internal squeeze
 (`symbolic.contact.force_closure`), pressed as hard as the load asks.
+
+Two round pads that face one another have a start without such a squeeze, because pressing harder
+carries anything: `OppositePads`, whose geometry may vary. Its coordinates are tangents a, b and
+normal n = a x b of contact 1. Shifts and arms in m, forces in N.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -29,9 +37,9 @@ from symbolic.contact.force_closure import (
 )
 from symbolic.contact.patches import Patch, least
 from symbolic.contact.rectangular_patch import RectangularPatch
-from symbolic.contact.round_patch import RoundPatch
+from symbolic.contact.round_patch import RoundPatch, cross_2, patch_slack
 from symbolic.errors import SettingsError
-from symbolic.expression import reciprocal
+from symbolic.expression import Expression, reciprocal
 from symbolic.path.rotation import rotation_matrix
 from symbolic.records import Contact, Workcell
 from symbolic.records.quantities import GRAVITY
@@ -186,8 +194,7 @@ class Grasp:
     def units(self, i: int, friction: ca.SX, reach: ca.SX = WHOLE) -> ca.SX:
         """(6,) what the entries of pad i's scaled wrench are multiples of."""
         robot = self.robots[i]
-        mu, r = friction[robot], reach[robot] * self._pads[i].patch_radius
-        return ca.vertcat(1.0, mu, mu, r, r, mu * r)
+        return _units(friction[robot], reach[robot] * self._pads[i].patch_radius)
 
     def _at(self, states: list[ca.SX], friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
         """States at the nominal friction and size with what they carry, at others: each corner's
@@ -252,3 +259,175 @@ def _sparse(matrix: Array) -> ca.DM:
     """Without what is zero but for rounding."""
     small = np.abs(matrix) < 1e-14 * np.abs(matrix).max()
     return ca.sparsify(ca.DM(np.where(small, 0.0, matrix)))
+
+
+def _units(mu: ca.SX, r: ca.SX) -> ca.SX:
+    return ca.vertcat(1.0, mu, mu, r, r, mu * r)
+
+
+# --- two round pads that face one another ---
+
+
+Objective = Literal["effort", "squeeze"]
+"""|f_1|^2 + |f_2|^2 or N_1 + N_2."""
+
+LOWEST = (4.0 / 3.0) ** 0.5
+"""Bound of what a wrench without normal force takes from a patch's eigenvalues, over its length:
+their sum is zero and that of their squares is twice its square (Samuelson)."""
+
+BALANCE_SIZE = 9
+CELL_SIZES = (("balance", BALANCE_SIZE), ("friction", 2), ("radius", 2))
+
+
+def balance_of(
+    force: Expression, moment: Expression, arms: tuple[Expression, Expression]
+) -> Expression:
+    """What the contacts have to balance (9,), see `BALANCE_SIZE`.
+
+    Args:
+        force: (3,) resultant force.
+        moment: (3,) required moment about the centre of mass.
+        arms: (3,) each, from the centre of mass to the nominal contact points.
+    """
+    rest = moment - ca.cross(arms[1], force)
+    return ca.vertcat(force[2], force[:2], -rest[1], rest[0], rest[2], arms[0] - arms[1])
+
+
+def facing_wrenches(
+    balance: ca.MX,
+    friction: ca.MX,
+    radius: ca.MX,
+    objective: Objective = "effort",
+    differentiable: bool = False,
+) -> ca.MX:
+    """Wrenches (12,) of two round pads that face one another: of each N, T (2,) [N], the first
+    moment N d (2,) and M [N m] about n, all along a and b of contact 1.
+
+    There always are some, because pressing harder carries everything, if the patches overlap when
+    seen along the normal. Those of the least N_1 + N_2 in place of the least effort: the balance
+    fixes N_1 - N_2, so that both are as small as they can be; with less of either no pressure on
+    the patches carries what is asked, with more of both some does.
+
+    Args:
+        balance: (9,), see `balance_of`.
+        friction: (2,) Coulomb coefficients of the contacts.
+        radius: (2,) radii of the patches [m].
+        objective: what is least.
+        differentiable: whether first derivatives are wanted
+            (`symbolic.contact.central_path.differentiable_least_effort`).
+    """
+    scale = ca.sqrt(ca.sumsqr(balance[:3]) + ca.sumsqr(balance[3:5] / balance[8]) + SCALE_FLOOR**2)
+    scaled = (ca.vertcat(balance[:6] / scale, balance[6:]), friction, radius)
+    solve = differentiable_least_effort if differentiable else least_effort
+    return _facing_in_newtons()(solve(OppositePads(objective), *scaled), scale, friction, radius)
+
+
+@cache
+def _facing_in_newtons() -> ca.Function:
+    found, scale = ca.SX.sym("w", 2 * WRENCH_SIZE), ca.SX.sym("s")
+    mu, r = ca.SX.sym("mu", 2), ca.SX.sym("r", 2)
+    units = ca.vertcat(*[_units(mu[i], r[i]) for i in (0, 1)])
+    return ca.Function("in_newtons", [found, scale, mu, r], [scale * units * found])
+
+
+@dataclass(frozen=True)
+class OppositePads:
+    """Two round pads that face one another, as a `symbolic.contact.central_path.Program`.
+
+    Its inputs are `balance_of`, over the force's scale, the coefficients and the radii, so that all
+    of these may vary.
+
+    Attributes:
+        objective: what is minimised.
+    """
+
+    objective: Objective
+    patches: tuple[Patch, ...] = (RoundPatch(), RoundPatch())
+    cell_sizes: tuple[tuple[str, int], ...] = CELL_SIZES
+
+    def left(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+        """What contact 1 leaves to contact 2, its normal force along -n."""
+        (wrench,), (balance, friction, radius) = wrenches, cell
+        tangent, moment = friction[0] * wrench[1:3], radius[0] * wrench[3:5]
+        # Moments about pad 2: (p_1 - p_2) x f_1 and the contacts' own make up what is required.
+        moment_2 = moment - balance[8] * tangent + wrench[0] * balance[6:8] - balance[3:5]
+        about_n = balance[5] - cross_2(balance[6:8], tangent) - friction[0] * radius[0] * wrench[5]
+        over_mu, over_r = reciprocal(friction[1]), reciprocal(radius[1])
+        return ca.vertcat(
+            wrench[0] - balance[0],
+            (balance[1:3] - tangent) * over_mu,
+            moment_2 * over_r,
+            about_n * (over_mu * over_r),
+        )
+
+    def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+        """Half the sum of the squared forces, or the sum of the normal ones."""
+        if self.objective == "squeeze":
+            return wrenches[0][0] + wrenches[1][0]
+        mu = cell[1]
+        forces = [ca.vertcat(w[0], mu[i] * w[1:3]) for i, w in enumerate(wrenches)]
+        return ca.sumsqr(ca.vertcat(*forces)) / 2.0
+
+    def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
+        """Wrenches within both cones, pressed as hard as what else they carry asks."""
+        balance, friction, radius = cell
+        # Tangential forces that leave little moment to be carried: least squares, scaled.
+        over_mu_1, over_mu_2 = 1.0 / friction[0] ** 2, 1.0 / friction[1] ** 2
+        lever = balance[8] / ca.sum1(radius)
+        by_lever = lever / ca.sum1(radius)
+        tangent = (over_mu_2 * balance[1:3] - by_lever * balance[3:5]) / (
+            over_mu_1 + over_mu_2 + lever**2
+        )
+        lighter = ca.fmax(balance[0], 0.0)
+        asked = [_length(wrench[1:]) for wrench in _shared(cell, tangent, lighter)]
+        # The squeeze itself tilts the box where the pads do not face one another.
+        overlap = 1.0 - _length(balance[6:8]) / ca.sum1(radius)
+        pressed = LOWEST * ca.fmax(*asked) / (START_SHARE * overlap) + START_FLOOR
+        return _shared(cell, tangent, pressed + lighter), ca.SX(START_WEIGHT)
+
+
+def even_slack(balance: ca.SX, friction: ca.SX, radius: ca.SX, n_1: ca.SX) -> ca.SX:
+    """Whether wrenches hold that share everything evenly, if contact 1 presses with n_1 [N].
+
+    Positive where both lie within their cones: then the patches carry what is asked. Where it is
+    not, another pressure still may.
+
+    Args:
+        balance, friction, radius: as in `facing_wrenches`.
+    """
+    left = []
+    for wrench in _evenly([balance, friction, radius], n_1):
+        normal = wrench[0]
+        left += [
+            normal,
+            1.0 - ca.sumsqr(wrench[1:3]) / normal**2,
+            1.0 - ca.sumsqr(wrench[3:5]) / normal**2,
+            patch_slack(wrench) / normal**4,
+        ]
+    return ca.mmin(ca.vertcat(*left))
+
+
+def _evenly(cell: list[ca.SX], n_1: ca.SX) -> list[ca.SX]:
+    """`_shared` with tangential forces in proportion to friction."""
+    balance, friction, _ = cell
+    return _shared(cell, friction[0] / ca.sum1(friction) * balance[1:3], n_1)
+
+
+def _shared(cell: list[ca.SX], tangent: ca.SX, n_1: ca.SX) -> list[ca.SX]:
+    """Scaled wrenches (6,) of both contacts under a normal force and a tangential force (2,) of
+    contact 1, moments in proportion to radii and torsion to friction times radius."""
+    balance, friction, radius = cell
+    tilt = balance[8] * tangent + balance[3:5]
+    about_n = balance[5] - cross_2(balance[6:8], tangent)
+    # A share over the contact's own friction or radius is the whole over the sum of both.
+    first = ca.vertcat(
+        n_1,
+        tangent / friction[0],
+        (tilt - n_1 * balance[6:8]) / ca.sum1(radius),
+        about_n / ca.sum1(friction * radius),
+    )
+    return [first, OppositePads("effort").left([first], cell)]
+
+
+def _length(vector: ca.SX) -> ca.SX:
+    return ca.sqrt(ca.sumsqr(vector))

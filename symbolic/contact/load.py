@@ -2,20 +2,17 @@
 
 Joins rotation, force allocation and centre of pressure (paper Section 4.4). With the allocation
 `joint` the paper's result is kept wherever its shifts stay within the patches and leave no moment,
-and `symbolic.contact.facing` takes over where not. For pads that do not face one another,
-or are not round, or more than two, the paper has no result: `symbolic.contact.grasp` alone answers.
+and `symbolic.contact.grasp` takes over where not. For pads that do not face one another, or more
+than two, the paper has no result: `symbolic.contact.grasp` alone answers.
 """
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import casadi as ca
 import numpy as np
 
-from symbolic.contact.facing import JointAllocation, allocate_jointly, balance_of
 from symbolic.contact.force_closure import WRENCH_SIZE
-from symbolic.contact.grasp import Grasp, grasp_wrenches
+from symbolic.contact.grasp import Grasp, balance_of, facing_wrenches, grasp_wrenches
 from symbolic.contact.paper import allocate, pressure_shift, required_force, required_moment
 from symbolic.expression import Expression
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
@@ -164,8 +161,7 @@ def _joint_load_function(workcell: Workcell) -> ca.Function:
     asked = [inputs["pose"], force, paper["required_moment"], inputs["friction"]]
     asked.append(inputs["centre_of_mass"])
     unused = [ca.MX.sym("unused", value.shape[0]) for value in asked]
-    general = not workcell.has_facing_pads
-    anew = _grasp_sample_function(workcell) if general else _joint_sample_function(workcell)
+    anew = _sample_function(workcell)
     choice = ca.Function.if_else(
         "allocation",
         ca.Function("keep", [*unused, *passed], passed),
@@ -183,7 +179,7 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
     found = _required_function(workcell)(*[inputs[name] for name in SIZES if name != "friction"])
     outputs = dict(zip(names, found, strict=True))
     asked = (inputs["pose"], outputs["force"], outputs["required_moment"])
-    held = _grasp_sample_function(workcell)(*asked, inputs["friction"], inputs["centre_of_mass"])
+    held = _sample_function(workcell)(*asked, inputs["friction"], inputs["centre_of_mass"])
     outputs |= dict(zip(GRASP_OUTPUTS, held, strict=True))
     return _named(inputs, outputs)
 
@@ -243,80 +239,38 @@ def _suffices_function(workcell: Workcell) -> ca.Function:
     return ca.Function("suffices", inputs, [holds])
 
 
-def _grasp_sample_function(workcell: Workcell) -> ca.Function:
-    """As `_joint_sample_function`, for pads anywhere."""
-    inputs = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES]
-    pose, force, moment, friction, centre_of_mass = inputs
-    asked = (pose, force, moment, centre_of_mass)
-    wrenches = grasp_wrenches(Grasp(workcell), box_load_function(workcell)(*asked), friction)
-    return ca.Function("grasp_sample", inputs, grasp_world_function(workcell)(*asked, wrenches))
-
-
-def _joint_sample_function(workcell: Workcell) -> ca.Function:
+def _sample_function(workcell: Workcell) -> ca.Function:
     """pose, force, moment (world), friction and centre of mass to the outputs `GRASP_OUTPUTS`."""
     inputs = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES]
     pose, force, moment, friction, centre_of_mass = inputs
-    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
     asked = (pose, force, moment, centre_of_mass)
-    held = allocate_jointly(_balance_function(workcell)(*asked), friction, radius)
-    wrenches = [getattr(held, each.name) for each in fields(held)]
-    return ca.Function("joint_sample", inputs, _world_function(workcell)(*asked, *wrenches))
+    if workcell.has_facing_pads:
+        wrenches = _facing_wrenches(workcell, asked, friction)
+    else:
+        load = box_load_function(workcell)(*asked)
+        wrenches = grasp_wrenches(Grasp(workcell), load, friction)
+    return ca.Function("grasp_sample", inputs, grasp_world_function(workcell)(*asked, wrenches))
 
 
-def _balance_function(workcell: Workcell) -> ca.Function:
-    """pose, force, moment (world) and centre of mass to what the contacts have to balance (9,)."""
-    inputs, _, needed, arms = _in_pad_axes(workcell)
-    return ca.Function("joint_balance", inputs, [balance_of(*needed, arms)])
-
-
-def _world_function(workcell: Workcell) -> ca.Function:
-    """As `_balance_function`, then the fields of a `JointAllocation`, to the outputs
-    `GRASP_OUTPUTS`."""
-    inputs, axes, needed, arms = _in_pad_axes(workcell)
-    held = JointAllocation(*[ca.SX.sym(each.name, 2) for each in fields(JointAllocation)])
-    forces = [
-        ca.vertcat(held.tangent_1, held.normal[0]),
-        ca.vertcat(held.tangent_2, -held.normal[1]),
-    ]
-    shifts = [ca.vertcat(shift, 0.0) for shift in (held.shift_1, held.shift_2)]
-    moments = [
-        ca.cross(shift, at) + ca.vertcat(0.0, 0.0, held.torsion[i])
-        for i, (shift, at) in enumerate(zip(shifts, forces, strict=True))
-    ]
-    point = needed[1] - ca.cross(arms[0], forces[0]) - ca.cross(arms[1], forces[1])
-    local = (*forces, *shifts, *moments, point, point - moments[0] - moments[1])
-    first, second, shift_1, shift_2, moment_1, moment_2, before, left = (
-        ca.mtimes(axes, vector) for vector in local
-    )
-    outputs = {
-        "normal_force": held.normal,
-        "tangential_force": ca.vertcat(_length(held.tangent_1), _length(held.tangent_2)),
-        "contact_force": ca.vertcat(first, second),
-        "pressure_shift": ca.vertcat(_length(held.shift_1), _length(held.shift_2)),
-        "shift_vector": ca.vertcat(shift_1, shift_2),
-        "point_moment_residual": before,
-        "moment_residual": left,
-        "wrench_1": ca.vertcat(first, moment_1),
-        "wrench_2": ca.vertcat(second, moment_2),
-    }
-    wrenches = [getattr(held, each.name) for each in fields(held)]
-    return ca.Function(
-        "joint_world", [*inputs, *wrenches], [outputs[name] for name in GRASP_OUTPUTS]
-    )
-
-
-def _in_pad_axes(
-    workcell: Workcell,
-) -> tuple[list[ca.SX], ca.SX, tuple[ca.SX, ca.SX], tuple[ca.SX, ca.SX]]:
-    """Inputs pose, force, moment and centre of mass; the axes of pad 1 in the world (3, 3); force
-    and moment, and the contacts' arms from the centre of mass, along these axes."""
-    sizes = (("pose", 6), ("force", 3), ("moment", 3), ("centre_of_mass", 3))
-    pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in sizes]
+def _facing_wrenches(
+    workcell: Workcell, asked: tuple[ca.MX, ca.MX, ca.MX, ca.MX], friction: ca.MX
+) -> ca.MX:
+    """As `symbolic.contact.grasp.grasp_wrenches`, of two round pads that face one another, from the
+    inputs of `box_load_function`."""
+    pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     first, second = (contact.T_box_pad for contact in workcell.contacts)
     in_box = ca.DM(first[:3, :3])
-    axes = ca.mtimes(rotation_matrix(workcell.task.orientation, pose[3:]), in_box)
-    arms = tuple(ca.mtimes(in_box.T, ca.DM(T[:3, 3]) - centre_of_mass) for T in (first, second))
-    return inputs, axes, (ca.mtimes(axes.T, force), ca.mtimes(axes.T, moment)), (arms[0], arms[1])
+    to_pad = ca.mtimes(rotation_matrix(workcell.task.orientation, pose[3:]), in_box).T
+    arms = [ca.mtimes(in_box.T, ca.DM(T[:3, 3]) - centre_of_mass) for T in (first, second)]
+    needed = (ca.mtimes(to_pad, force), ca.mtimes(to_pad, moment))
+    balance = ca.Function("balance", inputs, [balance_of(*needed, (arms[0], arms[1]))])
+    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
+    found = facing_wrenches(balance(*asked), friction, radius)
+    # Pad 2 has its own tangents, and its normal is the opposite.
+    turn = ca.DM((second[:3, :3].T @ first[:3, :3])[:2, :2])
+    own = ca.diagcat(ca.DM.eye(WRENCH_SIZE), 1.0, turn, turn, -1.0)
+    wrenches = ca.SX.sym("w", 2 * WRENCH_SIZE)
+    return ca.Function("in_pads", [wrenches], [ca.mtimes(own, wrenches)])(found)
 
 
 def _length(vector: Expression) -> Expression:

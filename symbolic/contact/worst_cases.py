@@ -22,9 +22,17 @@ from dataclasses import replace
 import casadi as ca
 
 from symbolic.contact.central_path import least_effort
-from symbolic.contact.facing import balance_of, even_slack, least_squeeze
-from symbolic.contact.force_closure import WRENCH_SIZE, is_closed
-from symbolic.contact.grasp import BEYOND, LOAD_SIZE, MOMENT_ARM, SCALE_FLOOR, Grasp
+from symbolic.contact.force_closure import WRENCH_SIZE, has_force_closure
+from symbolic.contact.grasp import (
+    BEYOND,
+    LOAD_SIZE,
+    MOMENT_ARM,
+    SCALE_FLOOR,
+    Grasp,
+    balance_of,
+    even_slack,
+    facing_wrenches,
+)
 from symbolic.contact.load import resultant_force
 from symbolic.contact.paper import required_moment
 from symbolic.contact.patches import least
@@ -57,9 +65,9 @@ def case_squeeze_function(workcell: Workcell) -> ca.Function:
     motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = ca.MX.sym("case", CASE_SIZE)
     friction, radius, *_ = case_parts(case)
-    held = least_squeeze(_balance_function(workcell)(*motion, case), friction, radius)
+    force = _least_squeeze(_balance_function(workcell)(*motion, case), friction, radius)
     names = ["pose", "rate", "second_rate", "case"]
-    return ca.Function("case_squeeze", [*motion, case], [held.normal], names, ["normal_force"])
+    return ca.Function("case_squeeze", [*motion, case], [force], names, ["normal_force"])
 
 
 def case_gradient_function(workcell: Workcell) -> ca.Function:
@@ -69,7 +77,7 @@ def case_gradient_function(workcell: Workcell) -> ca.Function:
     case = ca.MX.sym("case", CASE_SIZE)
     friction, radius, *_ = case_parts(case)
     balance = _balance_function(workcell)(*motion, case)
-    force = least_squeeze(balance, friction, radius, differentiable=True).normal
+    force = _least_squeeze(balance, friction, radius, differentiable=True)
     slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in motion]).T)
     names = ["pose", "rate", "second_rate", "case"]
     outputs = ["normal_force", "slope"]
@@ -87,11 +95,11 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     motion = (pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w)
     friction, radius, *_ = case_parts(case)
     balance = _balance_function(workcell)(*motion, case)
-    held = least_squeeze(balance, friction, radius, differentiable=True)
-    slope = ca.densify(ca.jacobian(held.normal, ca.vertcat(*path, a, w)).T)
+    force = _least_squeeze(balance, friction, radius, differentiable=True)
+    slope = ca.densify(ca.jacobian(force, ca.vertcat(*path, a, w)).T)
     names = ["pose", "first", "second", "a", "w", "case"]
     outputs = ["normal_force", "slope"]
-    return ca.Function("case_slopes", [*path, a, w, case], [held.normal, slope], names, outputs)
+    return ca.Function("case_slopes", [*path, a, w, case], [force, slope], names, outputs)
 
 
 def case_difference_function(workcell: Workcell) -> ca.Function:
@@ -119,6 +127,13 @@ def case_slack_function(workcell: Workcell) -> ca.Function:
     names = ["pose", "rate", "second_rate", "case", "force", "arm"]
     slack = ca.cse([even_slack(balance, friction, radius, n_1)])
     return ca.Function("case_slack", [*motion, case, force, arm], slack, names, ["slack"])
+
+
+def _least_squeeze(
+    balance: ca.MX, friction: ca.MX, radius: ca.MX, differentiable: bool = False
+) -> ca.MX:
+    """(2,) N_1 and N_2 [N], see `symbolic.contact.grasp.facing_wrenches`."""
+    return facing_wrenches(balance, friction, radius, "squeeze", differentiable)[::WRENCH_SIZE]
 
 
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
@@ -204,7 +219,7 @@ def case_grasp_slack_function(workcell: Workcell, commanded: int) -> ca.Function
     friction, *_ = case_parts(case)
     squeeze = GraspSqueeze(workcell, commanded)
     load = _origin_load_function(workcell)(*motion, case)
-    slack = held_slack(squeeze, load, friction, _sizes(workcell, case), force)
+    slack = commanded_slack(squeeze, load, friction, _sizes(workcell, case), force)
     names = ["pose", "rate", "second_rate", "case", "force"]
     inputs = [*motion, case, force]
     return ca.Function("case_grasp_slack", inputs, ca.cse([slack]), names, ["slack"])
@@ -260,7 +275,7 @@ class GraspSqueeze(Grasp):
             SettingsError: no squeeze holds the payload whatever is asked.
         """
         smaller = ((share, smaller_patches(workcell, share)) for share in REACHES)
-        closed = ((share, cell) for share, cell in smaller if is_closed(cell))
+        closed = ((share, cell) for share, cell in smaller if has_force_closure(cell))
         self.reach, cell = next(closed, (1.0, workcell))
         super().__init__(cell)
         self.commanded = commanded
@@ -290,7 +305,7 @@ def commanded_forces(squeeze: GraspSqueeze, load: ca.MX, friction: ca.MX, share:
     return _in_newtons(squeeze)(found, size, friction, reach)
 
 
-def held_slack(
+def commanded_slack(
     squeeze: GraspSqueeze, load: ca.SX, friction: ca.SX, share: ca.SX, force: ca.SX
 ) -> ca.SX:
     """Positive where the least wrenches that balance a load, and as much of the squeeze as makes

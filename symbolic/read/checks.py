@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.contact.force_closure import is_closed
+from symbolic.contact.force_closure import has_force_closure
 from symbolic.errors import RobotModelError
 from symbolic.read.arms import (
     arm_model,
@@ -70,7 +70,7 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
     elif not joint:
         if problems.clean("task.allocation"):
             problems.add("contacts[1].xyz", _paper_problem(workcell))
-    elif not is_closed(workcell):
+    elif not has_force_closure(workcell):
         problems.add(
             "contacts",
             "the pads do not close their grasp: no squeeze within their friction cones holds the "

@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
-from symbolic.contact.force_closure import is_closed
+from symbolic.contact.force_closure import has_force_closure
 from symbolic.records import Contact, Workcell
 
 TOLERANCES = (1e-11, 1e-10, 1e-9)
@@ -165,7 +165,7 @@ def random_grasp(rng: np.random.Generator, cell: Workcell, kinds: tuple[str, ...
         ]
         first = replace(pads[0], further=tuple(pads[1:-1]))
         found = replace(cell, contacts=(first, pads[-1]))
-        if is_closed(found):
+        if has_force_closure(found):
             return found
 
 

@@ -6,12 +6,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from symbolic.contact.force_closure import is_closed
+from symbolic.contact.force_closure import has_force_closure
 from symbolic.contact.worst_cases import (
     OTHER_WEIGHT,
     GraspSqueeze,
     commanded_forces,
-    held_slack,
+    commanded_slack,
     smaller_patches,
 )
 from symbolic.records import Workcell
@@ -28,7 +28,9 @@ def function_of(cell: Workcell, commanded: int) -> ca.Function:
 
 def closed_grasp(rng: np.random.Generator, kinds: tuple[str, ...]) -> Workcell:
     """Also by smaller patches."""
-    while not is_closed(smaller_patches(cell := random_grasp(rng, hand_cell(), kinds), 0.8)):
+    while not has_force_closure(
+        smaller_patches(cell := random_grasp(rng, hand_cell(), kinds), 0.8)
+    ):
         pass
     return cell
 
@@ -57,7 +59,7 @@ def test_what_the_quick_look_holds_needs_no_more() -> None:
         function, squeeze = function_of(cell, 1), GraspSqueeze(cell, 1)
         load, friction, share = (ca.SX.sym(n, k) for n, k in (("l", 6), ("mu", 2), ("s", 2)))
         force = ca.SX.sym("force")
-        slack = held_slack(squeeze, load, friction, share, force)
+        slack = commanded_slack(squeeze, load, friction, share, force)
         look = ca.Function("look", [load, friction, share, force], [slack])
         for _ in range(10):
             asked, known = random_load(rng), (friction_of(cell), [0.9, 0.9])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 
 from symbolic.array import Array
 from symbolic.contact.central_path import FINAL_WEIGHT, NEAR
-from symbolic.contact.facing import JointAllocation, allocate_jointly, balance_of, least_squeeze
+from symbolic.contact.grasp import Objective, balance_of, facing_wrenches
 from symbolic.contact.paper import allocate
 from tests.symbolic.contact.joint_oracle import Case, least_squeeze_within, least_wrenches
 
@@ -40,22 +39,23 @@ REGIMES = (
 )
 
 
-def _function(solve: Callable[..., JointAllocation], differentiable: bool = False) -> ca.Function:
+def _function(objective: Objective, differentiable: bool = False) -> ca.Function:
     force, moment, arms = ca.MX.sym("force", 3), ca.MX.sym("moment", 3), ca.MX.sym("arms", 3, 2)
     friction, radius = ca.MX.sym("friction", 2), ca.MX.sym("radius", 2)
     balance = balance_of(force, moment, (arms[:, 0], arms[:, 1]))
-    held = solve(balance, friction, radius, differentiable)
-    columns = [
-        ca.vertcat(held.tangent_1, held.normal[0], held.shift_1, held.torsion[0]),
-        ca.vertcat(held.tangent_2, -held.normal[1], held.shift_2, held.torsion[1]),
-    ]
+    found = facing_wrenches(balance, friction, radius, objective, differentiable)
+    columns = []
+    for sign, own in zip((1.0, -1.0), ca.vertsplit(found, 6), strict=True):
+        tangent, shift = own[1:3], own[3:5] / own[0]
+        torsion = own[5] - (shift[0] * tangent[1] - shift[1] * tangent[0])
+        columns.append(ca.vertcat(tangent, sign * own[0], shift, torsion))
     inputs = [force, moment, arms, friction, radius]
     return ca.Function("joint", inputs, [ca.horzcat(*columns)])
 
 
-FUNCTION = _function(allocate_jointly)
-DIFFERENTIABLE = _function(allocate_jointly, differentiable=True)
-SQUEEZE = _function(least_squeeze)
+FUNCTION = _function("effort")
+DIFFERENTIABLE = _function("effort", differentiable=True)
+SQUEEZE = _function("squeeze")
 
 
 def held(case: Case) -> tuple[Array, Array, Array]:
