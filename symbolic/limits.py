@@ -1,7 +1,7 @@
 """What bounds the timing of a path, as coefficients that compiled passes read.
 
 `symbolic.path_motion` gives a carry's geometry in physical quantities. Here every limit at
-a sample is a function of (u'', u'^2) whose coefficients lie packed in one row of numbers.
+a sample is a function of (u'', u'^2) whose coefficients lie packed in one vector of numbers.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SPEEDS_OF_BOX = 4
 
 @dataclass(frozen=True)
 class LimitLayout:
-    """Where the coefficients lie in a sample's row; `joints` counts those of both arms.
+    """Where the coefficients lie in a sample's vector; `joints` counts those of both arms.
 
     Blocks, in order:
     speed (joints + 4): demands d, each |d u'| <= 1: joints, payload, payload turning, and the
@@ -120,7 +120,7 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
 
 
 def sample_limits_function(model: CellModel) -> ca.Function:
-    """A sample's `LimitLayout` row, limits (size,), from the `PATH_OUTPUTS` of the sample."""
+    """`PATH_OUTPUTS` of one sample to its coefficients, limits (size,) by `LimitLayout`."""
     workcell = model.workcell
     payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
     given = [ca.SX.sym(name, task.extended_size) for name in ("pose", "first", "second")]
@@ -165,11 +165,11 @@ def sample_limits_function(model: CellModel) -> ca.Function:
         "wrench": ca.vec(ca.vertcat(*wrench).T),
     }
     assert {name: block.shape[0] for name, block in blocks.items()} == layout.sizes
-    row = ca.vertcat(*[ca.densify(blocks[name]) for name in layout.sizes])
+    limits = ca.vertcat(*[ca.densify(blocks[name]) for name in layout.sizes])
     return ca.Function(
         "sample_limits",
         [*given, *q],
-        ca.cse([row]),
+        ca.cse([limits]),
         list(PATH_OUTPUTS),
         ["limits"],
     )

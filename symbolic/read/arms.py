@@ -23,7 +23,8 @@ from symbolic.read.urdf import Urdf, UrdfJoint, read_urdf
 from symbolic.records import PAYLOAD, Robot, Workcell
 from symbolic.records.problems import matching, suggestion
 
-Held = tuple[tuple[str, float], ...]
+Positions = tuple[tuple[str, float], ...]
+"""Names of joints and where they stand [rad or m]."""
 
 
 def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
@@ -52,7 +53,7 @@ def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
     return tuple(name for name in reversed(found) if urdf.joints[name].kind != "fixed")
 
 
-def held_joints(urdf: Urdf, moving: Sequence[str], locked: Held) -> Held:
+def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positions:
     """Every joint of a description that does not move, with the position it is held at.
 
     That is the one of `locked`, else zero or the nearest that its limits allow; a joint that
@@ -181,7 +182,7 @@ def robot_urdf(robot: Robot) -> Urdf:
     return without_links(urdf, robot.drop_links) if robot.drop_links else urdf
 
 
-def reduced_model(urdf: Urdf, held: Held = ()) -> pin.Model:
+def reduced_model(urdf: Urdf, held: Positions = ()) -> pin.Model:
     """The Pinocchio model of a URDF with some joints held.
 
     Args:
@@ -206,7 +207,7 @@ def reduced_model(urdf: Urdf, held: Held = ()) -> pin.Model:
     return pin.buildReducedModel(model, joints, configuration) if joints else model
 
 
-def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Held) -> tuple[str, ...]:
+def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Positions) -> tuple[str, ...]:
     """The joints that move an arm's flange.
 
     Args:

@@ -234,14 +234,10 @@ def read_uncertainty(table: Table) -> Uncertainty:
 
 def read_handling(table: Table) -> Handling:
     """How the box is taken hold of and let go, by default as `Handling` says."""
-    # Not imported at the top: the records, which hold this one, are free of reading.
-    from symbolic.records import quantities as quantity
-
     usual = Handling()
 
     def height(key: str) -> float | None:
-        given = table.raw(key, None) is not None
-        return table.number(key, quantity.LIFT) if given else None
+        return table.number(key, quantity.LIFT) if table.has(key) else None
 
     handling = Handling(
         stand_off=table.number("stand_off", quantity.STAND_OFF, usual.stand_off),

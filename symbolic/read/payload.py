@@ -68,17 +68,12 @@ def read_payload(table: Table, folder: Path) -> Payload:
         angular_acceleration_max=table.number(
             "angular_acceleration_max", quantity.ANGULAR_ACCELERATION, 10.0
         ),
-        jerk_max=_read_jerk(table),
+        jerk_max=table.number("jerk_max", quantity.JERK) if table.has("jerk_max") else None,
         shape=solid.shape,
     )
     if kind:  # without a kind nobody can say which keys are unknown
         table.close()
     return payload
-
-
-def _read_jerk(table: Table) -> float | None:
-    given = table.raw("jerk_max", None) is not None
-    return table.number("jerk_max", quantity.JERK) if given else None
 
 
 def solid_box_inertia(size: Array, mass: float) -> Array:

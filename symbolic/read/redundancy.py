@@ -15,7 +15,6 @@ import numpy as np
 import pinocchio as pin
 
 from symbolic.array import Array
-from symbolic.path.spline import path_basis
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, link_frame, turning_joints
 from symbolic.read.payload import SHAPE_KEYS
 from symbolic.read.tables import Table
@@ -58,16 +57,15 @@ class RedundancyEntry:
 def read_redundant(table: Table, n_waypoints: int) -> tuple[RedundancyEntry, ...]:
     """The entries of `task.redundant`."""
     found = []
-    for entry in table.tables("redundant") if "redundant" in table else ():
+    for entry in table.tables("redundant") if table.has("redundant") else ():
         values = {
             key: entry.vector(key, (quantity.LOCKED_POSITION,) * n_waypoints, scalar_fills=True)
-            if key in entry
-            else entry.raw(key, None)
+            if entry.has(key)
+            else None
             for key in ("lower", "upper", "initial")
         }
         found.append(RedundancyEntry(entry.path, entry.text("joint"), **values))
         entry.close()
-    table.raw("redundant", None)
     return tuple(found)
 
 
@@ -121,8 +119,6 @@ def _choice(
     workcell: Workcell, i: int, entries: Sequence[RedundancyEntry], common: tuple[str, ...]
 ) -> tuple[PosturePath | None, tuple[str, ...]]:
     """Arm i's path along the hand-made trajectory, where it is needed, and its redundant joints."""
-    # Not imported at the top: it needs CasADi, which cells of six-joint arms do not to be read.
-
     robot = workcell.robots[i]
     model = arm_model(robot)
     names, beyond = list(model.names)[1:], model.nq - FOLLOWING
@@ -291,6 +287,9 @@ def posture_path(
     Returns:
         None where none is found.
     """
+    # Not imported at the top: it needs CasADi, which cells of six-joint arms do not to be read.
+    from symbolic.path.spline import path_basis
+
     chain = _Chain(robot, contact, task, held)
     points = np.array([waypoint.lower for waypoint in task.waypoints])
     points[list(task.free_indices)] = task.initial

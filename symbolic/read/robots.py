@@ -14,7 +14,7 @@ from symbolic.array import Array
 from symbolic.errors import OutsideError, RobotModelError, UrdfError
 from symbolic.read.arms import (
     FOLLOWING,
-    Held,
+    Positions,
     flange_problem,
     held_joints,
     moving_joints,
@@ -92,8 +92,7 @@ def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot,
 
 def _read_jerk(table: Table, joints: int) -> Array | None:
     """The joints' largest jerks, where the file states them."""
-    if "jerk_max" not in table:
-        table.raw("jerk_max", None)
+    if not table.has("jerk_max"):
         return None
     return table.vector("jerk_max", (quantity.ANGULAR_JERK,) * joints, scalar_fills=True)
 
@@ -116,16 +115,14 @@ def _read_redundant(table: Table, model: pin.Model | None) -> tuple[str, ...]:
 
 
 def _read_tool_load(table: Table) -> ToolLoad | None:
-    if "tool_load" not in table:
-        table.raw("tool_load", None)
+    if not table.has("tool_load"):
         return None
     inner = table.table("tool_load")
     mass = inner.number("mass", quantity.MASS)
     centre = inner.vector("centre_of_mass", (quantity.POSITION,) * 3, default=(0.0, 0.0, 0.0))
     inertia = read_only(np.zeros((3, 3)))
-    if "inertia" in inner:
+    if inner.has("inertia"):
         inertia = read_inertia(inner, mass * LARGEST_GYRATION**2)
-    inner.raw("inertia", None)
     inner.close()
     return ToolLoad(mass, centre, inertia)
 
@@ -162,10 +159,9 @@ def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array]:
 
 
 def _limit(table: Table, key: str, each: tuple[Quantity, ...], urdf_value: Array | None) -> Array:
-    if key in table:
+    if table.has(key):
         # One number for all joints is right for a bound on magnitude, not for a range's end.
         return table.vector(key, each, scalar_fills=not key.startswith("position"))
-    table.raw(key, None)
     if urdf_value is None:
         return read_only(np.ones(len(each)))
     for joint, (value, allowed) in enumerate(zip(urdf_value, each, strict=True)):
@@ -196,7 +192,7 @@ class Description:
     srdf: Path | None
     chain_root: str
     flange: str
-    locked_joints: Held
+    locked_joints: Positions
     drop_links: tuple[str, ...]
 
 
@@ -255,7 +251,7 @@ def _read_folders(table: Table, folder: Path) -> tuple[Path, ...]:
     return tuple(folders)
 
 
-def _read_locked(table: Table) -> Held:
+def _read_locked(table: Table) -> Positions:
     inner = table.table("locked_joints", {})
     return tuple((name, inner.number(name, quantity.LOCKED_POSITION)) for name in inner)
 
@@ -289,8 +285,7 @@ def _read_described(table: Table, key: str, folder: Path, package_dirs: tuple[Pa
 
 
 def _read_srdf(table: Table, folder: Path, package_dirs: tuple[Path, ...]) -> Path | None:
-    if "srdf" not in table:
-        table.raw("srdf", None)
+    if not table.has("srdf"):
         return None
     path = _read_described(table, "srdf", folder, package_dirs)
     if table.problems.clean(table.at("srdf")):
@@ -322,8 +317,7 @@ def _tell(table: Table, key: str, error: UrdfError) -> None:
 
 def _read_chain(table: Table) -> tuple[str, str]:
     """The links that the arm begins and ends at; '' for the first where only a flange is given."""
-    if "chain" not in table:
-        table.raw("chain", None)
+    if not table.has("chain"):
         return "", table.text("flange")
     if "flange" in table:
         table.raw("flange")
@@ -362,7 +356,9 @@ def _without(table: Table, urdf: Urdf | None, patterns: tuple[str, ...]) -> Urdf
         return None
 
 
-def _read_model(table: Table, urdf: Urdf, locked: Held, chain: tuple[str, str]) -> pin.Model | None:
+def _read_model(
+    table: Table, urdf: Urdf, locked: Positions, chain: tuple[str, str]
+) -> pin.Model | None:
     """The arm's model, or recorded problems and None."""
     problems, (root, flange) = table.problems, chain
     if not problems.clean(table.at("locked_joints"), table.at("chain")):

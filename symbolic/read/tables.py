@@ -66,6 +66,10 @@ class Table:
             return None
         return default
 
+    def has(self, key: str) -> bool:
+        """Whether an optional key is there; it is known either way."""
+        return self.raw(key, None) is not None
+
     def close(self) -> None:
         """Record every key that nobody asked for."""
         unknown = [key for key in self._data if key not in self._known]
