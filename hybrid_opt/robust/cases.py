@@ -24,7 +24,7 @@ from symbolic.records import Uncertainty, Workcell
 
 
 def nominal_case(workcell: Workcell) -> Array:
-    """(15,) the case that the workcell describes, laid out by `case_squeeze.CASE_SIZES`."""
+    """(15,) the case that the workcell describes, laid out by `worst_cases.CASE_SIZES`."""
     contacts, payload = workcell.contacts, workcell.payload
     return np.concatenate(
         [

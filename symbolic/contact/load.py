@@ -110,18 +110,10 @@ def paper_load_function(workcell: Workcell) -> ca.Function:
     """`uncertain_load_function` by the paper's allocation, whatever the workcell's own is."""
     inputs = {name: ca.SX.sym(name, size) for name, size in SIZES.items()}
     pose, rate, second, friction, centre_of_mass = inputs.values()
-    payload, contacts = workcell.payload, workcell.contacts
-    turned = workcell.task.orientation
-    rotation = rotation_matrix(turned, pose[3:])
-    omega = angular_velocity(turned, pose[3:], rate[3:])
-    alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
-
-    offset = ca.mtimes(rotation, centre_of_mass)
-    force = resultant_force(payload.mass, offset, omega, alpha, second[:3])
+    contacts = workcell.contacts
+    rotation, omega, alpha, force, moment = _required(workcell, pose, rate, second, centre_of_mass)
     normal = ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, 2]))
     forces = allocate(force, normal, (friction[0], friction[1]))
-
-    moment = required_moment(ca.SX(ca.DM(payload.inertia)), rotation, omega, alpha)
     arms = tuple(ca.mtimes(rotation, ca.DM(c.T_box_pad[:3, 3]) - centre_of_mass) for c in contacts)
     tangents = tuple(ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, k])) for k in (0, 1))
     shift = pressure_shift(
@@ -176,7 +168,9 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
     """The least forces of pads anywhere, see `symbolic.contact.grasp`."""
     inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
     names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
-    found = _required_function(workcell)(*[inputs[name] for name in SIZES if name != "friction"])
+    given = [ca.SX.sym(name, size) for name, size in SIZES.items() if name != "friction"]
+    required = ca.Function("required", given, _required(workcell, *given)[1:])
+    found = required(*[inputs[name] for name in SIZES if name != "friction"])
     outputs = dict(zip(names, found, strict=True))
     asked = (inputs["pose"], outputs["force"], outputs["required_moment"])
     held = _sample_function(workcell)(*asked, inputs["friction"], inputs["centre_of_mass"])
@@ -195,11 +189,11 @@ def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
     )
 
 
-def _required_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate and centre of mass to the angular velocity and acceleration, and to
-    the force and moment about the centre of mass that the motion asks for, (3,) each, world."""
-    pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
-    centre_of_mass = ca.SX.sym("centre_of_mass", 3)
+def _required(
+    workcell: Workcell, pose: ca.SX, rate: ca.SX, second: ca.SX, centre_of_mass: ca.SX
+) -> list[ca.SX]:
+    """R_world_box (3, 3), the angular velocity and acceleration, and the force and moment about the
+    centre of mass that the motion asks for, (3,) each, world."""
     turned = workcell.task.orientation
     rotation = rotation_matrix(turned, pose[3:])
     omega = angular_velocity(turned, pose[3:], rate[3:])
@@ -207,9 +201,7 @@ def _required_function(workcell: Workcell) -> ca.Function:
     offset = ca.mtimes(rotation, centre_of_mass)
     force = resultant_force(workcell.payload.mass, offset, omega, alpha, second[:3])
     moment = required_moment(ca.SX(ca.DM(workcell.payload.inertia)), rotation, omega, alpha)
-    return ca.Function(
-        "required", [pose, rate, second, centre_of_mass], [omega, alpha, force, moment]
-    )
+    return [rotation, omega, alpha, force, moment]
 
 
 def _suffices_function(workcell: Workcell) -> ca.Function:

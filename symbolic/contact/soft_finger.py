@@ -29,7 +29,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.contact.worst_cases import CASE_SIZE, case_load_function, case_parts
+from symbolic.contact.worst_cases import CASE_SIZE, case_in_pad_axes, case_parts
 from symbolic.expression import Expression
 from symbolic.records import Contact, Workcell
 
@@ -223,25 +223,17 @@ def _pressed(
 
 
 def case_soft_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (15,), see `case_squeeze.CASE_SIZES`, to normal_force
+    """pose, rate, second_rate (6,) and a case (15,), see `worst_cases.CASE_SIZES`, to normal_force
     (2,) [N]: the least with which two pads with opposite normals that press evenly hold the case.
 
     The radii of a case are not read: a displaced patch presses evenly about its displaced centre.
     """
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = ca.SX.sym("case", CASE_SIZE)
-    friction, *_, displacement = case_parts(case)
-    axes = workcell.contacts[0].T_box_pad[:3, :3]
-    force, moment = (ca.mtimes(axes.T, x) for x in case_load_function(workcell)(*motion, case))
-    arms = [
-        axes.T @ (contact.T_box_pad[:3, 3] - workcell.payload.centre_of_mass)
-        + ca.vertcat(displacement[2 * i : 2 * i + 2], 0.0)
-        for i, contact in enumerate(workcell.contacts)
-    ]
-    patches = [SoftPatch.of(contact, axes) for contact in workcell.contacts]
-    held = least_soft_squeeze(
-        force, moment, (arms[0], arms[1]), friction, (patches[0], patches[1]), offset=True
-    )
+    friction, axes = case_parts(case)[0], workcell.contacts[0].T_box_pad[:3, :3]
+    first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
+    needed = case_in_pad_axes(workcell, motion, case)
+    held = least_soft_squeeze(*needed, friction, (first, second), offset=True)
     names = ["pose", "rate", "second_rate", "case"]
     outputs = ca.cse([ca.densify(held.normal)])
     return ca.Function("case_soft", [*motion, case], outputs, names, ["normal_force"])

@@ -148,8 +148,21 @@ def _balance_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate and a case to what the contacts have to balance (9,)."""
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = ca.SX.sym("case", CASE_SIZE)
+    balance = balance_of(*case_in_pad_axes(workcell, motion, case))
+    return ca.Function("case_balance", [*motion, case], [balance])
+
+
+def case_in_pad_axes(
+    workcell: Workcell, motion: list[ca.SX], case: ca.SX
+) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX]]:
+    """What a case asks of two pads with opposite normals, along the axes of contact 1: force and
+    moment about the nominal centre of mass, (3,) each, and the displaced contacts' arms from there.
+
+    Args:
+        motion: pose, rate, second_rate (6,).
+        case: (15,), see `CASE_SIZES`.
+    """
     *_, displacement = case_parts(case)
-    in_box = case_load_function(workcell)(*motion, case)
     nominal = ca.DM(workcell.payload.centre_of_mass)
     axes = ca.DM(workcell.contacts[0].T_box_pad[:3, :3])
     arms = [
@@ -157,10 +170,9 @@ def _balance_function(workcell: Workcell) -> ca.Function:
         + ca.vertcat(displacement[2 * i : 2 * i + 2], 0.0)
         for i, contact in enumerate(workcell.contacts)
     ]
+    in_box = case_load_function(workcell)(*motion, case)
     force, moment = (ca.mtimes(axes.T, part) for part in in_box)
-    return ca.Function(
-        "case_balance", [*motion, case], [balance_of(force, moment, (arms[0], arms[1]))]
-    )
+    return force, moment, (arms[0], arms[1])
 
 
 def case_load_function(workcell: Workcell) -> ca.Function:
@@ -192,8 +204,8 @@ def case_load_function(workcell: Workcell) -> ca.Function:
 
 
 def case_grasp_function(workcell: Workcell, commanded: int) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (15,), see `case_squeeze.CASE_SIZES`, to
-    normal_force (2,) [N], see `grasp_squeeze.commanded_forces`.
+    """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to
+    normal_force (2,) [N], see `commanded_forces`.
 
     Args:
         commanded: index of the robot whose force is commanded.
