@@ -32,7 +32,7 @@ def cell_functions(model):
     # NaN outside the bounds of x.
     return {"roots": ca.Function("roots", [x, p], [ca.sqrt(x - 2), p @ p], ["x", "p"], ["y", "z"])}
 
-faked = {"cell_model": build_cell_model, "functions.cell": cell_functions, "workcell.file": load}
+faked = {"cell_model": build_cell_model, "functions": cell_functions, "read.cell": load}
 for name, content in faked.items():
     module = types.ModuleType(f"symbolic.{name}")
     setattr(module, content.__name__, content)
