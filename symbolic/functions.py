@@ -331,7 +331,7 @@ def _time_share(time: ca.MX) -> ca.MX:
 def cell_functions(model: CellModel) -> dict[str, ca.Function]:
     """The functions by name.
 
-    candidate: the evaluator of a whole candidate (`symbolic.functions`).
+    candidate: the evaluator of a whole candidate, see `candidate_function`.
     inverse_dynamics_i: of each arm i = 1, 2 (`symbolic.robot.model`).
     posture: both arms at one box pose (`symbolic.robot.arm.posture_function`).
     clearance, piece_poses, motion: collision bounds, placements and bounds of the motion
@@ -348,8 +348,7 @@ def cell_functions(model: CellModel) -> dict[str, ca.Function]:
 def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
     """What a whole evaluation is put together from, sample by sample.
 
-    path, begin, start, predict, sample and, of some cells, forces: see
-    `symbolic.functions.sample_functions`.
+    path, begin, start, predict, sample and, of some cells, forces: see `sample_functions`.
     clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
     """
     screening = {name: model.screening[name] for name in ("clearance", "piece_poses")}

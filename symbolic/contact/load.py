@@ -284,7 +284,7 @@ GRASP_OUTPUTS = (
     "wrench_1",
     "wrench_2",
 )
-"""Those of `symbolic.contact.load.LOAD_OUTPUTS` that depend on the allocation."""
+"""Those of `LOAD_OUTPUTS` that depend on the allocation."""
 
 LEAST_FORCE = 1e-9
 """Normal force below which a centre of pressure counts as the patch's [N]."""

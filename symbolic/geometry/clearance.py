@@ -166,7 +166,7 @@ class Scene:
         placements: tuple[tuple[ca.SX, ca.SX], tuple[ca.SX, ca.SX]],
         softness: Softness,
     ) -> None:
-        """See `symbolic.geometry.clearance.clearance_expressions`."""
+        """See `clearance_expressions`."""
         self.geometry, self.soft = geometry, softness
         self._between = between_bases(geometry)
         self._placed: dict[Frame, tuple[ca.SX, ca.SX]] = {

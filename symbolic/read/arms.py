@@ -176,7 +176,7 @@ def robot_urdf(robot: Robot) -> Urdf:
 
     Raises:
         RobotModelError: see `symbolic.read.urdf.read_urdf` and
-            `symbolic.read.arms.without_links`.
+            `without_links`.
     """
     urdf = read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
     return without_links(urdf, robot.drop_links) if robot.drop_links else urdf
@@ -217,7 +217,7 @@ def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Positions) -
         locked: joints that the user holds, with their positions.
 
     Raises:
-        RobotModelError: see `symbolic.read.arms.chain_joints`.
+        RobotModelError: see `chain_joints`.
     """
     if chain_root:
         found = chain_joints(urdf, chain_root, flange)
@@ -342,7 +342,7 @@ def arm_links(robots: Arms, i: int) -> ArmLinks:
     """The links that are modelled as arm i's (0 or 1).
 
     Raises:
-        RobotModelError: see `symbolic.read.arms.arm_model`.
+        RobotModelError: see `arm_model`.
     """
     moved, still = _sorted_links(robots[i])
     mount = _mount(robots[i], still)
@@ -362,7 +362,7 @@ def common_joints(robots: Arms) -> tuple[str, ...]:
     """Joints that move both arms of one machine, in their order.
 
     Raises:
-        RobotModelError: see `symbolic.read.arms.arm_model`.
+        RobotModelError: see `arm_model`.
     """
     if not one_machine(robots):
         return ()
@@ -374,7 +374,7 @@ def machine_problem(robots: Arms) -> str:
     """Why two robots cannot be the arms of one machine, or an empty string.
 
     Raises:
-        RobotModelError: see `symbolic.read.arms.arm_model`.
+        RobotModelError: see `arm_model`.
     """
     if not one_machine(robots):
         return ""

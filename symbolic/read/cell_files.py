@@ -408,7 +408,7 @@ _TABLE = re.compile(r"^[ \t]*\[{1,2}[ \t]*[A-Za-z_][\w. \t-]*\]{1,2}[ \t]*(#.*)?
 
 
 def drivable_files(stored: CellFiles) -> CellFiles:
-    """The files of a cell (`symbolic.read.cell_files.collect_cell`) under 'optimal'.
+    """The files of a cell (`collect_cell`) under 'optimal'.
 
     Raises:
         BundleError: the file writes the task in a way that cannot be changed line by line, or the

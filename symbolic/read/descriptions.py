@@ -161,8 +161,7 @@ def description_content(
         package_dirs: folders of packages that `$(find NAME)` looks in first.
 
     Raises:
-        OutsideError: it cannot be read or expanded, or not within the bounds of
-            `symbolic.read.descriptions`.
+        OutsideError: it cannot be read or expanded, or not within the bounds of that process.
     """
     content = outside.read_bytes(path, outside.URDF_BYTES)
     if not is_xacro(content):
