@@ -11,6 +11,7 @@ import casadi as ca
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.load import LOAD_OUTPUTS, load_function, uncertain_load_function
+from symbolic.limits import path_force_function
 from symbolic.path.spline import extended_matrix, sample_basis, waypoint_matrix
 from symbolic.path.time_law import driven_path, timed_path
 from symbolic.path_motion import arm_derivative_function, path_motion_function
@@ -360,7 +361,8 @@ def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
 
     path_motion: see `symbolic.path_motion`, at that many samples. load, uncertain_load: see
     `symbolic.contact.load`. arm_i per arm i = 1, 2: see
-    `symbolic.path_motion.arm_derivative_function`.
+    `symbolic.path_motion.arm_derivative_function`. path_force, where the normal forces have a
+    closed form: see `symbolic.limits.path_force_function`.
     """
     workcell = model.workcell
     functions = {
@@ -368,6 +370,8 @@ def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
         "load": load_function(workcell),
         "uncertain_load": uncertain_load_function(workcell),
     }
+    if workcell.task.allocation != "joint":
+        functions["path_force"] = path_force_function(workcell)
     for i, (robot, robot_model, contact) in enumerate(
         zip(workcell.robots, model.robots, workcell.contacts, strict=True), start=1
     ):

@@ -12,7 +12,8 @@ import casadi as ca
 import numpy as np
 
 from symbolic.cell_model import CellModel
-from symbolic.contact.paper import allocate, pressure_shift
+from symbolic.contact.closed_form import Asked, HeldLoad, held_by
+from symbolic.contact.soft_finger import Detached
 from symbolic.path.spline import path_basis, waypoint_matrix
 from symbolic.path_motion import (
     ARM_OUTPUTS,
@@ -175,6 +176,59 @@ def sample_limits_function(model: CellModel) -> ca.Function:
     )
 
 
+def _held(
+    workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.SX, detached: Detached
+) -> HeldLoad:
+    """Contact wrenches along the axes of contact 1 from the blocks force and moment."""
+    by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
+    axes, centre = workcell.contacts[0].T_box_pad[:3, :3], workcell.payload.centre_of_mass
+    arms = [ca.SX(ca.DM(axes.T @ (c.T_box_pad[:3, 3] - centre))) for c in workcell.contacts]
+    asked = Asked(
+        by[0] * a + by[1] * w + by[2],
+        blocks["moment"][:3] * a + blocks["moment"][3:] * w,
+        (arms[0], arms[1]),
+        ca.SX(ca.DM.eye(3)),
+        ca.SX([contact.friction for contact in workcell.contacts]),
+    )
+    return held_by(workcell, workcell.task.allocation, asked, detached)
+
+
+def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
+    """Both normal forces at one sample, which are convex in (u'', u'^2), and their slopes.
+
+    Both take the force (9,) and moment (6,) blocks of `LimitLayout` as one input, then u'' and
+    u'^2. `limit_forces` gives (2,) [N]; `limit_force_slopes` the same and its derivatives (2,) by
+    u'' and by u'^2.
+    """
+    sizes = limit_layout(workcell).sizes
+    blocks = {name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment")}
+    a, w = ca.SX.sym("a"), ca.SX.sym("w")
+    detached: Detached = []
+    value = _held(workcell, blocks, a, w, detached).normal
+    names = ("limit_forces", "limit_force_slopes")
+    return _with_slopes(names, value, [ca.vertcat(*blocks.values()), a, w], detached)
+
+
+def path_force_function(workcell: Workcell) -> ca.Function:
+    """Box pose and its derivatives by u (6,), u'' and u'^2 to normal_force (2,) [N] and slope
+    (2, 2), of each force by u'' and by u'^2."""
+    path = [ca.SX.sym(name, 6) for name in ("pose", "first", "second")]
+    a, w = ca.SX.sym("a"), ca.SX.sym("w")
+    box = dict(zip(BOX_OUTPUTS, box_function(workcell)(*path), strict=True))
+    rotation = ca.reshape(box["rotation"], 3, 3).T
+    axes = ca.mtimes(rotation, ca.DM(workcell.contacts[0].T_box_pad[:3, :3]))
+    weight = ca.DM(GRAVITY) * workcell.payload.mass
+    asked = (
+        *(box["force_by_acceleration"], box["force_by_speed"], -weight),
+        *(box["moment_by_acceleration"], box["moment_by_speed"]),
+    )
+    blocks = ca.vertcat(*[ca.mtimes(axes.T, part) for part in asked])
+    force, by_a, by_w = force_functions(workcell)[1](blocks, a, w)
+    outputs = ca.cse([force, ca.vertcat(by_a.T, by_w.T)])
+    names = ["pose", "first", "second", "a", "w"]
+    return ca.Function("path_force", [*path, a, w], outputs, names, ["normal_force", "slope"])
+
+
 def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """Limits that are not convex, at one sample, and their derivatives by (u'', u'^2).
 
@@ -189,38 +243,37 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
         name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment", "torque", "wrench")
     }
     a, w = ca.SX.sym("a"), ca.SX.sym("w")
-    by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
-    force = by[0] * a + by[1] * w + by[2]
-    moment = blocks["moment"][:3] * a + blocks["moment"][3:] * w
-    friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
-    forces = allocate(force, ca.SX(ca.DM([0.0, 0.0, 1.0])), friction)
-    axes = workcell.contacts[0].T_box_pad[:3, :3]
-    arms = [
-        ca.SX(ca.DM(axes.T @ (contact.T_box_pad[:3, 3] - workcell.payload.centre_of_mass)))
-        for contact in workcell.contacts
-    ]
-    unit = ca.SX(ca.DM.eye(3))
-    shift = pressure_shift(
-        moment, (arms[0], arms[1]), (forces.force_1, forces.force_2), (unit[:, 0], unit[:, 1])
+    detached: Detached = []
+    held = _held(workcell, blocks, a, w, detached)
+    wrenches = (
+        ca.vertcat(held.force_1, held.moment_1),
+        ca.vertcat(held.force_2, held.moment_2),
     )
-    shifts, pushes = (shift.shift_1, shift.shift_2), (forces.force_1, forces.force_2)
     own = ca.reshape(blocks["torque"], joints, 3)
     wrench_by_joint = ca.reshape(blocks["wrench"], 6, joints).T
     torque, start = own[:, 0] * a + own[:, 1] * w + own[:, 2], 0
     ratios = []
-    for i, robot in enumerate(workcell.robots):
+    for robot, wrench in zip(workcell.robots, wrenches, strict=True):
         stop = start + len(robot.velocity_max)
-        wrench = ca.vertcat(pushes[i], ca.cross(shifts[i], pushes[i]))
         ratios.append(torque[start:stop] + ca.mtimes(wrench_by_joint[start:stop, :], wrench))
         start = stop
     ratios += [
         ca.sqrt(ca.sumsqr(moved) + 1e-24) / contact.patch_radius
-        for moved, contact in zip(shifts, workcell.contacts, strict=True)
+        for moved, contact in zip((held.shift_1, held.shift_2), workcell.contacts, strict=True)
     ]
-    value = ca.vertcat(*ratios)
     inputs = [ca.vertcat(*blocks.values()), a, w]
-    slopes = [ca.densify(ca.jacobian(value, z)) for z in (a, w)]
+    return _with_slopes(("limit_ratios", "limit_slopes"), ca.vertcat(*ratios), inputs, detached)
+
+
+def _with_slopes(
+    names: tuple[str, str], value: ca.SX, inputs: list[ca.SX], detached: Detached
+) -> tuple[ca.Function, ca.Function]:
+    """A function of blocks, u'' and u'^2, and the same with its derivatives by the latter two."""
+    value = ca.densify(value)
+    outputs = [value, *[ca.densify(ca.jacobian(value, z)) for z in inputs[1:]]]
+    for symbol, solved in detached:
+        outputs = ca.substitute(outputs, [symbol], [solved])
     return (
-        ca.Function("limit_ratios", inputs, ca.cse([value])),
-        ca.Function("limit_slopes", inputs, ca.cse([value, *slopes])),
+        ca.Function(names[0], inputs, ca.cse(outputs[:1])),
+        ca.Function(names[1], inputs, ca.cse(outputs)),
     )

@@ -15,7 +15,7 @@ from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.cases import nominal_case, worst_cases
 from hybrid_opt.robust.force import HeldMotion, check_set
 from symbolic.array import Array
-from symbolic.contact.soft_finger import case_soft_function
+from symbolic.contact.worst_cases import case_soft_function
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
 

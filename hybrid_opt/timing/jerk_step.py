@@ -12,7 +12,6 @@ from hybrid_opt.timing.records import JerkLimits, TimingLimits
 from hybrid_opt.timing.rows import squared_speed_limit
 from hybrid_opt.timing.use import limits_pressure
 from symbolic.array import Array
-from symbolic.records.quantities import GRAVITY
 
 LEAST_SHARE = 0.05
 """Least share of its last value that a coefficient keeps."""
@@ -28,8 +27,7 @@ def convex_step(
     """Better coefficients than c (k,), which satisfy all limits at the points; None without any."""
     rows = Rows(len(c))
     _motion_rows(model, at, limits, rows)
-    _force_rows(model, at, limits, rows)
-    _robust_rows(model, at, c, limits, rows)
+    _force_rows(model, at, c, limits, rows)
     _ratio_rows(model, at, c, limits, rows)
     _jerk_rows(at, c, jerk, rows)
     rows.below(-np.ones((len(c), 1)), -LEAST_SHARE * c, np.arange(len(c)))
@@ -68,55 +66,24 @@ def _motion_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows
         rows.within(A / most, np.zeros((len(at.s), 3)), none, keep, first_basis)
 
 
-def _force_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows) -> None:
-    """Both normal forces, each branch a cone: share_n F_n + share_t |F_t| <= the limit."""
+def _force_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, rows: Rows) -> None:
+    """Normal forces below the limit, planned and robust ones, linearised at c: they are convex in
+    (u'', u'^2)."""
     if limits.force is None:
         return
-    import casadi as ca
-
-    from symbolic.contact.paper import normal_force_branches
-
-    workcell, m, force = model.workcell, at.motion, limits.force
-    friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
-    by_normal, by_tangent = (
-        np.array(normal_force_branches(ca.DM(n), ca.DM(1 - n), friction)).reshape(-1)
-        for n in (1, 0)
-    )
-    weight = workcell.payload.mass * np.array(GRAVITY)
-    A = m.force_by_acceleration[:, :, None] * at.local(at.acceleration_by)[:, None] + (
-        m.force_by_speed[:, :, None] * at.local(at.squared_by)[:, None]
-    )
-    along = np.einsum("nd,ndk->nk", m.normal, A)
-    still = -(m.normal @ weight)
-    across = A - m.normal[:, :, None] * along[:, None]
-    rest = -weight - m.normal * still[:, None]
-    for extra in (1.0, 0.0):  # N_1 = N_2 + F_n
-        for share_n, share_t in zip(by_normal + extra, by_tangent, strict=True):
-            room = at.keep * force - share_n * still
-            if share_t > 0.0:
-                rows.within(
-                    share_t * across / force,
-                    share_t * rest / force,
-                    share_n * along / force,
-                    room / force,
-                    at.first_basis,
-                )
-            elif share_n:
-                rows.below(share_n * along / force, room / force, at.first_basis)
-
-
-def _robust_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, rows: Rows) -> None:
-    """Robust forces below the limit, linearised at c: they are convex in (u'', u'^2)."""
-    if limits.force is None or not limits.robust:
-        return
+    workcell, m = model.workcell, at.motion
     a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
-    m = at.motion
-    path = (m.pose[:, :6], m.pose_first[:, :6], m.pose_second[:, :6])
-    force, slope = robust_path(model.workcell).at(PathPoints(*path, a, w))
-    by = (slope[:, :, BY_TIMING] / limits.force)[..., None] * np.stack(
-        [at.acceleration_by, at.squared_by], axis=1
-    )[:, None]
-    _linearised(at, c, force / limits.force, by.sum(axis=2), rows)
+    forces = []
+    if workcell.task.allocation != "joint":
+        forces.append(model.path_force(m, a, w))
+    if limits.robust:
+        path = (m.pose[:, :6], m.pose_first[:, :6], m.pose_second[:, :6])
+        force, slope = robust_path(workcell).at(PathPoints(*path, a, w))
+        forces.append((force, slope[:, :, BY_TIMING]))
+    along = np.stack([at.acceleration_by, at.squared_by], axis=1)[:, None]
+    for force, slope in forces:
+        by = ((slope / limits.force)[..., None] * along).sum(axis=2)
+        _linearised(at, c, force / limits.force, by, rows)
 
 
 def _linearised(at: Point, c: Array, value: Array, by: Array, rows: Rows) -> None:

@@ -121,6 +121,13 @@ class TimingModel:
         """`symbolic.contact.load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
         return self._functions["load"].batch(pose, rate, second_rate)
 
+    def path_force(self, motion: PathMotion, a: Array, w: Array) -> tuple[Array, Array]:
+        """Normal forces (n, 2) [N] under u'' = a and u'^2 = w (n,), and their slopes (n, 2, 2) by
+        these; of allocations with a closed form."""
+        path = (motion.pose, motion.pose_first, motion.pose_second)
+        found = self._functions["path_force"].batch(*path, a, w)
+        return found["normal_force"], found["slope"]
+
     def uncertain_load(
         self, carry: Carry, friction: Array, centre_of_mass: Array
     ) -> dict[str, Array]:

@@ -60,8 +60,8 @@ def passes_function(
         cuts: lines at every sample that the caller gives.
     """
     workcell, cache = compiled.workcell, compiled.cache
-    if workcell.task.allocation != "paper":
-        return None  # the passes know the paper's normal forces in closed form, and no others
+    if workcell.task.allocation == "joint":
+        return None  # the passes know normal forces in closed form, and no others
     if compiled.is_identified:
         own = source_digest("hybrid_opt")
         key = compiled.key("path timing", str(intervals), str(cuts), own)
@@ -75,24 +75,20 @@ def passes_function(
 def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, str]:
     # Not imported at the top: a warm start needs no CasADi.
     from codegen.source import handwritten_source
-    from symbolic.limits import limit_layout, ratio_functions
+    from symbolic.limits import force_functions, limit_layout, ratio_functions
 
     layout = limit_layout(workcell)
-    branches = _branches(workcell)
     constants = {
         "INTERVALS": intervals,
         "JOINTS": layout.joints,
         "SIZE": layout.size,
         "RATIOS": layout.joints + 2,
-        "FORCE_BRANCHES": len(branches),
         "CUTS": cuts,
         **{f"AT_{name.upper()}": place for name, place in layout.offsets.items()},
     }
-    rows = ", ".join(f"{{{n!r}, {t!r}}}" for n, t in branches)
     text = "".join(
         [
             *[f"#define {name} {value}\n" for name, value in constants.items()],
-            f"static const double BRANCH[FORCE_BRANCHES][2] = {{{rows}}};\n",
             files("hybrid_opt.timing").joinpath("c/passes.c").read_text(),
         ]
     )
@@ -106,18 +102,6 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
         ),
         ((), (), (), (2,), (len(KINDS), 3), (intervals + 1,), (), ()),
     )
-    return signature, handwritten_source(signature, text, ratio_functions(workcell))
-
-
-def _branches(workcell: Workcell) -> list[tuple[float, float]]:
-    """N_2 by branch as shares of the required force's normal and tangential parts."""
-    import casadi as ca
-
-    from symbolic.contact.paper import normal_force_branches
-
-    friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
-    normal, tangential = (
-        ca.DM(normal_force_branches(ca.DM(n), ca.DM(1 - n), friction)).full().ravel().tolist()
-        for n in (1, 0)
+    return signature, handwritten_source(
+        signature, text, (*force_functions(workcell), *ratio_functions(workcell))
     )
-    return list(zip(normal, tangential, strict=True))

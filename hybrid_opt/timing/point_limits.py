@@ -74,30 +74,28 @@ class PointLimits:
             )
         ]
         still = np.zeros(len(self._index))
-        force = self._force_cut(still, still, self._robust(still, still))
+        force = self._force_cuts(self._convex_forces(still, still), still, still)
         return rows_of.join([*cuts, *force])
 
-    @property
-    def _convex_force(self) -> float | None:
-        """The force limit where the normal forces are convex, in closed form."""
-        return self._limits.force if self._model.workcell.has_facing_pads else None
-
-    def _force_cut(self, a: Array, w: Array, robust: tuple[Array, Array] | None) -> list[PointRows]:
-        """robust: see `_robust`."""
-        if self._convex_force is None:
+    def _convex_forces(self, a: Array, w: Array) -> list[tuple[Array, Array]]:
+        """Limited normal forces (n, 2) that are convex in (u'', u'^2) and their slopes (n, 2, 2):
+        planned ones in closed form, and robust ones."""
+        if self._limits.force is None:
             return []
-        tangent = rows_of.tangent_direction(self.points, self._model.workcell, a, w)
-        force = self._convex_force
-        cuts = [rows_of.force_rows(self.points, self._model.workcell, force, tangent)]
-        if robust is not None:
-            value, slope = robust
-            cuts.append(rows_of.tangent_rows(value / force, slope / force, np.stack([a, w], 1)))
-        return cuts
+        closed = self._model.workcell.task.allocation != "joint"
+        found = [self._model.path_force(self.points, a, w)] if closed else []
+        robust = self._robust(a, w)
+        return found if robust is None else [*found, robust]
+
+    def _force_cuts(self, forces: list[tuple[Array, Array]], a: Array, w: Array) -> list[PointRows]:
+        """Their supporting lines at u'' = a and u'^2 = w."""
+        z, limit = np.stack([a, w], axis=1), self._limits.force or np.inf
+        return [rows_of.tangent_rows(force / limit, slope / limit, z) for force, slope in forces]
 
     def _robust(self, a: Array, w: Array) -> tuple[Array, Array] | None:
         """Robust forces (n, 2) and their slopes (n, 2, 2) by (u'', u'^2), where these are limited
         and convex."""
-        if not self._limits.robust or self._convex_force is None:
+        if not (self._limits.robust and self._model.workcell.has_facing_pads):
             return None
         p = self.points
         path = (p.pose[:, :6], p.pose_first[:, :6], p.pose_second[:, :6])
@@ -120,16 +118,14 @@ class PointLimits:
             if excess > POINT_TOLERANCE:
                 direction = vector / np.maximum(length, 1e-12)
                 cuts.append(rows_of.norm_rows(first, second, limit, direction[:, None, :]))
-        if self._convex_force is not None:
-            largest = float(self._model.drive(p, np.sqrt(w), a)["normal_force"].max())
-            robust = self._robust(a, w)
-            if robust is not None:
-                largest = max(largest, float(robust[0].max()))
-            excess = largest / self._convex_force - 1.0
+        forces = self._convex_forces(a, w)
+        if forces and self._limits.force is not None:
+            largest = max(float(force.max()) for force, _ in forces)
+            excess = largest / self._limits.force - 1.0
             worst_excess = max(worst_excess, excess)
             # What the force limit leaves for the motion is small, so the whole of it counts.
             if excess > POINT_TOLERANCE * FORCE_SHARPNESS:
-                cuts += self._force_cut(a, w, robust)
+                cuts += self._force_cuts(forces, a, w)
                 worst_excess = max(worst_excess, 2.0 * POINT_TOLERANCE)
         return cuts, worst_excess
 
@@ -138,7 +134,7 @@ class PointLimits:
         columns: list[Array] = []
         p, workcell = self.points, self._model.workcell
         pressure = limits_pressure(workcell, self._limits)
-        force = None if workcell.has_facing_pads else self._limits.force
+        force = self._limits.force if workcell.task.allocation == "joint" else None
         if not (self._limits.torque or pressure or force):
             return np.zeros((len(a), 0))
         load = self._model.drive(p, np.sqrt(w), a)
@@ -151,7 +147,7 @@ class PointLimits:
             columns.append(load["pressure_shift"] / radius)
         if force:
             needed = load["normal_force"]
-            if self._limits.robust:
+            if self._limits.robust and not workcell.has_facing_pads:
                 needed = np.maximum(needed, self._robust_anywhere(a, w))
             columns.append(needed / force)
         return np.concatenate(columns, axis=1)

@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 
 from hybrid_opt.timing.adapter import SPEED_CEILING, IntervalRows
 from hybrid_opt.timing.path_motion import PathMotion
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
-from symbolic.contact.paper import normal_force_branches
 from symbolic.records import Workcell
-from symbolic.records.quantities import GRAVITY
 
 INTERVAL_ENDS = (0.0, 1.0)
 """Places within an interval at which limits are imposed, as a share of its length."""
@@ -116,42 +113,6 @@ def spanning_directions(first: Array, second: Array) -> Array:
     one = _unit(first)
     two = _unit(second - np.sum(second * one, axis=1, keepdims=True) * one)
     return np.stack([one, -one, two, -two], axis=1)
-
-
-def force_rows(motion: PathMotion, workcell: Workcell, force: float, tangent: Array) -> PointRows:
-    """Supporting lines of both normal forces at most `force`.
-
-    Each normal force is the largest of five functions, affine in the normal part and in the
-    length of the tangential part of the required force (`normal_force_branches`), so it is convex
-    in (u'', u'^2); a unit vector in the tangent plane turns the length into a lower bound that is
-    exact along it.
-
-    Args:
-        force: limit [N].
-        tangent: (n, 3) unit vectors, orthogonal to the contact normals.
-    """
-    friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
-    by_normal: Array = np.array(normal_force_branches(ca.DM(1), ca.DM(0), friction)).reshape(-1)
-    by_tangent: Array = np.array(normal_force_branches(ca.DM(0), ca.DM(1), friction)).reshape(-1)
-    weight = workcell.payload.mass * np.array(GRAVITY)
-    normal_share = np.concatenate([by_normal + 1.0, by_normal])  # N_1 = N_2 + F_n
-    tangent_share = np.concatenate([by_tangent, by_tangent])
-    axes = (
-        normal_share[None, :, None] * motion.normal[:, None, :]
-        + tangent_share[None, :, None] * tangent[:, None, :]
-    )
-    return PointRows(
-        np.einsum("nkd,nd->nk", axes, motion.force_by_acceleration) / force,
-        np.einsum("nkd,nd->nk", axes, motion.force_by_speed) / force,
-        1.0 + axes @ weight / force,
-    )
-
-
-def tangent_direction(motion: PathMotion, workcell: Workcell, a: Array, w: Array) -> Array:
-    """(n, 3) direction of the tangential force at u'' = a and u'^2 = w (n,)."""
-    weight = workcell.payload.mass * np.array(GRAVITY)
-    force = motion.force_by_acceleration * a[:, None] + motion.force_by_speed * w[:, None] - weight
-    return _unit(force - np.sum(force * motion.normal, axis=1, keepdims=True) * motion.normal)
 
 
 def tangent_rows(value: Array, gradient: Array, z: Array) -> PointRows:

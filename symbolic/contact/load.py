@@ -1,9 +1,10 @@
 """What one sample of the box motion asks of the two contacts, as one CasADi function.
 
-Joins rotation, force allocation and centre of pressure (paper Section 4.4). With the allocation
-`joint` the paper's result is kept wherever its shifts stay within the patches and leave no moment,
-and `symbolic.contact.grasp` takes over where not. For pads that do not face one another, or more
-than two, the paper has no result: `symbolic.contact.grasp` alone answers.
+Joins rotation, force allocation and centre of pressure (paper Section 4.4). The allocations `paper`
+and `soft-finger` have closed forms (`symbolic.contact.closed_form`). With `joint` the paper's
+result is kept wherever its shifts stay within the patches and leave no moment, and
+`symbolic.contact.grasp` takes over where not. For pads that do not face one another, or more than
+two, the paper has no result: `symbolic.contact.grasp` alone answers.
 """
 
 from __future__ import annotations
@@ -11,12 +12,13 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from symbolic.contact.closed_form import Asked, held_by
 from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp, balance_of, facing_wrenches, grasp_wrenches
-from symbolic.contact.paper import allocate, pressure_shift, required_force, required_moment
+from symbolic.contact.paper import required_force, required_moment
 from symbolic.expression import Expression
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
-from symbolic.records import Workcell
+from symbolic.records import Allocation, Workcell
 
 LOAD_OUTPUTS = (
     "angular_velocity",
@@ -66,7 +68,7 @@ def load_function(workcell: Workcell) -> ca.Function:
     Inputs: pose, rate, second_rate (6,) as in `symbolic.path.time_law.TimedPath`.
     Outputs: see `LOAD_OUTPUTS`.
     """
-    kind = ca.SX if workcell.task.allocation == "paper" else ca.MX
+    kind = ca.MX if workcell.task.allocation == "joint" else ca.SX
     motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     friction = kind([contact.friction for contact in workcell.contacts])
     centre_of_mass = kind(ca.DM(workcell.payload.centre_of_mass))
@@ -99,39 +101,36 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
     Inputs: pose, rate, second_rate (6,); friction (2,) coefficients of the contacts;
     centre_of_mass (3,) in the box frame [m]. Outputs: see `LOAD_OUTPUTS`.
     """
-    if workcell.task.allocation == "paper":
-        return paper_load_function(workcell)
+    if workcell.task.allocation != "joint":
+        return closed_load_function(workcell, workcell.task.allocation)
     if workcell.has_opposite_pads:
         return _joint_load_function(workcell)
     return _grasp_load_function(workcell)
 
 
-def paper_load_function(workcell: Workcell) -> ca.Function:
-    """`uncertain_load_function` by the paper's allocation, whatever the workcell's own is."""
+def closed_load_function(workcell: Workcell, allocation: Allocation) -> ca.Function:
+    """`uncertain_load_function` by an allocation with a closed form, whatever the workcell's own
+    is."""
     inputs = {name: ca.SX.sym(name, size) for name, size in SIZES.items()}
     pose, rate, second, friction, centre_of_mass = inputs.values()
     contacts = workcell.contacts
     rotation, omega, alpha, force, moment = _required(workcell, pose, rate, second, centre_of_mass)
-    normal = ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, 2]))
-    forces = allocate(force, normal, (friction[0], friction[1]))
     arms = tuple(ca.mtimes(rotation, ca.DM(c.T_box_pad[:3, 3]) - centre_of_mass) for c in contacts)
-    tangents = tuple(ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, k])) for k in (0, 1))
-    shift = pressure_shift(
-        moment, (arms[0], arms[1]), (forces.force_1, forces.force_2), (tangents[0], tangents[1])
-    )
+    axes = ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, :3]))
+    held = held_by(workcell, allocation, Asked(force, moment, (arms[0], arms[1]), axes, friction))
     outputs = {
         "angular_velocity": omega,
         "angular_acceleration": alpha,
-        "normal_force": forces.normal,
-        "tangential_force": forces.tangential,
-        "contact_force": ca.vertcat(forces.force_1, forces.force_2),
-        "pressure_shift": ca.vertcat(_length(shift.shift_1), _length(shift.shift_2)),
-        "shift_vector": ca.vertcat(shift.shift_1, shift.shift_2),
-        "required_moment": shift.required_moment,
-        "point_moment_residual": shift.point_residual,
-        "moment_residual": shift.residual,
-        "wrench_1": ca.vertcat(forces.force_1, ca.cross(shift.shift_1, forces.force_1)),
-        "wrench_2": ca.vertcat(forces.force_2, ca.cross(shift.shift_2, forces.force_2)),
+        "normal_force": held.normal,
+        "tangential_force": held.tangential,
+        "contact_force": ca.vertcat(held.force_1, held.force_2),
+        "pressure_shift": ca.vertcat(_length(held.shift_1), _length(held.shift_2)),
+        "shift_vector": ca.vertcat(held.shift_1, held.shift_2),
+        "required_moment": moment,
+        "point_moment_residual": held.point_residual,
+        "moment_residual": held.residual,
+        "wrench_1": ca.vertcat(held.force_1, held.moment_1),
+        "wrench_2": ca.vertcat(held.force_2, held.moment_2),
     }
     return _named(inputs, {name: ca.densify(value) for name, value in outputs.items()})
 
@@ -139,7 +138,7 @@ def paper_load_function(workcell: Workcell) -> ca.Function:
 def _joint_load_function(workcell: Workcell) -> ca.Function:
     """The paper's result where the patches suffice for it, and the joint allocation elsewhere."""
     inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
-    found = paper_load_function(workcell)(*inputs.values())
+    found = closed_load_function(workcell, "paper")(*inputs.values())
     paper = dict(zip(LOAD_OUTPUTS, found, strict=True))
     force = paper["contact_force"][:3] + paper["contact_force"][3:]
     shift = "pressure_shift" if workcell.has_facing_pads else "shift_vector"

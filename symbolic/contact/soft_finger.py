@@ -24,17 +24,17 @@ Coordinates: tangents a, b and normal n = a x b of contact 1. Forces in N, lengt
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.contact.worst_cases import CASE_SIZE, case_in_pad_axes, case_parts
 from symbolic.expression import Expression
-from symbolic.records import Contact, Workcell
+from symbolic.records import Contact
 
-FACING_STEPS = 6
-"""Newton steps for given tangential forces; the equation is nearly linear, five leave 1e-9."""
+NEWTON_STEPS = 5
+"""For given tangential forces; the equation is nearly linear."""
 
 OFFSET_STEPS = 7
 """Secant steps where the pads lie beside one another."""
@@ -50,6 +50,15 @@ BEND = 3.0 / 80.0
 
 FORCE_FLOOR = 1e-9
 """Added in squares to forces [N], so that lengths have slopes where there is no force."""
+
+
+Load: TypeAlias = tuple[Expression, Expression, Expression]
+"""Tangential force (2,) of each contact [N], and the torsion that both carry together [N m]."""
+
+Detached: TypeAlias = list[tuple[ca.SX, ca.SX]]
+"""Receives what was solved for, as a symbol and its value. Results then depend on the symbol, by
+two more steps of Newton's method, so that first and second derivatives are exact although they take
+it for a constant; replace it afterwards."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +141,7 @@ def least_soft_squeeze(
     friction: Expression,
     patches: tuple[SoftPatch, SoftPatch],
     offset: bool = False,
+    detached: Detached | None = None,
 ) -> SoftFingers:
     """The least normal forces that hold.
 
@@ -142,13 +152,14 @@ def least_soft_squeeze(
         patches: of both pads.
         offset: whether the contacts may lie beside one another, seen along n; tangential forces
             and torsion then depend on the squeeze.
+        detached: see `Detached`; without effect where `offset` is set.
     """
     apart = arms[0] - arms[1]
     # About the middle of the contacts: apart x half the difference of both forces, and torsion.
     rest = moment - ca.cross((arms[0] + arms[1]) / 2.0, force)
 
-    def shared(squeeze: Expression) -> tuple[Expression, Expression, Expression]:
-        """Tangential forces of both contacts and the torsion under N_1 + N_2 = squeeze."""
+    def shared(squeeze: Expression) -> Load:
+        """What both contacts carry under N_1 + N_2 = squeeze."""
         half = ca.vertcat(
             (rest[1] + apart[0] * squeeze / 2.0) / apart[2],
             (apart[1] * squeeze / 2.0 - rest[0]) / apart[2],
@@ -156,9 +167,9 @@ def least_soft_squeeze(
         torsion = rest[2] - (apart[0] * half[1] - apart[1] * half[0])
         return force[:2] / 2.0 + half, force[:2] / 2.0 - half, torsion
 
-    squeeze = ca.fabs(force[2])
+    squeeze = ca.fabs(force[2]) if offset else ca.SX(0.0)
     load = shared(squeeze)
-    normal, capacity = _pressed(load, force[2], friction, patches)
+    normal, capacity = _pressed(load, force[2], friction, patches, None if offset else detached)
     # The least squeeze for what a squeeze asks is a convex function of it: secants reach the one
     # that asks for itself.
     before = squeeze
@@ -172,15 +183,16 @@ def least_soft_squeeze(
             slope = ca.fmin(slope, -LEAST_SLOPE)
             squeeze, before, excess = squeeze - now / slope, squeeze, now
         load = shared(squeeze)
-        normal, capacity = _pressed(load, force[2], friction, patches)
+        normal, capacity = _pressed(load, force[2], friction, patches, None)
     return SoftFingers(normal, *load, capacity)
 
 
 def _pressed(
-    load: tuple[Expression, Expression, Expression],
+    load: Load,
     difference: Expression,
     friction: Expression,
     patches: tuple[SoftPatch, SoftPatch],
+    detached: Detached | None,
 ) -> tuple[Expression, Expression]:
     """Least normal forces (2,) [N] and torsion capacities (2,) [N m] for given tangential forces.
 
@@ -188,8 +200,10 @@ def _pressed(
         load: tangential force (2,) of each contact, and the torsion.
         difference: N_1 - N_2.
         friction, patches: of both pads.
+        detached: see `Detached`.
     """
     *tangents, torsion = load
+    asked = ca.fabs(torsion)
     needed = [
         (ca.sumsqr(tangent) + FORCE_FLOOR**2) / friction[i] ** 2
         for i, tangent in enumerate(tangents)
@@ -199,41 +213,39 @@ def _pressed(
     own = ca.if_else(first_binds, needed[0], needed[1])
     mu = ca.if_else(first_binds, friction[0], friction[1])
     beside = ca.if_else(first_binds, difference, 0.0)
-    grip = ca.fabs(torsion) / (patches[0].twist + patches[1].twist)
 
-    def at(grip: Expression) -> tuple[Expression, list[Expression], Expression]:
-        """Normal forces, capacities, and the slope of the latter's sum by the grip."""
+    def normal_at(grip: Expression) -> tuple[Expression, Expression]:
         bound = ca.sqrt(own + (grip / mu) ** 2)
         n_2 = bound - beside
-        normal, slope, capacity = ca.vertcat(n_2 + difference, n_2), 0.0, []
+        return ca.vertcat(n_2 + difference, n_2), bound
+
+    def capacity_at(normal: Expression) -> tuple[list[Expression], Expression]:
+        """Both capacities, and the slope of their sum by the squeeze."""
+        slope, capacity = 0.0, []
         for i, patch in enumerate(patches):
             left = ca.fmax(normal[i] ** 2 - needed[i], 0.0) + FORCE_FLOOR**2
             own_grip = friction[i] * ca.sqrt(left)
             carried, by_grip = torsion_capacity(own_grip, tangents[i], patch)
             capacity.append(carried)
             slope += by_grip * friction[i] ** 2 * normal[i] / own_grip
-        return normal, capacity, slope * grip / (mu**2 * bound)
+        return capacity, slope
 
-    for _ in range(FACING_STEPS):
-        _, capacity, slope = at(grip)
-        missing = ca.fabs(torsion) - capacity[0] - capacity[1]
-        grip = ca.fmax(grip + missing / (slope + LEVER_FLOOR), FORCE_FLOOR)
-    normal, capacity, _ = at(grip)
-    return normal, ca.vertcat(*capacity)
+    def newton(grip: Expression) -> Expression:
+        normal, bound = normal_at(grip)
+        capacity, slope = capacity_at(normal)
+        missing = asked - capacity[0] - capacity[1]
+        by_grip = slope * grip / (mu**2 * bound)
+        return ca.fmax(grip + missing / (by_grip + LEVER_FLOOR), FORCE_FLOOR)
 
-
-def case_soft_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (15,), see `worst_cases.CASE_SIZES`, to normal_force
-    (2,) [N]: the least with which two pads with opposite normals that press evenly hold the case.
-
-    The radii of a case are not read: a displaced patch presses evenly about its displaced centre.
-    """
-    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case = ca.SX.sym("case", CASE_SIZE)
-    friction, axes = case_parts(case)[0], workcell.contacts[0].T_box_pad[:3, :3]
-    first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
-    needed = case_in_pad_axes(workcell, motion, case)
-    held = least_soft_squeeze(*needed, friction, (first, second), offset=True)
-    names = ["pose", "rate", "second_rate", "case"]
-    outputs = ca.cse([ca.densify(held.normal)])
-    return ca.Function("case_soft", [*motion, case], outputs, names, ["normal_force"])
+    grip = asked / (patches[0].twist + patches[1].twist)
+    # As if both pads had the same load: their levers are between h / 2 and c.
+    share = grip**2 / (grip**2 + mu**2 * own)
+    grip = grip * (4.0 - share) / 3.0
+    for _ in range(NEWTON_STEPS):
+        grip = newton(grip)
+    if detached is not None:
+        symbol = ca.SX.sym("grip")
+        detached.append((symbol, grip))
+        grip = newton(newton(symbol))
+    normal, _ = normal_at(grip)
+    return normal, ca.vertcat(*capacity_at(normal)[0])

@@ -36,6 +36,7 @@ from symbolic.contact.grasp import (
 from symbolic.contact.load import resultant_force
 from symbolic.contact.paper import required_moment
 from symbolic.contact.patches import least
+from symbolic.contact.soft_finger import SoftPatch, least_soft_squeeze
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.records import Contact, Workcell
 
@@ -100,6 +101,23 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     names = ["pose", "first", "second", "a", "w", "case"]
     outputs = ["normal_force", "slope"]
     return ca.Function("case_slopes", [*path, a, w, case], [force, slope], names, outputs)
+
+
+def case_soft_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to normal_force
+    (2,) [N]: the least with which two pads with opposite normals that press evenly hold the case.
+
+    The radii of a case are not read: a displaced patch presses evenly about its displaced centre.
+    """
+    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = ca.SX.sym("case", CASE_SIZE)
+    friction, axes = case_parts(case)[0], workcell.contacts[0].T_box_pad[:3, :3]
+    first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
+    needed = case_in_pad_axes(workcell, motion, case)
+    held = least_soft_squeeze(*needed, friction, (first, second), offset=True)
+    names = ["pose", "rate", "second_rate", "case"]
+    outputs = ca.cse([ca.densify(held.normal)])
+    return ca.Function("case_soft", [*motion, case], outputs, names, ["normal_force"])
 
 
 def case_difference_function(workcell: Workcell) -> ca.Function:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import cast
+from typing import cast, get_args
 
 import numpy as np
 
@@ -21,7 +21,7 @@ MIN_SAMPLES = 5
 MAX_SAMPLES = 2_000
 MAX_WAYPOINTS = 100
 TIME_LAWS = ("constant", "ramped", "optimal")
-ALLOCATIONS = ("paper", "joint")
+ALLOCATIONS = get_args(Allocation)
 ROTATIONS = ("roll-pitch-yaw", "quaternion")
 
 MOST_TURN = 5.0

@@ -2,8 +2,8 @@
 
    docs/timing.md explains the method; `symbolic.limits.LimitLayout` the numbers at a
    sample. The text before this file defines INTERVALS, JOINTS, the SIZE of a sample's row, the
-   offset of every block (AT_...), RATIOS, FORCE_BRANCHES, CUTS, the lines that a caller gives at every
-   sample, and limit_ratios, limit_slopes of CasADi.
+   offset of every block (AT_...), RATIOS, CUTS, the lines that a caller gives at every sample, and
+   limit_forces, limit_force_slopes, limit_ratios, limit_slopes of CasADi.
 
    x and y are the squared speeds u'^2 at the beginning and the end of an interval. There is rest at
    both ends of the path, and standing still is allowed everywhere, so that (0, 0) satisfies every
@@ -72,25 +72,23 @@ static void slopes_at(const double* f, double a, double w, double* r, double* by
   limit_slopes(arg, res, 0, 0, 0);
 }
 
-/* The required force along the axes of contact 1, and its part in the contact plane. */
-static double required_force(const double* f, double a, double w, double* force) {
-  const double* c = f + AT_FORCE;
-  for (int k = 0; k < 3; ++k) force[k] = c[k] * a + c[3 + k] * w + c[6 + k];
-  return sqrt(force[0] * force[0] + force[1] * force[1]);
+/* Both normal forces. */
+static void normal_forces(const double* f, double a, double w, double* n) {
+  const double* arg[3] = {f + AT_FORCE, &a, &w};
+  double* res[1] = {n};
+  limit_forces(arg, res, 0, 0, 0);
 }
 
-/* Both normal forces; the branch that the larger one follows. */
-static int normal_forces(const double* f, double a, double w, double* n, double* force) {
-  const double tangential = required_force(f, a, w, force);
-  int best = 0;
-  double largest = -INFINITY;
-  for (int k = 0; k < FORCE_BRANCHES; ++k) {
-    const double value = BRANCH[k][0] * force[2] + BRANCH[k][1] * tangential;
-    if (value > largest) { largest = value; best = k; }
-  }
-  n[1] = largest;
-  n[0] = largest + force[2];
-  return best;
+/* The larger normal force and its slopes by u'' and u'^2. */
+static double force_slopes(const double* f, double a, double w, double* by_a, double* by_w) {
+  double n[2], each_by_a[2], each_by_w[2];
+  const double* arg[3] = {f + AT_FORCE, &a, &w};
+  double* res[3] = {n, each_by_a, each_by_w};
+  limit_force_slopes(arg, res, 0, 0, 0);
+  const int k = n[1] > n[0];
+  *by_a = each_by_a[k];
+  *by_w = each_by_w[k];
+  return n[k];
 }
 
 /* ---- rows of an interval ---- */
@@ -163,24 +161,13 @@ static int convex_rows(const problem* p, int interval, double x, double y, doubl
       count = append(rows, count, interval_row(by_a, by_w, limit, end));
     }
     if (isfinite(p->force)) {
-      double n[2], force[3], direction[3];
+      double n[2], by_a, by_w;
       const double rest = p->rest_force[interval + end];
       const double bound = rest + (p->force - rest) / p->tight[interval][FORCE];
-      const int branch = normal_forces(f, a, w, n, force);
-      const double value = larger(n[0], n[1]);
-      if (value - rest <= (bound - rest) * threshold) continue;
-      const double tangential = sqrt(force[0] * force[0] + force[1] * force[1]);
-      const double share = tangential > 0.0 ? BRANCH[branch][1] / tangential : 0.0;
-      direction[0] = share * force[0];
-      direction[1] = share * force[1];
-      direction[2] = BRANCH[branch][0] + (n[0] > n[1] ? 1.0 : 0.0);
-      const double* c = f + AT_FORCE;
-      double by_a = 0.0, by_w = 0.0, still = 0.0;
-      for (int k = 0; k < 3; ++k) {
-        by_a += direction[k] * c[k];
-        by_w += direction[k] * c[3 + k];
-        still += direction[k] * c[6 + k];
-      }
+      normal_forces(f, a, w, n);
+      if (larger(n[0], n[1]) - rest <= (bound - rest) * threshold) continue;
+      const double value = force_slopes(f, a, w, &by_a, &by_w);
+      const double still = value - by_a * a - by_w * w;
       const line row = interval_row(by_a / bound, by_w / bound, 1.0 - still / bound, end);
       count = append(rows, count, row);
     }
@@ -432,7 +419,7 @@ static void note(largest_use* use, int kind, double ratio, double parameter, int
    only where asked for; `peak` keeps the largest normal forces. */
 static void judge(const problem* p, const double* f, double parameter, double a, double w,
                   int with_ratios, largest_use* use, double* peak) {
-  double ratios[RATIOS], n[2], force[3];
+  double ratios[RATIOS], n[2];
   const double speed = sqrt(larger(w, 0.0));
   const double *d = f + AT_SPEED, *alpha = f + AT_ACCELERATION, *cones = f + AT_CONE;
   for (int j = 0; j < JOINTS; ++j) {
@@ -452,7 +439,7 @@ static void judge(const problem* p, const double* f, double parameter, double a,
     }
     note(use, BOX_ACCELERATION + cone, sqrt(sum), parameter, 0);
   }
-  normal_forces(f, a, w, n, force);
+  normal_forces(f, a, w, n);
   for (int k = 0; k < 2; ++k) {
     peak[k] = larger(peak[k], n[k]);
     note(use, NORMAL_FORCE, n[k] / p->force, parameter, k);
@@ -492,7 +479,7 @@ static void judge_inside(const problem* p, int interval, double factor, largest_
   const int near = larger(middle[JOINT_TORQUE].ratio, middle[PRESSURE].ratio) > NEARLY;
   for (int quarter = 1; quarter <= 3; quarter += 2) {
     const double share = 0.25 * quarter;
-    between(p, 2.0 * (interval + share), near ? SIZE : AT_MOMENT, f);
+    between(p, 2.0 * (interval + share), near ? SIZE : AT_TORQUE, f);
     judge(p, f, (interval + share) / INTERVALS, a, x + share * (y - x), near, use, peak);
   }
 }
@@ -536,10 +523,10 @@ static double judge_rest(problem* p, largest_use* use, double* peak) {
   reset(use, peak);
   for (int i = 0; i <= INTERVALS; ++i) {
     const double* f = p->samples + 2 * i * SIZE;
-    double n[2], force[3];
+    double n[2];
     judge(p, f, i / (double)INTERVALS, 0.0, 0.0, 1, use, peak);
     ratios_at(f, 0.0, 0.0, p->rest + i * RATIOS);
-    normal_forces(f, 0.0, 0.0, n, force);
+    normal_forces(f, 0.0, 0.0, n);
     p->rest_force[i] = larger(n[0], n[1]);
   }
   return worst_of(use);

@@ -16,10 +16,10 @@ from symbolic.array import Array
 from symbolic.contact.grasp import balance_of, facing_wrenches
 from symbolic.contact.soft_finger import (
     SoftPatch,
-    case_soft_function,
     least_soft_squeeze,
     torsion_capacity,
 )
+from symbolic.contact.worst_cases import case_soft_function
 from symbolic.records import Contact, Workcell
 from tests.symbolic.cells import hand_cell, with_contacts
 
