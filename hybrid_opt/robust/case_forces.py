@@ -40,7 +40,8 @@ class CaseForces:
         check_pads(workcell)
         self.workcell, self._cache = workcell, cache
         self._general: dict[int, tuple[NumericFunction, NumericFunction]] = {}
-        if workcell.has_facing_pads:
+        self._squeezed = is_squeezed(workcell)
+        if self._squeezed:
             self._facing = [
                 compile_function(function(workcell), cache, lanes=0)
                 for function in (case_squeeze_function, case_slack_function)
@@ -72,13 +73,13 @@ class CaseForces:
         """(m,) whether a pressure that is known beforehand holds under commanded forces (m,) [N];
         where not, another one still may."""
         slack = self._functions(1 - leader)[1]
-        arm = (float(1 - leader),) if self.workcell.has_facing_pads else ()
+        arm = (float(1 - leader),) if self._squeezed else ()
         found = slack.batch(*motion, cases, force, *arm, threads=threads)["slack"]
         return np.asarray(found.ravel() > 0.0, dtype=np.bool_)
 
     def leading_share(self, leader: int) -> float:
         """Rise of the leading robot's force per newton of the commanded one."""
-        if self.workcell.has_facing_pads:
+        if self._squeezed:
             return 1.0
         normals = self._squeeze_normals
         return float(normals[leader] / normals[1 - leader])
@@ -88,7 +89,7 @@ class CaseForces:
         return GraspSqueeze(self.workcell, 1).squeeze_normals()
 
     def _functions(self, commanded: int) -> tuple[NumericFunction, NumericFunction]:
-        if self.workcell.has_facing_pads:
+        if self._squeezed:
             return self._facing[0], self._facing[1]
         if commanded not in self._general:
             first, second = (
@@ -97,6 +98,12 @@ class CaseForces:
             )
             self._general[commanded] = first, second
         return self._general[commanded]
+
+
+def is_squeezed(workcell: Workcell) -> bool:
+    """Whether the force of one pad decides that of the other, so that a least squeeze says all."""
+    soft = workcell.task.allocation == "soft-finger"
+    return workcell.has_facing_pads or (soft and workcell.has_opposite_pads)
 
 
 def check_pads(workcell: Workcell) -> None:

@@ -9,7 +9,11 @@ Which are worst follows from the least squeeze that a case asks for:
   largest at vertices of both ranges;
 - a disc of radius r - e about the nominal pad lies within every disc of radius r displaced by at
   most e, so that a patch smaller by e stands for all displaced ones. This one is sufficient, not
-  exact. A rectangle shrinks in proportion, so that its shorter side shrinks by e.
+  exact. A rectangle shrinks in proportion, so that its shorter side shrinks by e;
+- soft fingers press about their displaced places. Displaced alike by e, both leave the centre of
+  mass as much beside them. Displaced apart, they turn the squeeze into a moment, which a difference
+  of their tangential forces of up to 2 e N / L each carries, L being their distance: a coefficient
+  of friction that is lower by 2 e / L stands for it. Both at once are sufficient, not exact.
 """
 
 from __future__ import annotations
@@ -39,13 +43,25 @@ def nominal_case(workcell: Workcell) -> Array:
 
 def worst_cases(workcell: Workcell, uncertainty: Uncertainty) -> Array:
     """(k, 15) cases that ask for as much squeeze as any within the ranges, or a little more."""
-    case = nominal_case(workcell)
+    case, off = nominal_case(workcell), uncertainty.pad_position
     case[0:2] *= 1.0 - uncertainty.friction
-    case[2:4] *= 1.0 - uncertainty.pad_position / np.array(least_reaches(workcell))
     case[4] *= 1.0 + uncertainty.mass
-    ranges = np.concatenate([uncertainty.centre_of_mass, uncertainty.disturbance])
+    centre = uncertainty.centre_of_mass
+    if workcell.task.allocation == "soft-finger":
+        case[0:2] -= off * friction_by_displacement(workcell)
+        normal = workcell.contacts[0].T_box_pad[:3, 2]
+        centre = centre + off * np.sqrt(np.maximum(1.0 - normal**2, 0.0))
+    else:
+        case[2:4] *= 1.0 - off / np.array(least_reaches(workcell))
+    ranges = np.concatenate([centre, uncertainty.disturbance])
     corners = product(*[(-width, width) if width > 0.0 else (0.0,) for width in ranges])
     return np.array([case + np.concatenate([np.zeros(5), at, np.zeros(4)]) for at in corners])
+
+
+def friction_by_displacement(workcell: Workcell) -> float:
+    """What soft fingers lose of their coefficients of friction by being displaced apart [1/m]."""
+    first, second = (contact.T_box_pad for contact in workcell.contacts)
+    return 2.0 / abs(float((first[:3, 3] - second[:3, 3]) @ first[:3, 2]))
 
 
 def random_cases(

@@ -7,7 +7,7 @@ fixed by the motion (and the case), the commanded force decides the squeeze.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,12 @@ from codegen.cache import Cache
 from hybrid_opt.carry import Carry
 from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.case_forces import CaseForces
-from hybrid_opt.robust.cases import nominal_case, random_cases, worst_cases
+from hybrid_opt.robust.cases import (
+    friction_by_displacement,
+    nominal_case,
+    random_cases,
+    worst_cases,
+)
 from hybrid_opt.robust.ruling import ruling_cases
 from symbolic.array import Array
 from symbolic.contact.worst_cases import least_reaches
@@ -131,6 +136,10 @@ class RobustModel:
             forces = self._cases.least(repeated, np.repeat(some, n, axis=0), leader)
             found[start : start + step] = forces.reshape(len(some), n, 2)
         return found
+
+    def nominal(self, motion: HeldMotion) -> Array:
+        """(n, 2) least normal forces of the cell as it is described [N]."""
+        return np.asarray(self.least_squeeze(motion, nominal_case(self.workcell)[None])[0])
 
     def hold(
         self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
@@ -276,16 +285,31 @@ def check_set(workcell: Workcell, uncertainty: Uncertainty) -> None:
 
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
     """Largest multiple of a set that leaves some friction and patches."""
-    radii = least_reaches(workcell)
     limits = [float("inf")]
     limits += [1.0 / share for share in (uncertainty.friction, uncertainty.mass) if share > 0.0]
-    if uncertainty.pad_position > 0.0:
+    off = uncertainty.pad_position
+    if workcell.task.allocation == "soft-finger":
+        lost = off * friction_by_displacement(workcell)
+        friction = min(contact.friction for contact in workcell.contacts)
+        limits.append(friction / max(friction * uncertainty.friction + lost, 1e-300))
+    elif off > 0.0:
+        radii = least_reaches(workcell)
         room = min(radii)
         if workcell.has_facing_pads:
             room = min(room, (sum(radii) - pads_beside(workcell) / PATCH_OVERLAP) / 2.0)
-        limits.append(room / uncertainty.pad_position)
+        limits.append(room / off)
     return min(limits)
 
 
 robust_model = kept_per_workcell(RobustModel)
 """The model of a workcell, the same one for the same record."""
+
+
+def _soft_model(workcell: Workcell) -> RobustModel:
+    task = replace(workcell.task, allocation="soft-finger")
+    return RobustModel(replace(workcell, task=task))
+
+
+soft_model = kept_per_workcell(_soft_model)
+"""The model of a workcell whose pads press evenly, whatever its own allocation: two pads with
+opposite normals."""

@@ -7,6 +7,7 @@ In every case the least squeeze is convex in the required force and moment, and 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from codegen.build import compile_function
 from codegen.cache import Cache
 from hybrid_opt.per_workcell import kept_per_workcell
-from hybrid_opt.robust.case_forces import check_pads
+from hybrid_opt.robust.case_forces import check_pads, is_squeezed
 from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import check_set
 from hybrid_opt.robust.ruling import RulingCases, felt_share, ruling_cases
@@ -87,9 +88,10 @@ class RobustPath:
                 friction or patch.
             DualArmError: a function cannot be built.
         """
-        if not workcell.has_facing_pads:
+        if not is_squeezed(workcell):
             raise SettingsError(
-                "limits and slopes of robust forces need two round pads that face one another"
+                "limits and slopes of robust forces need two round pads that face one another, or "
+                "task.allocation = 'soft-finger' and two pads with opposite normals"
             )
         check_pads(workcell)
         check_set(workcell, workcell.uncertainty)
@@ -99,7 +101,7 @@ class RobustPath:
         self._squeeze, self._slopes, self._slack, self._difference = (
             compile_function(function(workcell), cache, lanes=0)
             for function in (
-                case_squeeze_function,
+                partial(case_squeeze_function, displaced=False),
                 case_slopes_function,
                 case_slack_function,
                 case_difference_function,

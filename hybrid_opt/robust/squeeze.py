@@ -5,7 +5,7 @@ place and feels what follows, the other is force-controlled (`hybrid_opt.robust`
 beyond the plan presses both pads against one another and moves nothing.
 
 The plan may assume pads that choose their pressure. What is commanded always holds pads that press
-evenly as well (`hybrid_opt.robust.even_pads`).
+evenly as well (`hybrid_opt.robust.force.soft_model`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from hybrid_opt.robust.even_pads import even_pads
-from hybrid_opt.robust.force import HeldMotion, robust_model
+from hybrid_opt.robust.force import HeldMotion, robust_model, soft_model
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
@@ -122,15 +121,15 @@ def extra_force(
     follower = 1 - squeeze.leader
     planned = least[:, follower]
     if squeeze.uncertainty is not None:
-        commanded, _ = robust_model(workcell).hold(motion, squeeze.uncertainty, squeeze.leader)
-        needed = np.maximum((1.0 + RESERVE) * commanded, planned)
+        needed, known = planned, (motion, squeeze.uncertainty, squeeze.leader)
         if squeeze.even_pads:
-            even = even_pads(workcell).hold(motion, squeeze.uncertainty, squeeze.leader)
-            needed = np.maximum(needed, even)
+            needed = np.maximum(needed, soft_model(workcell).hold(*known)[0])
+        if workcell.task.allocation != "soft-finger":
+            needed = np.maximum(needed, (1.0 + RESERVE) * robust_model(workcell).hold(*known)[0])
     else:
         assert squeeze.factor is not None, "a squeeze has a factor or a set"
         if squeeze.even_pads:
-            least = np.maximum(least, even_pads(workcell).nominal(motion))
+            least = np.maximum(least, soft_model(workcell).nominal(motion))
         needed = least[:, follower] + (squeeze.factor - 1.0) * least.mean(axis=1)
     return smooth_above(time, needed, squeeze.smoothing) - planned
 

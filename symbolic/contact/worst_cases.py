@@ -11,17 +11,20 @@ known. Whatever wrenches of all pads then carry the load, an internal squeeze ca
 that presses this robot's pads harder, so that with more than its least force the load is held as
 well.
 
-A displaced pad counts as a smaller one that lies within it: a disc shrinks by the displacement, a
-rectangle in proportion, so that its shorter side does.
+A displaced pad that chooses its pressure counts as a smaller one that lies within it: a disc
+shrinks by the displacement, a rectangle in proportion, so that its shorter side does. A soft finger
+presses about its displaced place.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 
 from symbolic.contact.central_path import least_effort
+from symbolic.contact.closed_form import are_beside
 from symbolic.contact.force_closure import WRENCH_SIZE, has_force_closure
 from symbolic.contact.grasp import (
     BEYOND,
@@ -36,7 +39,8 @@ from symbolic.contact.grasp import (
 from symbolic.contact.load import resultant_force
 from symbolic.contact.paper import required_moment
 from symbolic.contact.patches import least
-from symbolic.contact.soft_finger import SoftPatch, least_soft_squeeze
+from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
+from symbolic.expression import Expression
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.records import Contact, Workcell
 
@@ -58,66 +62,55 @@ SQUARED_SPEED_FLOOR = 1e-12
 CASE_SIZE = sum(CASE_SIZES.values())
 
 
-def case_squeeze_function(workcell: Workcell) -> ca.Function:
+def case_squeeze_function(workcell: Workcell, displaced: bool = True) -> ca.Function:
     """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to normal_force (2,) [N].
 
-    With the least squeeze the patches can carry the case; with more they can, with less not.
+    With the least squeeze the pads can carry the case; with more they can, with less not.
+
+    Args:
+        workcell: with two pads of opposite normals.
+        displaced: whether cases may displace the pads, which costs soft fingers more.
     """
-    motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case = ca.MX.sym("case", CASE_SIZE)
-    friction, radius, *_ = case_parts(case)
-    force = _least_squeeze(_balance_function(workcell)(*motion, case), friction, radius)
+    kind = _kind(workcell)
+    motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = kind.sym("case", CASE_SIZE)
+    force = _least_squeeze(workcell, motion, case, displaced=displaced)
     names = ["pose", "rate", "second_rate", "case"]
     return ca.Function("case_squeeze", [*motion, case], [force], names, ["normal_force"])
 
 
 def case_gradient_function(workcell: Workcell) -> ca.Function:
     """As `case_squeeze_function`, and slope (NumPy shape (2, 18)), of each force by pose, rate and
-    second_rate."""
-    motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case = ca.MX.sym("case", CASE_SIZE)
-    friction, radius, *_ = case_parts(case)
-    balance = _balance_function(workcell)(*motion, case)
-    force = _least_squeeze(balance, friction, radius, differentiable=True)
+    second_rate; of cases without displaced pads."""
+    kind = _kind(workcell)
+    motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    case = kind.sym("case", CASE_SIZE)
+    detached: Detached = []
+    force = _least_squeeze(workcell, motion, case, detached, differentiable=True)
     slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in motion]).T)
     names = ["pose", "rate", "second_rate", "case"]
     outputs = ["normal_force", "slope"]
-    return ca.Function("case_gradient", [*motion, case], [force, slope], names, outputs)
+    found = _solved([force, slope], detached)
+    return ca.Function("case_gradient", [*motion, case], found, names, outputs)
 
 
 def case_slopes_function(workcell: Workcell) -> ca.Function:
     """Box pose and its derivatives by u (6,), u'', u'^2 and a case (15,), see `CASE_SIZES`, to
     normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 20)), of each
-    force by pose, both derivatives, u'' and u'^2."""
-    path = [ca.MX.sym(name, 6) for name in ("pose", "first", "second")]
-    a, w, case = ca.MX.sym("a"), ca.MX.sym("w"), ca.MX.sym("case", CASE_SIZE)
+    force by pose, both derivatives, u'' and u'^2; of cases without displaced pads."""
+    kind = _kind(workcell)
+    path = [kind.sym(name, 6) for name in ("pose", "first", "second")]
+    a, w, case = kind.sym("a"), kind.sym("w"), kind.sym("case", CASE_SIZE)
     pose, first, second = path
     # A root has no slope at rest, what follows from its square has.
-    motion = (pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w)
-    friction, radius, *_ = case_parts(case)
-    balance = _balance_function(workcell)(*motion, case)
-    force = _least_squeeze(balance, friction, radius, differentiable=True)
+    motion = [pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w]
+    detached: Detached = []
+    force = _least_squeeze(workcell, motion, case, detached, differentiable=True)
     slope = ca.densify(ca.jacobian(force, ca.vertcat(*path, a, w)).T)
     names = ["pose", "first", "second", "a", "w", "case"]
     outputs = ["normal_force", "slope"]
-    return ca.Function("case_slopes", [*path, a, w, case], [force, slope], names, outputs)
-
-
-def case_soft_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to normal_force
-    (2,) [N]: the least with which two pads with opposite normals that press evenly hold the case.
-
-    The radii of a case are not read: a displaced patch presses evenly about its displaced centre.
-    """
-    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case = ca.SX.sym("case", CASE_SIZE)
-    friction, axes = case_parts(case)[0], workcell.contacts[0].T_box_pad[:3, :3]
-    first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
-    needed = case_in_pad_axes(workcell, motion, case)
-    held = least_soft_squeeze(*needed, friction, (first, second), offset=True)
-    names = ["pose", "rate", "second_rate", "case"]
-    outputs = ca.cse([ca.densify(held.normal)])
-    return ca.Function("case_soft", [*motion, case], outputs, names, ["normal_force"])
+    found = _solved([force, slope], detached)
+    return ca.Function("case_slopes", [*path, a, w, case], found, names, outputs)
 
 
 def case_difference_function(workcell: Workcell) -> ca.Function:
@@ -143,15 +136,46 @@ def case_slack_function(workcell: Workcell) -> ca.Function:
     balance = _balance_function(workcell)(*motion, case)
     n_1 = force + arm * balance[0]
     names = ["pose", "rate", "second_rate", "case", "force", "arm"]
-    slack = ca.cse([even_slack(balance, friction, radius, n_1)])
+    if workcell.task.allocation == "soft-finger":
+        slack = [n_1 - _least_squeeze(workcell, motion, case)[0]]
+    else:
+        slack = ca.cse([even_slack(balance, friction, radius, n_1)])
     return ca.Function("case_slack", [*motion, case, force, arm], slack, names, ["slack"])
 
 
+def _kind(workcell: Workcell) -> Any:
+    """The kind of expressions that a cell's least squeeze is made of, SX or MX."""
+    return ca.SX if workcell.task.allocation == "soft-finger" else ca.MX
+
+
 def _least_squeeze(
-    balance: ca.MX, friction: ca.MX, radius: ca.MX, differentiable: bool = False
-) -> ca.MX:
-    """(2,) N_1 and N_2 [N], see `symbolic.contact.grasp.facing_wrenches`."""
-    return facing_wrenches(balance, friction, radius, "squeeze", differentiable)[::WRENCH_SIZE]
+    workcell: Workcell,
+    motion: list[Expression],
+    case: Expression,
+    detached: Detached | None = None,
+    differentiable: bool = False,
+    displaced: bool = False,
+) -> Expression:
+    """(2,) N_1 and N_2 [N]: of soft fingers where the cell has these, else of pads that choose
+    their pressure, see `symbolic.contact.grasp.facing_wrenches`."""
+    friction, radius, *_ = case_parts(case)
+    if workcell.task.allocation != "soft-finger":
+        balance = _balance_function(workcell)(*motion, case)
+        wrenches = facing_wrenches(balance, friction, radius, "squeeze", differentiable)
+        return wrenches[::WRENCH_SIZE]
+    axes = workcell.contacts[0].T_box_pad[:3, :3]
+    first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
+    needed = case_in_pad_axes(workcell, motion, case)
+    beside = displaced or are_beside(workcell)
+    held = least_soft_squeeze(*needed, friction, (first, second), beside, detached)
+    return ca.densify(held.normal)
+
+
+def _solved(outputs: list[Expression], detached: Detached) -> list[Expression]:
+    """Outputs with what was solved for in its place."""
+    for symbol, value in detached:
+        outputs = ca.substitute(outputs, [symbol], [value])
+    return ca.cse(outputs) if detached else outputs
 
 
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from hybrid_opt.robust.cases import random_cases
-from hybrid_opt.robust.even_pads import even_pads
-from hybrid_opt.robust.force import BoxMotion
+from hybrid_opt.robust.force import BoxMotion, soft_model
 from hybrid_opt.robust.squeeze import SqueezeSettings, chosen_squeeze, extra_force
-from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.records import Uncertainty, Workcell
 from tests.symbolic.cells import RACK, rack_cell
@@ -34,25 +32,25 @@ def rack() -> Workcell:
 
 
 def test_no_random_case_needs_more(rack: Workcell) -> None:
-    model, rng = even_pads(rack), np.random.default_rng(1)
+    model, rng = soft_model(rack), np.random.default_rng(1)
     motion = motions(rng)
-    commanded = model.hold(motion, SET)
-    needed = model.least(motion, random_cases(rack, SET, 4000, rng))[:, :, 1]
+    commanded, _ = model.hold(motion, SET)
+    needed = model.least_squeeze(motion, random_cases(rack, SET, 4000, rng))[:, :, 1]
     share = (needed / commanded).max()
     assert 0.75 < share <= 1.0
 
 
 def test_nothing_uncertain_is_the_nominal_force(rack: Workcell) -> None:
-    model, motion = even_pads(rack), motions(np.random.default_rng(2))
+    model, motion = soft_model(rack), motions(np.random.default_rng(2))
     np.testing.assert_allclose(
-        model.hold(motion, Uncertainty()), model.nominal(motion)[:, 1], rtol=1e-12
+        model.hold(motion, Uncertainty())[0], model.nominal(motion)[:, 1], rtol=1e-12
     )
 
 
 @pytest.mark.parametrize("settings", [SqueezeSettings(), SqueezeSettings(1.0)])
 def test_what_is_commanded_holds_even_pads(rack: Workcell, settings: SqueezeSettings) -> None:
     """Although the plan, here none at all, asks for less."""
-    model, motion = even_pads(rack), motions(np.random.default_rng(3))
+    model, motion = soft_model(rack), motions(np.random.default_rng(3))
     time, planned = np.linspace(0.0, 2.0, 30), np.zeros((30, 2))
     squeeze = chosen_squeeze(rack, settings)
     extra = extra_force(rack, squeeze, time, motion, planned)
@@ -62,6 +60,4 @@ def test_what_is_commanded_holds_even_pads(rack: Workcell, settings: SqueezeSett
 
 def test_other_pads_are_told() -> None:
     cell = load(RACK.with_name("corner.toml"))
-    with pytest.raises(SettingsError, match="opposite normals"):
-        even_pads(cell)
     assert "choose their pressure" in str(chosen_squeeze(cell, SqueezeSettings()))

@@ -13,7 +13,7 @@ pytest.importorskip("mujoco")
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.cases import nominal_case
-from hybrid_opt.robust.even_pads import even_pads
+from hybrid_opt.robust.force import soft_model
 from hybrid_opt.witness.cases import witness_of_case, workcell_of_case
 from hybrid_opt.witness.drive import PlannedMoments, drive_of
 from hybrid_opt.witness.scene import SimulationSettings
@@ -180,7 +180,7 @@ def test_pads_that_press_evenly_slip_below_the_soft_finger_force(path: tuple[flo
         replace(contact, T_box_pad=T) for contact, T in zip(cell.contacts, raised, strict=True)
     )
     carry = carry_along(replace(cell, contacts=(first, second)), np.array(path), 0.5)
-    press = even_pads(carry.workcell).nominal(carry)[:, 1]
+    press = soft_model(carry.workcell).nominal(carry)[:, 1]
     settings = SimulationSettings(pads="even", points=37)
     witness = Witness(carry.workcell, settings)
     found = witness.threshold(drive_of(carry, settings, press), 0.9, 1.1, 5)

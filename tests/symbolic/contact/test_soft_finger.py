@@ -19,9 +19,9 @@ from symbolic.contact.soft_finger import (
     least_soft_squeeze,
     torsion_capacity,
 )
-from symbolic.contact.worst_cases import case_soft_function
+from symbolic.contact.worst_cases import case_squeeze_function
 from symbolic.records import Contact, Workcell
-from tests.symbolic.cells import hand_cell, with_contacts
+from tests.symbolic.cells import hand_cell, with_contacts, with_task
 
 MASS, GRAVITY = 10.0, 9.81
 
@@ -31,6 +31,7 @@ def cell_of(
 ) -> Workcell:
     """A solid box between two pads across y, these a height above its centre."""
     cell = with_contacts(hand_cell(), friction=(friction, friction))
+    cell = with_task(cell, allocation="soft-finger")
     contacts = []
     for contact in cell.contacts:
         T = contact.T_box_pad.copy()
@@ -100,7 +101,7 @@ def test_forces_are_those_of_the_exact_limit_curve(
 def least(cell: Workcell, pose: Array, acceleration: Array) -> Array:
     """(2,) normal forces at a pose (6,) under an acceleration (3,) of the box."""
     second = np.concatenate([acceleration, np.zeros(3)])
-    function = case_soft_function(cell)
+    function = case_squeeze_function(cell)
     return np.asarray(function(pose, np.zeros(6), second, nominal_case(cell))).ravel()
 
 
