@@ -233,17 +233,38 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """Limits that are not convex, at one sample, and their derivatives by (u'', u'^2).
 
     Both take force (9,), moment (6,), torque and wrench blocks of `LimitLayout` as one input, then
-    u'' and u'^2. `limit_ratios` gives (joints + 2,): joint torques over their limits, signed, then
-    the shifts of both centres of pressure over their patch radii. `limit_slopes` gives the same
-    and its derivatives (joints + 2,) by u'' and by u'^2.
+    u'' and u'^2. `limit_ratios` gives `contact_limits`' ratios; `limit_slopes` gives the same and
+    their derivatives (joints + 2,) by u'' and by u'^2.
     """
-    layout = limit_layout(workcell)
-    sizes, joints = layout.sizes, layout.joints
-    blocks = {
-        name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment", "torque", "wrench")
-    }
+    sizes = limit_layout(workcell).sizes
+    names = ("force", "moment", "torque", "wrench")
+    blocks = {name: ca.SX.sym(name, sizes[name]) for name in names}
     a, w = ca.SX.sym("a"), ca.SX.sym("w")
     detached: Detached = []
+    _, ratios = contact_limits(workcell, blocks, (a, w), detached)
+    inputs = [ca.vertcat(*blocks.values()), a, w]
+    return _with_slopes(("limit_ratios", "limit_slopes"), ratios, inputs, detached)
+
+
+def contact_limits(
+    workcell: Workcell,
+    blocks: dict[str, ca.SX],
+    timing: tuple[ca.SX, ca.SX],
+    detached: Detached,
+) -> tuple[ca.SX, ca.SX]:
+    """What depends on the contact forces at one sample.
+
+    Args:
+        workcell: the cell.
+        blocks: force, moment, torque and wrench, see `LimitLayout`.
+        timing: u'' and u'^2.
+        detached: see `symbolic.contact.soft_finger.Detached`.
+
+    Returns:
+        Normal forces (2,) [N]; ratios (joints + 2,): joint torques over their limits, signed, then
+        the shifts of both centres of pressure over their patch radii.
+    """
+    (a, w), joints = timing, limit_layout(workcell).joints
     held = _held(workcell, blocks, a, w, detached)
     wrenches = (
         ca.vertcat(held.force_1, held.moment_1),
@@ -261,8 +282,7 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
         ca.sqrt(ca.sumsqr(moved) + 1e-24) / contact.patch_radius
         for moved, contact in zip((held.shift_1, held.shift_2), workcell.contacts, strict=True)
     ]
-    inputs = [ca.vertcat(*blocks.values()), a, w]
-    return _with_slopes(("limit_ratios", "limit_slopes"), ca.vertcat(*ratios), inputs, detached)
+    return held.normal, ca.vertcat(*ratios)
 
 
 def _with_slopes(

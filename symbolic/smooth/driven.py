@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from symbolic.cell_model import CellModel
-from symbolic.limits import PATH_OUTPUTS, limit_layout, ratio_functions, sample_limits_function
+from symbolic.contact.soft_finger import Detached
+from symbolic.limits import PATH_OUTPUTS, contact_limits, limit_layout, sample_limits_function
 from symbolic.records import POSE_SIZE, Workcell
 
 DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
@@ -32,7 +33,8 @@ class DrivenLayout:
     speed (joints + 2): squared speeds over their squared limits: joints, payload, its turning.
     acceleration (joints): of the joints over their limits, signed.
     cone (2): squared length of the payload's acceleration and angular acceleration, likewise.
-    force (2): normal component and tangential magnitude of the required force [N].
+    force (2): normal component and tangential magnitude of the required force, of which the
+    paper's normal forces are made (`planned_branches`), or both normal forces of soft fingers [N].
     torque (joints): over their limits, signed.
     pressure (2): shifts of the centres of pressure over their patches' radii.
     """
@@ -87,25 +89,28 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     names = [*PATH_OUTPUTS, "a", "w"]
     sizes = [layout.pose] * 3 + [*[len(start) for start in model.start], 1, 1]
     inputs = [ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)]
-    value, y = _value(model, inputs), ca.vertcat(*inputs)
+    detached: Detached = []
+    value, y = _value(model, inputs, detached), ca.vertcat(*inputs)
     assert value.shape == (layout.size, 1)
-    first = ca.cse([value, ca.densify(ca.jacobian(value, y).T)])
+    first = [value, ca.densify(ca.jacobian(value, y).T)]
     weight, direction = ca.SX.sym("weight", layout.size), ca.SX.sym("direction", layout.variables)
     gradient = ca.gradient(ca.dot(weight, value), y)
-    second = ca.cse([ca.densify(ca.jtimes(gradient, y, direction))])
+    second = [ca.densify(ca.jtimes(gradient, y, direction))]
+    for symbol, solved in detached:
+        first, second = (ca.substitute(found, [symbol], [solved]) for found in (first, second))
     return {
-        DRIVEN_FIRST: ca.Function(DRIVEN_FIRST, inputs, first, names, ["value", "slope"]),
+        DRIVEN_FIRST: ca.Function(DRIVEN_FIRST, inputs, ca.cse(first), names, ["value", "slope"]),
         DRIVEN_SECOND: ca.Function(
             DRIVEN_SECOND,
             [*inputs, weight, direction],
-            second,
+            ca.cse(second),
             [*names, "weight", "direction"],
             ["change"],
         ),
     }
 
 
-def _value(model: CellModel, inputs: list[ca.SX]) -> ca.SX:
+def _value(model: CellModel, inputs: list[ca.SX], detached: Detached) -> ca.SX:
     """The quantities of `DrivenLayout`."""
     workcell = model.workcell
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints
@@ -121,14 +126,18 @@ def _value(model: CellModel, inputs: list[ca.SX]) -> ca.SX:
     )
     # Not the lengths' squares: a length has no slope where the box does not move.
     speeds = [ca.sumsqr(cones[k][:3] * reach[k]) for k in (0, 1)]
-    force = block["force"][:3] * a + block["force"][3:6] * w + block["force"][6:]
-    ratios = ratio_functions(workcell)[0](row[at["force"] :], a, w)
+    normal, ratios = contact_limits(workcell, block, (a, w), detached)
+    if workcell.task.allocation == "paper":
+        force = block["force"][:3] * a + block["force"][3:6] * w + block["force"][6:]
+        tangential = ca.sqrt(force[0] ** 2 + force[1] ** 2 + TANGENT_FLOOR**2)
+        forces = ca.vertcat(force[2], tangential)
+    else:
+        forces = normal
     return ca.vertcat(
         block["speed"][:joints] ** 2 * w,
         *[speed * w for speed in speeds],
         block["acceleration"][:joints] * a + block["acceleration"][joints:] * w,
         *[ca.sumsqr(cone[:3] * a + cone[3:] * w) for cone in cones],
-        force[2],
-        ca.sqrt(force[0] ** 2 + force[1] ** 2 + TANGENT_FLOOR**2),
+        forces,
         ratios,
     )

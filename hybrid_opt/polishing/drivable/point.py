@@ -53,9 +53,8 @@ class DriveStart:
 
 
 def is_polishable(task: Task) -> bool:
-    """Whether drivable carries of a task can be polished: with the paper's allocation of forces,
-    whose branches are what the program's rows are made of."""
-    return task.allocation == "paper"
+    """Whether drivable carries of a task can be polished: those whose forces have a closed form."""
+    return task.allocation != "joint"
 
 
 class DrivableSolver:
@@ -74,8 +73,8 @@ class DrivableSolver:
         driver, task = evaluator.driver, evaluator.workcell.task
         if driver is None or functions.driven is None or not is_polishable(task):
             raise SettingsError(
-                "the polish of drivable carries needs the time law 'optimal' and the paper's "
-                "allocation of forces: switch the polish off"
+                "the polish of drivable carries needs the time law 'optimal' and the allocation "
+                "'soft-finger' or 'paper': switch the polish off"
             )
         grid = Grid(task)
         cell = SmoothCell(evaluator.workcell, functions, grid)

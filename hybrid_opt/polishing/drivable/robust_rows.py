@@ -63,8 +63,11 @@ class RobustForces:
 
 
 def planned_branches(workcell: Workcell) -> Array:
-    """(2, 5, quantities) both planned normal forces' branches as sums of a point's quantities."""
+    """(2, branches, quantities) both planned normal forces' branches as sums of a point's
+    quantities: the paper's five, or soft fingers' one."""
     layout = driven_layout(workcell)
+    if workcell.task.allocation == "soft-finger":
+        return np.eye(layout.size)[layout.block("force")][:, None]
     forces = np.zeros((2, 5, layout.size))
     friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
     for column, split in ((0, (1.0, 0.0)), (1, (0.0, 1.0))):
