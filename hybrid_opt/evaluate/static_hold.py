@@ -12,7 +12,7 @@ import numpy as np
 
 from hybrid_opt.per_workcell import kept_per_workcell
 from symbolic.array import Array
-from symbolic.contact.load import LOAD_OUTPUTS, paper_load_function, uncertain_load_function
+from symbolic.contact.load import LOAD_OUTPUTS, closed_load_function, uncertain_load_function
 from symbolic.errors import WorkcellError
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
@@ -294,7 +294,7 @@ class _Still:
         workcell = self._workcell
         if workcell.task.allocation == "paper" or not workcell.has_facing_pads:
             return ""
-        function = paper_load_function(workcell)
+        function = closed_load_function(workcell, "paper")
         if not self._bears(function=function):
             return ""
         loads = [still_load(workcell, pose, function=function) for pose in self._poses.values()]
