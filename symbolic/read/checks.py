@@ -63,11 +63,14 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
     """The pads can hold the payload whatever the motion asks, as the allocation takes them."""
     if not problems.clean("contacts", *SHAPE_KEYS):
         return
-    joint = workcell.task.allocation == "joint"
-    if workcell.has_facing_pads:
-        if joint and problems.clean("task.allocation"):
+    allocation = workcell.task.allocation
+    if allocation == "soft-finger":
+        if problems.clean("task.allocation"):
+            _check_soft_fingers(workcell, problems)
+    elif workcell.has_facing_pads:
+        if allocation == "joint" and problems.clean("task.allocation"):
             _check_overlap(workcell, problems)
-    elif not joint:
+    elif allocation == "paper":
         if problems.clean("task.allocation"):
             problems.add("contacts[1].xyz", _paper_problem(workcell))
     elif not has_force_closure(workcell):
@@ -77,6 +80,29 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
             "payload against whatever the motion asks; allowed is enough friction (with 5 % to "
             "spare) along the lines between them: turn them towards one another, raise friction "
             "or add a pad (further)",
+        )
+
+
+def _check_soft_fingers(workcell: Workcell, problems: Problems) -> None:
+    """Soft fingers carry any moment by pressing harder where the line between them lies well within
+    their friction cones."""
+    if not workcell.has_opposite_pads:
+        problems.add(
+            "contacts[1].xyz",
+            "is not opposite contacts[0]; task.allocation = 'soft-finger' allows two pads with "
+            "opposite normals: 'joint' takes any",
+        )
+        return
+    beside, friction = pads_beside(workcell), min(c.friction for c in workcell.contacts)
+    first, second = (contact.T_box_pad for contact in workcell.contacts)
+    apart = abs(float((first[:3, 3] - second[:3, 3]) @ first[:3, 2]))
+    room = PATCH_OVERLAP * friction * apart
+    if beside >= room:
+        problems.add(
+            "contacts[1].xyz",
+            f"faces a point {beside:g} m beside contacts[0]; task.allocation = 'soft-finger' "
+            f"allows less than {room:g} m here, {PATCH_OVERLAP:g} of friction times the pads' "
+            "distance",
         )
 
 

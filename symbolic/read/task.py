@@ -51,10 +51,11 @@ def read_task(table: Table) -> Task:
                 table.at("waypoints"),
                 f"found {len(waypoints)} poses with start and goal; allowed are {MAX_WAYPOINTS}",
             )
+    time_law = cast("TimeLaw", table.choice("time_law", TIME_LAWS, "constant"))
     task = Task(
         waypoints=waypoints,
         samples=table.integer("samples", MIN_SAMPLES, MAX_SAMPLES, 100),
-        time_law=cast("TimeLaw", table.choice("time_law", TIME_LAWS, "constant")),
+        time_law=time_law,
         reference_speed=table.number("reference_speed", quantity.SPEED),
         reference_angular_speed=table.number(
             "reference_angular_speed", quantity.ANGULAR_SPEED, 0.5
@@ -63,13 +64,20 @@ def read_task(table: Table) -> Task:
         reference_force=table.vector("reference_force", (quantity.FORCE,) * 2, scalar_fills=True),
         initial=_read_initial(table, [w for w in waypoints if not w.is_fixed], names),
         allowed_contacts=tuple(_allowed_contact(e) for e in table.tables("allowed_contacts")),
-        allocation=cast("Allocation", table.choice("allocation", ALLOCATIONS, "paper")),
+        allocation=_allocation(table, time_law),
         force_limit=_force_limit(table),
         orientation=orientation,
     )
     if orientation.is_vector:
         _check_vectors(task, problems)
     return task
+
+
+def _allocation(table: Table, time_law: TimeLaw) -> Allocation:
+    """The allocation of forces; what robots drive may have one of its own."""
+    usual = table.choice("allocation", ALLOCATIONS, "paper")
+    driven = table.choice("drivable_allocation", ALLOCATIONS, usual)
+    return cast("Allocation", driven if time_law == "optimal" else usual)
 
 
 def _check_vectors(task: Task, problems: Problems) -> None:
