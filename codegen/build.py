@@ -1,27 +1,107 @@
-"""Build sets of functions: from the cache where possible, otherwise compiled side by side."""
+"""From functions and C text to loaded libraries: found in the cache, else compiled side by side.
+
+There is one way for all of them. A `Source` is C to compile: of one CasADi function with its
+driver, of one that is written by hand, of a program (`load_or_build_program`) or of our own C alone
+(`load_or_build_library`). Its library is kept under a key of the text and of what compiles it;
+long functions in it are parts, object files under keys of their own. What sources are made from has
+a key as well, a recipe's: under it the cache holds the keys of the libraries, so that a warm start
+makes neither expressions nor C.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+import ctypes
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
-from codegen.cache import FORMAT, Cache, digest, source_digest
-from codegen.compilation import Source, compile_source, load_compiled
-from codegen.compiler import Compiler, find_compiler, interruptible, stop_if_interrupted
-from codegen.function import NumericFunction, available_cores
-from codegen.interpreted import InterpretedFunction, warn_interpreted
-from codegen.signature import Signature
+from codegen.cache import Cache, Entry, key_of
+from codegen.compiled import CompiledFunction, cannot_load
+from codegen.compiler import (
+    FLAGS,
+    LANE_FLAGS,
+    LANE_LEVEL,
+    Compiler,
+    default_level,
+    find_compiler,
+    interruptible,
+    stop_if_interrupted,
+)
+from codegen.function import NumericFunction, Signature, available_cores
+from codegen.parts import Part, in_parts
 
 if TYPE_CHECKING:
     import casadi as ca
 
+HANDWRITTEN_LEVEL = 3
+"""Optimisation level of what is written by hand: it is short."""
+
 _MAKING = Lock()
 """Sets that are built side by side are made one after the other, so that compilers are busy with
 the first while the second is made."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """C to compile.
+
+    Attributes:
+        name: of what it becomes, in its set.
+        text: the C.
+        level: optimisation level.
+        lanes: evaluations side by side, 0 for what suits the machine; 1 for none.
+        signature: of the function in it; None where it is none with the driver.
+        operations: instructions per evaluation, see `codegen.source.operations`.
+        most: highest level of its parts.
+    """
+
+    name: str
+    text: str
+    level: int
+    lanes: int = 1
+    signature: Signature | None = None
+    operations: int = 0
+    most: int = 3
+
+    @classmethod
+    def of(cls, name: str, function: ca.Function, lanes: int, level: int | None) -> Source:
+        """The C of a function; level None for one by the size of what CasADi generates."""
+        from codegen.source import c_source, dense, generated_c, operations
+
+        whole = dense(function)
+        generated = generated_c([whole])
+        text = c_source(whole, lanes, generated)
+        chosen, most = (default_level(len(generated)), 3) if level is None else (level, level)
+        return cls(name, text, chosen, lanes, Signature.of(whole), operations(function), most)
+
+
+@dataclass(frozen=True)
+class Library:
+    """A library of the cache, loaded.
+
+    Attributes:
+        entry: what the cache holds of it.
+        handle: what it offers, by attribute.
+    """
+
+    entry: Entry
+    handle: ctypes.CDLL
+
+    def function(self) -> CompiledFunction:
+        """What it holds as a numeric function.
+
+        Raises:
+            CodegenError: it has no driver.
+        """
+        signature = Signature.from_json(self.entry.facts["signature"])
+        return CompiledFunction(signature, self.entry.library, self.handle)
 
 
 @dataclass(frozen=True)
@@ -31,12 +111,10 @@ class FunctionReport:
     Attributes:
         name: in the set that was built.
         operations: instructions per evaluation, see `codegen.source.operations`.
-        c_bytes: size of the C text; 0 where the function is interpreted.
-        compile_seconds: what the compiler took, now or when the cached library was made; 0 where
-            the function is interpreted.
+        c_bytes: size of the C text.
+        compile_seconds: what the compiler took, now or when the cached library was made.
         level: the compiler's optimisation level.
         from_cache: whether the library was there already.
-        compiled: False where the function is interpreted for want of a compiler.
     """
 
     name: str
@@ -45,7 +123,6 @@ class FunctionReport:
     compile_seconds: float
     level: int
     from_cache: bool
-    compiled: bool
 
 
 @dataclass(frozen=True)
@@ -55,7 +132,7 @@ class Build:
     Attributes:
         functions: by name.
         reports: how each was built.
-        keys: by name, where the cache holds it; empty where functions are interpreted.
+        keys: by name, where the cache holds it.
     """
 
     functions: dict[str, NumericFunction]
@@ -69,7 +146,7 @@ def compile_function(
     *,
     level: int | None = None,
     lanes: int = 1,
-) -> NumericFunction:
+) -> CompiledFunction:
     """Compile one CasADi function, or take it from the cache.
 
     Args:
@@ -78,23 +155,19 @@ def compile_function(
         level: optimisation level 0 to 3; by default by the size of the source.
         lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
 
-    Returns:
-        A `CompiledFunction`, or without a C compiler an `InterpretedFunction`, with one warning
-        per process.
-
     Raises:
-        CodegenError: it cannot be generated, compiled, cached or loaded.
+        CodegenError: there is no C compiler; or it cannot be generated, compiled, cached or loaded.
     """
-    levels = None if level is None else {"function": level}
-    return build({"function": function}, cache, levels=levels, lanes=lanes).functions["function"]
+    source = Source.of(function.name(), function, lanes, level)
+    return _compiled([source], cache or Cache())[source.name][0].function()
 
 
 def build(
     functions: Mapping[str, ca.Function],
     cache: Cache | None = None,
     *,
+    key: str | None = None,
     levels: Mapping[str, int] | None = None,
-    jobs: int = 0,
     rebuild: bool = False,
     lanes: int = 1,
 ) -> Build:
@@ -103,52 +176,36 @@ def build(
     Args:
         functions: by the name under which they are wanted.
         cache: where libraries are kept; by default the user's.
+        key: under which `load_or_build` is to find them; None if it is not to.
         levels: optimisation level per name, where the default by size is not wanted.
-        jobs: compilers that run at once; 0 for one per core.
         rebuild: compile also what is in the cache.
         lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
 
     Raises:
         CodegenError: see `compile_function`.
     """
-    from codegen.source import operations
-
-    compiler = find_compiler()
-    if compiler is None:
-        return _interpreted(functions)
     cache = cache or Cache()
-    with ThreadPoolExecutor(jobs or available_cores()) as pool, interruptible():
-        futures = {}
-        with _MAKING:
-            # The longest first: none is left to run alone in the end.
-            for name in sorted(functions, key=lambda name: -operations(functions[name])):
-                source = Source.of(functions[name], lanes)
-                level = (levels or {}).get(name)
-                futures[name] = compile_source(
-                    source, compiler, cache, level, pool.submit, rebuild=rebuild
-                )
-        built = [futures[name].result() for name in functions]
-    reports = tuple(
+    sources = _sources_of(lambda: functions, levels or {}, lanes)
+    built = _compiled(sources, cache, rebuild=rebuild)
+    ordered = {name: built[name] for name in functions}
+    if key is not None:
+        _remember(_set_key(key, levels, lanes, cache), ordered, cache)
+    told = ("operations", "c_bytes", "compile_seconds", "level")
+    reports = [
         FunctionReport(
-            name=name,
-            operations=entry.facts["operations"],
-            c_bytes=entry.facts["c_bytes"],
-            compile_seconds=entry.facts["compile_seconds"],
-            level=entry.facts["level"],
-            from_cache=found,
-            compiled=True,
+            name=name, from_cache=found, **{fact: library.entry.facts[fact] for fact in told}
         )
-        for name, (_, entry, found) in zip(functions, built, strict=True)
-    )
+        for name, (library, found) in ordered.items()
+    ]
     return Build(
-        {name: function for name, (function, _, _) in zip(functions, built, strict=True)},
-        reports,
-        {name: entry.key for name, (_, entry, _) in zip(functions, built, strict=True)},
+        {name: library.function() for name, (library, _) in ordered.items()},
+        tuple(reports),
+        {name: library.entry.key for name, (library, _) in ordered.items()},
     )
 
 
 def load_or_build(
-    key: str,
+    key: str | None,
     make: Callable[[], Mapping[str, ca.Function]],
     cache: Cache | None = None,
     *,
@@ -161,7 +218,8 @@ def load_or_build(
     expressions nor C are made again: `make` is not called and CasADi is not imported.
 
     Args:
-        key: changes with everything that `make` depends on, except the version of CasADi.
+        key: changes with everything that `make` depends on, except the version of CasADi; None
+            where nothing does, and `make` is asked each time.
         make: makes the functions.
         cache: where libraries are kept; by default the user's.
         levels: optimisation level per name, where the default by size is not wanted.
@@ -170,113 +228,250 @@ def load_or_build(
     Raises:
         CodegenError: see `compile_function`; and whatever `make` raises.
     """
-    compiler = find_compiler()
-    if compiler is None:
-        return _interpreted(make()).functions
     cache = cache or Cache()
-    found = _load_set(key, lanes, compiler, cache)
-    if found is not None:
-        return found
-    with cache.lock(_set_key(key, lanes, compiler)):
-        found = _load_set(key, lanes, compiler, cache)
-        if found is None:
-            with _MAKING:
-                stop_if_interrupted()
-                functions = make()
-            found = build_set(key, functions, cache, levels=levels, lanes=lanes).functions
-        return found
+    full = None if key is None else _set_key(key, levels, lanes, cache)
+    libraries = _obtained(full, lambda: _sources_of(make, levels or {}, lanes), cache)
+    return {name: library.function() for name, library in libraries.items()}
 
 
 def load_or_compile(
-    key: str, make: Callable[[], tuple[Signature, str]], cache: Cache | None = None
-) -> NumericFunction | None:
+    key: str | None, make: Callable[[], tuple[Signature, str]], cache: Cache | None = None
+) -> NumericFunction:
     """A function written in C by hand, by the key of what it is made from.
 
     Args:
-        key: changes with everything that `make` depends on, except the version of CasADi.
+        key: as of `load_or_build`.
         make: its signature and its text (`codegen.source.handwritten_source`); not called where
             the function was compiled before.
         cache: where libraries are kept; by default the user's.
 
+    Raises:
+        CodegenError: there is no C compiler; or it cannot be compiled, cached or loaded; and
+            whatever `make` raises.
+    """
+
+    def source() -> Iterable[Source]:
+        signature, text = make()
+        yield Source(signature.name, text, HANDWRITTEN_LEVEL, signature=signature)
+
+    cache = cache or Cache()
+    full = None if key is None else _set_key(key, None, 1, cache)
+    (library,) = _obtained(full, source, cache).values()
+    return library.function()
+
+
+def load_or_build_program(
+    name: str,
+    key: str,
+    make: Callable[[], Mapping[str, ca.Function]],
+    own: str,
+    cache: Cache | None = None,
+    lanes: int = 0,
+) -> ctypes.CDLL:
+    """Several CasADi functions in lanes, and C of our own that calls them, as one library.
+
+    For work in which calling through NumPy would cost more than the functions: intermediate results
+    stay in lanes and in the cache of the processor; see `codegen.source.program_source`.
+
+    Args:
+        name: for messages.
+        key: changes with everything that `make` depends on, except the version of CasADi.
+        make: makes the functions, by the names under which our C calls them.
+        own: our C, which follows the functions.
+        cache: where libraries are kept; by default the user's.
+        lanes: evaluations side by side; 0 for what suits the machine.
+
     Returns:
-        The function, or None without a C compiler.
+        The library; `dual_arm_lanes()` says how many it has, and where that is one the machine has
+        no form in lanes and the library nothing else.
 
     Raises:
-        CodegenError: it cannot be compiled, cached or loaded; and whatever `make` raises.
+        CodegenError: as of `load_or_compile`; or a function has no form in lanes.
+    """
+
+    def source() -> Iterable[Source]:
+        from codegen.source import program_source
+
+        yield Source(name, program_source(make(), own, lanes), LANE_LEVEL, lanes)
+
+    cache = cache or Cache()
+    full = key_of("program", name=name, of=_set_key(key, None, lanes, cache), own=own)
+    return _obtained(full, source, cache)[name].handle
+
+
+def c_text(package: str, names: Sequence[str], constants: Mapping[str, float] | None = None) -> str:
+    """C files of a package, one after the other, with values in place of every @NAME@.
+
+    Args:
+        package: that they are in.
+        names: of the files, in order.
+        constants: by name.
+    """
+    text = "\n".join(files(package).joinpath(name).read_text() for name in names)
+    for name, value in (constants or {}).items():
+        text = text.replace(f"@{name}@", repr(value))
+    return text
+
+
+def load_or_build_library(name: str, text: str, cache: Cache | None = None) -> ctypes.CDLL:
+    """A library of our own C alone, from the cache where it was built before.
+
+    Args:
+        name: for messages.
+        text: self-contained C (`c_text`); what it offers is visible by attribute.
+        cache: where libraries are kept; by default the user's.
+
+    Raises:
+        CodegenError: there is no C compiler; or it cannot be compiled, cached or loaded.
+    """
+    return _compiled([Source(name, text, HANDWRITTEN_LEVEL)], cache or Cache())[name][0].handle
+
+
+def _sources_of(
+    make: Callable[[], Mapping[str, ca.Function]], levels: Mapping[str, int], lanes: int
+) -> Iterable[Source]:
+    from codegen.source import operations
+
+    functions = make()
+    # The longest first: none is left to run alone in the end.
+    for name in sorted(functions, key=lambda name: -operations(functions[name])):
+        yield Source.of(name, functions[name], lanes, levels.get(name))
+
+
+def _set_key(key: str, levels: Mapping[str, int] | None, lanes: int, cache: Cache) -> str:
+    return key_of(
+        "set",
+        recipe=key,
+        levels=sorted((levels or {}).items()),
+        lanes=lanes,
+        compiler=find_compiler().identity,
+        casadi=version("casadi"),
+        generator=cache.code_digest("codegen"),
+    )
+
+
+def _obtained(
+    key: str | None, sources: Callable[[], Iterable[Source]], cache: Cache
+) -> dict[str, Library]:
+    """The libraries of a recipe: those that its record names, or what its sources become."""
+    if key is None:
+        return {name: library for name, (library, _) in _compiled(sources(), cache).items()}
+
+    def find() -> dict[str, Library] | None:
+        record = cache.read_record(key)
+        if record is None:
+            return None
+        found: dict[str, Library] = {}
+        for name, member in record["members"].items():
+            library = _loaded(member, cache)
+            if library is None:
+                return None
+            found[name] = library
+        return found
+
+    def make() -> dict[str, Library]:
+        built = _compiled(sources(), cache)
+        _remember(key, built, cache)
+        return {name: library for name, (library, _) in built.items()}
+
+    return cache.obtain(key, find, make)[0]
+
+
+def _remember(key: str, built: Mapping[str, tuple[Library, bool]], cache: Cache) -> None:
+    members = {name: library.entry.key for name, (library, _) in built.items()}
+    cache.write_record(key, {"members": members})
+
+
+def _loaded(key: str, cache: Cache) -> Library | None:
+    """The library kept under a key; None where there is none that can be loaded."""
+    entry = cache.find(key)
+    try:
+        return None if entry is None else Library(entry, ctypes.CDLL(str(entry.library)))
+    except OSError:
+        return None  # intact, but made against another C library: to be made again
+
+
+def _compiled(
+    sources: Iterable[Source], cache: Cache, *, rebuild: bool = False
+) -> dict[str, tuple[Library, bool]]:
+    """The libraries of sources by name, and whether the cache had them already.
+
+    Compilers run side by side, and while the sources that follow are made.
     """
     compiler = find_compiler()
-    if compiler is None:
-        return None
-    cache = cache or Cache()
-    found = _load_set(key, 1, compiler, cache)
-    if found is not None:
-        return next(iter(found.values()))
-    signature, text = make()
-    source = Source(signature, 0, text, len(text), None)
-    with ThreadPoolExecutor(1) as pool, interruptible():
-        function, entry, _ = compile_source(source, compiler, cache, 3, pool.submit).result()
-    cache.write_record(_set_key(key, 1, compiler), {"members": {signature.name: entry.key}})
-    return function
+    with ThreadPoolExecutor(available_cores()) as pool, interruptible():
+        with _MAKING:
+            stop_if_interrupted()
+            futures = {
+                source.name: _begin(source, compiler, cache, pool, rebuild) for source in sources
+            }
+        return {name: future.result() for name, future in futures.items()}
 
 
-def build_set(
-    key: str, functions: Mapping[str, ca.Function], cache: Cache | None = None, **options: Any
-) -> Build:
-    """`build`, and remember the set for `load_or_build` under the same key."""
-    cache = cache or Cache()
-    built = build(functions, cache, **options)
-    compiler = find_compiler()
-    if compiler is not None:
-        key = _set_key(key, options.get("lanes", 1), compiler)
-        cache.write_record(key, {"members": built.keys})
-    return built
-
-
-def _load_set(
-    key: str, lanes: int, compiler: Compiler, cache: Cache
-) -> dict[str, NumericFunction] | None:
-    record = cache.read_record(_set_key(key, lanes, compiler))
-    if record is None:
-        return None
-    functions: dict[str, NumericFunction] = {}
-    for name, member in record["members"].items():
-        hit = load_compiled(member, cache)
-        if hit is None:
-            return None
-        functions[name] = hit[0]
-    return functions
-
-
-def _set_key(key: str, lanes: int, compiler: Compiler) -> str:
-    return digest(
-        "set",
-        str(FORMAT),
-        key,
-        str(lanes),
-        compiler.identity,
-        version("casadi"),
-        source_digest("codegen"),
+def _begin(
+    source: Source, compiler: Compiler, cache: Cache, pool: ThreadPoolExecutor, rebuild: bool
+) -> Future[tuple[Library, bool]]:
+    """Begin to compile a source. Work that is submitted begins in turn: parts before what needs
+    them."""
+    flags = () if source.lanes == 1 else LANE_FLAGS
+    rest, parts = in_parts(source.text, source.lanes, source.most)
+    # Names and shapes are part of the C text, except which of two equal layouts they mean.
+    signature = None if source.signature is None else source.signature.to_json()
+    key = key_of(
+        "library",
+        compiler=compiler.identity,
+        level=source.level,
+        flags=(*FLAGS, *flags),
+        signature=signature,
+        parts=[(part.name, part.level) for part in parts],
+        text=rest,
     )
+    find = partial(_loaded, key, cache)
+    if not rebuild and (known := find()) is not None:
+        done: Future[tuple[Library, bool]] = Future()
+        done.set_result((known, True))
+        return done
+    longest_first = sorted(parts, key=lambda part: -len(part.text))
+    objects = [pool.submit(_object, part, compiler, cache) for part in longest_first]
+    file = source.name if source.signature is None else source.signature.name
+
+    def write(library: Path) -> dict[str, Any]:
+        text = library.parent / f"{file}.c"
+        text.write_text(rest)
+        start = time.perf_counter()
+        given = [part.result() for part in objects]
+        compiler.compile(text, library, source.level, flags, given)
+        return {
+            "signature": signature,
+            "operations": source.operations,
+            "c_bytes": len(source.text),
+            "compile_seconds": time.perf_counter() - start,
+            "level": source.level,
+        }
+
+    def make() -> Library:
+        entry = cache.store(key, write)
+        try:
+            return Library(entry, ctypes.CDLL(str(entry.library)))
+        except OSError as error:
+            raise cannot_load(file, error) from error
+
+    return pool.submit(cache.obtain, key, find, make, anew=rebuild)
 
 
-def _interpreted(functions: Mapping[str, ca.Function]) -> Build:
-    from codegen.source import dense, operations
+def _object(part: Part, compiler: Compiler, cache: Cache) -> Path:
+    """A part's object file."""
+    flags = (*FLAGS, *LANE_FLAGS)
+    key = key_of("part", compiler=compiler.identity, level=part.level, flags=flags, text=part.text)
 
-    warn_interpreted()
-    reports = tuple(
-        FunctionReport(
-            name=name,
-            operations=operations(function),
-            c_bytes=0,
-            compile_seconds=0.0,
-            level=0,
-            from_cache=False,
-            compiled=False,
-        )
-        for name, function in functions.items()
-    )
-    return Build(
-        {name: InterpretedFunction(dense(function)) for name, function in functions.items()},
-        reports,
-        {},
-    )
+    def find() -> Path | None:
+        entry = cache.find(key)
+        return None if entry is None else entry.library
+
+    def write(result: Path) -> dict[str, Any]:
+        text = result.with_name(f"{part.name}.c")
+        text.write_text(part.text)
+        compiler.compile(text, result, part.level, LANE_FLAGS, None)
+        return {}
+
+    return cache.obtain(key, find, lambda: cache.store(key, write, ".o").library)[0]

@@ -10,6 +10,7 @@ writable by nobody else, and nobody else may be able to exchange the folder itse
 
 from __future__ import annotations
 
+import ast
 import fcntl
 import hashlib
 import importlib.util
@@ -19,12 +20,12 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import platformdirs
 
@@ -38,8 +39,26 @@ FORMAT = 1
 
 _SOURCES = {".py", ".c", ".h"}
 
+Found = TypeVar("Found")
+
 _STALE_SECONDS = 3600.0
 _MOST_BYTES = 256 * outside.MEBIBYTE
+
+
+def key_of(what: str, **parts: object) -> str:
+    """The key of something in a cache: what it is, and by name all that it is made from.
+
+    Every key of a cache comes from here, so that what makes it anew can be read in one place:
+
+      library        the text, the compiler, its level and flags            (`codegen.build`)
+      part           the same of an object file that several libraries share
+      set            a recipe's key, lanes and levels, the compiler, CasADi, `codegen`'s code
+      recipe         a cell's files and the code of what makes its expressions
+                     (`hybrid_opt.compiled_cell`)
+      code           packages' sources, for what they do (`Cache.code_digest`)
+    """
+    named = [f"{name}={value}" for name, value in sorted(parts.items())]
+    return digest(what, str(FORMAT), *named)
 
 
 def digest(*parts: str | bytes) -> str:
@@ -53,19 +72,40 @@ def digest(*parts: str | bytes) -> str:
 
 
 def source_digest(*packages: str) -> str:
-    """SHA-256 over the Python and C sources of installed packages, none of which is imported."""
+    """SHA-256 over the Python and C sources of installed packages and modules, which are not
+    imported."""
     total: list[str | bytes] = []
+    for name, file in _sources(packages):
+        total += [name, file.read_bytes()]
+    return digest(*total)
+
+
+def _code(file: Path) -> str | bytes:
+    """What a source does: a Python file without its comments and docstrings."""
+    raw = file.read_bytes()
+    if file.suffix != ".py":
+        return raw
+    return ast.dump(_Undocumented().visit(ast.parse(raw)))
+
+
+class _Undocumented(ast.NodeTransformer):
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        said = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if said else node
+
+
+def _sources(packages: Sequence[str]) -> Iterator[tuple[str, Path]]:
+    """Every source file of packages or modules, with a name that does not depend on its folder."""
     for package in packages:
         spec = importlib.util.find_spec(package)
-        folders = [] if spec is None else spec.submodule_search_locations or []
-        for file in sorted(
-            path
-            for folder in folders
-            for path in Path(folder).rglob("*")
-            if path.suffix in _SOURCES
-        ):
-            total += [f"{package}/{file.name}", file.read_bytes()]
-    return digest(*total)
+        if spec is None:
+            continue
+        folders = spec.submodule_search_locations
+        if folders is None and spec.origin is not None:
+            yield package, Path(spec.origin)
+        files = [path for folder in folders or () for path in Path(folder).rglob("*")]
+        for file in sorted(path for path in files if path.suffix in _SOURCES):
+            yield f"{package}/{file.name}", file
 
 
 def default_folder() -> Path:
@@ -160,6 +200,45 @@ class Cache:
         self._make_folder()
         with _writing(self.folder):
             replace_file(self.folder / f"{key}.json", text.encode(), 0o600)
+
+    def obtain(
+        self,
+        key: str,
+        find: Callable[[], Found | None],
+        make: Callable[[], Found],
+        *,
+        anew: bool = False,
+    ) -> tuple[Found, bool]:
+        """What is kept under a key; made, by one process only, where it is not there.
+
+        Args:
+            find: loads it; None where it is missing, damaged or cannot be loaded.
+            make: makes and keeps it.
+            anew: make also what is there.
+
+        Returns:
+            It, and whether it was there already.
+        """
+        # A lock writes: what is there already needs none.
+        found = None if anew else find()
+        if found is not None:
+            return found, True
+        with self.lock(key):
+            found = None if anew else find()
+            return (make(), False) if found is None else (found, True)
+
+    def code_digest(self, *packages: str) -> str:
+        """SHA-256 over what packages' sources do: comments and docstrings do not count.
+
+        Parsing takes a while: the answer is kept by the digest of the sources as they are.
+        """
+        key = key_of("code", sources=source_digest(*packages))
+        record = self.read_record(key)
+        if record is None:
+            parts = [part for name, file in _sources(packages) for part in (name, _code(file))]
+            record = {"digest": digest(*parts)}
+            self.write_record(key, record)
+        return str(record["digest"])
 
     @contextmanager
     def lock(self, key: str) -> Iterator[None]:

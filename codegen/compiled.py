@@ -9,7 +9,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.errors import CodegenError, SlowerWarning
-from codegen.function import NativeCall, NumericFunction, available_cores
-from codegen.signature import Signature
+from codegen.function import NativeCall, NumericFunction, Signature, available_cores
 from symbolic.array import Array
 
 _CHUNKS_PER_THREAD = 4
@@ -47,26 +46,27 @@ class CompiledFunction(NumericFunction):
             or where they do not give the bits of single evaluations.
     """
 
-    def __init__(self, signature: Signature, library: Path) -> None:
-        """Load the library.
+    def __init__(self, signature: Signature, library: Path, loaded: ctypes.CDLL) -> None:
+        """Take the function of a library.
 
         Raises:
-            CodegenError: it cannot be loaded.
+            CodegenError: it has no driver.
         """
         super().__init__(signature)
         self.library = library
         try:
-            loaded = ctypes.CDLL(str(library))
-            self._once, self._run = loaded.dual_arm_once, loaded.dual_arm_run
+            self._run = loaded.dual_arm_run
             loaded.dual_arm_load()
             sizes = (ctypes.c_longlong * 4)()
             loaded.dual_arm_sizes(sizes)
-        except (OSError, AttributeError) as error:
+        except AttributeError as error:
             raise cannot_load(self.name, error) from error
-        self._once.argtypes = [ctypes.c_void_p] * 3
         self._run.argtypes = [ctypes.c_void_p] * 2 + [ctypes.c_longlong] * 2
-        self._once.restype = self._run.restype = ctypes.c_longlong
+        self._run.restype = ctypes.c_longlong
         self._work_sizes = tuple(int(size) for size in sizes)
+        self._n_ports = len(self.input_names) + len(self.output_names)
+        sizes_of = [8 * _size(shape) for shape in self.output_shapes]
+        self._offsets = list(accumulate(sizes_of, initial=0))[:-1]
         self._idle: deque[_Work] = deque()
         self._own = threading.local()
         self.lanes = 1
@@ -82,23 +82,18 @@ class CompiledFunction(NumericFunction):
 
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
         work = self._take_work()
-        addresses = work.inputs
-        for i, array in enumerate(inputs):
-            addresses[i] = _address(array)
-        base = _address_of(_writable(block)) if block.nbytes else 0
-        self._finish(work, self._once(work.inputs_address, base, work.address))
-
-    def _evaluate_into(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
-        work = self._take_work()
         ports = work.ports
         slot = 0
         for array in inputs:
             ports[slot] = _address(array)
             slot += 2
-        for array in outputs:
-            ports[slot] = _address(array)
+        base = _address_of(_writable(block)) if block.nbytes else 0
+        for offset in self._offsets:
+            ports[slot] = base + offset
             slot += 2
-        self._finish(work, self._run(work.ports_address, work.address, 0, 1))
+        status = self._run(work.ports_address, work.address, 0, 1)
+        self._idle.append(work)
+        self._check(status, "")
 
     def _evaluate_batch(
         self,
@@ -188,7 +183,7 @@ class CompiledFunction(NumericFunction):
         try:
             return self._idle.pop()
         except IndexError:
-            return _Work(self._work_sizes, len(self.input_names), len(self.output_names))
+            return _Work(self._work_sizes, self._n_ports)
 
     def _take_lane_work(self) -> _Work:
         try:
@@ -196,8 +191,7 @@ class CompiledFunction(NumericFunction):
         except IndexError:
             arg, res, iw, w = self._work_sizes
             w += sum(map(_size, (*self.input_shapes, *self.output_shapes)))
-            n_in, n_out = len(self.input_names), len(self.output_names)
-            return _Work((arg, res, iw, w * self.lanes), n_in, n_out)
+            return _Work((arg, res, iw, w * self.lanes), self._n_ports)
 
     def _lanes_agree(self) -> bool:
         """Whether a ragged batch in lanes gives the bits of single evaluations."""
@@ -216,10 +210,6 @@ class CompiledFunction(NumericFunction):
             self._evaluate_batch([array[rows] for array in inputs], batched, one, 1, 1)
         return all(map(_same, together, apart))
 
-    def _finish(self, work: _Work, status: int, of: str = "") -> None:
-        self._idle.append(work)
-        self._check(status, of)
-
     def _check(self, status: int, of: str) -> None:
         if status == _SUCCESS:
             return
@@ -231,7 +221,7 @@ class CompiledFunction(NumericFunction):
 class _Work:
     """Work memory of one thread at a time, with the addresses the driver wants."""
 
-    def __init__(self, sizes: Sequence[int], n_in: int, n_out: int) -> None:
+    def __init__(self, sizes: Sequence[int], n_ports: int) -> None:
         arg, res, iw, w = sizes
         self._memory: list[ctypes.Array[Any]] = [
             (ctypes.c_void_p * (arg + 1))(),
@@ -243,9 +233,7 @@ class _Work:
         addresses[3] += -addresses[3] % _ALIGNMENT
         self._pointers = (ctypes.c_void_p * 4)(*addresses)
         self.address = ctypes.addressof(self._pointers)
-        self.inputs = (ctypes.c_longlong * (n_in + 1))()
-        self.inputs_address = ctypes.addressof(self.inputs)
-        self.ports = (ctypes.c_longlong * (2 * (n_in + n_out)))()
+        self.ports = (ctypes.c_longlong * (2 * n_ports))()
         self.ports_address = ctypes.addressof(self.ports)
 
 

@@ -211,13 +211,24 @@ def part_level(c_bytes: int, in_lanes: bool) -> int:
     return level if c_bytes < LONG_PART else min(level, 1 if in_lanes else 2)
 
 
-def find_compiler() -> Compiler | None:
+def find_compiler() -> Compiler:
     """The C compiler: the one that CC names, otherwise the first of cc, gcc and clang that works.
 
-    None where there is none. A set CC is taken at its word: if it does not run, nothing else is
-    tried.
+    A set CC is taken at its word: if it does not run, nothing else is tried.
+
+    Raises:
+        CodegenError: there is none.
     """
-    return _find(os.environ.get("CC", ""), os.environ.get("PATH", ""))
+    own = os.environ.get("CC", "")
+    found = _find(own, os.environ.get("PATH", ""))
+    if found is None:
+        tried = f"CC names {own.strip()!r}" if own.strip() else "tried were cc, gcc and clang"
+        raise CodegenError(
+            f"no C compiler that works was found ({tried}), and without one nothing can be "
+            "computed: install one (Debian and Ubuntu: `apt install g++`), or name it in the "
+            "environment variable CC"
+        )
+    return found
 
 
 def _words(cc: str) -> list[str]:

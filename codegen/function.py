@@ -1,5 +1,8 @@
 """Numeric functions that NumPy calls: the interface that all share.
 
+CasADi stores matrices by column. A CasADi (r, c) matrix is therefore a NumPy (c, r) array in C
+order without a copy; a column or row vector is (n,) and a scalar (1, 1) is ().
+
 Arrays are C-contiguous float64 and are passed by address, never copied; anything else that NumPy
 can turn into such an array is converted where that is allowed (`__call__`, `batch`).
 """
@@ -10,15 +13,87 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from codegen.errors import CodegenError
-from codegen.signature import Shape, Signature
 from symbolic.array import Array
 
+if TYPE_CHECKING:
+    import casadi as ca
+
 _FLOAT = np.dtype(np.float64)
+
+Shape = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Signature:
+    """Name, arguments and results of a numeric function; every array is dense float64.
+
+    Attributes:
+        name: of the function.
+        input_names, output_names: in call order.
+        input_shapes, output_shapes: NumPy shapes of one evaluation.
+    """
+
+    name: str
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    input_shapes: tuple[Shape, ...]
+    output_shapes: tuple[Shape, ...]
+
+    @classmethod
+    def of(cls, function: ca.Function) -> Signature:
+        """Signature of a CasADi function, its sparse inputs and outputs taken as dense."""
+        return cls(
+            name=function.name(),
+            input_names=tuple(function.name_in()),
+            output_names=tuple(function.name_out()),
+            input_shapes=tuple(numpy_shape(*function.size_in(i)) for i in range(function.n_in())),
+            output_shapes=tuple(
+                numpy_shape(*function.size_out(i)) for i in range(function.n_out())
+            ),
+        )
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> Signature:
+        """Read what `to_json` wrote."""
+        return cls(
+            name=stored["name"],
+            input_names=tuple(stored["input_names"]),
+            output_names=tuple(stored["output_names"]),
+            input_shapes=tuple(tuple(shape) for shape in stored["input_shapes"]),
+            output_shapes=tuple(tuple(shape) for shape in stored["output_shapes"]),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain lists and strings."""
+        return {
+            "name": self.name,
+            "input_names": list(self.input_names),
+            "output_names": list(self.output_names),
+            "input_shapes": [list(shape) for shape in self.input_shapes],
+            "output_shapes": [list(shape) for shape in self.output_shapes],
+        }
+
+    def output_record(self) -> np.dtype[np.void]:
+        """Structured type that holds all outputs of one evaluation in one block of memory."""
+        return np.dtype(
+            [
+                (name, np.float64, shape)
+                for name, shape in zip(self.output_names, self.output_shapes, strict=True)
+            ]
+        )
+
+
+def numpy_shape(rows: int, columns: int) -> Shape:
+    """NumPy shape of a dense CasADi (rows, columns) matrix."""
+    if rows == 1 or columns == 1:
+        return () if rows == columns else (rows * columns,)
+    return (columns, rows)
 
 
 class NumericFunction(ABC):
@@ -60,26 +135,6 @@ class NumericFunction(ABC):
         block = np.empty((), self._record)
         self._evaluate_block(arrays, block)
         return {name: block[name] for name in self.output_names}
-
-    def evaluate_into(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
-        """Evaluate once into arrays that the caller keeps; nothing is allocated or converted.
-
-        Args:
-            inputs: one C-contiguous float64 array per input, of its exact shape.
-            outputs: likewise per output, writable, not overlapping each other or an input.
-
-        Raises:
-            CodegenError: an array that does not fit, or the function failed.
-        """
-        self._require_count(len(inputs))
-        if len(outputs) != len(self.output_names):
-            raise CodegenError(
-                f"{self.name}: {len(outputs)} output arrays given, {len(self.output_names)} "
-                f"needed: {', '.join(self.output_names)}"
-            )
-        self._require_exact(inputs, self.input_names, self.input_shapes, write=False)
-        self._require_exact(outputs, self.output_names, self.output_shapes, write=True)
-        self._evaluate_into(inputs, outputs)
 
     def batch(self, *inputs: ArrayLike, threads: int = 1) -> dict[str, Array]:
         """Evaluate n candidates.
@@ -150,7 +205,14 @@ class NumericFunction(ABC):
             given[name] if name in given else np.zeros(shape)
             for name, shape in zip(names, shapes, strict=True)
         ]
-        self._require_exact(own, names, shapes, write=True)
+        for array, name, shape in zip(own, names, shapes, strict=True):
+            flags = array.flags
+            if not flags.carray or array.dtype != _FLOAT or array.shape != shape:
+                raise CodegenError(
+                    f"{self.name}: array '{name}' is {array.dtype} {array.shape}, C-contiguous "
+                    f"{flags.c_contiguous}, writable {flags.writeable}; needed is C-contiguous "
+                    f"writable float64 {shape}"
+                )
         split = len(self.input_names)
         inputs = dict(zip(names[:split], own[:split], strict=True))
         outputs = dict(zip(names[split:], own[split:], strict=True))
@@ -173,10 +235,6 @@ class NumericFunction(ABC):
     @abstractmethod
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
         """Evaluate once into a record of `Signature.output_record`."""
-
-    @abstractmethod
-    def _evaluate_into(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
-        """Evaluate once into separate arrays."""
 
     @abstractmethod
     def _evaluate_batch(
@@ -210,19 +268,6 @@ class NumericFunction(ABC):
         if flags.carray or (flags.c_contiguous and flags.aligned):
             return array
         return array.copy(order="C")
-
-    def _require_exact(
-        self, arrays: Sequence[Array], names: Sequence[str], shapes: Sequence[Shape], *, write: bool
-    ) -> None:
-        for array, name, shape in zip(arrays, names, shapes, strict=True):
-            flags = array.flags
-            usable = flags.carray or (not write and flags.c_contiguous and flags.aligned)
-            if not usable or array.dtype != _FLOAT or array.shape != shape:
-                raise CodegenError(
-                    f"{self.name}: array '{name}' is {array.dtype} {array.shape}, C-contiguous "
-                    f"{flags.c_contiguous}, writable {flags.writeable}; needed is C-contiguous "
-                    f"{'writable ' if write else ''}float64 {shape}"
-                )
 
     def _wrong_shape(self, name: str, found: Shape, needed: str) -> CodegenError:
         return CodegenError(f"{self.name}: input '{name}' has shape {found}, needed is {needed}")

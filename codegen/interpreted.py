@@ -1,21 +1,30 @@
-"""CasADi's own evaluation behind the interface of the compiled functions."""
+"""CasADi's own evaluation, the oracle of the compiled functions: outputs and first derivatives.
+
+It also serves where a function is evaluated so few times that compiling it would take longer.
+"""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.errors import CodegenError, SlowerWarning
-from codegen.function import NumericFunction
-from codegen.signature import Signature
+from codegen.build import compile_function
+from codegen.cache import Cache
+from codegen.errors import CodegenError
+from codegen.function import NumericFunction, Signature
+from codegen.source import dense
 from symbolic.array import Array
 
-if TYPE_CHECKING:
-    import casadi as ca
+TOLERANCE = 1e-10
+"""Largest relative difference allowed between compiled and interpreted."""
+
+RESIDUE = 1e-6
+"""Outputs whose largest entry is below this (m, rad, N, s) are residues of rounding and are
+compared to this instead of to their own size."""
 
 
 class InterpretedFunction(NumericFunction):
@@ -31,9 +40,9 @@ class InterpretedFunction(NumericFunction):
         self.function = function
 
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
-        self._evaluate_into(inputs, [block[name] for name in self.output_names])
+        self._into(inputs, [block[name] for name in self.output_names])
 
-    def _evaluate_into(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
+    def _into(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
         buffer, evaluate = self.function.buffer()
         for i, array in enumerate(inputs):
             buffer.set_arg(i, array.data)
@@ -42,26 +51,6 @@ class InterpretedFunction(NumericFunction):
         evaluate()
         if buffer.ret():
             raise CodegenError(f"{self.name}: the function failed")
-
-    def _prepared(
-        self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
-    ) -> tuple[Callable[[int], None], None]:
-        buffers = []
-        for k in range(len(outputs[0]) if outputs else 0):
-            buffer, evaluate = self.function.buffer()
-            for i, (array, per_candidate) in enumerate(zip(inputs, batched, strict=True)):
-                buffer.set_arg(i, (array[k, ...] if per_candidate else array).data)
-            for i, array in enumerate(outputs):
-                buffer.set_res(i, array[k, ...].data)
-            buffers.append((buffer, evaluate))
-
-        def run(count: int, _memory: object = (inputs, outputs)) -> None:
-            for buffer, evaluate in buffers[:count]:
-                evaluate()
-                if buffer.ret():
-                    raise CodegenError(f"{self.name}: the function failed")
-
-        return run, None
 
     def _evaluate_batch(
         self,
@@ -77,21 +66,106 @@ class InterpretedFunction(NumericFunction):
                 array[k, ...] if per_candidate else array
                 for array, per_candidate in zip(inputs, batched, strict=True)
             ]
-            self._evaluate_into(chosen, [output[k, ...] for output in outputs])
+            self._into(chosen, [output[k, ...] for output in outputs])
 
 
-_warned = False
+@dataclass(frozen=True)
+class Agreement:
+    """Worst relative differences of one function.
+
+    Attributes:
+        name: of the function.
+        samples: random inputs tried.
+        outputs: worst difference of any output entry.
+        derivatives: worst difference of any entry of the derivative along a random direction of
+            all inputs.
+        worst_output: name of the output (or derivative) with the largest difference.
+    """
+
+    name: str
+    samples: int
+    outputs: float
+    derivatives: float
+    worst_output: str
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both are within `TOLERANCE`."""
+        return max(self.outputs, self.derivatives) <= TOLERANCE
 
 
-def warn_interpreted() -> None:
-    """Tell once per process that functions are interpreted for want of a compiler."""
-    global _warned
-    if _warned:
-        return
-    _warned = True
-    warnings.warn(
-        "no C compiler was found (environment variable CC, then cc, gcc, clang): functions are "
-        "interpreted, which is much slower; install gcc or clang, or set CC",
-        SlowerWarning,
-        stacklevel=3,
+def compare(
+    function: ca.Function,
+    compiled: NumericFunction,
+    bounds: Mapping[str, tuple[Array, Array]],
+    rng: np.random.Generator,
+    samples: int = 20,
+    cache: Cache | None = None,
+) -> Agreement:
+    """Compare a compiled function, and its compiled derivative, with CasADi's own evaluation.
+
+    Args:
+        function: what `compiled` was made from.
+        compiled: the function to check.
+        bounds: by input name, between which limits inputs are drawn uniformly; the others are
+            standard normal.
+        rng: source of the inputs.
+        samples: number of random inputs.
+        cache: where the compiled derivative is kept.
+    """
+    interpreted = InterpretedFunction(dense(function))
+    derivative = directional_derivative(function)
+    compiled_derivative = compile_function(derivative, cache)
+    reference_derivative = InterpretedFunction(dense(derivative))
+    worst, worst_derivative = ("", 0.0), ("", 0.0)
+    for _ in range(samples):
+        inputs = [
+            rng.uniform(*bounds[label]) if label in bounds else rng.standard_normal(shape)
+            for label, shape in zip(compiled.input_names, compiled.input_shapes, strict=True)
+        ]
+        expected = interpreted(*inputs)
+        worst = max(worst, _worst(expected, compiled(*inputs)), key=_difference)
+        directions = [rng.standard_normal(shape) for shape in compiled.input_shapes]
+        slope = [*inputs, *expected.values(), *directions]
+        worst_derivative = max(
+            worst_derivative,
+            _worst(reference_derivative(*slope), compiled_derivative(*slope)),
+            key=_difference,
+        )
+    overall = max(worst, worst_derivative, key=_difference)
+    return Agreement(function.name(), samples, worst[1], worst_derivative[1], overall[0])
+
+
+def directional_derivative(function: ca.Function) -> ca.Function:
+    """Directional derivative: the inputs, the outputs and a direction to the outputs' slopes.
+
+    A random direction reaches every first derivative at the price of about two evaluations.
+    """
+    return dense(function).forward(1)
+
+
+def relative_difference(reference: Array, other: Array) -> float:
+    """Largest difference of two arrays over the reference's largest finite entry.
+
+    Infinite where NaN or infinite entries differ.
+    """
+    finite = np.isfinite(reference)
+    if not np.array_equal(reference[~finite], other[~finite], equal_nan=True):
+        return np.inf
+    if not np.isfinite(other[finite]).all():
+        return np.inf
+    if not finite.any():
+        return 0.0
+    scale = max(float(np.abs(reference[finite]).max()), RESIDUE)
+    return float(np.abs(reference[finite] - other[finite]).max()) / scale
+
+
+def _worst(expected: Mapping[str, Array], found: Mapping[str, Array]) -> tuple[str, float]:
+    return max(
+        ((name, relative_difference(expected[name], found[name])) for name in expected),
+        key=_difference,
     )
+
+
+def _difference(item: tuple[str, float]) -> float:
+    return item[1]

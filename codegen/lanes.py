@@ -1,9 +1,24 @@
-"""CasADi's C as C for numbers in lanes: the same functions on vectors, one evaluation per lane.
+"""CasADi's C: its grammar, and its form for numbers in lanes.
 
-The text that CasADi writes has few forms. Those whose meaning for lanes is known are rewritten
-over the types of `codegen/c/lanes.h`: constants become equal in all lanes, comparisons and choices
-become masks, and a branch of `casadi.Function.if_else` runs where any lane wants it. A text with
-anything else is not taken (`lane_text` returns None): its function runs one evaluation at a time.
+`codegen.parts` and this module read what CasADi's code generator writes. Of that text they rely on
+
+  text      = helper* constant* function+ entry
+  constant  = "static const casadi_real casadi_" ("c" N | "zeros") "[" N "] = {" number,* "};"
+  function  = [ "/* name:(inputs)->(outputs) */" ]
+              "static int casadi_f" N "(const casadi_real** arg, casadi_real** res, casadi_int* iw,
+              casadi_real* w, int mem) {" body "}"
+  body      = straight | calls | choice
+  straight  = "casadi_real a0, a1, ...;" statement* "return 0;"            (a function of scalars)
+  calls     = declarations, lines with helpers, loops and other functions  (a function of matrices)
+  choice    = "if (arg[0] ? casadi_to_int(*arg[0]) : 0) {" call "} else {" call "}" "return 0;"
+  entry     = "return casadi_f" N "(arg, res, iw, w, mem);"
+
+with at most one statement on a line. The forms that a line may take are listed in `FORMS`, each
+with an example, and in `KEPT`, those that mean the same for lanes as for numbers. In lanes (the
+types of `codegen/c/lanes.h`) constants are equal in all lanes, comparisons and choices are masks,
+and a branch of `casadi.Function.if_else` runs where any lane wants it. A line of any other form is
+refused with a message that shows it: a new version of CasADi, or a function of it that was not
+used before, then asks for one more entry here.
 """
 
 from __future__ import annotations
@@ -12,8 +27,71 @@ import re
 from dataclasses import dataclass
 from math import prod
 
+from codegen.errors import CodegenError
+
 _NUMBER = r"-?(?:\d+\.?\d*(?:e[+-]?\d+)?|casadi_inf|casadi_nan|INFINITY|NAN)"
 _TERM = r"(?:[aw]\d+|\(\*c[rs]\+\+\)|\*\s*c[rs]\+\+|c[rs]\[i\]|" + _NUMBER + ")"
+_SIDES = rf"\(\s*({_TERM})\s*{{}}\s*({_TERM})\s*\)"
+
+FORMS = [
+    (example, re.compile(pattern, re.M), in_lanes)
+    for example, pattern, in_lanes in (
+        ("/* #3: @0 = (@0<@2) */", r"/\*.*?\*/", ""),
+        ("a1=2.5;", rf"^(\s*[aw]\d+\s*=\s*)({_NUMBER});", r"\1lanes_all_equal(\2);"),
+        (
+            "*rr++ = 0.5;",
+            rf"^(\s*(?:\*rr\+\+|res\[\d+\]\[\d+\])\s*=\s*)({_NUMBER});",
+            r"\1lanes_all_equal(\2);",
+        ),
+        (
+            "a0=arg[0]? arg[0][1] : 0;",
+            r"\? (arg\[\d+\]\[\d+\]) : 0;",
+            r"? \1 : lanes_all_equal(0.0);",
+        ),
+        ("a0=(a0<=a1);", _SIDES.format("<="), r"lanes_le(\1, \2)"),
+        ("a0=(a0<a1);", _SIDES.format("<"), r"lanes_lt(\1, \2)"),
+        ("a0=(a0==a1);", _SIDES.format("=="), r"lanes_eq(\1, \2)"),
+        ("a0=(a0!=a1);", _SIDES.format("!="), r"lanes_ne(\1, \2)"),
+        ("a0=(a0&&a1);", _SIDES.format("&&"), r"lanes_and(\1, \2)"),
+        ("a0=(a0||a1);", _SIDES.format(r"\|\|"), r"lanes_or(\1, \2)"),
+        ("a0=(a0?a1:0);", rf"\(\s*({_TERM})\s*\?\s*({_TERM})\s*:\s*0\s*\)", r"lanes_if(\1, \2)"),
+        ("a0=(!a0);", rf"\(\s*!\s*({_TERM})\s*\)", r"lanes_not(\1)"),
+        (
+            "a0=sin(a1);",
+            r"\b(sqrt|sin|cos|ceil|floor|exp|log|tan|asin|acos|atan|sinh|cosh|tanh|pow|atan2|"
+            r"hypot|fmod)\(",
+            r"lanes_\1(",
+        ),
+    )
+]
+"""What is written anew for lanes: an example, its pattern, and what takes its place. In order."""
+
+KEPT = [
+    (example, re.compile(pattern))
+    for example, pattern in (
+        ("if (res[0]!=0) res[0][1]=a0;", r"if \(res\d*\[\d+\](?:!=0)?\)"),
+        ("if (arg[0]) w1=arg[0];", r"if \(arg\d*\[\d+\]\)"),
+        (
+            "w1=arg[0] ? arg[0]+3 : casadi_zeros;",
+            r"arg\[\d+\]\s*\? arg\[\d+\](?:\[\d+\]|\+\d+)? : "
+            r"(?:casadi_zeros|lanes_all_equal\(0\.0\)|0)",
+        ),
+        (
+            "for (i=0, rr=w1, cs=w2; i<4; ++i)",
+            r"for \([^;]*;\s*(?:i<\d+|cs!=\(?&?w\w*\)?(?:\+\d+)?);[^;)]*\)",
+        ),
+    )
+]
+"""Comparisons and choices that are not of numbers: an example and its pattern."""
+
+_WORD = re.compile(r"[A-Za-z_]\w*")
+_WORDS = re.compile(
+    r"^(?:const|static|int|for|if|else|return|arg\d*|res\d*|iw|w|mem|i|j|k|rr|cs|cr|"
+    r"casadi_(?:real|int|zeros|copy|fill|clear|fmax|fmin|fabs|sign|sq|mtimes_dense|vfmax|vfmin|"
+    r"mmax|mmin|dot|norm_2|norm_inf)|casadi_[fc]\d+|lanes_\w+|a\d+|w\d+|wr\d+|INFINITY|NAN|e)$"
+)
+"""Words that lanes know; beside them a line holds arithmetic and indices only."""
+_COMPARES = re.compile(r"[?<>!|]|&&|==")
 
 _CONSTANT = re.compile(
     r"^static const casadi_real casadi_(c\d+|zeros)\[(\d+)\]\s*=\s*\{(.*?)\};", re.DOTALL | re.M
@@ -23,49 +101,14 @@ _FUNCTION = re.compile(
     r"^static int casadi_(?P<name>f\d+)\([^)]*\) \{\n(?P<body>.*?)^\}\n",
     re.DOTALL | re.M,
 )
-_SWITCH = re.compile(
+_CHOICE = re.compile(
     r"  if \(arg\[0\] \? casadi_to_int\(\*arg\[0\]\) : 0\) \{\n"
     r"    if \(casadi_(f\d+)\(arg\+1, res, iw, w, 0\)\) return 1;\n"
     r"  \} else \{\n"
     r"    if \(casadi_(f\d+)\(arg\+1, res, iw, w, 0\)\) return 1;\n"
     r"  \}\n  return 0;\n$"
 )
-
-_REWRITES = [
-    (re.compile(pattern, re.M), replacement)
-    for pattern, replacement in (
-        (r"/\*.*?\*/", ""),
-        (rf"^(\s*[aw]\d+\s*=\s*)({_NUMBER});", r"\1lanes_all_equal(\2);"),
-        (rf"^(\s*(?:\*rr\+\+|res\[\d+\]\[\d+\])\s*=\s*)({_NUMBER});", r"\1lanes_all_equal(\2);"),
-        (r"\? (arg\[\d+\]\[\d+\]) : 0;", r"? \1 : lanes_all_equal(0.0);"),
-        (rf"\(\s*({_TERM})\s*<=\s*({_TERM})\s*\)", r"lanes_le(\1, \2)"),
-        (rf"\(\s*({_TERM})\s*<\s*({_TERM})\s*\)", r"lanes_lt(\1, \2)"),
-        (rf"\(\s*({_TERM})\s*==\s*({_TERM})\s*\)", r"lanes_eq(\1, \2)"),
-        (rf"\(\s*({_TERM})\s*!=\s*({_TERM})\s*\)", r"lanes_ne(\1, \2)"),
-        (rf"\(\s*({_TERM})\s*&&\s*({_TERM})\s*\)", r"lanes_and(\1, \2)"),
-        (rf"\(\s*({_TERM})\s*\|\|\s*({_TERM})\s*\)", r"lanes_or(\1, \2)"),
-        (rf"\(\s*({_TERM})\s*\?\s*({_TERM})\s*:\s*0\s*\)", r"lanes_if(\1, \2)"),
-        (rf"\(\s*!\s*({_TERM})\s*\)", r"lanes_not(\1)"),
-        (
-            r"\b(sqrt|sin|cos|ceil|floor|exp|log|tan|asin|acos|atan|sinh|cosh|tanh|pow|atan2|"
-            r"hypot|fmod)\(",
-            r"lanes_\1(",
-        ),
-    )
-]
-
-# What may be left after the rewriting, besides arithmetic on numbers in lanes.
-_KNOWN = re.compile(
-    r"^(?:const|static|int|for|if|else|return|arg\d*|res\d*|iw|w|mem|i|j|k|rr|cs|cr|"
-    r"casadi_(?:real|int|zeros|copy|fill|clear|fmax|fmin|fabs|sign|sq|mtimes_dense|vfmax|vfmin|"
-    r"mmax|mmin|dot|norm_2|norm_inf)|casadi_[fc]\d+|lanes_\w+|a\d+|w\d+|wr\d+|INFINITY|NAN|e)$"
-)
-_WORD = re.compile(r"[A-Za-z_]\w*")
-_SCALAR_CONDITION = re.compile(
-    r"if \(res\d*\[\d+\](?:!=0)?\)|if \(arg\d*\[\d+\]\)|"
-    r"arg\[\d+\]\s*\? arg\[\d+\](?:\[\d+\]|\+\d+)? : (?:casadi_zeros|lanes_all_equal\(0\.0\)|0)|"
-    r"for \([^;]*;\s*(?:i<\d+|cs!=\(?&?w\w*\)?(?:\+\d+)?);[^;)]*\)"
-)
+_ENTRY = re.compile(r"^\s+return casadi_(f\d+)\(arg, res, iw, w, mem\);$", re.M)
 
 
 @dataclass(frozen=True)
@@ -81,12 +124,15 @@ class LaneText:
     entry: str
 
 
-def lane_text(generated: str, prefix: str) -> LaneText | None:
-    """What CasADi generated for one function, over `codegen/c/lanes.h`; None if it cannot be.
+def lane_text(generated: str, prefix: str) -> LaneText:
+    """What CasADi generated for one function, over `codegen/c/lanes.h`.
 
     Args:
         generated: CasADi's text, with its own comments.
         prefix: begins the names of everything defined.
+
+    Raises:
+        CodegenError: a line has a form that has none in lanes.
     """
     parts = []
     for name, size, values in _CONSTANT.findall(generated):
@@ -95,40 +141,39 @@ def lane_text(generated: str, prefix: str) -> LaneText | None:
         parts.append(f"static const casadi_real casadi_{name}[{size}] = {{{equal}}};\n")
     names = []
     for found in _FUNCTION.finditer(generated):
-        body = _switch(found) or _straight(found["body"])
-        if body is None:
-            return None
         names.append(found["name"])
         parts.append(
             f"static int casadi_{found['name']}(const casadi_real** arg, casadi_real** res, "
-            f"casadi_int* iw, casadi_real* w, int mem) {{\n{body}}}\n"
+            f"casadi_int* iw, casadi_real* w, int mem) {{\n{_choice(found) or _lines(found)}}}\n"
         )
-    entry = re.search(r"^\s+return casadi_(f\d+)\(arg, res, iw, w, mem\);$", generated, re.M)
+    entry = _ENTRY.search(generated)
     if entry is None or entry[1] not in names:
-        return None
+        raise _unknown("the text", "no function that is called from outside")
     text = re.sub(r"\bcasadi_(f\d+|c\d+|zeros)\b", rf"{prefix}_\1", "".join(parts))
     return LaneText(text.replace("casadi_", "lanes_"), f"{prefix}_{entry[1]}")
 
 
-def _straight(body: str) -> str | None:
-    for pattern, replacement in _REWRITES:
-        body = pattern.sub(replacement, body)
-    for line in body.splitlines():
-        rest = _SCALAR_CONDITION.sub("", line)
-        if re.search(r"[?<>!|]|&&|==", re.sub(r"if \(casadi_f\d+\(.*\)\)", "", rest)):
-            return None
-        if not all(_KNOWN.match(word) for word in _WORD.findall(rest)):
-            return None
+def _lines(function: re.Match[str]) -> str:
+    body = function["body"]
+    for _, pattern, in_lanes in FORMS:
+        body = pattern.sub(in_lanes, body)
+    for written, line in zip(function["body"].splitlines(), body.splitlines(), strict=True):
+        rest = line
+        for _, pattern in KEPT:
+            rest = pattern.sub("", rest)
+        if _COMPARES.search(rest) or not all(map(_WORDS.match, _WORD.findall(rest))):
+            head = function[0].partition("\n")[0] if function["outputs"] else function["name"]
+            raise _unknown(head.strip("/* "), written.strip())
     return body
 
 
-def _switch(found: re.Match[str]) -> str | None:
+def _choice(function: re.Match[str]) -> str | None:
     """`casadi.Function.if_else`: each branch runs if a lane wants it, and its lanes are taken."""
-    branches = _SWITCH.match(found["body"])
-    if branches is None or found["outputs"] is None:
+    branches = _CHOICE.match(function["body"])
+    if branches is None or function["outputs"] is None:
         return None
     wanted, otherwise = branches.groups()
-    sizes = [_size(output) for output in found["outputs"].split(",")]
+    sizes = [_size(output) for output in function["outputs"].split(",")]
     call = "if (casadi_{}(arg+1, {}, iw, w, 0)) return 1;\n"
     lines = [
         "  unsigned bits = arg[0] ? lanes_bits(lanes_true(*arg[0])) : 0;\n",
@@ -152,3 +197,10 @@ def _size(described: str) -> int:
     """Entries of a result as CasADi's comment describes it: name, name[3] or name[3x4]."""
     shape = re.search(r"\[(\d+)(?:x(\d+))?\]", described)
     return prod(int(length) for length in shape.groups(default="1")) if shape else 1
+
+
+def _unknown(function: str, line: str) -> CodegenError:
+    return CodegenError(
+        f"{function}: CasADi wrote a form of C that has no form in lanes: `{line}`; compile the "
+        "function with lanes=1, or add the form to codegen/lanes.py"
+    )

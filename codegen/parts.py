@@ -1,25 +1,30 @@
-"""C text in parts: what is long and calls nothing is compiled apart, once wherever it occurs.
+"""C text in parts that are compiled apart, and long straight-line C in pieces.
 
 The same functions stand in many texts: an arm's Newton steps in everything that follows a path,
-and twice where both arms are of one kind. A part is named by its content, so that texts which hold
-it share one object file, which a cache keeps beside the libraries. Parts of one text are compiled
-side by side, and those that are written for lanes at a level of their own.
+and twice where both arms are of one kind. A part is a function that is long and calls no other
+(`straight` in the grammar of `codegen.lanes`, and functions of matrices that need no helper), in
+a file of its own, named by its content, so that texts which hold it share one object file. Parts of
+one text are compiled side by side, and those that are written for lanes at a level of their own.
+
+CasADi writes a function of scalars as one line of statements over as many local variables as live
+at once. A compiler takes more than in proportion to its length over such a text: every variable may
+conflict with every other. Cut into pieces, functions of some hundred statements which hand the
+variables that live on from one to the next by an array, the same statements run in the same order
+and give the same bits.
+
+What has another form than these patterns say is neither taken out nor cut: it is compiled where it
+stands, which only takes longer.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from functools import cache
+from importlib.resources import files
 
-from codegen.cache import FORMAT, Cache, digest
-from codegen.compiler import FLAGS, LANE_FLAGS, Compiler, part_level
-from codegen.pieces import in_pieces, is_long
-from codegen.runtime import runtime
+from codegen.cache import digest
+from codegen.compiler import part_level
 
 LEAST_BYTES = 8000
 """Bytes of a function from which on it is compiled apart: a compiler's start costs 0.03 s, as much
@@ -28,7 +33,7 @@ as 2000 bytes."""
 LEAST_ENTRY = 50_000
 """The same of a text's own function, which others hardly share."""
 
-_FUNCTION = re.compile(
+_CALLED = re.compile(
     r"^static int (?P<name>\w+_f\d+)(?P<rest>\(const (?P<real>casadi|lanes)_real\*\* arg, [^)]*\) "
     r"\{\n(?P<body>(?:  [^\n]*\n)*)\}\n)",
     re.M,
@@ -45,14 +50,25 @@ _OWN = {
 }
 """Words of a function that a part knows: those of `codegen/c/part.h` and `codegen/c/lanes.h`."""
 
-T = TypeVar("T")
+LONG = 10_000
+"""Statements from which on a function is cut: shorter ones are evaluated more often, and a seventh
+faster as a whole."""
 
+PIECE = 250
+"""Statements of a piece. `force_inner_second` of the rack (45,000 statements, half of them in
+lanes, -O1) took gcc 12 on a busy machine 15.2 s as a whole, 7.7 s in pieces of 1000 and 5.5 s in
+pieces of 250; 56 evaluations took 199, 240 and 229 us."""
 
-class Submit(Protocol):
-    """Runs work in turn."""
+_INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
 
-    def __call__(self, work: Callable[[], T], /) -> Future[T]:
-        """Begin once what was given earlier has begun."""
+_STRAIGHT = re.compile(
+    r"^static int (?P<name>\w+)\(const (?P<real>\w+)\*\* arg, [^)]*\) \{\n"
+    r"(?P<declared>(?:  (?P=real) a\d+(?:, a\d+)*;\n)+)"
+    r"(?P<body>(?:  (?:a\d+\s*=|if \(res\[)[^\n]*\n)+)"
+    r"  return 0;\n\}\n",
+    re.M,
+)
+_VARIABLE = re.compile(r"\ba\d+\b")
 
 
 @dataclass(frozen=True)
@@ -70,12 +86,13 @@ class Part:
     level: int
 
 
-def in_parts(text: str, lanes: int) -> tuple[str, tuple[Part, ...]]:
-    """C text of `codegen.source` or `codegen.program` with declarations in place of its parts, and
+def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[Part, ...]]:
+    """C text of `codegen.source` with declarations in place of its parts, and
     the parts, each once.
 
     Args:
         lanes: of the text; 0 for what suits the machine.
+        most: highest optimisation level of a part.
     """
     before = {
         "casadi": _preamble(*(["one_lane.h"] if "dual_arm_sin" in text else []), "part.h"),
@@ -102,11 +119,11 @@ def in_parts(text: str, lanes: int) -> tuple[str, tuple[Part, ...]]:
         # What is long and has lanes is evaluated in batches; one by one it only tells whether lanes
         # are right.
         hardly_used = kind == "casadi" and "dual_arm_run_lanes" in text and is_long(body)
-        parts[name] = Part(name, whole, 0 if hardly_used else level)
+        parts[name] = Part(name, whole, 0 if hardly_used else min(level, most))
         names[found["name"]] = name
         return f"int PART_{found['name']}{found['rest'].split(' {', 1)[0]};\n"
 
-    text = _FUNCTION.sub(take, text)
+    text = _CALLED.sub(take, text)
     text = re.sub(
         r"^#define (\w+) CASADI_PREFIX\(f\d+\)\n",
         lambda found: "" if found[1] in names else found[0],
@@ -117,67 +134,65 @@ def in_parts(text: str, lanes: int) -> tuple[str, tuple[Part, ...]]:
     return text, tuple(parts.values())
 
 
-@dataclass(frozen=True)
-class Objects:
-    """A text whose parts are being compiled.
-
-    Attributes:
-        rest: what is left of the text.
-        parts: the object files to be.
-        compiler: that compiles them.
-    """
-
-    rest: str
-    parts: tuple[Future[Path], ...]
-    compiler: Compiler
-
-    def link(self, source: Path, library: Path, level: int, flags: tuple[str, ...]) -> None:
-        """Write the rest as a C file, compile it, and put all together.
-
-        Raises:
-            CodegenError: it or a part cannot be compiled or kept.
-        """
-        source.write_text(self.rest)
-        parts = [part.result() for part in self.parts]
-        self.compiler.compile(source, library, level, flags, parts)
-
-
-def compile_parts(
-    rest: str,
-    parts: Sequence[Part],
-    compiler: Compiler,
-    cache: Cache,
-    submit: Submit,
-) -> Objects:
-    """Begin to compile the parts of a text.
-
-    Args:
-        rest, parts: as `in_parts` gives them.
-        submit: see `codegen.compilation.compile_source`.
-    """
-    longest_first = sorted(parts, key=lambda part: -len(part.text))
-    futures = [submit(partial(_object, part, compiler, cache)) for part in longest_first]
-    return Objects(rest, tuple(futures), compiler)
-
-
-def _object(part: Part, compiler: Compiler, cache: Cache) -> Path:
-    """A part's object file, from the cache where it was compiled before."""
-    key = digest(
-        "part", str(FORMAT), compiler.identity, str(part.level), *FLAGS, *LANE_FLAGS, part.text
-    )
-
-    def make(result: Path) -> dict[str, Any]:
-        source = result.with_name(f"{part.name}.c")
-        source.write_text(part.text)
-        compiler.compile(source, result, part.level, LANE_FLAGS, None)
-        return {}
-
-    found = cache.find(key)
-    if found is None:
-        with cache.lock(key):
-            found = cache.find(key) or cache.store(key, make, ".o")
-    return found.library
+@cache
+def runtime(name: str) -> str:
+    """C that stands around generated functions: the text of a file of `codegen/c`, those that it
+    includes filled in."""
+    text = files("codegen").joinpath("c", name).read_text()
+    return _INCLUDE.sub(lambda found: runtime(found[1]), text)
 
 
 def _preamble(*runtimes: str) -> str:
     return "".join(["#include <math.h>\n", *map(runtime, ("arithmetic.h", *runtimes))])
+
+
+def is_long(body: str) -> bool:
+    """Whether a function's lines are so many that it is cut."""
+    return body.count("\n") >= LONG
+
+
+def in_pieces(text: str) -> str:
+    """C text of CasADi functions, also of `codegen.lanes`, the long straight ones in pieces."""
+    return _STRAIGHT.sub(_cut, text)
+
+
+def _cut(found: re.Match[str]) -> str:
+    if not is_long(found["body"]):
+        return found[0]
+    statements = found["body"].splitlines()
+    name, real = found["name"], found["real"]
+    pieces = [statements[at : at + PIECE] for at in range(0, len(statements), PIECE)]
+    used = [_used(piece) for piece in pieces]
+    slots = {variable: k for k, variable in enumerate(_VARIABLE.findall(found["declared"]))}
+    alive: set[str] = set()
+    texts = []
+    for k in reversed(range(len(pieces))):
+        read, written = used[k]
+        kept = sorted(written & alive)
+        alive = (alive - written) | read
+        lines = [
+            f"static __attribute__((noinline)) void {name}_{k}"
+            f"(const {real}** arg, {real}** res, {real}* kept) {{",
+            f"  {real} {', '.join(sorted(read | written))};" if read | written else "",
+            *[f"  {v}=kept[{slots[v]}];" for v in sorted(read)],
+            *pieces[k],
+            *[f"  kept[{slots[v]}]={v};" for v in kept],
+            "}\n",
+        ]
+        texts.append("\n".join(lines))
+    calls = "".join(f"  {name}_{k}(arg, res, kept);\n" for k in range(len(pieces)))
+    head = found[0][: found.start("declared") - found.start()]
+    whole = f"{head}  {real} kept[{len(slots)}];\n{calls}  return 0;\n}}\n"
+    return "".join([*reversed(texts), whole])
+
+
+def _used(piece: list[str]) -> tuple[set[str], set[str]]:
+    """Variables that a piece reads before it sets them, and those that it sets."""
+    read, written = set[str](), set[str]()
+    for line in piece:
+        variables = _VARIABLE.findall(line)
+        target = variables.pop(0) if line.startswith("  a") else None
+        read.update(variable for variable in variables if variable not in written)
+        if target is not None:
+            written.add(target)
+    return read, written

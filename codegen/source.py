@@ -1,17 +1,16 @@
-"""From a CasADi function to self-contained C text with a batch driver."""
+"""From CasADi functions to self-contained C text: with a batch driver, or behind C of our own."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import accumulate
+from collections.abc import Mapping, Sequence
 from math import prod
 
 import casadi as ca
 
 from codegen.errors import CodegenError
+from codegen.function import Signature
 from codegen.lanes import lane_text
-from codegen.runtime import runtime
-from codegen.signature import Signature
+from codegen.parts import runtime
 
 
 def dense(function: ca.Function) -> ca.Function:
@@ -47,7 +46,8 @@ def c_source(function: ca.Function, lanes: int = 1, generated: str = "") -> str:
             many as given, or for 0 as many as suit the machine that compiles.
 
     Raises:
-        CodegenError: CasADi cannot write this function as C (a callback, an external solver).
+        CodegenError: CasADi cannot write this function as C (a callback, an external solver), or
+            it has no form in lanes.
     """
     include = "#include <math.h>\n"
     generated, signature = generated or generated_c([function]), Signature.of(function)
@@ -82,6 +82,38 @@ def handwritten_source(signature: Signature, text: str, helpers: Sequence[ca.Fun
     return generated + text + _filled(runtime("driver.c"), signature)
 
 
+def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 0) -> str:
+    """C text of functions in lanes, with C of our own that calls them.
+
+    It finds, for a function `f` of the program, `f(arg, res, iw, w)` over `lanes_real`, the room
+    that it needs as f_ARG, f_RES, f_IW and f_W, and the size of its k-th result as f_OUT_k.
+
+    Raises:
+        CodegenError: CasADi cannot write a function as C, or it has no form in lanes.
+    """
+    parts = ["#include <math.h>\n#include <stdlib.h>\n#include <string.h>\n"]
+    parts += [runtime("arithmetic.h"), runtime("one_lane.h")]
+    parts += [f"#define DUAL_ARM_LANES {lanes}\n" if lanes else "", runtime("lanes.h")]
+    parts.append(
+        '#define DUAL_ARM_EXPORT __attribute__((visibility("default")))\n'
+        "DUAL_ARM_EXPORT long long dual_arm_lanes(void) { return DUAL_ARM_LANES; }\n"
+        "#if DUAL_ARM_LANES > 1\n"
+    )
+    for name, function in functions.items():
+        whole = dense(function)
+        found = lane_text(generated_c([whole]), name)
+        sizes = {"ARG": whole.sz_arg(), "RES": whole.sz_res(), "IW": whole.sz_iw()}
+        sizes |= {"W": whole.sz_w()}
+        sizes |= {f"OUT_{i}": whole.numel_out(i) for i in range(whole.n_out())}
+        parts += [f"#define {name}_{what} {size}\n" for what, size in sizes.items()]
+        parts.append(found.text)
+        parts.append(
+            f"static int {name}(const lanes_real** arg, lanes_real** res, lanes_int* iw, "
+            f"lanes_real* w) {{\n  return {found.entry}(arg, res, iw, w, 0);\n}}\n"
+        )
+    return "".join([*parts, own, "#endif\n"])
+
+
 def generated_c(functions: Sequence[ca.Function]) -> str:
     """What CasADi generates for dense functions, at least one.
 
@@ -107,7 +139,6 @@ def _filled(driver: str, signature: Signature) -> str:
         driver.replace("@NAME@", signature.name)
         .replace("@N_IN@", str(len(inputs)))
         .replace("@N_OUT@", str(len(outputs)))
-        .replace("@OFFSETS@", ", ".join(map(str, accumulate(outputs, initial=0))))
         .replace("@SIZES@", ", ".join(map(str, [*inputs, *outputs, 0])))
     )
 

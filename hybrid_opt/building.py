@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from importlib.metadata import version
 
-from codegen.cache import Cache, source_digest
+from codegen.cache import Cache
 from codegen.compiler import find_compiler, interruptible
 from codegen.errors import CodegenError
 from hybrid_opt.campaign.progress import Progress
@@ -31,8 +31,8 @@ def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: b
     """Load or build the functions of a study, all compilers side by side.
 
     What a polish compiles when its solves first ask for it, rows of arms' clearances, is not among
-    them. Where all was built before, or there is no compiler, nothing is done; what cannot be built
-    is left to who asks for it.
+    them. Where all was built before nothing is done; what cannot be built is left to who asks for
+    it.
 
     Args:
         cell: read from a file.
@@ -40,13 +40,11 @@ def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: b
         polish: whether fronts are polished.
         drivable: whether carries are also searched for as robots drive them.
     """
-    compiler, cache = find_compiler(), cell.compiled.cache or Cache()
-    if compiler is None or not cell.compiled.is_identified:
-        return
-    what = (str(cell.force_kind), str(polish), str(drivable), compiler.identity)
-    sources = source_digest("codegen", "hybrid_opt")
+    cache = cell.compiled.cache or Cache()
+    what = (str(cell.force_kind), str(polish), str(drivable), find_compiler().identity)
+    sources = cache.code_digest("codegen", "hybrid_opt")
     key = cell.compiled.key("study", *what, version("casadi"), sources)
-    if cache.read_record(key) is not None:
+    if key is None or cache.read_record(key) is not None:
         return
     # What drives has the longest functions.
     cells = [cell.drivable(), cell] if drivable and not _driven(cell) else [cell]

@@ -25,7 +25,7 @@ from hybrid_opt.evaluate.objectives import (
     force_kind,
     select_objectives,
 )
-from hybrid_opt.evaluate.static_hold import StaticHold, require_hold, static_hold, unheld
+from hybrid_opt.static_hold import StaticHold, require_hold, static_hold, unheld
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.read.cell import load

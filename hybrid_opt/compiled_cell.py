@@ -7,8 +7,9 @@ from functools import cached_property
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
-from codegen.build import build, load_or_build
-from codegen.cache import Cache, digest, source_digest
+from codegen.build import load_or_build
+from codegen.cache import Cache, key_of
+from codegen.compiler import find_compiler
 from codegen.function import NumericFunction
 from symbolic.records import Workcell
 
@@ -37,7 +38,11 @@ class CompiledCell:
         Args:
             model: the cell's symbolic model where it does not follow from the workcell alone, such
                 as with other start postures than the stated criterion's.
+
+        Raises:
+            CodegenError: there is no C compiler.
         """
+        find_compiler()
         self.workcell = workcell
         self.cache = cache
         self._given = model
@@ -73,16 +78,27 @@ class CompiledCell:
 
         return build_cell_bodies(self.workcell)
 
+    @cached_property
+    def _expressions(self) -> str:
+        return (self.cache or Cache()).code_digest("symbolic")
+
     @property
     def is_identified(self) -> bool:
         """Whether the workcell's files say what is compiled; otherwise only its own text does."""
         return bool(self.workcell.digest) and self._given is None
 
-    def key(self, name: str, *details: str) -> str:
-        """What a set of functions is made from: the workcell, the symbolic package's sources, the
-        libraries that write the expressions (CasADi's version is part of every set's key)."""
-        libraries = [f"{library} {version(library)}" for library in ("pin", "scipy")]
-        return digest(name, self.workcell.digest, source_digest("symbolic"), *libraries, *details)
+    def key(self, name: str, *details: str) -> str | None:
+        """A recipe's key: what a set of functions is made from (CasADi is part of every set's).
+        None where the cell is not identified."""
+        if not self.is_identified:
+            return None
+        return key_of(
+            name,
+            workcell=self.workcell.digest,
+            expressions=self._expressions,
+            libraries=[f"{library} {version(library)}" for library in ("pin", "scipy")],
+            details=details,
+        )
 
     def functions(
         self,
@@ -118,8 +134,6 @@ class CompiledCell:
         Raises:
             DualArmError: the code cannot be built.
         """
-        if not self.is_identified:
-            return build(make(), self.cache, lanes=lanes, levels=levels).functions
         return load_or_build(self.key(name, *details), make, self.cache, lanes=lanes, levels=levels)
 
     @cached_property

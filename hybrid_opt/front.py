@@ -13,12 +13,13 @@ from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.selection import balanced, peak_normal_forces
 from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.shown import Shown
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Front:
+class Front(Shown):
     """Non-dominated feasible carries of a cell, by increasing first objective; read-only arrays.
 
     Every member is proven free of collisions between the samples too.
@@ -118,13 +119,3 @@ class Front:
                 "the front is empty: no feasible candidate was found; give the search more "
                 "evaluations or the task wider bounds"
             )
-
-    def __repr__(self) -> str:
-        from hybrid_opt.display.front import front_text
-
-        return front_text(self)
-
-    def _repr_html_(self) -> str:
-        from hybrid_opt.display.front import front_html
-
-        return front_html(self)

@@ -28,8 +28,6 @@ from typing import Any
 import numpy as np
 
 from codegen.build import compile_function
-from codegen.compiled import CompiledFunction
-from codegen.errors import CodegenError
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt.compiled_cell import CompiledCell
@@ -202,7 +200,8 @@ def _costs(
     x: dict[str, Array] = {}
     for n, task in tasks.items():
         progress(f"building the evaluator with {n} {what}")
-        ways[str(n)] = _compiled(replace(model, workcell=replace(model.workcell, task=task)))
+        sized = replace(model, workcell=replace(model.workcell, task=task))
+        ways[str(n)] = compile_function(candidate_function(sized))
         x[str(n)] = _candidates(task, candidates, seed)
     return {int(name): value for name, value in interleaved(ways, x, repeats).items()}
 
@@ -246,13 +245,6 @@ def with_free_waypoints(task: Task, count: int) -> Task:
 def _candidates(task: Task, count: int, seed: int) -> Array:
     rng = np.random.default_rng(seed)
     return rng.uniform(task.lower, task.upper, (count, task.n_var))
-
-
-def _compiled(model: CellModel) -> CompiledFunction:
-    function = compile_function(candidate_function(model))
-    if not isinstance(function, CompiledFunction):
-        raise CodegenError("there is no C compiler to compare with; install one, e.g. gcc")
-    return function
 
 
 def _processor() -> str:

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.evaluation import LockedEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations
-from hybrid_opt.evaluate.locked import LockedEvaluator
 from hybrid_opt.indicators.metrics import front_rows, hypervolume
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from studies.program import Parser, add_verbose, carried_out, load_workcell, run_program

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from codegen.build import Build, FunctionReport, build_set
+from codegen.build import Build, FunctionReport, build
 from codegen.cache import Cache
-from codegen.check import Agreement, compare
+from codegen.interpreted import Agreement, compare
 from studies.program import Parser, add_verbose, program_of, run_program
 from studies.text_table import text_table
 
@@ -82,9 +82,8 @@ def _run(options: argparse.Namespace) -> int:
         workcell = load(options.workcell)
         cell = CompiledCell(workcell, cache)
         made = cell_functions(cell.model)
-        built = build_set(
-            cell.key(EVALUATORS), made, cache, rebuild=options.check, lanes=EVALUATOR_LANES
-        )
+        key = cell.key(EVALUATORS)
+        built = build(made, cache, key=key, rebuild=options.check, lanes=EVALUATOR_LANES)
         if options.check:
             bounds = {"x": (workcell.task.lower, workcell.task.upper)}
             rng = np.random.default_rng(options.seed)
@@ -148,8 +147,6 @@ _HEADINGS = ("function", "operations", "C size", "compile time", "from cache")
 
 
 def _row(report: FunctionReport) -> tuple[str, ...]:
-    if not report.compiled:
-        return (report.name, f"{report.operations:,}", "-", "interpreted", "-")
     return (
         report.name,
         f"{report.operations:,}",

@@ -24,11 +24,11 @@ from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.campaign.simulated import read_simulations
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.static_hold import require_hold
 from hybrid_opt.polishing.drivable.point import is_polishable
 from hybrid_opt.polishing.front import knows_forces
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
+from hybrid_opt.static_hold import require_hold
 from studies.drivable import is_drivable, known_paths
 from studies.jerk_costs import jerk_costs, jerk_text
 from studies.recommendation_stage import recommendation_stage

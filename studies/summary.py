@@ -28,11 +28,11 @@ from hybrid_opt.campaign.summary import (
     StoredFront,
     StoredTest,
 )
-from hybrid_opt.evaluate.static_hold import StaticHold
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.bounds import binding_bounds
 from hybrid_opt.indicators.selection import Selected
 from hybrid_opt.indicators.statistics import corrected, rank_test, summarise
+from hybrid_opt.static_hold import StaticHold
 from symbolic.array import Array
 from symbolic.records import Workcell
 

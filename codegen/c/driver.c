@@ -24,26 +24,6 @@ DUAL_ARM_EXPORT void dual_arm_sizes(long long* sizes) {
   sizes[0] = arg; sizes[1] = res; sizes[2] = iw; sizes[3] = w;
 }
 
-/* Evaluate once: arguments by address, results one after the other in a block. Returns as
-   dual_arm_run. */
-DUAL_ARM_EXPORT long long dual_arm_once(const casadi_real* const* inputs, casadi_real* block,
-                                        const dual_arm_work* work) {
-  static const long long offsets[] = {@OFFSETS@};
-  long long failed = -1;
-  int mem, i;
-  dual_arm_acquire();
-  mem = @NAME@_checkout();
-  __sync_lock_release(&dual_arm_lock);
-  if (mem < 0) return -2;
-  for (i = 0; i < @N_IN@; ++i) work->arg[i] = inputs[i];
-  for (i = 0; i < @N_OUT@; ++i) work->res[i] = block + offsets[i];
-  if (@NAME@(work->arg, work->res, work->iw, work->w, mem)) failed = 0;
-  dual_arm_acquire();
-  @NAME@_release(mem);
-  __sync_lock_release(&dual_arm_lock);
-  return failed;
-}
-
 /* Evaluate candidates begin to end. Returns -1, or the first candidate that failed, or -2 where
    too many evaluations run at once. */
 DUAL_ARM_EXPORT long long dual_arm_run(const dual_arm_port* ports, const dual_arm_work* work,

@@ -8,17 +8,95 @@ than FCL's own resolution, so near the tolerance FCL alone decides, screened or 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
-from hybrid_opt.collision.pair_values import MotionBounds, Separations, by_sample
-from hybrid_opt.collision.verdict import Touch, Verdict, sample_durations
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.records import PAYLOAD
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Two bodies in collision.
+
+    Attributes:
+        sample: index of the sample; for a collision between samples, of the one before.
+        time: [s] since the start of the candidate.
+        first, second: names of the bodies.
+    """
+
+    sample: int
+    time: float
+    first: str
+    second: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The collisions of one candidate.
+
+    Attributes:
+        colliding: (n,) samples in collision.
+        collision_time: time that the colliding samples stand for [s]; each stands for half of
+            its two neighbouring steps.
+        first_touch: the earliest collision, or None.
+        min_clearance: lower bound of the least distance over all pairs and samples [m]; at most
+            the collision tolerance where something collides or the bounds cannot tell.
+        open_samples: samples that the bounds left to FCL.
+        fcl_calls: FCL queries made.
+    """
+
+    colliding: NDArray[np.bool_]
+    collision_time: float
+    first_touch: Touch | None
+    min_clearance: float
+    open_samples: int
+    fcl_calls: int
+
+    @property
+    def is_free(self) -> bool:
+        """Whether no sample collides."""
+        return self.first_touch is None
+
+
+def sample_durations(time: Array) -> Array:
+    """Time (..., n) [s] that each sample stands for: half of both neighbouring steps."""
+    halves = np.diff(time) / 2.0
+    durations = np.zeros(time.shape)
+    durations[..., :-1] += halves
+    durations[..., 1:] += halves
+    return durations
+
+
+Separations = dict[tuple[bytes, int], float | None]
+"""By configuration and pair the distance that it surely keeps [m], None where it collides."""
+
+
+@dataclass(frozen=True)
+class MotionBounds:
+    """Chord and bend (n, n_pairs) [m] of every pair between configurations, see
+    `symbolic.geometry.motion_bounds`."""
+
+    chord: Array
+    bend: Array
+
+
+def by_sample(bounds: Array, unsure: NDArray[np.bool_]) -> dict[int, list[int]]:
+    """The pairs of each sample that has open ones: least bound first, ties in order."""
+    # Flat indices: much faster to find than those of two axes.
+    open_pairs = np.flatnonzero(unsure)
+    samples, pairs = np.divmod(open_pairs, unsure.shape[1])
+    order = np.lexsort((bounds.ravel()[open_pairs], samples))
+    found: dict[int, list[int]] = {}
+    for sample, pair in zip(samples[order].tolist(), pairs[order].tolist(), strict=True):
+        found.setdefault(sample, []).append(pair)
+    return found
+
 
 RESTING_TOLERANCE = 1e-3
 """How deep the payload may sink into a body that it is allowed to rest on [m]."""

@@ -11,7 +11,7 @@ from string import Template
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.display.carry import heading
+from hybrid_opt.display.objects import heading_of
 from hybrid_opt.display.scene import embedded_json, packed, scene_data, scene_js, three_js
 from hybrid_opt.errors import DisplayError
 from symbolic.geometry.pairs import build_geometry
@@ -67,7 +67,7 @@ class CarryView:
             "begin": float(carry.time[look.sample] - carry.time[0]),
         }
         return Template(_own("view.html")).substitute(
-            title=html.escape(heading(carry)),
+            title=html.escape(heading_of(carry)),
             note=html.escape(look.text),
             data=embedded_json(document),
             three=three_js().replace("</script", "<\\/script"),
@@ -87,7 +87,9 @@ class CarryView:
             raise DisplayError(f"{path}: cannot be written ({error.strerror})") from error
 
     def __repr__(self) -> str:
-        return f"View of: {heading(self.carry)} (shown in a notebook; save('view.html') elsewhere)"
+        return (
+            f"View of: {heading_of(self.carry)} (shown in a notebook; save('view.html') elsewhere)"
+        )
 
     def _repr_html_(self) -> str:
         page = html.escape(self.page(), quote=True)

@@ -1,6 +1,6 @@
 """What a candidate is worth.
 
-evaluation: the verdict that searches call. objectives: what may be minimised. certification: the
-proof between samples. time_law: a candidate as a `Carry`. static_hold: the forces at rest, and what
-a force says of the payload. functions: the compiled functions behind.
+evaluation: the verdict that searches call. kernel: what the samples of candidates say, in lanes.
+evaluations: verdicts, and what can make a candidate infeasible. objectives: what may be minimised.
+explanation: why a candidate is infeasible.
 """

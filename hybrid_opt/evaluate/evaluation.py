@@ -17,12 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
-from hybrid_opt.carry import Carry
-from hybrid_opt.collision.certify import Certificate
+from hybrid_opt.carry import DRIVE_CONSTRAINTS, Carry, carry_under_time_law
+from hybrid_opt.collision.certify import (
+    Certificate,
+    LostPathError,
+    SampledPath,
+    certificates,
+    failed_at,
+)
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.certification import LostPathError, SampledPath, certificates, failed_at
-from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
 from hybrid_opt.evaluate.evaluations import (
     BETWEEN_SAMPLES,
     COLLISION,
@@ -31,11 +35,19 @@ from hybrid_opt.evaluate.evaluations import (
     REASONS,
     Evaluations,
 )
-from hybrid_opt.evaluate.kernel import Kernel, load_kernel
-from hybrid_opt.evaluate.known_proofs import KnownProofs
-from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, Objective, select_objectives
-from hybrid_opt.evaluate.sampled import SampledVerdicts, collision_shares, one_by_one
-from hybrid_opt.evaluate.time_law import carry_under_time_law
+from hybrid_opt.evaluate.kernel import (
+    Kernel,
+    SampledVerdicts,
+    collision_shares,
+    load_kernel,
+    one_by_one,
+)
+from hybrid_opt.evaluate.objectives import (
+    PAPER_OBJECTIVES,
+    Objective,
+    force_kind,
+    select_objectives,
+)
 from hybrid_opt.indicators.metrics import non_dominated
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -45,7 +57,10 @@ from symbolic.records import Workcell
 from symbolic.records.task import extended_waypoints
 
 if TYPE_CHECKING:
-    from hybrid_opt.evaluate.drive import Driver
+    from hybrid_opt.timing.drive import Driver
+
+
+from collections.abc import Callable
 
 
 class CandidateEvaluator:
@@ -105,9 +120,9 @@ class CandidateEvaluator:
         if self.workcell.task.time_law != "optimal":
             return None
         # Not imported at the top: other time laws need no timing, and hence no CasADi.
-        from hybrid_opt.evaluate.drive import driver_of
+        from hybrid_opt.timing.drive import driver_of
 
-        return driver_of(self.compiled, threads, self.objectives)
+        return driver_of(self.compiled, threads, force_kind(self.objectives).robust)
 
     def beginning_at(self, q_1: Array, q_2: Array) -> CandidateEvaluator:
         """The same evaluator with other start postures: joints (n,) of each arm that hold the box
@@ -129,7 +144,7 @@ class CandidateEvaluator:
     def outputs(self, x: Array) -> dict[str, Array]:
         """Every per-sample output for decision vectors (n, n_var), see
         `symbolic.functions`; under the time law 'optimal' also what
-        `hybrid_opt.evaluate.drive.Driver.outputs` adds."""
+        `hybrid_opt.timing.drive.Driver.outputs` adds."""
         x = self._checked(x)
         if self.driver is not None:
             return self.driver.outputs(self._candidate, x)
@@ -323,3 +338,73 @@ def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
             return None
         wanted |= set(objective.needs) - {"time"}
     return tuple(sorted(wanted)) if wanted <= SAMPLE_NAMES else None
+
+
+MOST_KNOWN = 4096
+"""Paths that are remembered; then it begins anew."""
+
+
+class KnownProofs:
+    """Remembers where paths fail. A resource: one per evaluator and start postures."""
+
+    def __init__(self) -> None:
+        self._known: dict[bytes, float | None] = {}
+
+    def failures(
+        self, paths: Array, find: Callable[[NDArray[np.intp]], list[float | None]]
+    ) -> list[float | None]:
+        """Path parameter where each of some paths (n, n_path) fails, None where none does.
+
+        Args:
+            find: answers for some of their rows, no path twice.
+        """
+        keys = [path.tobytes() for path in np.ascontiguousarray(paths)]
+        new = {key: row for row, key in enumerate(keys) if key not in self._known}
+        if new:
+            found = find(np.array(list(new.values())))
+            if len(self._known) + len(new) > MOST_KNOWN:
+                self._known = {key: self._known[key] for key in keys if key in self._known}
+            self._known.update(zip(new, found, strict=True))
+        return [self._known[key] for key in keys]
+
+
+class LockedEvaluator:
+    """Evaluates box paths alone, every redundant joint at one position throughout.
+
+    A redundant joint with a constant path gives what the arm with that joint locked gives, so that
+    one compiled cell serves all positions. Decision vectors are the free waypoints of the box.
+    """
+
+    def __init__(self, evaluator: CandidateEvaluator, positions: Array) -> None:
+        """Lock the joints.
+
+        Args:
+            evaluator: of a cell in which redundant joints are free at all waypoints.
+            positions: (m,) where they stand [rad or m].
+
+        Raises:
+            SettingsError: a redundant joint is fixed somewhere, or positions are not one per joint.
+        """
+        task = evaluator.workcell.task
+        n = len(task.waypoints)
+        if evaluator.n_var != task.n_box + n * len(task.redundant):
+            raise SettingsError("joints are locked in cells where they are free at every waypoint")
+        if np.shape(positions) != (len(task.redundant),):
+            raise SettingsError(f"{np.size(positions)} positions; needed are {len(task.redundant)}")
+        self._evaluator = evaluator
+        self._locked = np.repeat(np.asarray(positions, dtype=float), n)
+        self.objective_names = evaluator.objective_names
+        self.n_var = task.n_box
+        self.lower, self.upper = evaluator.lower[: self.n_var], evaluator.upper[: self.n_var]
+
+    def evaluate(self, x: Array) -> Evaluations:
+        """Verdicts on box paths (n, n_var)."""
+        return replace(self._evaluator.evaluate(self._whole(x)), x=x)
+
+    def certified(self, evaluations: Evaluations) -> Evaluations:
+        """See `CandidateEvaluator.certified`."""
+        whole = replace(evaluations, x=self._whole(evaluations.x))
+        return replace(self._evaluator.certified(whole), x=evaluations.x)
+
+    def _whole(self, x: Array) -> Array:
+        return np.hstack([x, np.tile(self._locked, (len(x), 1))])

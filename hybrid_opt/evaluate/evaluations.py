@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.carry import Judgement
-from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
+from hybrid_opt.carry import DRIVE_CONSTRAINTS, Judgement
 from symbolic.array import Array
 from symbolic.functions import CONSTRAINTS
-
-if TYPE_CHECKING:
-    pass
-
 
 COLLISION = "collision"
 
@@ -32,7 +26,7 @@ REASONS = (*CONSTRAINTS, COLLISION, BETWEEN_SAMPLES, NOT_FINITE, *DRIVE_CONSTRAI
 
 between_samples: not proven free of collisions between the samples; only fronts are certified.
 not_finite: an objective is NaN or infinite (a solver or model failure, never a front member).
-The rest only under the time law 'optimal', see `hybrid_opt.evaluate.drive_constraints`.
+The rest only under the time law 'optimal', see `hybrid_opt.carry.DRIVE_CONSTRAINTS`.
 """
 
 

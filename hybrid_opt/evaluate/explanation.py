@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import COLLISION, REASONS, Evaluations
-from hybrid_opt.evaluate.sampled import reached_samples
+from hybrid_opt.evaluate.kernel import reached_samples
 from symbolic.array import Array
 from symbolic.read.arms import arm_model, link_frame, turning_joints
 from symbolic.records import Contact, Robot

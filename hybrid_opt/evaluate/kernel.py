@@ -1,34 +1,31 @@
-"""Whole evaluations in lanes: from decision vectors to what is left for FCL.
+"""What the samples of candidates say: constraints and collisions, before objectives are known.
 
-`kernel.c` calls the cell's functions sample by sample, several candidates side by side, sums up the
-violations, bounds every pair's distance, and proves of most pairs that the bounds leave open that
-they are apart or intersect. Quantities per sample leave it only where they are asked for.
+Whole evaluations run in lanes: `kernel.c` calls the cell's functions sample by sample, several
+candidates side by side, sums up the violations, bounds every pair's distance, and proves of most
+pairs that the bounds leave open that they are apart or intersect; the rest is left to FCL.
+Quantities per sample leave it only where they are asked for. `one_by_one` says the same in NumPy,
+from the outputs of the candidate function: the kernel's oracle, and what judges cells that were
+not read from a file and candidates of the time law 'optimal'.
 """
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from codegen.build import load_or_build_program
 from codegen.compiled import thread_pool, warn_one_lane
 from codegen.errors import CodegenError
 from codegen.function import available_cores
-from codegen.program import load_or_build_program
-from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.collision.checker import CollisionChecker, sample_durations
+from hybrid_opt.collision.judge import FCL_RESOLUTION
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.kernel_data import (
-    BatchData,
-    configuration_size,
-    judge_arrays,
-    judge_data,
-    open_pair,
-)
-from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
 from symbolic.array import Array
 from symbolic.functions import (
     CONSTRAINTS,
@@ -38,6 +35,66 @@ from symbolic.functions import (
     sample_sizes,
 )
 from symbolic.geometry.pairs import CellGeometry
+from symbolic.geometry.pieces import ConvexShape, Hull
+from symbolic.records import PAYLOAD, POSE_SIZE, Box, Capsule, Cylinder, Sphere, Workcell
+
+
+@dataclass(frozen=True)
+class SampledVerdicts:
+    """n candidates on their samples.
+
+    Attributes:
+        outputs: 'time' (n, samples) [s], 'violation' and 'violation_time' (n, constraints), and
+            what else was asked for, as `symbolic.functions.candidate_function` has them.
+        first_sample: (n,) the first sample that violates a constraint; the number of samples
+            where none does.
+        first_reason: (n,) the first constraint violated there, -1 where none is.
+        colliding: (n, samples) whether a sample collides; only samples that both arms reach can.
+    """
+
+    outputs: Mapping[str, Array]
+    first_sample: NDArray[np.int64]
+    first_reason: NDArray[np.int64]
+    colliding: NDArray[np.bool_]
+
+
+def one_by_one(outputs: Mapping[str, Array], checker: CollisionChecker) -> SampledVerdicts:
+    """The verdicts from every per-sample output of the candidate function, in NumPy.
+
+    What `hybrid_opt.evaluate.kernel` does in lanes; used where there can be no kernel.
+    """
+    violated = np.asarray(outputs["constraint"] > 0.0)
+    bad = np.asarray(np.any(violated, axis=2))
+    n, samples = bad.shape
+    first = np.where(bad.any(axis=1), np.argmax(bad, axis=1), samples)
+    at = np.minimum(first, samples - 1)
+    reason = np.where(first < samples, np.argmax(violated[np.arange(n), at], axis=1), -1)
+    colliding = np.zeros((n, samples), dtype=bool)
+    totals = np.column_stack([outputs["violation"], outputs["time"]])
+    finite = np.isfinite(totals).all(axis=1)
+    for row in np.flatnonzero(finite).tolist():
+        reached = reached_samples(outputs, row)
+        pose, q_1, q_2, time = (
+            outputs[name][row, :reached] for name in ("pose", "q_1", "q_2", "time")
+        )
+        colliding[row, :reached] = checker.check(pose, q_1, q_2, time).colliding
+    return SampledVerdicts(outputs, first, reason, colliding)
+
+
+def reached_samples(outputs: Mapping[str, Array], row: int) -> int:
+    """Number of samples of a candidate before an arm loses the path: those that can collide."""
+    lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
+    return int(np.argmax(lost)) if lost.any() else len(lost)
+
+
+def collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
+    """Share (n,) of the duration that the colliding samples (n, samples) stand for."""
+    shares = np.zeros(len(time))
+    durations = sample_durations(time)
+    for row in np.flatnonzero(colliding.any(axis=1)).tolist():
+        shares[row] = durations[row, colliding[row]].sum() / time[row, -1]
+    return shares
+
 
 _LEAST_ROOM = 4096
 """Open pairs that are collected before they are handed on, beside those of one pass."""
@@ -194,9 +251,11 @@ def load_kernel(
         lanes: candidates side by side; 0 for what suits the machine.
 
     Returns:
-        None where there can be no kernel; with one warning where it can be but fails.
+        None for a cell that was not read from a file or a machine without lanes; with one warning
+        where the kernel fails.
     """
-    if not compiled.is_identified:
+    key = compiled.key("kernel")
+    if key is None:
         return None
 
     def make() -> Mapping[str, Any]:
@@ -208,10 +267,8 @@ def load_kernel(
         files("hybrid_opt").joinpath(*path).read_text()
         for path in (("collision", "prejudge.c"), ("evaluate", "kernel.c"))
     )
-    library = load_or_build_program(
-        "kernel", compiled.key("kernel"), make, own, compiled.cache, lanes
-    )
-    if library is None:
+    library = load_or_build_program("kernel", key, make, own, compiled.cache, lanes)
+    if library.dual_arm_lanes() < 2:
         return None
     kernel = Kernel(library, checker)
     task = compiled.workcell.task
@@ -279,3 +336,111 @@ def _definitions(geometry: CellGeometry) -> str:
         entries = ", ".join(map(str, values))
         lines.append(f"static const int {name}[{len(values)}] = {{{entries}}};")
     return "\n".join(lines) + "\n"
+
+
+PROOF_MARGIN = 5 * FCL_RESOLUTION
+"""How clearly two shapes must be apart or intersect to be decided without FCL [m]."""
+
+_SHAPE = np.dtype(
+    [("kind", np.int64), ("first", np.int64), ("count", np.int64), ("size", np.float64, 3)]
+)
+_RESTING = np.dtype([("pair", np.int64), ("place", np.float64, 3), ("departure", np.float64)])
+
+
+def configuration_size(workcell: Workcell) -> int:
+    """Entries of a configuration: box pose, joints of the first and of the second arm."""
+    return POSE_SIZE + sum(len(robot.position_lower) for robot in workcell.robots)
+
+
+def open_pair(workcell: Workcell) -> np.dtype[np.void]:
+    """`open_pair` of kernel.c: a pair of a sample that is left to FCL."""
+    return np.dtype(
+        [
+            ("candidate", np.int64),
+            ("sample", np.int64),
+            ("pair", np.int64),
+            ("configuration", np.float64, configuration_size(workcell)),
+        ]
+    )
+
+
+class JudgeData(ctypes.Structure):
+    """`judge_data` of kernel.c."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("pairs", "first_piece", "shapes", "vertices")),
+        *((name, ctypes.c_void_p) for name in ("resting", "free_beyond", "tolerance")),
+        *((name, ctypes.c_longlong) for name in ("n_resting", "payload_piece", "resting_piece")),
+        *((name, ctypes.c_double) for name in ("apart", "overlap")),
+    ]
+
+
+class BatchData(ctypes.Structure):
+    """`batch_data` of kernel.c."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("x", "begin")),
+        *((name, ctypes.c_longlong) for name in ("n", "with_collisions", "all_forces", "room")),
+        *((name, ctypes.c_void_p) for name in ("time", "violation", "violation_time")),
+        *((name, ctypes.c_void_p) for name in ("first_sample", "first_reason", "reached")),
+        *((name, ctypes.c_void_p) for name in ("colliding", "wanted", "open")),
+        ("n_open", ctypes.c_longlong),
+    ]
+
+
+def judge_arrays(checker: CollisionChecker) -> dict[str, NDArray[Any]]:
+    """The memory that `judge_data` points into, to be kept as long as it."""
+    geometry = checker.geometry
+    bodies = [body.pieces for body in geometry.bodies]
+    shapes = [piece.shape for pieces in bodies for piece in pieces]
+    table, vertices = shape_table([*shapes, *checker.judge.resting_shapes])
+    return {
+        "pairs": np.array([(p.first, p.second) for p in geometry.active], dtype=np.int64),
+        "first_piece": np.cumsum([0] + [len(pieces) for pieces in bodies], dtype=np.int64),
+        "shapes": table,
+        "vertices": vertices,
+        "resting": np.array(checker.resting_places, dtype=_RESTING),
+        "free_beyond": np.ascontiguousarray(checker.free_beyond),
+        "tolerance": np.ascontiguousarray(geometry.tolerance),
+    }
+
+
+def shape_table(shapes: Sequence[ConvexShape]) -> tuple[NDArray[np.void], Array]:
+    """`shape` of prejudge.c for each, and the vertices (n, 3) [m] of those that are hulls."""
+    table = np.zeros(len(shapes), _SHAPE)
+    vertices = [np.zeros((0, 3))]
+    for row, shape in zip(table, shapes, strict=True):
+        row["kind"], row["size"] = _measures(shape)
+        if isinstance(shape, Hull):
+            row["first"], row["count"] = sum(map(len, vertices)), len(shape.vertices)
+            vertices.append(shape.vertices)
+    return table, np.concatenate(vertices)
+
+
+def judge_data(checker: CollisionChecker, arrays: Mapping[str, NDArray[Any]]) -> JudgeData:
+    """Pairs, shapes and margins of a cell."""
+    first_piece = arrays["first_piece"]
+    return JudgeData(
+        n_resting=len(arrays["resting"]),
+        payload_piece=int(first_piece[checker.geometry.index(PAYLOAD)]),
+        resting_piece=int(first_piece[-1]),
+        apart=PROOF_MARGIN,
+        overlap=PROOF_MARGIN,
+        **{name: array.ctypes.data for name, array in arrays.items()},
+    )
+
+
+def _measures(shape: ConvexShape) -> tuple[int, tuple[float, float, float]]:
+    """Kind and size of a shape as prejudge.c counts them."""
+    match shape:
+        case Box():
+            x, y, z = (float(length) / 2.0 for length in shape.size)
+            return 0, (x, y, z)
+        case Cylinder():
+            return 1, (shape.radius, shape.length / 2.0, 0.0)
+        case Sphere():
+            return 2, (shape.radius, 0.0, 0.0)
+        case Capsule():
+            return 3, (shape.radius, shape.length / 2.0, 0.0)
+        case Hull():
+            return 4, (0.0, 0.0, 0.0)

@@ -14,11 +14,10 @@ import numpy as np
 
 from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry, joints_of
-from hybrid_opt.collision.certify import Certificate, certify
+from hybrid_opt.collision.certify import Certificate, SampledPath, certificates, certify
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import JobError
-from hybrid_opt.evaluate.certification import SampledPath, certificates
 from hybrid_opt.job.carry_motion import carry_motion
 from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.job.forces import held, pressing, without_force
@@ -35,8 +34,8 @@ from hybrid_opt.job.straight import (
     standing_still,
     timed,
 )
-from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.squeeze import SqueezeSettings, chosen_squeeze
+from hybrid_opt.static_hold import kept_per_workcell
 from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing

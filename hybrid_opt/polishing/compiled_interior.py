@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from codegen.build import c_text, load_or_build_library
 from codegen.cache import Cache
-from codegen.library import c_text, load_or_build_library
 from hybrid_opt.polishing import interior, interior_steps
-from hybrid_opt.polishing.interior import DenseSolver, Error, State, dense
+from hybrid_opt.polishing.interior import DenseSolver, Error, State
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.solvers import Answer, Program
 
@@ -51,13 +51,13 @@ class _Step(ctypes.Structure):
 
 
 def dense_method(cache: Cache | None = None) -> Method:
-    """The compiled method; without a C compiler, with a warning, the interpreted one.
+    """The compiled method.
 
     Args:
         cache: where the library is kept; by default the user's.
 
     Raises:
-        CodegenError: it cannot be compiled, cached or loaded.
+        CodegenError: there is no C compiler; or it cannot be compiled, cached or loaded.
     """
     return _method((cache or Cache()).folder)
 
@@ -66,8 +66,6 @@ def dense_method(cache: Cache | None = None) -> Method:
 def _method(folder: Path) -> Method:
     text = c_text("hybrid_opt.polishing", ["interior.c"], _CONSTANTS)
     library = load_or_build_library("dense_interior", text, Cache(folder))
-    if library is None:
-        return dense
     steps = _Steps(library)
     return lambda program, settings: CompiledSolver(program, settings, steps).solve()
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from codegen.build import c_text, load_or_build_library
 from codegen.cache import Cache
 from codegen.errors import CodegenError
-from codegen.library import c_text, load_or_build_library
 from hybrid_opt.polishing.decision import UnitBox
 from hybrid_opt.polishing.force_values import ForceValues
 from hybrid_opt.polishing.place_groups import ArmRows, Indices
@@ -81,13 +81,13 @@ Binder = Callable[[RowParts], "CompiledRows | None"]
 
 
 def row_binder(cache: Cache | None = None) -> Binder:
-    """What puts programs' rows together in C; without a compiler nothing does.
+    """What puts programs' rows together in C.
 
     Args:
         cache: where the library is kept; by default the user's.
 
     Raises:
-        CodegenError: it cannot be compiled, cached or loaded.
+        CodegenError: there is no C compiler; or it cannot be compiled, cached or loaded.
     """
     return _binder((cache or Cache()).folder)
 
@@ -96,8 +96,6 @@ def row_binder(cache: Cache | None = None) -> Binder:
 def _binder(folder: Path) -> Binder:
     text = c_text("hybrid_opt.polishing", ["rows.c", "row_curvatures.c", "held.c"])
     library = load_or_build_library("rows", text, Cache(folder))
-    if library is None:
-        return lambda parts: None
     values, curvature = library.dual_arm_rows_values, library.dual_arm_rows_curvature
     values.argtypes = [ctypes.c_void_p, ctypes.c_longlong]
     curvature.argtypes = library.dual_arm_rows_slopes.argtypes = [ctypes.c_void_p]

@@ -178,7 +178,7 @@ class PlaceValues:
                 continue
             for pull in arm.pulls.values():
                 pull.slopes[...] = pull.gradient[:, pull.columns]
-            # The interface's arrays are transposed matrices (`codegen.signature`).
+            # The interface's arrays are transposed matrices (`codegen.function`).
             follow = arm.first.outputs["follow"].take(arm.at[arm.rows], axis=0)
             by_pose[arm.rows] += np.einsum("rij,rj->ri", follow, arm.slopes)
         total = self._free[0] * by_pose.take(self._columns, axis=1)

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from codegen.compiler import find_compiler
 from hybrid_opt.carry import Judgement
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing.bases import base_choices
@@ -160,7 +161,9 @@ def propose(
         WorkcellError: the file is wrong.
         ProposalError: no carry was found; the text says what is in the way.
         SettingsError: OMPL is not installed.
+        CodegenError: there is no C compiler, which the verdict on a proposal needs.
     """
+    find_compiler()
     search = _Search(read_problem(path), rng, settings or ProposeSettings(), tell)
     return search.run()
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.evaluate.explanation import missing_reach
-from hybrid_opt.evaluate.static_hold import require_hold
 from hybrid_opt.proposing.document import merged
 from hybrid_opt.proposing.holding import SEARCH_DAMPING, HoldQuery, HoldSearch, find_holds
 from hybrid_opt.proposing.judge import PoseJudge, judge_of
@@ -26,6 +25,7 @@ from hybrid_opt.proposing.kinematics import (
 )
 from hybrid_opt.proposing.pairing import Pair, ranked_pairs
 from hybrid_opt.proposing.problem import Problem
+from hybrid_opt.static_hold import require_hold
 from symbolic.array import Array
 from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ForceKind
-from hybrid_opt.evaluate.static_hold import static_hold
 from hybrid_opt.recommending.driven_paths import DrivenPaths
 from hybrid_opt.robust.force import BoxMotion, robust_model
+from hybrid_opt.static_hold import static_hold
 from symbolic.array import Array
 from symbolic.records import Workcell
 

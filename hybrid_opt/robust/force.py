@@ -13,7 +13,6 @@ import numpy as np
 
 from codegen.cache import Cache
 from hybrid_opt.carry import Carry
-from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.case_forces import CaseForces
 from hybrid_opt.robust.cases import (
     friction_by_displacement,
@@ -22,6 +21,7 @@ from hybrid_opt.robust.cases import (
     worst_cases,
 )
 from hybrid_opt.robust.ruling import ruling_cases
+from hybrid_opt.static_hold import kept_per_workcell
 from symbolic.array import Array
 from symbolic.contact.worst_cases import least_reaches
 from symbolic.errors import SettingsError

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from codegen.function import NumericFunction
-from hybrid_opt.carry import ArmMotion, Carry, joints_of
+from hybrid_opt.carry import ArmMotion, Carry, carry_under_time_law, joints_of
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.time_law import carry_under_time_law
 from hybrid_opt.timing.path_motion import SAMPLED, PathMotion
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
@@ -31,7 +30,7 @@ REFINEMENT = 10
 if TYPE_CHECKING:
     import casadi as ca
 
-    from hybrid_opt.evaluate.drive import Driver
+    from hybrid_opt.timing.drive import Driver
     from hybrid_opt.timing.path_timer import PathTiming
 
 _BOX = (
@@ -223,7 +222,7 @@ class TimingModel:
         return found
 
     def search_carry(self, x: Array) -> Carry:
-        """The carry under the task's own time law, see `hybrid_opt.evaluate.time_law`."""
+        """The carry under the task's own time law, see `hybrid_opt.carry`."""
         x = self._checked(x)
         functions = self._search_functions
         if self.workcell.task.time_law != "optimal":
@@ -235,7 +234,7 @@ class TimingModel:
     @cached_property
     def _driver(self) -> Driver:
         # Not imported at the top: it is built on this module.
-        from hybrid_opt.evaluate.drive import Driver
+        from hybrid_opt.timing.drive import Driver
         from hybrid_opt.timing.path_timer import PathTimer
 
         return Driver(PathTimer(self._compiled), robust=self._robust)

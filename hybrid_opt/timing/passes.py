@@ -5,10 +5,8 @@ from __future__ import annotations
 from importlib.resources import files
 
 from codegen.build import load_or_compile
-from codegen.cache import digest, source_digest
-from codegen.compiler import find_compiler
-from codegen.function import NumericFunction
-from codegen.signature import Signature
+from codegen.cache import source_digest
+from codegen.function import NumericFunction, Signature
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.records import TimingStatus
 from symbolic.records import Workcell
@@ -40,8 +38,7 @@ OUTCOMES = (
 def passes_function(
     compiled: CompiledCell, intervals: int, cuts: int = 0
 ) -> NumericFunction | None:
-    """The timing of one path from its limits; None without a C compiler, or where the contact
-    forces are allocated jointly.
+    """The timing of one path from its limits; None where the contact forces are allocated jointly.
 
     Inputs: samples (2 intervals + 1, `LimitLayout.size`), both ends and the middle of
     every interval; options (4,): largest normal force [N],
@@ -62,14 +59,13 @@ def passes_function(
     workcell, cache = compiled.workcell, compiled.cache
     if workcell.task.allocation == "joint":
         return None  # the passes know normal forces in closed form, and no others
-    if compiled.is_identified:
-        own = source_digest("hybrid_opt")
-        key = compiled.key("path timing", str(intervals), str(cuts), own)
-        return load_or_compile(key, lambda: _source(workcell, intervals, cuts), cache)
-    if find_compiler() is None:
-        return None
-    signature, text = _source(workcell, intervals, cuts)
-    return load_or_compile(digest("path timing", text), lambda: (signature, text), cache)
+    details = (str(intervals), str(cuts), source_digest(__name__), _passes_c())
+    key = compiled.key("path timing", *details)
+    return load_or_compile(key, lambda: _source(workcell, intervals, cuts), cache)
+
+
+def _passes_c() -> str:
+    return files("hybrid_opt.timing").joinpath("c/passes.c").read_text()
 
 
 def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, str]:
@@ -89,7 +85,7 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
     text = "".join(
         [
             *[f"#define {name} {value}\n" for name, value in constants.items()],
-            files("hybrid_opt.timing").joinpath("c/passes.c").read_text(),
+            _passes_c(),
         ]
     )
     signature = Signature(

@@ -8,6 +8,7 @@ from enum import StrEnum
 import numpy as np
 
 from hybrid_opt.carry import Carry
+from hybrid_opt.shown import Shown
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
@@ -134,7 +135,7 @@ class Excess:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Timing:
+class Timing(Shown):
     """A timing of a path, or why there is none.
 
     Attributes:
@@ -165,16 +166,6 @@ class Timing:
     def ok(self) -> bool:
         """Whether the timing respects every limit."""
         return self.status is TimingStatus.OK
-
-    def __repr__(self) -> str:
-        from hybrid_opt.display.timing import timing_text
-
-        return timing_text(self)
-
-    def _repr_html_(self) -> str:
-        from hybrid_opt.display.timing import timing_html
-
-        return timing_html(self)
 
     @property
     def duration(self) -> float:

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.evaluate.static_hold import mass_at_reference, static_hold
+from hybrid_opt.static_hold import mass_at_reference, static_hold
 from hybrid_opt.timing.model import TimingModel, contact_torque
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.use import limits_pressure

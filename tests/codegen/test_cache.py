@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from codegen.cache import Cache, default_folder, digest, source_digest
+from codegen.cache import Cache, default_folder, digest, key_of, source_digest
 from codegen.errors import CodegenError
 
 KEY = digest("test")
@@ -240,3 +240,34 @@ def test_source_digest_follows_the_source(tmp_path: Path, monkeypatch: pytest.Mo
     assert source_digest("some_package") == before
     (package / "inner" / "module.py").write_text("x = 2\n")
     assert source_digest("some_package") != before
+
+
+def test_code_digest_follows_what_the_source_does(
+    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = tmp_path / "some_module.py"
+    monkeypatch.syspath_prepend(tmp_path)
+    texts = (
+        "X = 1\n",
+        '"""Said."""\n\nX = 1  # more\n"""Also said."""\n',
+        "X = 2\n",
+        "X = 'said'\n",
+        "def f():\n    return 1\n",
+        'def f():\n    """Said."""\n    return 1\n',
+    )
+    found = []
+    for text in texts:
+        module.write_text(text)
+        found.append(cache.code_digest("some_module"))
+        assert cache.code_digest("some_module") == found[-1]
+    one, same, two, three, four, same_as_four = found
+    assert one == same
+    assert four == same_as_four
+    assert len({one, two, three, four}) == 4
+
+
+def test_keys_tell_names_and_values_apart() -> None:
+    keys = [key_of("set", a="x"), key_of("set", b="x"), key_of("set", a="y"), key_of("part", a="x")]
+    keys += [key_of("set", a="x", b="y"), key_of("set", a="x", b=("y",))]
+    assert len(set(keys)) == len(keys)
+    assert key_of("set", b=2, a=1) == key_of("set", a=1, b=2)

@@ -14,11 +14,14 @@ from hypothesis import strategies as st
 
 from codegen.build import compile_function
 from codegen.cache import Cache
-from codegen.check import directional_derivative, relative_difference
 from codegen.compiled import CompiledFunction
 from codegen.errors import CodegenError
 from codegen.function import NumericFunction
-from codegen.interpreted import InterpretedFunction
+from codegen.interpreted import (
+    InterpretedFunction,
+    directional_derivative,
+    relative_difference,
+)
 from codegen.source import dense
 from symbolic.array import Array
 from tests.codegen.samples import random_function, small
@@ -168,14 +171,6 @@ def test_sparse_becomes_dense(make: Make) -> None:
     np.testing.assert_array_equal(found["copy"].T, np.tril(matrix))
 
 
-def test_evaluate_into_uses_the_given_memory(make: Make) -> None:
-    function = make(small())
-    outputs = [np.full(shape, np.nan) for shape in function.output_shapes]
-    function.evaluate_into([np.ones(3), np.ones((4, 2))], outputs)
-    np.testing.assert_array_equal(outputs[0], np.full((4, 2), 2.0))
-    assert outputs[2] == 3.0
-
-
 def test_nan_and_infinity_pass_through(make: Make) -> None:
     found = make(small())(np.array([np.nan, 1.0, 2.0]), np.full((4, 2), np.inf))
     assert np.isnan(found["b"]).all()
@@ -236,21 +231,17 @@ def test_wrong_batches_are_told(make: Make) -> None:
 
 def test_wrong_memory_is_told(make: Make) -> None:
     function = make(small())
-    inputs = [np.ones(3), np.ones((4, 2))]
-    outputs = [np.empty(shape) for shape in function.output_shapes]
-    locked = np.empty((4, 2))
+    locked = np.empty((5, 4, 2))
     locked.flags.writeable = False
     wrongs: list[Any] = [
         locked,
-        np.empty((4, 2), np.float32),
-        np.empty((4, 4))[:, ::2],
-        np.empty(8),
+        np.empty((5, 4, 2), np.float32),
+        np.empty((5, 4, 4))[:, :, ::2],
+        np.empty(40),
     ]
     for wrong in wrongs:
         with pytest.raises(CodegenError, match="needed is C-contiguous writable float64"):
-            function.evaluate_into(inputs, [wrong, *outputs[1:]])
-    with pytest.raises(CodegenError, match="2 output arrays given, 3 needed"):
-        function.evaluate_into(inputs, outputs[:2])
+            function.prepared(5, given={"a": wrong})
 
 
 def test_zero_size_arguments(make: Make) -> None:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from codegen import compiled as compiled_module
-from codegen.build import build_set, compile_function, load_or_build
+from codegen.build import build, compile_function, load_or_build
 from codegen.cache import Cache
 from codegen.compiled import CompiledFunction
-from codegen.lanes import lane_text
-from codegen.source import generated_c
+from codegen.errors import CodegenError
+from codegen.lanes import FORMS, KEPT, lane_text
 from symbolic.array import Array
 from tests.codegen.samples import random_function
 
@@ -121,33 +121,46 @@ def test_a_branch_runs_where_a_lane_wants_it(cache: Cache) -> None:
     np.testing.assert_array_equal(found["d"], np.where(wants, b_values, np.sqrt(b_values)))
 
 
-def test_other_c_runs_one_at_a_time(cache: Cache) -> None:
+def test_what_has_no_form_in_lanes_is_told(cache: Cache) -> None:
     x, p = ca.SX.sym("x"), ca.SX.sym("p")
     finder = ca.rootfinder("finder", "fast_newton", {"x": x, "p": p, "g": x**2 - p})
     q = ca.MX.sym("q")
     function = ca.Function("root", [q], [finder(x0=1.0, p=q)["x"]], ["q"], ["root"])
-    assert lane_text(generated_c([function]), "lanes") is None
-    made = compile_function(function, cache, lanes=0)
-    assert isinstance(made, CompiledFunction)
-    assert made.lanes == 1
+    with pytest.raises(CodegenError, match=r"no form in lanes: `.*`; .* lanes=1"):
+        compile_function(function, cache, lanes=0)
+    made = compile_function(function, cache)
     np.testing.assert_allclose(made.batch(np.array([4.0, 9.0]))["root"], [2.0, 3.0])
 
 
-@pytest.mark.parametrize(
-    "script",
-    [
-        # A compiler that makes wrong code of lanes, and one that cannot compile them.
-        "s/lanes_sq(lanes_real x) { return x \\* x; }/lanes_sq(lanes_real x) { return x + x; }/",
-        "s/typedef double lanes_real/typedef nonsense lanes_real/",
-    ],
-)
-def test_lanes_that_fail_fall_back_with_one_warning(
-    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str
+@pytest.mark.parametrize("example", [example for example, *_ in (*FORMS, *KEPT)])
+def test_every_form_is_taken_and_none_beside_them(example: str) -> None:
+    def text(line: str) -> str:
+        return (
+            "static int casadi_f0(const casadi_real** arg, int mem) {\n"
+            f"  {line}\n  return 0;\n}}\n"
+            "  return casadi_f0(arg, res, iw, w, mem);\n"
+        )
+
+    assert "own_f0" in lane_text(text(example), "own").text
+    for unknown in (f"{example} a0=(a0>a1);", f"{example} casadi_qp(w1);"):
+        with pytest.raises(CodegenError, match="no form in lanes") as told:
+            lane_text(text(unknown), "own")
+        assert unknown in str(told.value)
+
+
+def test_a_text_without_an_entry_is_told() -> None:
+    with pytest.raises(CodegenError, match="called from outside"):
+        lane_text("int main(void) { return 0; }\n", "own")
+
+
+def test_wrong_code_of_lanes_is_not_used(
+    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    wrong = "s/lanes_sq(lanes_real x) { return x \\* x; }/lanes_sq(lanes_real x) { return x + x; }/"
     compiler = tmp_path / "cc"
     compiler.write_text(
         '#!/bin/sh\nfor file in "$@"; do case "$file" in *.c) '
-        f'sed -i \'{script}\' "$file" ;; esac; done\nexec gcc "$@"\n'
+        f'sed -i \'{wrong}\' "$file" ;; esac; done\nexec gcc "$@"\n'
     )
     compiler.chmod(0o755)
     monkeypatch.setenv("CC", str(compiler))
@@ -168,7 +181,7 @@ def test_lanes_that_fail_fall_back_with_one_warning(
 def test_sets_with_and_without_lanes_are_kept_apart(cache: Cache) -> None:
     x = ca.SX.sym("x")
     functions = {"f": ca.Function("f", [x], [ca.sin(x)])}
-    build_set("set", functions, cache, lanes=2)
+    build(functions, cache, key="set", lanes=2)
 
     def missing() -> dict[str, ca.Function]:
         raise AssertionError("made again")

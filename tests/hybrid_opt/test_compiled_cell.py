@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
+import numpy as np
 import pytest
 
+import hybrid_opt as ho
 import symbolic.cell_model
+from codegen.errors import CodegenError
 from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
@@ -36,8 +41,9 @@ def test_the_model_is_built_once_for_all_functions(monkeypatch: pytest.MonkeyPat
     ) -> dict[str, NumericFunction]:
         return {name: InterpretedFunction(dense(function)) for name, function in make().items()}
 
-    def no_program(name: str, key: str, make: Callable[[], Any], *_: Any) -> None:
+    def no_program(name: str, key: str, make: Callable[[], Any], *_: Any) -> SimpleNamespace:
         make()
+        return SimpleNamespace(dual_arm_lanes=lambda: 1)
 
     monkeypatch.setattr(symbolic.cell_model, "build_cell_model", counted)
     monkeypatch.setattr(compiled_cell, "load_or_build", built)
@@ -54,6 +60,16 @@ def test_a_compiled_cell_is_shared() -> None:
     compiled = CompiledCell(hand_cell())
     assert CompiledCell.of(compiled) is compiled
     assert CompiledCell.of(compiled.workcell).workcell is compiled.workcell
+
+
+def test_a_missing_compiler_is_told_before_any_work(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("CC", "/missing/cc")
+    with pytest.raises(CodegenError, match="no C compiler"):
+        CompiledCell(hand_cell())
+    with pytest.raises(CodegenError, match="no C compiler"):
+        ho.propose(tmp_path / "no-problem.toml", rng=np.random.default_rng(0))
 
 
 def test_keys_tell_sets_and_cells_apart() -> None:

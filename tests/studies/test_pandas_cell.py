@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.locked import LockedEvaluator
+from hybrid_opt.evaluate.evaluation import LockedEvaluator
 from studies.redundancy import compare, locks
 from studies.run import main
 from symbolic.read.cell import load

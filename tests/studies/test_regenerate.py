@@ -139,8 +139,9 @@ def test_wrong_options_are_told(cache: Cache) -> None:
         assert message in done.stderr
 
 
-def test_without_a_compiler(cache: Cache) -> None:
+def test_without_a_compiler_nothing_is_begun(cache: Cache) -> None:
     done = run(["cell.toml"], "import os; os.environ['CC'] = '/missing/cc'")
-    assert done.returncode == 0
-    assert "interpreted" in done.stdout
-    assert done.stderr.count("SlowerWarning") == 1
+    assert done.returncode == 2
+    assert "no C compiler that works was found (CC names '/missing/cc')" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not cache.folder.exists()

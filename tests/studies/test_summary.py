@@ -17,8 +17,8 @@ from hybrid_opt.campaign.results import CampaignResults, Replica
 from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures, SelectedEntry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
-from hybrid_opt.evaluate.static_hold import StaticHold
 from hybrid_opt.indicators.statistics import rank_test
+from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.store.json_records import from_json, to_json
 from studies.summary import (
     FIGURES,

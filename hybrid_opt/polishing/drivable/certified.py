@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybrid_opt.evaluate.drive import Driver
+from hybrid_opt.timing.drive import Driver
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.refined import drive_path
 from hybrid_opt.timing.solve import time_path

@@ -10,8 +10,8 @@ from typing import get_args
 
 import numpy as np
 
+from codegen.build import c_text, load_or_build_library
 from codegen.cache import Cache
-from codegen.library import c_text, load_or_build_library
 from hybrid_opt.polishing.drivable import interior
 from hybrid_opt.polishing.drivable.interior import Answer, Ending, QuadraticProgram
 
@@ -39,13 +39,13 @@ class _Program(ctypes.Structure):
 
 
 def interior_method(cache: Cache | None = None) -> Method:
-    """The compiled method; without a C compiler, with a warning, the interpreted one.
+    """The compiled method.
 
     Args:
         cache: where the library is kept; by default the user's.
 
     Raises:
-        CodegenError: it cannot be compiled, cached or loaded.
+        CodegenError: there is no C compiler; or it cannot be compiled, cached or loaded.
     """
     return _method((cache or Cache()).folder)
 
@@ -55,7 +55,7 @@ def _method(folder: Path) -> Method:
     constants = {name: getattr(interior, name) for name in CONSTANTS}
     text = c_text("hybrid_opt.polishing.drivable", ["bordered.c", "interior.c"], constants)
     library = load_or_build_library("interior", text, Cache(folder))
-    return interior.solve if library is None else _Compiled(library)
+    return _Compiled(library)
 
 
 class _Compiled:

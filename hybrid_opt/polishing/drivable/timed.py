@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from hybrid_opt.evaluate.drive import Driver
 from hybrid_opt.robust.path_force import PathPoints, robust_path
+from hybrid_opt.timing.drive import Driver
 from symbolic.array import Array
 from symbolic.records.task import waypoints_of
 

@@ -12,8 +12,7 @@ from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt.collision.between import check_between
 from hybrid_opt.collision.certify import certify
-from hybrid_opt.collision.checker import CollisionChecker
-from hybrid_opt.collision.pair_values import Separations
+from hybrid_opt.collision.checker import CollisionChecker, Separations
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import build_geometry

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
-from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
-from hybrid_opt.collision.verdict import sample_durations
+from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker, sample_durations
 from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance, coal_geometry
 from symbolic.geometry.pieces import Piece
 from symbolic.records import AllowedContact, CollisionSettings, Uncertainty, Workcell

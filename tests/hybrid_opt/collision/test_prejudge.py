@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.collision.judge import fcl_object
-from hybrid_opt.evaluate.kernel_data import PROOF_MARGIN, shape_table
+from hybrid_opt.evaluate.kernel import PROOF_MARGIN, shape_table
 from symbolic.array import Array
 from symbolic.geometry.pieces import ConvexShape, Hull, Piece
 from symbolic.records import Box, Capsule, Cylinder, Sphere

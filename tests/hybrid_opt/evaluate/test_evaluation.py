@@ -14,7 +14,7 @@ import pytest
 from hybrid_opt.collision.judge import FCL_RESOLUTION
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
-from hybrid_opt.evaluate.sampled import reached_samples
+from hybrid_opt.evaluate.kernel import reached_samples
 from studies.plain.collisions import PlainCollisionChecker
 from studies.plain.verdict import PlainJudge, PlainVerdict
 from symbolic.array import Array

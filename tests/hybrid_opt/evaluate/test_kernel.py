@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import cache
 from pathlib import Path
 
@@ -13,8 +12,7 @@ from codegen import compiled as compiled_module
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations
-from hybrid_opt.evaluate.kernel import Kernel, load_kernel
-from hybrid_opt.evaluate.sampled import SampledVerdicts, one_by_one
+from hybrid_opt.evaluate.kernel import Kernel, SampledVerdicts, load_kernel, one_by_one
 from symbolic.array import Array
 from symbolic.functions import SAMPLE_NAMES, force_sizes, sample_functions, sample_sizes
 from symbolic.read.cell import load
@@ -188,11 +186,3 @@ def test_a_kernel_that_differs_is_not_used(monkeypatch: pytest.MonkeyPatch) -> N
 
     with pytest.warns(RuntimeWarning, match="it differs from the functions"):
         assert load_kernel(ours.compiled, ours.checker, others) is None
-
-
-def test_without_a_compiler_there_is_no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", "/missing/cc")
-    ours = fused(RACK)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert load_kernel(ours.compiled, ours.checker, ours.outputs) is None

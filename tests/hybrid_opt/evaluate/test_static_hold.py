@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.evaluate.static_hold import still_load, unheld
+from hybrid_opt.static_hold import still_load, unheld
 from hybrid_opt.timing.model import TimingModel
 from studies import propose, run
 from studies.inspect import told

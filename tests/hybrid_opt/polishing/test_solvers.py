@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from codegen import library
-from codegen.cache import Cache
 from hybrid_opt.polishing.compiled_interior import dense_method
 from hybrid_opt.polishing.interior import dense
 from hybrid_opt.polishing.ipopt import ipopt
@@ -173,14 +169,6 @@ def test_compiled_steps_start_anew_where_none_is_found() -> None:
     answer, expected = compiled(program, LONG), dense(program, LONG)
     assert answer.message == expected.message
     np.testing.assert_allclose(answer.z, expected.z, atol=1e-6)
-
-
-def test_without_a_compiler_steps_are_interpreted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(library, "find_compiler", lambda: None)
-    with warnings.catch_warnings(action="ignore"):
-        assert dense_method(Cache(tmp_path)) is dense
 
 
 def test_ipopt_is_not_cut_off_where_it_violates_something() -> None:

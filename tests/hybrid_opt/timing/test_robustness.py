@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.evaluate.static_hold import static_hold
+from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing import TimingModel, closest_to_reference_timing, force_limited_timing
 from hybrid_opt.timing.robustness import (
     Margin,

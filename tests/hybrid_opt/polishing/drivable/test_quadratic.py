@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from codegen import library
-from codegen.cache import Cache
 from hybrid_opt.polishing.drivable import quadratic
 from hybrid_opt.polishing.drivable.bordered import BorderedMatrix, BorderedRows
 from hybrid_opt.polishing.drivable.compiled_interior import Method, interior_method
@@ -141,15 +137,6 @@ def test_compiled_and_interpreted_answers_agree() -> None:
         assert outer.ending == inner.ending
         np.testing.assert_allclose(outer.d, inner.d, atol=1e-6)
         assert value(of, outer.d) == pytest.approx(value(of, inner.d), abs=1e-8, rel=1e-8)
-
-
-def test_without_a_compiler_the_method_is_interpreted(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(library, "find_compiler", lambda: None)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        assert interior_method(Cache(tmp_path)) is solve_inside
 
 
 def test_clarabel_answers_where_the_own_method_does_not() -> None:

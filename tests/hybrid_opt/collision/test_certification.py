@@ -11,14 +11,14 @@ import pytest
 
 from codegen.function import NumericFunction
 from hybrid_opt import metaheuristics
-from hybrid_opt.collision.certify import Certificate
-from hybrid_opt.collision.checker import CollisionChecker
-from hybrid_opt.evaluate.certification import (
+from hybrid_opt.collision.certify import (
+    Certificate,
     LostPathError,
     SampledPath,
     certificates,
     configurations,
 )
+from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import BETWEEN_SAMPLES, REASONS
 from hybrid_opt.indicators.metrics import non_dominated

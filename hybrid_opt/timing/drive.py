@@ -6,20 +6,13 @@ force and all limits of robots, payload and contacts (`hybrid_opt.timing.path_ti
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from codegen.function import NumericFunction
+from hybrid_opt.carry import DRIVE_CONSTRAINTS, FORCE_LIMIT, JOINT_TORQUE, NO_TIMING
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.drive_constraints import (
-    DRIVE_CONSTRAINTS,
-    FORCE_LIMIT,
-    JOINT_TORQUE,
-    NO_TIMING,
-)
-from hybrid_opt.evaluate.objectives import Objective, force_kind
 from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from symbolic.array import Array
@@ -131,10 +124,9 @@ class Driver:
         return Drive(time, speed, acceleration, force, robust, violation, position)
 
 
-def driver_of(compiled: CompiledCell, threads: int, objectives: Sequence[Objective]) -> Driver:
-    """What drives candidates of a cell under the time law 'optimal', see `Driver`; limits are those
-    of robust forces where these are minimised."""
-    return Driver(PathTimer(compiled, threads=threads), threads, force_kind(objectives).robust)
+def driver_of(compiled: CompiledCell, threads: int, robust: bool) -> Driver:
+    """What drives candidates of a cell under the time law 'optimal', see `Driver`."""
+    return Driver(PathTimer(compiled, threads=threads), threads, robust)
 
 
 def _at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:

@@ -8,7 +8,7 @@ import pytest
 
 from codegen.build import compile_function
 from codegen.cache import Cache
-from codegen.check import compare, relative_difference
+from codegen.interpreted import compare, relative_difference
 
 
 @pytest.mark.parametrize(

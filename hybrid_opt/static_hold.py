@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import lru_cache, wraps
+from typing import TYPE_CHECKING, TypeVar
 
 import casadi as ca
 import numpy as np
 
-from hybrid_opt.per_workcell import kept_per_workcell
 from symbolic.array import Array
 from symbolic.contact.load import LOAD_OUTPUTS, closed_load_function, uncertain_load_function
 from symbolic.errors import WorkcellError
@@ -29,6 +29,38 @@ ROUNDING = 1e-6
 STEPS = 24
 """Bisections for the mass or the friction that would do."""
 
+KEPT = 2
+"""Workcells that a function remembers."""
+
+Built = TypeVar("Built")
+
+
+class _Identity:
+    """Lets a cache compare workcells by what they are, not by what they say."""
+
+    def __init__(self, workcell: Workcell) -> None:
+        self.workcell = workcell
+
+    def __hash__(self) -> int:
+        return id(self.workcell)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Identity) and self.workcell is other.workcell
+
+
+def kept_per_workcell(build: Callable[[Workcell], Built]) -> Callable[[Workcell], Built]:
+    """A function that gives the same record the same answer of `build` again."""
+
+    @lru_cache(maxsize=KEPT)
+    def kept(identity: _Identity) -> Built:
+        return build(identity.workcell)
+
+    @wraps(build, updated=())
+    def built(workcell: Workcell) -> Built:
+        return kept(_Identity(workcell))
+
+    return built
+
 
 @dataclass(frozen=True)
 class StaticHold:
@@ -45,25 +77,19 @@ class StaticHold:
     payload_limit: float
 
 
+@kept_per_workcell
 def static_hold(workcell: Workcell) -> StaticHold:
     """Forces of the payload held level and still; the same record for the same workcell.
 
     With equal friction coefficients mu the normal forces are m g / (2 mu) each, and the whole
     forces (m g / 2) sqrt(1 + 1 / mu^2).
     """
-    return _kept(workcell)
-
-
-def _static_hold(workcell: Workcell) -> StaticHold:
     outputs = still_load(workcell, np.zeros(6))
     normal = outputs["normal_force"]
     whole = np.linalg.norm(outputs["contact_force"].reshape(2, 3), axis=1)
     for force in (normal, whole):
         force.setflags(write=False)
     return StaticHold(normal, whole, payload_limit(workcell, whole))
-
-
-_kept = kept_per_workcell(_static_hold)
 
 
 def mass_at_reference(workcell: Workcell, force: Array) -> Array:

@@ -10,9 +10,8 @@ import pytest
 
 from codegen.build import build
 from hybrid_opt import metaheuristics
+from hybrid_opt.carry import DRIVE_CONSTRAINTS
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.drive import Driver
-from hybrid_opt.evaluate.drive_constraints import DRIVE_CONSTRAINTS
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES
@@ -21,6 +20,7 @@ from hybrid_opt.metaheuristics.problem import CarryProblem
 from hybrid_opt.polishing.drivable.certified import AGREEMENT
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing import PathTimer, TimingLimits, drivable_timing, time_path
+from hybrid_opt.timing.drive import Driver
 from hybrid_opt.timing.path_timer import PATH_INTERVALS
 from symbolic.array import Array
 from symbolic.functions import candidate_function

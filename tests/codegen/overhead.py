@@ -1,4 +1,4 @@
-"""What a call costs beside the computation: `python -m codegen.overhead`.
+"""What a call costs beside the computation: `python -m tests.codegen.overhead`.
 
 Times empty work (each output a copy of one input entry) through every way to call a function, and
 CasADi's own buffer beside it, in the same run.
@@ -44,7 +44,6 @@ def measure(n_out: int) -> dict[str, float]:
         buffer.set_res(k, output.data)
     return {
         "call": microseconds(lambda: compiled(x)),
-        "evaluate_into": microseconds(lambda: compiled.evaluate_into([x], outputs)),
         "batch of 64": microseconds(lambda: compiled.batch(batch)),
         "interpreted call": microseconds(lambda: interpreted(x)),
         "interpreted, bound CasADi buffer": microseconds(evaluate),

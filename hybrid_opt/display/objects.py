@@ -1,0 +1,181 @@
+"""Objects as text, and in a notebook as their figures beside a picture.
+
+A carry stands beside its normal forces, a front's points before the search's candidates, a timing's
+use of its limits beside the carry under it.
+"""
+
+from __future__ import annotations
+
+import html
+from functools import singledispatch
+
+import numpy as np
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.display.svg import ARMS, CLOUD, FRONT, REST, Series, plot
+from hybrid_opt.display.table import lines, table
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
+from hybrid_opt.front import Front
+from hybrid_opt.indicators.metrics import excess_above_static
+from hybrid_opt.static_hold import static_hold
+from hybrid_opt.timing.records import Timing
+from symbolic.array import Array
+
+MAX_CLOUD = 1500
+"""Feasible candidates behind a front."""
+
+
+def text_of(shown: object) -> str:
+    """What an object prints."""
+    return "\n".join([heading_of(shown), *lines(figures_of(shown))])
+
+
+def html_of(shown: object) -> str:
+    """What a notebook shows of an object."""
+    heading = html.escape(heading_of(shown))
+    return f"<div><p>{heading}</p>{table(figures_of(shown))}{picture_of(shown)}</div>"
+
+
+@singledispatch
+def heading_of(shown: object) -> str:
+    """An object in one line."""
+    raise NotImplementedError(f"{type(shown).__name__} has no display")
+
+
+@singledispatch
+def figures_of(shown: object) -> dict[str, str]:
+    """Its figures by name, with units."""
+    raise NotImplementedError(f"{type(shown).__name__} has no display")
+
+
+@singledispatch
+def picture_of(shown: object) -> str:
+    """A picture of it as HTML, '' for none."""
+    raise NotImplementedError(f"{type(shown).__name__} has no display")
+
+
+@heading_of.register
+def _(carry: Carry) -> str:
+    timing = "a timing within limits" if carry.timing == "limits" else f"time law {carry.timing!r}"
+    verdict = f": {carry.judgement}" if carry.judgement is not None else ""
+    return f"Carry of {carry.workcell.name!r} under {timing}, {carry.duration:.3f} s{verdict}"
+
+
+@figures_of.register
+def _(carry: Carry) -> dict[str, str]:
+    hold = static_hold(carry.workcell)
+    peaks = carry.peak_normal_force
+    excess = excess_above_static(peaks, hold.normal_force)
+    found = {
+        "peak normal force": f"{_pair(peaks, 3)} N",
+        "over the reference": _pair(carry.force_ratio, 4),
+        "above level and still": f"{_pair(excess, 2)} %",
+        "peak whole force": f"{_pair(carry.peak_resultant_force, 3)} N",
+        "payload limit": f"{carry.payload_limit:.3f} kg (level and still {hold.payload_limit:.3f})",
+        "largest pressure shift": f"{_pair(1e3 * carry.peak_pressure_shift, 2)} mm",
+        "torque of the contacts": f"{_pair(100.0 * carry.peak_contact_torque_use, 1)} % of maximum",
+    }
+    if carry.judgement is not None:
+        found |= {
+            f"objective {name}": f"{value:.6f}"
+            for name, value in carry.judgement.objectives.items()
+        }
+    return found
+
+
+@picture_of.register
+def _(carry: Carry) -> str:
+    still = float(static_hold(carry.workcell).normal_force.max())
+    time = carry.time - carry.time[0]
+    series = [
+        Series(robot.name, np.column_stack([time, carry.normal_force[:, i]]), ARMS[i])
+        for i, robot in enumerate(carry.workcell.robots)
+    ]
+    rest = np.array([[time[0], still], [time[-1], still]])
+    series.append(Series("level and still", rest, REST, size=0.8))
+    focus = np.concatenate([one.points for one in series])
+    return plot(series, "time [s]", "normal force [N]", focus)
+
+
+def _pair(values: Array, digits: int) -> str:
+    return ", ".join(f"{value:.{digits}f}" for value in values)
+
+
+@heading_of.register
+def _(front: Front) -> str:
+    points = "1 carry" if len(front) == 1 else f"{len(front)} carries"
+    return f"Front of {front.cell.workcell.name!r} by {front.title}: {points}"
+
+
+@figures_of.register
+def _(front: Front) -> dict[str, str]:
+    found = {"searched": repr(front.evaluations)}
+    if len(front):
+        found |= {
+            name: f"{column.min():.5f} to {column.max():.5f}"
+            for name, column in zip(front.objective_names, front.objectives.T, strict=True)
+        }
+    found["hypervolume"] = f"{front.hypervolume():.5f}"
+    if front.polished is not None:
+        attempts = ", ".join(
+            f"{count} {status}"
+            for status, count in front.polished.counts.items()
+            if ":" not in status
+        )
+        found["polish"] = f"{attempts} of {len(front.polished.outcomes)} attempts"
+    return found
+
+
+@picture_of.register
+def _(front: Front) -> str:
+    """Its points and candidates by their first two objectives."""
+    if len(front) == 0 or front.objectives.shape[1] < 2:
+        return ""
+    series = []
+    cloud = front.evaluations.objectives[front.evaluations.feasible][:, :2]
+    if len(cloud) > MAX_CLOUD:
+        cloud = cloud[np.linspace(0, len(cloud) - 1, MAX_CLOUD).astype(int)]
+    series.append(Series("feasible candidates", cloud, CLOUD, "dots", 1.5))
+    points = front.objectives[:, :2]
+    series.append(Series(front.title, points, FRONT, "dots", 3.0))
+    focus = [points, _nearest(cloud, points)]
+    if front.objective_names[:2] == PAPER_OBJECTIVES:
+        hold = front.cell.static_hold.normal_force / front.cell.workcell.task.reference_force
+        series.append(Series("level and still", hold[None], REST, "cross", 5.0))
+        focus.append(hold[None])
+    titles = [objective.title for objective in front.cell.evaluator.objectives[:2]]
+    return plot(series, titles[0], titles[1], np.concatenate(focus))
+
+
+def _nearest(cloud: Array, points: Array) -> Array:
+    """A front of one point gets some of the candidates around it to stand before."""
+    if len(points) > 1 or len(cloud) == 0:
+        return np.empty((0, 2))
+    distance = np.abs(cloud - points[0]).max(axis=1)
+    return np.asarray(cloud[np.argsort(distance)[:20]])
+
+
+@heading_of.register
+def _(timing: Timing) -> str:
+    return f"Timing, {timing.status}: {timing.reason}"
+
+
+@figures_of.register
+def _(timing: Timing) -> dict[str, str]:
+    """How far each limit is used and where, the most used first."""
+    ranked = sorted(timing.use.items(), key=lambda item: -item[1].ratio)
+    return {
+        name: f"{100.0 * excess.ratio:5.1f} %  {_where(excess.place.robot, excess.place.joint)}"
+        f"u = {excess.place.parameter:.3f}"
+        for name, excess in ranked
+    }
+
+
+@picture_of.register
+def _(timing: Timing) -> str:
+    return "" if timing.carry is None else html_of(timing.carry)
+
+
+def _where(robot: str, joint: str) -> str:
+    who = " ".join(part for part in (robot, joint) if part)
+    return f"{who}, " if who else ""
