@@ -78,7 +78,7 @@ class PathTiming:
 
 class PathTimer:
     """Times paths of one workcell. Where it has no compiled passes it asks `time_path`, which is
-    slow: without a C compiler, and with the joint allocation of the contact forces.
+    slow: with the joint allocation of the contact forces.
 
     Attributes:
         workcell: the cell.
