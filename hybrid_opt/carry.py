@@ -14,19 +14,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from codegen.function import NumericFunction
 from hybrid_opt.indicators.metrics import excess_above_static
 from hybrid_opt.shown import Shown, display
 from hybrid_opt.static_hold import payload_limit, static_hold
 from symbolic.array import Array
+from symbolic.path.spline import sample_basis
 from symbolic.records import Workcell
+from symbolic.records.task import waypoints_of
 
 if TYPE_CHECKING:
     from hybrid_opt.display.view import CarryView
 
-
-from codegen.function import NumericFunction
-from symbolic.path.spline import sample_basis
-from symbolic.records.task import waypoints_of
 
 FORCE_LIMIT = "force_limit"
 JOINT_TORQUE = "joint_torque"
@@ -37,6 +36,9 @@ DRIVE_CONSTRAINTS = (FORCE_LIMIT, JOINT_TORQUE, NO_TIMING)
 force_limit, joint_torque: standing still needs more; violation: its share of the limit, minus 1.
 no_timing: the solver of timings fails the path for any other reason; violation: 1.
 """
+
+STANDSTILL = 1e-30
+"""Squared length of a path's tangent below which it counts as none [(m, rad per u)^2]."""
 
 
 @dataclass(frozen=True)
@@ -239,10 +241,6 @@ def _set_read_only(record: object) -> None:
         value = getattr(record, field.name)
         if isinstance(value, np.ndarray):
             value.setflags(write=False)
-
-
-STANDSTILL = 1e-30
-"""Squared length of a path's tangent below which it counts as none [(m, rad per u)^2]."""
 
 
 def carry_under_time_law(

@@ -45,6 +45,9 @@ MOST_ROUNDS = 14
 CACHED_ROWS = 128
 """Configurations whose pairs are looked at together."""
 
+TOGETHER = 8
+"""Carries certified at once: enough to spare calls, few enough for their bounds to stay cached."""
+
 
 @dataclass(frozen=True, repr=False)
 class Certificate:
@@ -253,10 +256,6 @@ def _certificate_of(motion: MotionVerdict, u: Array, deviation: float) -> Certif
         k = motion.touch.interval
         where = float(u[k] + motion.touch.fraction * (u[k + 1] - u[k]))
     return Certificate(motion.status == "free", None, where, motion, len(u), float(deviation))
-
-
-TOGETHER = 8
-"""Carries certified at once: enough to spare calls, few enough for their bounds to stay cached."""
 
 
 class LostPathError(DualArmError):

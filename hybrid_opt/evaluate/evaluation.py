@@ -8,7 +8,7 @@ The same evaluation also returns each constraint's violation for constraint domi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -59,8 +59,8 @@ from symbolic.records.task import extended_waypoints
 if TYPE_CHECKING:
     from hybrid_opt.timing.drive import Driver
 
-
-from collections.abc import Callable
+MOST_KNOWN = 4096
+"""Paths that are remembered; then it begins anew."""
 
 
 class CandidateEvaluator:
@@ -338,10 +338,6 @@ def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
             return None
         wanted |= set(objective.needs) - {"time"}
     return tuple(sorted(wanted)) if wanted <= SAMPLE_NAMES else None
-
-
-MOST_KNOWN = 4096
-"""Paths that are remembered; then it begins anew."""
 
 
 class KnownProofs:

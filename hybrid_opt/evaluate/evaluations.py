@@ -13,13 +13,8 @@ from symbolic.array import Array
 from symbolic.functions import CONSTRAINTS
 
 COLLISION = "collision"
-
-
 BETWEEN_SAMPLES = "between_samples"
-
-
 NOT_FINITE = "not_finite"
-
 
 REASONS = (*CONSTRAINTS, COLLISION, BETWEEN_SAMPLES, NOT_FINITE, *DRIVE_CONSTRAINTS)
 """What can make a candidate infeasible; `Evaluations.reason` indexes it.
@@ -28,7 +23,6 @@ between_samples: not proven free of collisions between the samples; only fronts 
 not_finite: an objective is NaN or infinite (a solver or model failure, never a front member).
 The rest only under the time law 'optimal', see `hybrid_opt.carry.DRIVE_CONSTRAINTS`.
 """
-
 
 FEASIBLE = -1
 """`Evaluations.reason` of a feasible candidate."""

@@ -38,6 +38,17 @@ from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import ConvexShape, Hull
 from symbolic.records import PAYLOAD, POSE_SIZE, Box, Capsule, Cylinder, Sphere, Workcell
 
+_LEAST_ROOM = 4096
+"""Open pairs that are collected before they are handed on, beside those of one pass."""
+
+PROOF_MARGIN = 5 * FCL_RESOLUTION
+"""How clearly two shapes must be apart or intersect to be decided without FCL [m]."""
+
+_SHAPE = np.dtype(
+    [("kind", np.int64), ("first", np.int64), ("count", np.int64), ("size", np.float64, 3)]
+)
+_RESTING = np.dtype([("pair", np.int64), ("place", np.float64, 3), ("departure", np.float64)])
+
 
 @dataclass(frozen=True)
 class SampledVerdicts:
@@ -94,10 +105,6 @@ def collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
     for row in np.flatnonzero(colliding.any(axis=1)).tolist():
         shares[row] = durations[row, colliding[row]].sum() / time[row, -1]
     return shares
-
-
-_LEAST_ROOM = 4096
-"""Open pairs that are collected before they are handed on, beside those of one pass."""
 
 
 class Kernel:
@@ -336,15 +343,6 @@ def _definitions(geometry: CellGeometry) -> str:
         entries = ", ".join(map(str, values))
         lines.append(f"static const int {name}[{len(values)}] = {{{entries}}};")
     return "\n".join(lines) + "\n"
-
-
-PROOF_MARGIN = 5 * FCL_RESOLUTION
-"""How clearly two shapes must be apart or intersect to be decided without FCL [m]."""
-
-_SHAPE = np.dtype(
-    [("kind", np.int64), ("first", np.int64), ("count", np.int64), ("size", np.float64, 3)]
-)
-_RESTING = np.dtype([("pair", np.int64), ("place", np.float64, 3), ("departure", np.float64)])
 
 
 def configuration_size(workcell: Workcell) -> int:
