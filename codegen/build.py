@@ -23,7 +23,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from codegen.cache import Cache, Entry, key_of
-from codegen.compiled import CompiledFunction, cannot_load
+from codegen.compiled import CompiledFunction, cannot_load, warn_one_lane
 from codegen.compiler import (
     FLAGS,
     LANE_FLAGS,
@@ -34,6 +34,7 @@ from codegen.compiler import (
     interruptible,
     stop_if_interrupted,
 )
+from codegen.errors import FormError
 from codegen.function import NumericFunction, Signature, available_cores
 from codegen.parts import Part, in_parts
 
@@ -72,12 +73,17 @@ class Source:
 
     @classmethod
     def of(cls, name: str, function: ca.Function, lanes: int, level: int | None) -> Source:
-        """The C of a function; level None for one by the size of what CasADi generates."""
+        """The C of a function; level None for one by the size of what CasADi generates. Without
+        lanes, with one warning, where it has no form in them."""
         from codegen.source import c_source, dense, generated_c, operations
 
         whole = dense(function)
         generated = generated_c([whole])
-        text = c_source(whole, lanes, generated)
+        try:
+            text = c_source(whole, lanes, generated)
+        except FormError as error:
+            warn_one_lane(name, str(error))
+            text, lanes = c_source(whole, 1, generated), 1
         chosen, most = (default_level(len(generated)), 3) if level is None else (level, level)
         return cls(name, text, chosen, lanes, Signature.of(whole), operations(function), most)
 

@@ -30,6 +30,8 @@ _ALIGNMENT = 64
 _writable: Any = ctypes.c_char.from_buffer
 _address_of = ctypes.addressof
 
+OTHER_COMPILER = "another compiler (environment variable CC) may do better"
+
 _SUCCESS = -1
 _TOO_MANY = -2
 
@@ -78,7 +80,7 @@ class CompiledFunction(NumericFunction):
             self.lanes = int(loaded.dual_arm_lanes())
             if not self._lanes_agree():
                 self.lanes = 1
-                warn_one_lane(self.name, "lanes and single evaluations differ")
+                warn_one_lane(self.name, f"lanes and single evaluations differ; {OTHER_COMPILER}")
 
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
         work = self._take_work()
@@ -255,8 +257,7 @@ def warn_one_lane(name: str, reason: str) -> None:
         return
     _warned = True
     warnings.warn(
-        f"{name}: batches are evaluated one by one, which is slower: {reason}; another compiler "
-        "(environment variable CC) may do better",
+        f"{name}: batches are evaluated one by one, which is slower: {reason}",
         SlowerWarning,
         stacklevel=3,
     )

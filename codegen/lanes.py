@@ -17,7 +17,7 @@ with at most one statement on a line. The forms that a line may take are listed 
 with an example, and in `KEPT`, those that mean the same for lanes as for numbers. In lanes (the
 types of `codegen/c/lanes.h`) constants are equal in all lanes, comparisons and choices are masks,
 and a branch of `casadi.Function.if_else` runs where any lane wants it. A line of any other form is
-refused with a message that shows it: a new version of CasADi, or a function of it that was not
+told with its text (`FormError`): a new version of CasADi, or a function of it that was not
 used before, then asks for one more entry here.
 """
 
@@ -27,7 +27,7 @@ import re
 from dataclasses import dataclass
 from math import prod
 
-from codegen.errors import CodegenError
+from codegen.errors import FormError
 
 _NUMBER = r"-?(?:\d+\.?\d*(?:e[+-]?\d+)?|casadi_inf|casadi_nan|INFINITY|NAN)"
 _TERM = r"(?:[aw]\d+|\(\*c[rs]\+\+\)|\*\s*c[rs]\+\+|c[rs]\[i\]|" + _NUMBER + ")"
@@ -132,7 +132,7 @@ def lane_text(generated: str, prefix: str) -> LaneText:
         prefix: begins the names of everything defined.
 
     Raises:
-        CodegenError: a line has a form that has none in lanes.
+        FormError: a line has a form that has none in lanes.
     """
     parts = []
     for name, size, values in _CONSTANT.findall(generated):
@@ -199,8 +199,8 @@ def _size(described: str) -> int:
     return prod(int(length) for length in shape.groups(default="1")) if shape else 1
 
 
-def _unknown(function: str, line: str) -> CodegenError:
-    return CodegenError(
+def _unknown(function: str, line: str) -> FormError:
+    return FormError(
         f"{function}: CasADi wrote a form of C that has no form in lanes: `{line}`; compile the "
         "function with lanes=1, or add the form to codegen/lanes.py"
     )

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.build import load_or_build_program
-from codegen.compiled import thread_pool, warn_one_lane
-from codegen.errors import CodegenError
+from codegen.compiled import OTHER_COMPILER, thread_pool, warn_one_lane
+from codegen.errors import CodegenError, FormError
 from codegen.function import available_cores
 from hybrid_opt.collision.checker import CollisionChecker, sample_durations
 from hybrid_opt.collision.judge import FCL_RESOLUTION
@@ -274,7 +274,11 @@ def load_kernel(
         files("hybrid_opt").joinpath(*path).read_text()
         for path in (("collision", "prejudge.c"), ("evaluate", "kernel.c"))
     )
-    library = load_or_build_program("kernel", key, make, own, compiled.cache, lanes)
+    try:
+        library = load_or_build_program("kernel", key, make, own, compiled.cache, lanes)
+    except FormError as error:
+        warn_one_lane("kernel", str(error))
+        return None
     if library.dual_arm_lanes() < 2:
         return None
     kernel = Kernel(library, checker)
@@ -283,7 +287,7 @@ def load_kernel(
     every = tuple(sample_sizes(compiled.workcell))
     if _same(kernel.evaluate(x, every, all_forces=True), one_by_one(outputs(x), checker)):
         return kernel
-    warn_one_lane("kernel", "it differs from the functions that it is made of")
+    warn_one_lane("kernel", f"it differs from the functions that it is made of; {OTHER_COMPILER}")
     return None
 
 

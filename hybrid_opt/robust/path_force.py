@@ -99,7 +99,8 @@ class RobustPath:
         self._cases = worst_cases(workcell, workcell.uncertainty)
         self._set = workcell.uncertainty
         self._squeeze, self._slopes, self._slack, self._difference = (
-            compile_function(function(workcell), cache, lanes=0)
+            # Slopes add up in loops, for which there is no form in lanes.
+            compile_function(function(workcell), cache, lanes=int(function is case_slopes_function))
             for function in (
                 partial(case_squeeze_function, displaced=False),
                 case_slopes_function,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from codegen import compiled as compiled_module
-from codegen.build import build, compile_function, load_or_build
+from codegen.build import build, compile_function, load_or_build, load_or_build_program
 from codegen.cache import Cache
 from codegen.compiled import CompiledFunction
 from codegen.errors import CodegenError
@@ -121,14 +121,17 @@ def test_a_branch_runs_where_a_lane_wants_it(cache: Cache) -> None:
     np.testing.assert_array_equal(found["d"], np.where(wants, b_values, np.sqrt(b_values)))
 
 
-def test_what_has_no_form_in_lanes_is_told(cache: Cache) -> None:
+def test_what_has_no_form_in_lanes_is_told(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
     x, p = ca.SX.sym("x"), ca.SX.sym("p")
     finder = ca.rootfinder("finder", "fast_newton", {"x": x, "p": p, "g": x**2 - p})
     q = ca.MX.sym("q")
     function = ca.Function("root", [q], [finder(x0=1.0, p=q)["x"]], ["q"], ["root"])
-    with pytest.raises(CodegenError, match=r"no form in lanes: `.*`; .* lanes=1"):
-        compile_function(function, cache, lanes=0)
-    made = compile_function(function, cache)
+    monkeypatch.setattr(compiled_module, "_warned", False)
+    with pytest.warns(RuntimeWarning, match=r"no form in lanes: `.*`; .* lanes=1"):
+        made = compile_function(function, cache, lanes=0)
+    assert made.lanes == 1
+    with pytest.raises(CodegenError, match="no form in lanes"):
+        load_or_build_program("root", "root", lambda: {"root": function}, "", cache)
     np.testing.assert_allclose(made.batch(np.array([4.0, 9.0]))["root"], [2.0, 3.0])
 
 
