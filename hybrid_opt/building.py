@@ -12,9 +12,10 @@ from codegen.errors import CodegenError
 from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.collisions import JobCollisions
-from hybrid_opt.polishing import compiled_interior, compiled_rows
-from hybrid_opt.polishing.drivable import compiled_interior as drivable_interior
-from hybrid_opt.polishing.drivable.point import is_polishable
+from hybrid_opt.polishing.drive import is_polishable
+from hybrid_opt.polishing.rows import row_library
+from hybrid_opt.polishing.solvers.dense import dense_method
+from hybrid_opt.polishing.solvers.quadratic import quadratic_method
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PATH_INTERVALS
@@ -101,5 +102,5 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     yield lambda: JobCollisions(compiled)
     yield lambda: robust_model(workcell)
     if polished:
-        yield lambda: drivable_interior.interior_method(cache)
-        yield lambda: (compiled_interior.dense_method(cache), compiled_rows.row_binder(cache))
+        yield lambda: (quadratic_method(cache), dense_method(cache))
+        yield lambda: row_library(cache)

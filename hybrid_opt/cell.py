@@ -36,7 +36,7 @@ from symbolic.records.task import initial_decision
 if TYPE_CHECKING:
     # Not imported at run time before they are needed: a search needs none of them.
     from hybrid_opt.collision.certify import Certificate
-    from hybrid_opt.polishing.functions import PolishFunctions
+    from hybrid_opt.polishing.cell import PolishFunctions
     from hybrid_opt.timing.model import TimingModel
     from hybrid_opt.timing.path_timer import PathTimer
 
@@ -149,7 +149,7 @@ class Cell:
     @cached_property
     def polish_functions(self) -> PolishFunctions:
         """What polishes are assembled from."""
-        from hybrid_opt.polishing.functions import polish_functions
+        from hybrid_opt.polishing.cell import polish_functions
 
         return polish_functions(self.compiled)
 

@@ -13,10 +13,9 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
-from hybrid_opt.polishing.polisher import polisher_for
-from hybrid_opt.polishing.presets import usual_settings
+from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishOutcome
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import PolishSettings, usual_settings
 from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk
@@ -81,7 +80,7 @@ def polish(
     """
     task = cell.workcell.task
     settings = settings or usual_settings(task.time_law)
-    polisher = polisher_for(cell.evaluator, settings, cell.polish_functions)
+    polisher = Polisher(cell.evaluator, settings, cell.polish_functions)
     known = [np.asarray(_decision(path), dtype=float) for path in paths]
     if known and task.time_law != "optimal":
         raise SettingsError(

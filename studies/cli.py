@@ -16,8 +16,12 @@ from hybrid_opt.campaign.experiment_stage import drivable_settings
 from hybrid_opt.campaign.settings import FirstGeneration
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.metaheuristics.problem import ConstraintHandling
-from hybrid_opt.polishing.presets import DRIVABLE_ATTEMPTS, quick_settings
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import (
+    DRIVABLE_ATTEMPTS,
+    SOLVERS,
+    PolishSettings,
+    quick_settings,
+)
 from hybrid_opt.recommending.wish import Wish
 from studies.program import Parser
 from symbolic.errors import SettingsError
@@ -125,6 +129,13 @@ def campaign_parser(program: str, description: str, output: str) -> Parser:
         help="attempts that the polish of one front may take before it is filled between its ends "
         f"(default: {PolishSettings().attempts}, for a drivable one {DRIVABLE_ATTEMPTS}, "
         f"with --quick {quick_settings().attempts})",
+    )
+    after.add_argument(
+        "--polish-solver",
+        choices=SOLVERS,
+        default=PolishSettings().solver,
+        help="what solves the polish's programs of both peak forces: a dense interior-point "
+        "method, or IPOPT, for comparison (default: %(default)s)",
     )
     after.add_argument(
         "--drivable",
@@ -261,7 +272,8 @@ def polish_settings(
         return None
     chosen = quick_settings() if options.quick else settings
     asked = options.polish_attempts
-    return chosen if asked is None else replace(chosen, attempts=asked)
+    attempts = chosen.attempts if asked is None else asked
+    return replace(chosen, attempts=attempts, solver=options.polish_solver)
 
 
 def wish(options: argparse.Namespace) -> Wish:

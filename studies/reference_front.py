@@ -24,8 +24,8 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators import metrics
+from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront
-from hybrid_opt.polishing.run import Polisher
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
 from hybrid_opt.work.job import Emit, Job, answer_all

@@ -24,8 +24,8 @@ from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.campaign.simulated import read_simulations
 from hybrid_opt.cell import Cell
-from hybrid_opt.polishing.drivable.point import is_polishable
-from hybrid_opt.polishing.front import knows_forces
+from hybrid_opt.polishing.drive import is_polishable
+from hybrid_opt.polishing.polisher import knows_forces
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.wish import Wish
 from hybrid_opt.static_hold import require_hold
@@ -137,7 +137,7 @@ def run_study(
         progress.note(
             "the drivable carries of this cell are not polished, only searched: its task says "
             f'allocation = "{cell.task.allocation}", and the polish of time and force knows '
-            'the allocation "paper" alone'
+            'the allocations "soft-finger" and "paper" alone'
         )
         study = replace(study, drivable_polish=None, polish=None if alone else study.polish)
     with open_folder(settings, execution, cell) as folder:

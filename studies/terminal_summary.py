@@ -228,9 +228,11 @@ def _polish(algorithms: Mapping[str, AlgorithmFigures]) -> str:
     """Table of the polished fronts; nothing without a polish."""
     head = ["median", "HV before", "HV after", "better in", "points", "widest gap %"]
     rows = [[*head, "above static %", "payload kg", "seconds", "= evaluations"]]
+    solvers = set[str]()
     for name, entry in algorithms.items():
         if entry.polished is None:
             continue
+        solvers |= {one.polished.solver for one in entry.replicas if one.polished is not None}
         after = entry.polished.statistics
         rows.append(
             [
@@ -248,7 +250,8 @@ def _polish(algorithms: Mapping[str, AlgorithmFigures]) -> str:
         )
     if len(rows) == 1:
         return ""
-    return f"Fronts after the polish, and what it took\n{text_table(rows)}"
+    by = " and ".join(sorted(solvers))
+    return f"Fronts after the polish (solver: {by}), and what it took\n{text_table(rows)}"
 
 
 def _tests(tests: Sequence[StoredTest]) -> str:

@@ -113,6 +113,7 @@ class PolishEffort:
     """Effort and success of a polish.
 
     Attributes:
+        solver: what solved its programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
         attempts: solves.
         counts: attempts by status, and those not accepted also by 'status: reason'.
         success_share: of the front's own points, those accepted or optimal.
@@ -123,6 +124,7 @@ class PolishEffort:
             solve made and that stand on the front in the end.
     """
 
+    solver: str
     attempts: Count
     counts: Mapping[str, Count]
     success_share: Figure

@@ -24,6 +24,7 @@ def polish_document(front: PolishedFront) -> PolishDocument:
             for objectives, x, parent, polished in points
         ),
         figures=PolishEffort(
+            solver=front.solver,
             attempts=len(solved),
             counts=front.counts,
             success_share=front.success_share,

@@ -31,16 +31,16 @@ from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Stage
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.polishing.attempt import Lost, use_one_thread
-from hybrid_opt.polishing.polisher import polisher_for
+from hybrid_opt.polishing.front import Lost, use_one_thread
+from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import (
     PolishedFront,
     PolishOutcome,
     outcome_from_json,
     outcome_to_json,
 )
-from hybrid_opt.polishing.run import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.solvers.base import MOST_SECONDS
 from hybrid_opt.store.files import read_bytes, write_json
 from hybrid_opt.store.json_records import record_of, to_json
 from hybrid_opt.work.job import Job, give_up
@@ -79,7 +79,7 @@ class PolisherSource:
         return self.cell.make(self._polisher)
 
     def _polisher(self, workcell: Workcell) -> Polisher:
-        return polisher_for(CandidateEvaluator(workcell, self.objectives), self.settings)
+        return Polisher(CandidateEvaluator(workcell, self.objectives), self.settings)
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class PolishLedger:
         self._job = Job(
             PolisherSource(cell, folder.settings.objectives, settings),
             polish_replica,
-            patience=settings.max_seconds + JUDGING_SECONDS,
+            patience=MOST_SECONDS + JUDGING_SECONDS,
         )
         self._identity = {
             "campaign": identity(folder.settings, folder.root, folder.workcell),

@@ -1,25 +1,158 @@
-"""Which polish a cell gets: by its time law."""
+"""The polish of fronts: by the cell's time law of both peak forces, or of path and timing
+together."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.polishing.drivable.front import DrivablePolisher
-from hybrid_opt.polishing.front import FrontPolisher
-from hybrid_opt.polishing.functions import PolishFunctions
-from hybrid_opt.polishing.run import Polisher
+from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS, FORCE_PAIRS, ROBUST_OBJECTIVES
+from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell, polish_functions
+from hybrid_opt.polishing.drive import DriveWay
+from hybrid_opt.polishing.drive_front import DriveRun, second_opinion
+from hybrid_opt.polishing.force import ForceSolver
+from hybrid_opt.polishing.force_front import ForceRun
+from hybrid_opt.polishing.front import GrowingFront, Lost, PolishRun
+from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.work.threads import one_thread
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.records.cell import Workcell
+from symbolic.records.task import initial_decision
+
+TIMED_EVALUATIONS = 32
+"""Candidates whose evaluation is timed, to express the polish in their unit."""
 
 
-def polisher_for(
-    evaluator: CandidateEvaluator,
-    settings: PolishSettings,
-    functions: PolishFunctions | None = None,
-) -> Polisher:
-    """The polish of path and timing under the time law 'optimal', otherwise that of forces.
+def knows_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
+    """Whether the pads' forces are known: planned ones of any pads, robust ones of two round pads
+    that face one another."""
+    return workcell.has_facing_pads or tuple(objectives) != ROBUST_OBJECTIVES
 
-    Raises:
-        SettingsError: the objectives are not those of the polish.
-        DualArmError: its functions cannot be built.
+
+class Polisher:
+    """Polishes fronts of one evaluator. A resource: keep it for several fronts.
+
+    Attributes:
+        evaluator: judges what is found.
+        settings: effort and tolerances.
+        solver: of both peak forces; None under the time law 'optimal'.
+        way: how drivable carries are polished; None under other time laws.
     """
-    driven = evaluator.workcell.task.time_law == "optimal"
-    return (DrivablePolisher if driven else FrontPolisher)(evaluator, settings, functions)
+
+    solver: ForceSolver | None = None
+    way: DriveWay | None = None
+
+    def __init__(
+        self,
+        evaluator: CandidateEvaluator,
+        settings: PolishSettings,
+        functions: PolishFunctions | None = None,
+    ) -> None:
+        """Load or build the functions.
+
+        Raises:
+            SettingsError: the evaluator's objectives are not those of the polish: both peak forces,
+                planned or robust, or under the time law 'optimal' duration and one of them; the
+                pads do not close their grasp, robust forces are those of other pads than two round
+                ones that face one another, or forces of drivable carries are allocated jointly.
+            DualArmError: the functions cannot be built.
+        """
+        self.evaluator, self.settings = evaluator, settings
+        driven = evaluator.workcell.task.time_law == "optimal"
+        _require_objectives(evaluator, DRIVABLE_PAIRS if driven else FORCE_PAIRS, driven)
+        functions = functions or polish_functions(evaluator.compiled)
+        cell = SmoothCell(evaluator, functions, settings.clearance)
+        if not driven:
+            self.solver = ForceSolver(cell, settings)
+            return
+        self.way = DriveWay(cell, settings.drivable)
+        # At once: the cell's files may be there only for as long as this is made.
+        self._timings = TimingModel(evaluator.compiled, self.way.driver.timer.intervals)
+
+    def doubt(self, x: Array) -> str:
+        """Why the timing of a drivable decision vector is not believed, see `second_opinion`."""
+        assert self.way is not None
+        return second_opinion(self.way.driver, self._timings, x)
+
+    def polish(
+        self,
+        front_x: Array,
+        rng: np.random.Generator,
+        recorded: Sequence[PolishOutcome | Lost] = (),
+        emit: Callable[[PolishOutcome], None] = lambda outcome: None,
+        paths: Array | None = None,
+    ) -> PolishedFront:
+        """Polish a front.
+
+        Args:
+            front_x: (k, n_var) decision vectors; k may be 0.
+            rng: spreads the starts of attempts at the balanced middle.
+            recorded: outcomes of an earlier, interrupted polish of the same front, not repeated;
+                `Lost` for an attempt that ended its process.
+            emit: takes each new outcome.
+            paths: (m, n_path) free waypoints that are known to be good, and need not be on the
+                front; only the polish of drivable carries uses them. None for none.
+        """
+        begin = time.perf_counter()
+        x = np.asarray(front_x, dtype=float).reshape(-1, self.evaluator.n_var)
+        unit = self._evaluation_seconds(x)
+        found = self.evaluator.certified(self.evaluator.evaluate(x))
+        feasible = np.flatnonzero(found.feasible)
+        archive = GrowingFront(x[feasible], found.objectives[feasible], feasible.tolist())
+        known = np.empty((0, self.evaluator.workcell.task.n_path)) if paths is None else paths
+        given = archive, list(recorded), emit
+        run: PolishRun[Any]
+        if self.solver is not None:
+            run = ForceRun(self.solver, self.settings, *given)
+        else:
+            assert self.way is not None
+            run = DriveRun(self.way, self.settings, self.doubt, *given, known)
+        if len(feasible) and self.settings.attempts:
+            with one_thread():
+                run.all(rng)
+        rows = archive.rows() if len(feasible) else []
+        return PolishedFront(
+            x=np.array([archive.x[k] for k in rows]).reshape(-1, self.evaluator.n_var),
+            objectives=np.array([archive.objectives[k] for k in rows]).reshape(-1, 2),
+            parent=np.array([archive.parent[k] for k in rows], dtype=np.int64),
+            polished=np.array([archive.polished[k] for k in rows], dtype=bool),
+            outcomes=tuple(run.outcomes),
+            seconds=time.perf_counter()
+            - begin
+            + sum(o.seconds for o in recorded if isinstance(o, PolishOutcome)),
+            evaluation_seconds=unit,
+            solver="quadratic" if self.solver is None else self.settings.solver,
+        )
+
+    def _evaluation_seconds(self, x: Array) -> float:
+        """Time of one candidate evaluation; the initial trajectory's for an empty front."""
+        sample = x if len(x) else initial_decision(self.evaluator.workcell.task)[None]
+        batch = np.resize(sample, (TIMED_EVALUATIONS, self.evaluator.n_var))
+        begin = time.perf_counter()
+        self.evaluator.evaluate(batch)
+        return (time.perf_counter() - begin) / len(batch)
+
+
+def _require_objectives(
+    evaluator: CandidateEvaluator, pairs: tuple[tuple[str, str], ...], driven: bool
+) -> None:
+    names = evaluator.objective_names
+    known = [tuple(pair) for pair in pairs]
+    if names not in known and not (driven and names[::-1] in known):
+        named = " or ".join(" and ".join(pair) for pair in pairs)
+        raise SettingsError(
+            f"{'under the time law optimal ' if driven else ''}the polish minimises {named}; the "
+            f"objectives are {', '.join(names)}: switch the polish off for them"
+        )
+    if not knows_forces(evaluator.workcell, names):
+        raise SettingsError(
+            "the polish of robust forces knows two round pads that face one another, and no "
+            "others: switch it off"
+        )

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.polishing.residuals import Residuals
+from hybrid_opt.polishing.solvers.base import Residuals
 from symbolic.array import Array
 
 Aim = Literal["point", "extreme", "balance", "gap", "probe"]
@@ -31,7 +31,7 @@ class PolishOutcome:
         x: (n_var,) the new decision vector if accepted, otherwise the one started from.
         start, objectives: (2,) before and after; equal where nothing was accepted.
         residuals: of the solver's last answer, whatever became of it.
-        iterations: of IPOPT, over all rounds.
+        iterations: of the solver, over all rounds.
         rounds: solves, one more for every time that constraints were added.
         rows: constraints at places of the path in the last round.
         seconds: spent on this attempt, re-evaluation and certification included.
@@ -61,6 +61,7 @@ class PolishedFront:
         parent: (k,) row of the given front that the point replaced or still is, -1 for a new one.
         polished: (k,) whether the polish made the point.
         outcomes: every attempt, in order.
+        solver: what solved its programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
         seconds: spent in total.
         evaluation_seconds: measured for one candidate evaluation, the unit of the search.
     """
@@ -72,6 +73,7 @@ class PolishedFront:
     outcomes: tuple[PolishOutcome, ...]
     seconds: float
     evaluation_seconds: float
+    solver: str
 
     def __post_init__(self) -> None:
         """Make the arrays read-only."""

@@ -1,1 +1,1 @@
-"""The polish's smooth problem as expressions: samples, arms, and one file per kind of row."""
+"""The polish's smooth problem as expressions: samples, places, passages, and driven points."""

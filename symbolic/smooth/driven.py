@@ -2,7 +2,7 @@
 
 Path and timing are variables together: at a point of the path every limited quantity follows from
 the box pose, its first and second derivative along the path, the joints that hold the box there,
-u'' and u'^2. Joints are differentiated as in `symbolic.smooth.closure`.
+u'' and u'^2. Joints are differentiated as in `symbolic.smooth.places`.
 """
 
 from __future__ import annotations
@@ -10,11 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
+from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.contact.soft_finger import Detached
 from symbolic.limits import PATH_OUTPUTS, contact_limits, limit_layout, sample_limits_function
 from symbolic.records import POSE_SIZE, Workcell
+from symbolic.smooth.samples import branch_coefficients
 
 DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
 """Names of the functions."""
@@ -75,6 +78,15 @@ class DrivenLayout:
 def driven_layout(workcell: Workcell) -> DrivenLayout:
     """The layout for a workcell's arms."""
     return DrivenLayout(limit_layout(workcell).joints, workcell.task.extended_size)
+
+
+def planned_branches(workcell: Workcell) -> Array:
+    """(2, branches, quantities) both planned normal forces' branches as sums of a point's
+    quantities."""
+    layout, own = driven_layout(workcell), branch_coefficients(workcell)
+    forces = np.zeros((2, own.shape[1], layout.size))
+    forces[:, :, layout.block("force")] = own
+    return forces
 
 
 def driven_functions(model: CellModel) -> dict[str, ca.Function]:

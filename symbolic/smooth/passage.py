@@ -23,7 +23,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.geometry.clearance import BOX_NUMBERS
-from symbolic.smooth.place import Place, PlaceConstraint
+from symbolic.smooth.places import Place, PlaceConstraint
 
 GAPS = "gaps"
 """Name of `gap_function`."""

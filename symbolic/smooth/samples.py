@@ -2,10 +2,11 @@
 
 By the paper's allocation all normal forces are the largest of functions that are linear in the
 normal component F_n and the tangential magnitude F_t of the required force
-(`contact_forces.normal_force_branches`), so that these two, and not the kinked forces, are
-differentiated. How much of each patch the shift of the centre of pressure leaves is differentiated
-as it is: its kinks are those of the forces. Where forces are allocated jointly, what they have to
-hold is differentiated here, and `symbolic.smooth.held` goes on from there.
+(`symbolic.contact.paper.normal_force_branches`), so that these two, and not the kinked forces, are
+differentiated; those of soft fingers are differentiated themselves. How much of each patch the
+shift of the centre of pressure leaves is differentiated as it is: its kinks are those of the
+forces. Where forces are allocated jointly, what they have to hold is differentiated here, and from
+there the forces by `held_functions`.
 
 With the constant-speed law the motion at a sample depends on a window of five neighbouring
 samples alone (two finite differences). One small function serves all inner samples, its window's
@@ -15,32 +16,62 @@ differences, have one function per end. Any other time law is differentiated as 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
+from symbolic.contact.closed_form import Asked, held_by
+from symbolic.contact.grasp import Grasp
 from symbolic.contact.load import resultant_force
 from symbolic.contact.paper import (
-    allocate,
     normal_force_branches,
-    pressure_shift,
     required_moment,
     split_force,
 )
+from symbolic.contact.soft_grasp import SoftGrasp
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.path.spline import PathBasis, sample_basis, waypoint_matrix
 from symbolic.path.time_law import timed_path
-from symbolic.records import Task, Workcell
-from symbolic.smooth.keys import Block, Quantity, SampleKey
+from symbolic.records.cell import Workcell
+from symbolic.records.task import Task
+from symbolic.smooth.places import ORDERS, Order
+
+Quantity = Literal["force", "pressure", "load"]
+"""force: what normal forces are made of, see `_force_function` [N]. pressure: 1 - (shift / patch
+radius)^2 of contacts 1 and 2. load: force and moment about the box frame's origin, along the box's
+axes [N, N m]."""
+
+WIDTHS: Mapping[Quantity, int] = {"force": 2, "pressure": 2, "load": 6}
+"""Values of each sample."""
+
+Block = Literal["inner", "first", "last", "path"]
+"""Inner samples, one at a call; the first two; the last two; all of another time law."""
+
+WEIGHT = 1e-4
+"""Of the joint allocation's barriers, see `symbolic.contact.soft_grasp`. Forces exceed the least
+ones by about as much, relatively, times the number of constraints that bind, which the polish
+corrects at every round's candidate."""
 
 INPUTS = ("x", "basis", "rounding")
 """Of every function of samples."""
 
 WINDOW = 5
 """Samples that the motion at one of them depends on with the constant-speed law."""
+
+
+def sample_name(quantity: Quantity, block: Block, order: Order) -> str:
+    """Of a function of `sample_functions`."""
+    return f"{quantity}_{block}_{order}"
+
+
+def held_name(order: Order) -> str:
+    """Of a function of `held_functions`."""
+    return f"held_{order}"
 
 
 @dataclass(frozen=True)
@@ -75,7 +106,10 @@ def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
 
 
 def branch_coefficients(workcell: Workcell) -> Array:
-    """(2, 5, 2): per robot and branch the coefficients of F_n and F_t in the normal force."""
+    """(2, branches, 2): per robot and branch the coefficients of both force quantities of
+    `_force_function` in a normal force, which is the largest of its branches."""
+    if workcell.task.allocation == "soft-finger":
+        return np.eye(2)[:, None]
     f_n, f_t = ca.SX.sym("f_n"), ca.SX.sym("f_t")
     friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
     second = normal_force_branches(f_n, f_t, friction)
@@ -83,7 +117,7 @@ def branch_coefficients(workcell: Workcell) -> Array:
     return np.array([ca.DM(ca.jacobian(second + own * f_n, split)).full() for own in (1.0, 0.0)])
 
 
-def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[SampleKey, ca.Function]:
+def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Function]:
     """w = WIDTHS[quantity] values of each sample and their derivatives, for every block of
     `sample_blocks`.
 
@@ -98,15 +132,31 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[SampleKey, 
     One direction at a call keeps the second derivatives' code a tenth as long as a whole Hessian's:
     lanes take its columns side by side, and it stays in the processor's cache.
     """
-    makers = {"force": _split_function, "pressure": _margin_function, "load": _load_function}
+    makers = {"force": _force_function, "pressure": _margin_function, "load": _load_function}
     sample = makers[quantity](workcell)
     if workcell.task.time_law != "constant":
         return _whole_path(workcell, quantity, sample)
     columns: dict[Block, tuple[int, ...]] = {"inner": (2,), "first": (0, 1), "last": (3, 4)}
-    functions: dict[SampleKey, ca.Function] = {}
+    functions: dict[str, ca.Function] = {}
     for block, chosen in columns.items():
         functions |= _window_functions(workcell, sample, chosen, quantity, block)
     return functions
+
+
+def held_functions(workcell: Workcell) -> dict[str, ca.Function]:
+    """Normal forces as smooth convex functions of a sample's load: today those of the joint
+    allocation, see `symbolic.contact.soft_grasp.SoftGrasp.first` and `second`. Another contact
+    model without a closed form is plugged in here:
+
+    first: load (6,) -> normal (2,) [N], slope (6, 2), state (n,), whatever the second takes.
+    second: state, weight (2,) -> curvature (6, 6), the Hessian of weight . normal by the load.
+
+    Raises:
+        SettingsError: the pads do not close their grasp.
+    """
+    friction = np.array([contact.friction for contact in workcell.contacts])
+    soft = SoftGrasp(Grasp(workcell), friction, WEIGHT)
+    return {held_name("first"): soft.first(), held_name("second"): soft.second()}
 
 
 def motion_function(task: Task) -> ca.Function:
@@ -128,7 +178,7 @@ def _window_functions(
     columns: tuple[int, ...],
     quantity: Quantity,
     block: Block,
-) -> dict[SampleKey, ca.Function]:
+) -> dict[str, ca.Function]:
     task = workcell.task
     n_waypoints = len(task.waypoints)
     x, basis = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", n_waypoints, WINDOW)
@@ -147,7 +197,7 @@ def _window_functions(
 
 def _whole_path(
     workcell: Workcell, quantity: Quantity, sample: ca.Function
-) -> dict[SampleKey, ca.Function]:
+) -> dict[str, ca.Function]:
     task = workcell.task
     x, unused = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", len(task.waypoints), task.samples)
     rounding = ca.MX.sym("rounding")
@@ -194,13 +244,7 @@ def _margin_function(workcell: Workcell) -> ca.Function:
     """Force and moment (6,) in the box's frame to 1 - (shift / patch radius)^2 (2,), by the paper's
     allocation: where the patches suffice the joint one is the paper's."""
     wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
-    first, second, normal = (ca.SX(ca.DM(contacts[0].T_box_pad[:3, k])) for k in range(3))
-    centre = workcell.payload.centre_of_mass
-    arms = [ca.SX(ca.DM(c.T_box_pad[:3, 3] - centre)) for c in contacts]
-    forces = allocate(wrench[:3], normal, (contacts[0].friction, contacts[1].friction))
-    shift = pressure_shift(
-        wrench[3:], (arms[0], arms[1]), (forces.force_1, forces.force_2), (first, second)
-    )
+    shift = held_by(workcell, "paper", _asked(workcell, wrench))
     squares = ca.vertcat(ca.sumsqr(shift.shift_1), ca.sumsqr(shift.shift_2))
     radius = ca.DM([contact.patch_radius for contact in contacts])
     return ca.Function("sample_margin", [wrench], [1.0 - squares / radius**2])
@@ -213,18 +257,33 @@ def _load_function(workcell: Workcell) -> ca.Function:
     return ca.Function("sample_load", [wrench], [ca.vertcat(wrench[:3], about)])
 
 
-def _split_function(workcell: Workcell) -> ca.Function:
-    """Force and moment (6,) in the box's frame to F_n, F_t (2,)."""
+def _force_function(workcell: Workcell) -> ca.Function:
+    """Force and moment (6,) in the box's frame to the two quantities whose linear branches are the
+    normal forces (`branch_coefficients`): both normal forces of soft fingers, which have one branch
+    each, otherwise F_n and F_t. Another contact model in closed form is plugged in at these two."""
     wrench = ca.SX.sym("wrench", 6)
-    f_n, f_t, _ = split_force(wrench[:3], ca.SX(ca.DM(workcell.contacts[0].T_box_pad[:3, 2])))
-    return ca.Function("sample_split", [wrench], [ca.vertcat(f_n, f_t)])
+    if workcell.task.allocation == "soft-finger":
+        quantities = held_by(workcell, "soft-finger", _asked(workcell, wrench)).normal
+    else:
+        normal = ca.SX(ca.DM(workcell.contacts[0].T_box_pad[:3, 2]))
+        quantities = ca.vertcat(*split_force(wrench[:3], normal)[:2])
+    return ca.Function("sample_split", [wrench], [quantities])
+
+
+def _asked(workcell: Workcell, wrench: ca.SX) -> Asked:
+    """What force and moment (6,) in the box's frame ask of the contacts."""
+    contacts, centre = workcell.contacts, workcell.payload.centre_of_mass
+    first, second = (ca.SX(ca.DM(c.T_box_pad[:3, 3] - centre)) for c in contacts)
+    friction = ca.SX(ca.DM([contact.friction for contact in contacts]))
+    axes = ca.SX(ca.DM(contacts[0].T_box_pad[:3, :3]))
+    return Asked(wrench[:3], wrench[3:], (first, second), axes, friction)
 
 
 def _functions(
     values: ca.SX | ca.MX, inputs: list[ca.SX | ca.MX], quantity: Quantity, block: Block
-) -> dict[SampleKey, ca.Function]:
+) -> dict[str, ca.Function]:
     """See `sample_functions`."""
-    first, second = (SampleKey(quantity, block, order) for order in ("first", "second"))
+    first, second = (sample_name(quantity, block, order) for order in ORDERS)
     x, symbols = inputs[0], type(inputs[0])
     weight, along = symbols.sym("weight", values.numel()), symbols.sym("along", x.numel())
     gradient = ca.jacobian(values, x).T
@@ -232,9 +291,9 @@ def _functions(
     results = ca.cse([ca.densify(result) for result in (values, gradient)])
     names = list(INPUTS)
     return {
-        first: ca.Function(first.name, inputs, results, names, ["values", "gradient"]),
+        first: ca.Function(first, inputs, results, names, ["values", "gradient"]),
         second: ca.Function(
-            second.name,
+            second,
             [*inputs, weight, along],
             ca.cse([ca.densify(curvature)]),
             [*names, "weight", "along"],

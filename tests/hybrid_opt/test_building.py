@@ -11,7 +11,7 @@ from hybrid_opt.building import build_study
 from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.collisions import JobCollisions
-from hybrid_opt.polishing.polisher import polisher_for
+from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.robust.case_forces import CaseForces
 from hybrid_opt.timing.model import TimingModel
@@ -29,7 +29,7 @@ def test_nothing_is_compiled_after_everything_was_built(monkeypatch: pytest.Monk
     monkeypatch.setattr(Compiler, "compile", refuse)
     cell = Cell.load(RACK)
     for each in (cell, cell.drivable()):
-        assert polisher_for(each.evaluator, PolishSettings()) is not None
+        assert Polisher(each.evaluator, PolishSettings()) is not None
         assert TimingModel(each.compiled).joint_names
         assert JobCollisions(each.compiled).geometry.active
         assert CaseForces(each.workcell).workcell is each.workcell

@@ -49,7 +49,7 @@ def hybrid_data(data: ReportData) -> ReportData:
     objectives = np.concatenate([front.objectives for front in fronts])
     best = non_dominated(objectives)
     hybrid = Front(x[best], objectives[best])
-    effort = PolishEffort(1, {}, 1.0, 1.0, 1.0, 1, 0.5, 0.0, 0.0, 0.0)
+    effort = PolishEffort("dense", 1, {}, 1.0, 1.0, 1.0, 1, 0.5, 0.0, 0.0, 0.0)
     indicators = front_indicators(hybrid.objectives, hybrid.objectives, None, None)
     figures = PolishedFigures(**indicators, **vars(effort))
     algorithms = tuple(

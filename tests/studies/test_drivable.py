@@ -34,6 +34,7 @@ def test_ends_and_middle_of_polished_fronts_and_the_balanced_path_are_known(
         (),
         1.0,
         1.0,
+        "quadratic",
     )
     path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
     path.parent.mkdir(parents=True)

@@ -10,7 +10,7 @@ import pytest
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
-from hybrid_opt.polishing.front import FrontPolisher
+from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.robust.force import BoxMotion, RobustModel
 from hybrid_opt.robust.path_force import RobustPath
@@ -88,7 +88,7 @@ def test_robust_forces_keep_to_a_limit_and_hold_random_cases(cell: Cell) -> None
 def test_what_knows_closed_forms_only_refuses_it(cell: Cell) -> None:
     unsure = replace(cell.workcell, uncertainty=Uncertainty(0.08, 0.05, np.full(3, 0.004), 0.002))
     with pytest.raises(SettingsError, match="face one another"):
-        FrontPolisher(CandidateEvaluator(unsure, ROBUST_OBJECTIVES), PolishSettings())
+        Polisher(CandidateEvaluator(unsure, ROBUST_OBJECTIVES), PolishSettings())
     with pytest.raises(SettingsError, match="face one another"):
         RobustPath(cell.workcell)
 

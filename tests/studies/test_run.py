@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
+import hybrid_opt as ho
 from hybrid_opt.campaign import Progress
 from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.errors import NoCarryError
@@ -26,7 +27,7 @@ from hybrid_opt.store.replay import replay
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.document import read_timing
 from studies import rack, recommend, run
-from studies.cli import campaign_parser, campaign_settings
+from studies.cli import campaign_parser, campaign_settings, polish_settings
 from studies.recommendation_stage import recommend_from
 from studies.recommendation_text import recommendation_text
 from symbolic.read.cell import load
@@ -284,6 +285,16 @@ def test_help_explains_every_option_with_its_default() -> None:
     assert len(options) == len(named)
     for option in options:
         assert re.search(r"\(default:", option), option
+
+
+def test_options_tell_how_fronts_are_polished() -> None:
+    parser, usual = campaign_parser("program", "", ""), ho.PolishSettings()
+    assert polish_settings(parser.parse_args([]), True, usual) == usual
+    asked = parser.parse_args(["--polish-solver", "ipopt", "--polish-attempts", "3"])
+    found = polish_settings(asked, True, usual)
+    assert found is not None
+    assert (found.solver, found.attempts) == ("ipopt", 3)
+    assert polish_settings(parser.parse_args(["--no-polish"]), True, usual) is None
 
 
 def test_options_become_settings() -> None:

@@ -11,8 +11,7 @@ from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.path_motion import path_motion_function
 from symbolic.records.task import initial_decision
-from symbolic.smooth.closure import closure_functions
-from symbolic.smooth.keys import ClosureKey
+from symbolic.smooth.places import closure_functions, closure_name
 from tests.redundant_cells import free_pandas
 
 SAMPLES = 201
@@ -66,7 +65,7 @@ def test_own_torques_are_pinocchios(model: CellModel, motion: dict[str, Array], 
 @pytest.mark.parametrize("arm", [0, 1])
 def test_the_closure_has_exact_derivatives_by_the_extended_pose(model: CellModel, arm: int) -> None:
     functions = closure_functions(model, arm)
-    first, second = (functions[ClosureKey(arm, order)] for order in ("first", "second"))
+    first, second = (functions[closure_name(arm, order)] for order in ("first", "second"))
     x = initial_decision(model.workcell.task)
     pose = np.concatenate([model.workcell.task.waypoints[0].lower, [0.15, 0.05]])
     assert len(x) == 12
@@ -78,7 +77,7 @@ def test_the_closure_has_exact_derivatives_by_the_extended_pose(model: CellModel
         ends = [np.array(first(pose + sign * step, q)[0]).ravel() for sign in (1, -1)]
         columns.append((ends[0] - ends[1]) / (2 * width))
     np.testing.assert_allclose(follow, np.array(columns).T, atol=1e-7)
-    # The curvature of one joint along any direction, by the formula of `symbolic.smooth.closure`.
+    # The curvature of one joint along any direction, by the formula of `symbolic.smooth.places`.
     direction = np.random.default_rng(arm).normal(size=8)
     T = np.vstack([np.eye(8), follow])
     for joint in range(7):

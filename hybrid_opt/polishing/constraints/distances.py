@@ -1,23 +1,55 @@
-"""What clearances of all kinds require: a measured distance, told in the smooth bound's terms.
+"""Distances kept: of the arms, and how the payload passes an obstacle.
 
-The smooth bound may be lower than the true distance by a centimetre. So a row asks for the wanted
-distance less what FCL, or the sharp bound, measures beyond the smooth one at the current
-candidate; where the solution moves on and that was too much, the next round asks again.
+The smooth bound of a clearance may be lower than the true distance by a centimetre. So a row asks
+for the wanted distance less what FCL, or the sharp bound, measures beyond the smooth one at the
+current candidate; where the solution moves on and that was too much, the next round asks again.
+
+Between a box and a box, the bound is the largest of a few gaps along single directions. A row that
+holds one of these gaps is smooth. Where the largest gap changes from one that falls to one that
+rises, the payload passes an edge, and the height of that kink gets a row of its own
+(`symbolic.smooth.passage`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hybrid_opt.polishing.constraints.kind import Kind, Surroundings
-from hybrid_opt.polishing.layout import PlaceRow
-from hybrid_opt.polishing.place_values import row_numbers
-from hybrid_opt.polishing.placed_carry import PlacedCarry
+from hybrid_opt.polishing.carry import PlacedCarry, lowest
+from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.constraints.kinds import MARGIN, Kind, Limits, smooth_values
+from hybrid_opt.polishing.rows import PlaceRow
 from symbolic.array import Array
-from symbolic.smooth.clearance import Clearance
 from symbolic.smooth.passage import Passing, Separation
+from symbolic.smooth.places import Clearance
+
+BODY_DISTANCE = 0.03
+"""Pairs with an arm's body nearer than this get a row at their lowest [m]."""
+
+MEASURED_BELOW = 0.02
+"""Bounds lower than this are compared with FCL's distance [m]."""
+
+BESIDE_CLEARANCE = 0.015
+"""A violated clearance also gets rows this far to either side."""
+
+GAP_DISTANCE, GAP_STRIDE = 0.03, 0.02
+"""The payload's gaps below the distance [m] get a row in every such stretch: they are cheap,
+because they need no joints, and decide where the path may go."""
+
+FAR_GAP_DISTANCE, FAR_GAP_STRIDE = 0.08, 0.04
+"""The same farther away, less densely."""
+
+KINK_DISTANCE = 0.06
+"""Kinks of the payload's clearance lower than this get a row [m]."""
+
+BESIDE_KINK = 0.03
+"""Around a kink without rows of a gap: they would hold the kink in its place."""
+
+KINK_WINDOW = 0.04
+"""Around a kink, where its height is measured."""
 
 
 class DistanceKind(Kind[PlaceRow]):
@@ -30,19 +62,19 @@ class DistanceKind(Kind[PlaceRow]):
 
     window: int = 0
 
-    def __init__(self, around: Surroundings) -> None:
-        super().__init__(around)
-        tolerance = around.evaluator.checker.geometry.tolerance
-        self.wanted = tolerance + around.settings.clearance
+    def __init__(self, cell: SmoothCell) -> None:
+        super().__init__(cell)
+        tolerance = cell.evaluator.checker.geometry.tolerance
+        self.wanted = tolerance + cell.clearance
         # Half of what is wanted beyond the tolerance is left to what solver and FCL round off.
-        self.least = tolerance + around.settings.clearance / 2.0
-        self.rows = around.cell.functions.rows
+        self.least = tolerance + cell.clearance / 2.0
+        self.separable = cell.functions.rows.separable
 
     def required(
         self, carry: PlacedCarry, rows: Sequence[PlaceRow], lenient: bool = False
     ) -> list[float]:
         """See the module; the margin where no arm gets to."""
-        values = np.full(len(rows), self.around.settings.margin)
+        values = np.full(len(rows), MARGIN)
         chosen = [k for k, row in enumerate(rows) if row.place < carry.reached]
         if not chosen:
             return values.tolist()
@@ -50,7 +82,7 @@ class DistanceKind(Kind[PlaceRow]):
         wanted = self.wanted[[pair_of(rows[k]) for k in chosen]]
         if lenient:
             wanted = np.where(truth > 0.0, np.minimum(wanted, truth), wanted)
-        smooth = smooth_values(self.around, carry, [rows[k] for k in chosen])
+        smooth = smooth_values(self.cell, carry, [rows[k] for k in chosen])
         values[chosen] = wanted - (truth - smooth)
         return values.tolist()
 
@@ -59,11 +91,11 @@ class DistanceKind(Kind[PlaceRow]):
         return carry.once("violations", lambda: self._violations(carry))
 
     def _violations(self, carry: PlacedCarry) -> dict[int, Array]:
-        close = carry.lowered < self.least
+        close = carry.distances.lowered < self.least
         pairs = np.flatnonzero(close.any(axis=0)).tolist()
         if not pairs:
             return {}
-        truth = carry.distance(close)
+        truth = carry.distances.at(close)
         return {pair: truth[:, pair].copy() for pair in pairs}
 
     def _measured(self, carry: PlacedCarry, rows: Sequence[PlaceRow]) -> Array:
@@ -72,7 +104,7 @@ class DistanceKind(Kind[PlaceRow]):
             (slice(max(0, row.place - self.window), row.place + self.window + 1), pair_of(row))
             for row in rows
         ]
-        return np.array(carry.least(stretches, self.near_settings.measured_below))
+        return np.array(carry.distances.least(stretches, MEASURED_BELOW))
 
 
 def pair_of(row: PlaceRow) -> int:
@@ -81,17 +113,153 @@ def pair_of(row: PlaceRow) -> int:
     return row.constraint.pair
 
 
-def smooth_values(around: Surroundings, carry: PlacedCarry, rows: Sequence[PlaceRow]) -> Array:
-    """The rows' values as the smooth problem sees them."""
-    values = np.empty(len(rows))
-    groups: dict[str, list[int]] = {}
-    for k, row in enumerate(rows):
-        groups.setdefault(row.constraint.family, []).append(k)
-    for members in groups.values():
-        at = [rows[k].place for k in members]
-        functions, kinds = around.cell.functions.rows, [rows[k].constraint for k in members]
-        inputs = [array[at] for array in (carry.pose, carry.rate, *carry.q)]
-        inputs += row_numbers(kinds, functions)
-        function = functions.of(kinds[0], "first")
-        values[members] = function.batch(*inputs)["value"]
-    return values
+class Clearances(DistanceKind):
+    """Rows at the lowest places of every pair that comes near."""
+
+    lasting = True
+
+    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PlaceRow]:
+        """Pairs whose bound is small."""
+        for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < BODY_DISTANCE).tolist():
+            if pair not in self.separable:
+                for place in lowest(carry.distances.bounds[:, pair], BODY_DISTANCE):
+                    yield PlaceRow(Clearance(pair), place)
+
+    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
+        """Pairs that come too close: at the lowest place and around it; a dip counts at two
+        neighbours."""
+        width = self.grid.places(BESIDE_CLEARANCE)
+        for pair, distance in self.violations(carry).items():
+            if pair in self.separable:
+                continue
+            lows = lowest(distance, float(self.least[pair]))
+            for place in sorted({k + beside for k in lows for beside in (0, 1, -width, width)}):
+                if place < carry.reached:
+                    yield PlaceRow(Clearance(pair), place)
+
+
+class Separations(DistanceKind):
+    """Rows of single gaps between the payload and a box, away from kinks."""
+
+    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PlaceRow]:
+        """Along every stretch where the payload is near, at a few places each."""
+        grid = self.grid
+        beside = grid.places(BESIDE_KINK)
+        stretches = (
+            (GAP_DISTANCE, grid.places(GAP_STRIDE)),
+            (FAR_GAP_DISTANCE, grid.places(FAR_GAP_STRIDE)),
+        )
+        for pair, gaps in near_gaps(self, carry):
+            kinks = [kink for kink, _ in edges(gaps, KINK_DISTANCE)]
+            places = {
+                place
+                for distance, stride in stretches
+                for place in lowest(gaps.height, distance, stride)
+                if all(abs(place - kink) >= beside for kink in kinks)
+            }
+            for place in sorted(places):
+                yield separation(pair, gaps, place)
+
+    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
+        """Around places that are too close and far from every kink of the known candidate, in
+        whose directions the rows are."""
+        half = self.grid.places(KINK_WINDOW) // 2
+        for pair, gaps, place, near in violated_passages(self, carry, known):
+            if not near:
+                for k in (place - half, place, place + half):
+                    if 0 <= k < known.reached:
+                        yield separation(pair, gaps, k)
+
+
+class Passings(DistanceKind):
+    """Rows of the kinks where the payload passes an edge."""
+
+    def __init__(self, cell: SmoothCell) -> None:
+        super().__init__(cell)
+        self.window = cell.grid.places(KINK_WINDOW)
+
+    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PlaceRow]:
+        """Kinks that are low."""
+        for pair, gaps in near_gaps(self, carry):
+            for kink, place in edges(gaps, KINK_DISTANCE):
+                yield passing(pair, gaps, kink, place)
+
+    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
+        """Kinks of the known candidate near places that are too close."""
+        for pair, gaps, _, near in violated_passages(self, carry, known):
+            for kink, place in near:
+                yield passing(pair, gaps, kink, place)
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """A separable pair's gaps along every direction at m places.
+
+    Attributes:
+        along: (m, n) [m].
+        best: (m,) direction of the largest.
+        height: (m,) that one [m].
+    """
+
+    along: Array
+    best: NDArray[np.intp]
+    height: Array
+
+    @classmethod
+    def of(cls, along: Array) -> Gaps:
+        """Of all gaps."""
+        best = along.argmax(axis=1)
+        return cls(along, best, along[np.arange(len(best)), best])
+
+
+def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
+    """Kinks lower than a limit [m]: the place before each, and the lower one of both beside it."""
+    best, height, along = gaps.best, gaps.height, gaps.along
+    return [
+        (k, k + int(height[k + 1] < height[k]))
+        for k in np.flatnonzero(best[1:] != best[:-1]).tolist()
+        if height[k : k + 2].min() < limit
+        and along[k + 1, best[k]] < along[k, best[k]]
+        and along[k + 1, best[k + 1]] > along[k, best[k + 1]]
+    ]
+
+
+def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PlaceRow:
+    """The row of a kink of `edges`."""
+    before, after = (int(gaps.best[k]) for k in (kink, kink + 1))
+    return PlaceRow(Passing(pair, before, after), place)
+
+
+def separation(pair: int, gaps: Gaps, place: int) -> PlaceRow:
+    """The row of the largest gap at a place."""
+    return PlaceRow(Separation(pair, int(gaps.best[place])), place)
+
+
+def near_gaps(kind: DistanceKind, carry: PlacedCarry) -> Iterable[tuple[int, Gaps]]:
+    """Every separable pair that comes near, and its gaps."""
+    for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < FAR_GAP_DISTANCE).tolist():
+        if pair in kind.separable:
+            yield pair, gaps_of(kind, carry, pair)
+
+
+def violated_passages(
+    kind: DistanceKind, carry: PlacedCarry, known: PlacedCarry
+) -> Iterable[tuple[int, Gaps, int, list[tuple[int, int]]]]:
+    """Places that are too close: pair, gaps of the known candidate, place, its kinks nearby."""
+    window = kind.grid.places(KINK_WINDOW)
+    for pair, distance in kind.violations(carry).items():
+        if pair not in kind.separable:
+            continue
+        gaps = gaps_of(kind, known, pair)
+        kinks = edges(gaps, KINK_DISTANCE)
+        for place in lowest(distance, float(kind.least[pair])):
+            yield pair, gaps, place, [k for k in kinks if abs(k[1] - place) <= window]
+
+
+def gaps_of(kind: DistanceKind, carry: PlacedCarry, pair: int) -> Gaps:
+    """Of a separable pair, at the places that are reached."""
+
+    def find() -> Gaps:
+        return Gaps.of(carry.gaps(pair))
+
+    return carry.once(("gaps", pair), find)

@@ -34,18 +34,18 @@ from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.front import FrontPolisher
+from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import (
     PolishedFront,
     PolishOutcome,
     outcome_from_json,
     outcome_to_json,
 )
-from hybrid_opt.polishing.residuals import Residuals
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
+from hybrid_opt.polishing.solvers.base import Residuals
 from symbolic.array import Array
 from symbolic.read.cell import load
-from tests.symbolic.read.samples import RACK
+from tests.symbolic.cells import RACK
 
 SETTINGS = CampaignSettings(algorithms=("nsga2",), evaluations=200, replicas=1, seed=5)
 PROBE = ProbeSettings(starts=2, middle_starts=2)
@@ -110,14 +110,14 @@ def test_a_polisher_is_given_the_paths_that_are_known_beside(
 ) -> None:
     paths, seen = np.arange(36.0).reshape(2, 18), list[Any]()
 
-    def polish(self: FrontPolisher, front_x: Array, *_: object, **options: Any) -> PolishedFront:
+    def polish(self: Polisher, front_x: Array, *_: object, **options: Any) -> PolishedFront:
         seen.append(options["paths"])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(FrontPolisher, "polish", polish)
+    monkeypatch.setattr(Polisher, "polish", polish)
     request = PolishRequest(SETTINGS, "nsga2", 0, np.empty((0, 18)), (), paths)
     with pytest.raises(KeyboardInterrupt):
-        polish_replica(object.__new__(FrontPolisher), request, lambda block: None)
+        polish_replica(object.__new__(Polisher), request, lambda block: None)
     assert seen == [paths]
 
 
@@ -147,8 +147,10 @@ def test_what_was_not_solved_counts_in_no_figure_of_solves() -> None:
         (solved, as_it_is, lost),
         1.0,
         1.0,
+        "ipopt",
     )
     figures = polish_document(front).figures
+    assert figures.solver == "ipopt"
     assert figures.attempts == 2
     assert figures.median_attempt_seconds == 3.0
     assert figures.median_stationarity == figures.worst_stationarity == 1e-5
@@ -209,7 +211,7 @@ def test_a_recorded_attempt_of_nonsense_is_told() -> None:
             polish_replica(Repeating(), replace(request, recorded=(block,)), lambda message: None)
 
 
-class Repeating(FrontPolisher):
+class Repeating(Polisher):
     """A polisher that only reads what was recorded."""
 
     def __init__(self) -> None: ...

@@ -28,14 +28,9 @@ CHANGED: dict[str, PolishSettings] = {
     "rounds 4": replace(DEFAULT, rounds=4),
     "rounds 12": replace(DEFAULT, rounds=12),
     "max_iterations 15": replace(DEFAULT, max_iterations=15),
-    "solve.barrier 3e-3": replace(DEFAULT, solve=replace(DEFAULT.solve, barrier=3e-3)),
-    "trust.first 0.3": replace(DEFAULT, trust=replace(DEFAULT.trust, first=0.3)),
-    "trust.parts 0": replace(DEFAULT, trust=replace(DEFAULT.trust, parts=0)),
-    "near.reach_share 0.5": replace(DEFAULT, near=replace(DEFAULT.near, reach_share=0.5)),
-    "near.body_distance 0.01": replace(DEFAULT, near=replace(DEFAULT.near, body_distance=0.01)),
-    "kick.share 0.5": replace(DEFAULT, kick=replace(DEFAULT.kick, share=0.5)),
-    "front.own_share 0.5": replace(DEFAULT, front=replace(DEFAULT.front, own_share=0.5)),
-    "fill.rounds 4": replace(DEFAULT, fill=replace(DEFAULT.fill, rounds=4)),
+    "solver ipopt": replace(DEFAULT, solver="ipopt"),
+    "probe.rounds 3": replace(DEFAULT, probe=replace(DEFAULT.probe, rounds=3)),
+    "fill.solved 24": replace(DEFAULT, fill=replace(DEFAULT.fill, solved=24)),
 }
 
 

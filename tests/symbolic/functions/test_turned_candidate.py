@@ -12,10 +12,10 @@ from studies.plain.candidate import PlainEvaluator
 from symbolic.array import Array
 from symbolic.functions import candidate_function
 from symbolic.path_motion import path_motion_function
-from symbolic.records import TimeLaw, Workcell
+from symbolic.records.cell import Workcell
 from symbolic.records.poses import box_rotation
-from symbolic.smooth.closure import closure_functions
-from symbolic.smooth.keys import ClosureKey
+from symbolic.records.task import TimeLaw
+from symbolic.smooth.places import closure_functions, closure_name
 from tests.symbolic.cells import hand_model, start_posture
 from tests.turned_cells import pitched_cell, random_x, turned_cell
 
@@ -87,7 +87,7 @@ def test_derivatives_along_the_path_are_those_of_differences() -> None:
 def test_joints_follow_rotation_vectors_with_exact_derivatives(arm: int) -> None:
     model = hand_model(turned_cell())
     functions = closure_functions(model, arm)
-    first, second = (functions[ClosureKey(arm, order)] for order in ("first", "second"))
+    first, second = (functions[closure_name(arm, order)] for order in ("first", "second"))
     away = np.array([-0.1, 0.0, 0.02, 0.05, 0.3, -0.05])
     pose = model.workcell.task.waypoints[0].lower + away
     q, follow, pull = (np.array(value) for value in first(pose, model.start[arm]))

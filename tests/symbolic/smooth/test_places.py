@@ -18,13 +18,9 @@ from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import coal_distance
 from symbolic.path.rotation import rotation_matrix
 from symbolic.read.cell import load
-from symbolic.records import Box
+from symbolic.records.cell import Box
 from symbolic.records.poses import Orientation
 from symbolic.robot.arm import flange_target, manipulability, pose_error
-from symbolic.smooth.clearance import Clearance
-from symbolic.smooth.closure import closure_functions
-from symbolic.smooth.joint_limit import JointLimit
-from symbolic.smooth.keys import ClosureKey
 from symbolic.smooth.passage import (
     APART,
     DIRECTIONS,
@@ -33,8 +29,17 @@ from symbolic.smooth.passage import (
     Separation,
     gap_function,
 )
-from symbolic.smooth.place import TURN, Place, PlaceConstraint, row_function
-from symbolic.smooth.reach import Reach
+from symbolic.smooth.places import (
+    TURN,
+    Clearance,
+    JointLimit,
+    Place,
+    PlaceConstraint,
+    Reach,
+    closure_functions,
+    closure_name,
+    row_function,
+)
 from tests.symbolic.read.samples import RACK
 
 STILL = np.zeros(6)
@@ -75,7 +80,7 @@ def pose_near_start(seed: int) -> Array:
 
 @cache
 def closure(arm: int) -> ca.Function:
-    return closure_functions(model(), arm)[ClosureKey(arm, "first")]
+    return closure_functions(model(), arm)[closure_name(arm, "first")]
 
 
 def joints_at(pose: Array) -> tuple[Array, Array]:

@@ -11,15 +11,22 @@ import pytest
 
 from symbolic.array import Array
 from symbolic.functions import candidate_function
-from symbolic.records import TimeLaw, Workcell
-from symbolic.smooth.keys import Quantity, SampleKey
-from symbolic.smooth.samples import branch_coefficients, sample_blocks, sample_functions
+from symbolic.records.cell import Workcell
+from symbolic.records.task import Allocation, TimeLaw
+from symbolic.smooth.samples import (
+    Quantity,
+    branch_coefficients,
+    sample_blocks,
+    sample_functions,
+    sample_name,
+)
 from tests.symbolic.cells import hand_cell, hand_model
 
 
-def cell_with(time_law: TimeLaw, samples: int = 12) -> Workcell:
+def cell_with(time_law: TimeLaw, samples: int = 12, allocation: Allocation = "paper") -> Workcell:
     cell = hand_cell()
-    return replace(cell, task=replace(cell.task, time_law=time_law, samples=samples))
+    task = replace(cell.task, time_law=time_law, samples=samples, allocation=allocation)
+    return replace(cell, task=task)
 
 
 def random_x(cell: Workcell, seed: int) -> Array:
@@ -27,21 +34,25 @@ def random_x(cell: Workcell, seed: int) -> Array:
 
 
 def split_of(
-    cell: Workcell, functions: Mapping[SampleKey, ca.Function], x: Array, rounding: float = 0.0
+    cell: Workcell, functions: Mapping[str, ca.Function], x: Array, rounding: float = 0.0
 ) -> Array:
     """(samples, 2) from the blocks, put in the samples' order."""
     split = np.full((cell.task.samples, 2), np.nan)
     for block in sample_blocks(cell.task):
-        values = functions[SampleKey("force", block.block, "first")]
+        values = functions[sample_name("force", block.block, "first")]
         for samples, basis in zip(block.samples, block.basis, strict=True):
             split[samples] = np.array(values(x, basis.T, rounding)[0]).reshape(-1, 2)
     return split
 
 
 @pytest.mark.parametrize("time_law", ["constant", "ramped"])
-@pytest.mark.parametrize("samples", [5, 6, 12])
-def test_the_largest_branch_is_the_evaluators_normal_force(time_law: TimeLaw, samples: int) -> None:
-    cell = cell_with(time_law, samples)
+@pytest.mark.parametrize(
+    ("samples", "allocation"), [(5, "paper"), (6, "paper"), (12, "paper"), (12, "soft-finger")]
+)
+def test_the_largest_branch_is_the_evaluators_normal_force(
+    time_law: TimeLaw, samples: int, allocation: Allocation
+) -> None:
+    cell = cell_with(time_law, samples, allocation)
     evaluate = candidate_function(hand_model(cell))
     coefficients, functions = branch_coefficients(cell), sample_functions(cell, "force")
     for seed in range(5):
@@ -64,18 +75,21 @@ def test_a_rounded_time_law_is_near_the_sharp_one_and_nearer_the_less_it_is_roun
 
 
 @pytest.mark.parametrize("rounding", [0.0, 0.02])
-@pytest.mark.parametrize("quantity", ["force", "pressure", "load"])
+@pytest.mark.parametrize(
+    ("quantity", "allocation"),
+    [("force", "paper"), ("pressure", "paper"), ("load", "joint"), ("force", "soft-finger")],
+)
 @pytest.mark.parametrize("time_law", ["constant", "ramped"])
 def test_derivatives_are_those_of_the_values(
-    time_law: TimeLaw, quantity: Quantity, rounding: float
+    time_law: TimeLaw, quantity: Quantity, allocation: Allocation, rounding: float
 ) -> None:
-    cell = cell_with(time_law)
+    cell = cell_with(time_law, allocation=allocation)
     functions = sample_functions(cell, quantity)
     rng = np.random.default_rng(3)
     step = 1e-6
     for block in sample_blocks(cell.task):
         first, second = (
-            functions[SampleKey(quantity, block.block, order)] for order in ("first", "second")
+            functions[sample_name(quantity, block.block, order)] for order in ("first", "second")
         )
         x, basis = random_x(cell, 1), block.basis[len(block.basis) // 2].T
         weight = rng.normal(size=first.size1_out(0))

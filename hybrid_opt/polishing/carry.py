@@ -1,0 +1,281 @@
+"""A candidate as the polish sees it: on the task's samples, and on places between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache, partial
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_opt.polishing.cell import SmoothCell
+from symbolic.array import Array
+from symbolic.records.task import POSE_SIZE, extended_waypoints, place_redundant
+from symbolic.robot.arm import REACH_TOLERANCE
+from symbolic.smooth.places import Reach
+
+_Found = TypeVar("_Found")
+
+SHARPENED_BELOW = 0.1
+"""Bounds of the payload's distances that are lower are raised by the gaps across its edges [m]."""
+
+DIPS_BELOW = 0.1
+"""Pairs that stay farther apart than this are not looked at between places [m]."""
+
+AT_ONCE = 8
+"""Distances that are measured together where the first low one ends a search."""
+
+Stretch = tuple[slice, int]
+"""Places of the path, from a start that is given, and a pair."""
+
+
+@dataclass(frozen=True)
+class PlacedCarry:
+    """A candidate on m places.
+
+    Attributes:
+        pose, rate: (m, 6) box poses [m, rad], and their first derivative with respect to the
+            path parameter.
+        q: both arms' joint positions, (m, n) each [rad]; beyond `reached` without meaning.
+        reached: places before the first that an arm does not reach.
+        stranded: the arms that do not reach all places.
+        manipulability: (reached, 2) |det J| over its least value.
+        split: (n, 2) on samples: what normal forces are made of, see `symbolic.smooth.samples`: of
+            soft fingers themselves, otherwise normal component and tangential magnitude of the
+            required force [N]; without meaning where the pads do not face one another.
+        force: (n, 2) on samples: the normal forces that are minimised, planned or robust ones [N].
+        peak: (2,) their peaks over their references.
+        shift: (n, 2) on samples: shifts of the centres of pressure over their patches' radii.
+        distances: of every active pair at the places that are reached.
+        gaps: (reached, DIRECTIONS) of a pair that `symbolic.smooth.passage` separates [m].
+    """
+
+    pose: Array
+    rate: Array
+    q: tuple[Array, Array]
+    reached: int
+    stranded: tuple[int, ...]
+    manipulability: Array
+    split: Array
+    force: Array
+    peak: Array
+    shift: Array
+    distances: Distances = field(repr=False)
+    gaps: Callable[[int], Array] = field(repr=False)
+    _known: dict[object, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether both arms reach all places."""
+        return self.reached == len(self.pose)
+
+    def once(self, key: object, find: Callable[[], _Found]) -> _Found:
+        """What several kinds of constraints want to know of this candidate, found by the first."""
+        if key not in self._known:
+            self._known[key] = find()
+        found: _Found = self._known[key]
+        return found
+
+
+def lowest(values: Array, limit: float, stride: int | None = None) -> list[int]:
+    """Of every stretch of places below the limit the lowest, and those by the stride from it."""
+    below = values < limit
+    if not below.any():
+        return []
+    edges = np.diff(np.concatenate([[0], below.astype(np.int8), [0]]))
+    places: list[int] = []
+    for start, stop in zip(
+        np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True
+    ):
+        least = start + int(np.argmin(values[start:stop]))
+        if stride is None:
+            places.append(least)
+        else:
+            places += range(least - (least - start) // stride * stride, stop, stride)
+    return places
+
+
+def dipped(clearance: Array) -> Array:
+    """Clearances (n, k) with the dips between places: where an edge is passed, the clearance falls
+    steadily up to a kink and rises steadily from there, so the lines from both sides meet at the
+    least value in between, which then counts at both places."""
+    low = clearance.copy()
+    if len(clearance) < 4:
+        return low
+    before, left, right, after = (clearance[i : len(clearance) - 3 + i] for i in range(4))
+    falling, rising = before - left, after - right
+    both = (falling > 0.0) & (rising > 0.0)
+    slopes = np.where(both, falling + rising, 1.0)
+    share = np.where(both, (left - right + rising) / slopes, 0.0)
+    kink = np.where((share > 0.0) & (share < 1.0), left - falling * share, np.inf)
+    low[1:-2] = np.minimum(low[1:-2], kink)
+    low[2:-1] = np.minimum(low[2:-1], kink)
+    return low
+
+
+class Distances:
+    """Distances of one candidate; each is measured when it is first asked for, and kept.
+
+    Attributes:
+        bounds, lowered: (n, n_pairs) lower bounds [m], the latter with the dips that are to be
+            expected beside each place.
+    """
+
+    def __init__(
+        self,
+        find: Callable[[], Array],
+        measure: Callable[[NDArray[np.intp], Array, NDArray[np.bool_]], object],
+    ) -> None:
+        """find: gives the bounds; measure: raises those of some places (k,), (k, n_pairs), where
+        wanted. Neither is done before it is needed."""
+        self._find, self._measure = find, measure
+
+    @cached_property
+    def bounds(self) -> Array:
+        """See the class."""
+        return self._find()
+
+    @cached_property
+    def lowered(self) -> Array:
+        """See the class."""
+        near = self.bounds.min(axis=0, initial=np.inf) < DIPS_BELOW
+        lowered = self.bounds.copy()
+        lowered[:, near] = dipped(self.bounds[:, near])
+        return lowered
+
+    @cached_property
+    def _found(self) -> Array:
+        return self.lowered.copy()
+
+    @cached_property
+    def _unknown(self) -> NDArray[np.bool_]:
+        return np.ones(self.bounds.shape, dtype=np.bool_)
+
+    def at(self, wanted: NDArray[np.bool_]) -> Array:
+        """(n, n_pairs) as `lowered`, those wanted raised by what FCL's distance exceeds the bound
+        where nothing touches [m]."""
+        self._learn(*(wanted & self._unknown).nonzero())
+        return self._found
+
+    def _learn(self, places: NDArray[np.intp], pairs: NDArray[np.intp]) -> None:
+        """Measure pairs at places, side by side."""
+        if not len(places):
+            return
+        rows, local = np.unique(places, return_inverse=True)
+        wanted = np.zeros((len(rows), self.bounds.shape[1]), dtype=np.bool_)
+        wanted[local, pairs] = True
+        raised = self.bounds[rows]
+        self._measure(rows, raised, wanted)
+        self._found[places, pairs] += raised[local, pairs] - self.bounds[places, pairs]
+        self._unknown[places, pairs] = False
+
+    def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
+        """The least distance in each stretch, measured where bounds are below a limit [m]. No
+        distance is below its bound: of each stretch the lowest is measured until that is one that
+        is known."""
+        open_, found = list(range(len(stretches))), [np.inf] * len(stretches)
+        while open_:
+            lowest = dict[int, tuple[int, int]]()
+            for k in open_:
+                where, pair = stretches[k]
+                place = where.start + int(self._found[where, pair].argmin())
+                found[k] = float(self._found[place, pair])
+                if self._unknown[place, pair] and self.bounds[place, pair] < below:
+                    lowest[k] = place, pair
+            chosen = np.array(sorted(set(lowest.values())), dtype=np.intp).reshape(-1, 2)
+            self._learn(chosen[:, 0], chosen[:, 1])
+            open_ = list(lowest)
+        return found
+
+    def keep(self, limits: Array) -> bool:
+        """Whether every pair keeps its limit (n_pairs,) at all places [m]. The lowest are measured
+        first: the first that does not keep its limit tells."""
+        places, pairs = (self.lowered < limits).nonzero()
+        order = np.argsort(self.lowered[places, pairs], kind="stable")
+        for first in range(0, len(order), AT_ONCE):
+            some = order[first : first + AT_ONCE]
+            fresh = some[self._unknown[places[some], pairs[some]]]
+            self._learn(places[fresh], pairs[fresh])
+            if (self._found[places[some], pairs[some]] < limits[pairs[some]]).any():
+                return False
+        return True
+
+
+class CarryReader:
+    """Evaluates candidates of one cell on the places of a grid."""
+
+    def __init__(self, cell: SmoothCell) -> None:
+        self._evaluator, self._grid, self._robust = cell.evaluator, cell.grid, cell.robust
+        self._rows = cell.functions.rows
+        self._radii = [contact.patch_radius for contact in cell.workcell.contacts]
+
+    def read(self, x: Array) -> PlacedCarry:
+        """Evaluate a decision vector (n_var,)."""
+        evaluator, grid = self._evaluator, self._grid
+        found = {name: value[0] for name, value in evaluator.outputs(x[None]).items()}
+        task = evaluator.workcell.task
+        waypoints = extended_waypoints(task, x)
+        extended = grid.basis @ waypoints
+        pose = np.ascontiguousarray(extended[:, :POSE_SIZE])
+        guesses = [grid.between(found[f"q_{arm}"]) for arm in (1, 2)]
+        place_redundant(task, extended, guesses)
+        posture = evaluator.functions["posture"].batch(pose, *guesses)
+        followed = np.column_stack(
+            [
+                (posture[f"residual_{arm}"].reshape(-1) <= REACH_TOLERANCE)
+                & (grid.between(found[f"lost_{arm}"].reshape(-1, 1))[:, 0] == 0.0)
+                for arm in (1, 2)
+            ]
+        )
+        lost = np.flatnonzero(~followed.all(axis=1))
+        reached = int(lost[0]) if len(lost) else len(followed)
+        q_1, q_2 = posture["q_1"], posture["q_2"]
+        rate = np.ascontiguousarray((grid.rate_basis @ waypoints)[:, :POSE_SIZE])
+        squares = [
+            1.0 + self._rows.of(Reach(arm), "first").batch(pose, rate, q_1, q_2)["value"]
+            for arm in (0, 1)
+        ]
+        force = found["normal_force"]
+        minimised = force if self._robust is None else self._robust.forces(found)
+        held = pose[:reached], q_1[:reached], q_2[:reached]
+        gaps = lru_cache(maxsize=None)(partial(self._rows.gaps, pose=held[0]))
+        return PlacedCarry(
+            pose=pose,
+            rate=rate,
+            q=(q_1, q_2),
+            reached=reached,
+            stranded=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
+            manipulability=np.sqrt(np.maximum(np.column_stack(squares), 0.0))[:reached],
+            split=self._split(found),
+            force=minimised,
+            peak=minimised.max(axis=0) / task.reference_force,
+            shift=found["pressure_shift"] / self._radii,
+            distances=Distances(
+                lambda: self._sharpened(evaluator.checker.bounds(*held), gaps),
+                lambda rows, raised, wanted: evaluator.checker.measure(
+                    held[0][rows], held[1][rows], held[2][rows], raised, wanted
+                ),
+            ),
+            gaps=gaps,
+        )
+
+    def _split(self, found: Mapping[str, Array]) -> Array:
+        """See `PlacedCarry.split`. By the paper's allocation both tangential forces point the same
+        way."""
+        if self._evaluator.workcell.task.allocation == "soft-finger":
+            return found["normal_force"]
+        along = found["normal_force"][:, 0] - found["normal_force"][:, 1]
+        if self._evaluator.workcell.task.allocation == "paper":
+            return np.column_stack([along, found["tangential_force"].sum(axis=1)])
+        whole = found["contact_force"][:, :3] + found["contact_force"][:, 3:]
+        square = (whole**2).sum(axis=1) - along**2
+        return np.column_stack([along, np.sqrt(np.maximum(square, 0.0))])
+
+    def _sharpened(self, bounds: Array, gaps: Callable[[int], Array]) -> Array:
+        """Bounds (n, n_pairs), those of the payload from a box raised to the largest gap."""
+        near = bounds.min(axis=0, initial=np.inf) < SHARPENED_BELOW
+        for pair in self._rows.separable.intersection(np.flatnonzero(near).tolist()):
+            np.maximum(bounds[:, pair], gaps(pair).max(axis=1), out=bounds[:, pair])
+        return bounds

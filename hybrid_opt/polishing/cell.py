@@ -1,0 +1,294 @@
+"""What all programs of a cell share: compiled functions, places of the path, scaled variables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.function import NumericFunction
+from codegen.interpreted import InterpretedFunction
+from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
+from hybrid_opt.polishing.robust import RobustSamples
+from symbolic.array import Array
+from symbolic.cell_model import CellBodies, CellModel
+from symbolic.path.spline import path_basis
+from symbolic.records.cell import Workcell
+from symbolic.records.task import POSE_SIZE, Task, extended_waypoints
+from symbolic.smooth.driven import driven_functions
+from symbolic.smooth.passage import GAPS, Passing, Separation, gap_function
+from symbolic.smooth.places import (
+    ORDERS,
+    JointLimit,
+    Order,
+    Place,
+    PlaceConstraint,
+    Reach,
+    closure_functions,
+    closure_name,
+    row_function,
+    row_name,
+)
+from symbolic.smooth.samples import (
+    Quantity,
+    branch_coefficients,
+    held_functions,
+    held_name,
+    sample_blocks,
+    sample_functions,
+)
+
+COMPILED = (
+    Reach(0),
+    Reach(1),
+    Separation(0, 0),
+    Passing(0, 0, 1),
+    JointLimit(0, 0, "lower"),
+    JointLimit(1, 0, "lower"),
+)
+"""Members of the families whose functions are compiled at once: nearly every solve has them. Every
+clearance of an arm is a family of its own, of which a cell has hundreds and a solve needs a few:
+these are compiled when a solve first asks for them, and kept."""
+
+ARMS = (0, 1)
+
+LATER_LEVELS: dict[Order, int] = {"first": 1, "second": 0}
+"""Optimisation levels of what is compiled when it is asked for: 0.1 and 0.2 s each on the rack. Few
+second derivatives of clearances are ever needed."""
+
+PLACE_SPACING = 0.0025
+"""Wanted distance of neighbouring places in the path parameter. What dips between two places is
+covered by the distance kept from obstacles, and in the end certified."""
+
+Indices = NDArray[np.intp]
+
+
+class RowFunctions:
+    """The functions of rows at places; what is not known is built when first asked for."""
+
+    def __init__(
+        self,
+        model: CellBodies,
+        known: Mapping[str, NumericFunction],
+        compiled: CompiledCell | None = None,
+    ) -> None:
+        """known: by name; compiled: what compiles others and keeps them, None interprets them."""
+        self.model, self._known = model, dict(known)
+        self._place, self._cell = Place(model), compiled
+        self.numbers = lru_cache(maxsize=None)(self._numbers)
+        self.obstacle = lru_cache(maxsize=None)(self._place.obstacle)
+        self.separable = frozenset(self._place.separable())
+
+    def of(self, constraint: PlaceConstraint, order: Order) -> NumericFunction:
+        """See `symbolic.smooth.places.row_function`."""
+        name = row_name(constraint.family, order)
+        if name not in self._known:
+
+            def make() -> dict[str, ca.Function]:
+                return {name: row_function(self._place, constraint, order)}
+
+            level = LATER_LEVELS[order]
+            self._known[name] = (
+                InterpretedFunction(make()[name])
+                if self._cell is None
+                else self._cell.made(f"polish {name}", make, str(level), levels={name: level})[name]
+            )
+        return self._known[name]
+
+    def _numbers(self, constraint: PlaceConstraint) -> Array:
+        """See `PlaceConstraint.numbers`."""
+        return constraint.numbers(self._place)
+
+    def gaps(self, pair: int, pose: Array) -> Array:
+        """(n, DIRECTIONS) gaps [m] of a separable pair at box poses (n, 6)."""
+        return self._known[GAPS].batch(pose, self.obstacle(pair))["gaps"]
+
+
+@dataclass(frozen=True)
+class PolishFunctions:
+    """What the programs of a workcell are assembled from.
+
+    Attributes:
+        built: by name; see `symbolic.smooth`: forces and pressure at samples, the inverse
+            kinematics of both arms, under the time law 'optimal' limits along a driven path.
+        rows: constraints at places of the path.
+    """
+
+    built: Mapping[str, NumericFunction]
+    rows: RowFunctions = field(repr=False)
+
+    def closure(self, arm: int, order: Order) -> NumericFunction:
+        """How an arm's joints follow the box."""
+        return self.built[closure_name(arm, order)]
+
+
+def quantities_of(workcell: Workcell) -> tuple[Quantity, ...]:
+    """What a cell's programs ask at samples. What is driven has limits at the intervals of its
+    timing, not at samples; pads that press jointly keep their pressure, and where they do not face
+    one another nothing is in closed form."""
+    if workcell.task.time_law == "optimal":
+        return ()
+    if workcell.task.allocation != "joint":
+        return ("force", "pressure") if workcell.task.allocation == "paper" else ("force",)
+    return ("force", "load") if workcell.has_facing_pads else ("load",)
+
+
+def polish_functions(compiled: CompiledCell) -> PolishFunctions:
+    """Load or build the functions of a workcell's programs.
+
+    What serves many samples or places at a call is evaluated in lanes, at level 1: higher ones
+    compile three times as long and gain nothing (measured on the rack: every function within 5 %,
+    one slower by 40 %). Of the first and the last two samples, only second derivatives do.
+
+    Raises:
+        DualArmError: the cell's model cannot be built, or its functions not be compiled.
+    """
+    quantities = quantities_of(compiled.workcell)
+
+    @cache
+    def make() -> dict[str, ca.Function]:
+        model = compiled.model
+        place, functions = Place(model), dict[str, ca.Function]()
+        for quantity in quantities:
+            functions |= sample_functions(model.workcell, quantity)
+        if "load" in quantities:
+            functions |= held_functions(model.workcell)
+        for arm in ARMS:
+            functions |= closure_functions(model, arm)
+        for constraint in COMPILED:
+            for order in ORDERS:
+                name = row_name(constraint.family, order)
+                functions[name] = row_function(place, constraint, order)
+        return functions | {GAPS: gap_function(place)}
+
+    ends = {f"{q}_{block}_first" for q in quantities for block in ("first", "last", "path")}
+    levels = dict.fromkeys(sorted(_names(quantities) - ends), 1)
+
+    def in_lanes(_: CellModel) -> dict[str, ca.Function]:
+        return {name: f for name, f in make().items() if name in levels}
+
+    def one_by_one(_: CellModel) -> dict[str, ca.Function]:
+        return {name: f for name, f in make().items() if name not in levels}
+
+    details = str(levels)
+    built = compiled.functions("polish in lanes", in_lanes, details, levels=levels, lanes=0)
+    built |= compiled.functions("polish", one_by_one, details)
+    if compiled.workcell.task.time_law == "optimal":
+        built |= compiled.functions("driven", driven_functions, lanes=0)
+    return PolishFunctions(built, RowFunctions(compiled.bodies, built, compiled))
+
+
+def _names(quantities: tuple[Quantity, ...]) -> set[str]:
+    """Of all functions that `polish_functions` makes."""
+    blocks = ("inner", "first", "last", "path")
+    return {
+        GAPS,
+        *(f"{q}_{block}_{order}" for q in quantities for block in blocks for order in ORDERS),
+        *(held_name(order) for order in ORDERS),
+        *(closure_name(arm, order) for arm in ARMS for order in ORDERS),
+        *(row_name(constraint.family, order) for constraint in COMPILED for order in ORDERS),
+    }
+
+
+class Grid:
+    """Places along one task's path: its samples and some between them, closer than either matters.
+
+    Attributes:
+        per_sample: places per interval between samples.
+        parameter: (m,) of all places, in [0, 1].
+        sample_parameter: (n,) of the samples.
+        basis, rate_basis: (m, n_waypoints): poses = basis @ waypoints, and their first
+            derivative with respect to the path parameter.
+    """
+
+    def __init__(self, task: Task) -> None:
+        intervals = task.samples - 1
+        self.per_sample = max(1, round(1.0 / (intervals * PLACE_SPACING)))
+        self.sample_parameter = np.linspace(0.0, 1.0, task.samples)
+        self.parameter = np.linspace(0.0, 1.0, intervals * self.per_sample + 1)
+        along = path_basis(len(task.waypoints), self.parameter)
+        self.basis, self.rate_basis = along.position, along.first
+
+    def places(self, width: float) -> int:
+        """How many places lie in a width of the path parameter, at least one."""
+        return max(1, round(width * (len(self.parameter) - 1)))
+
+    def samples(self, width: float) -> int:
+        """How many samples lie in a width of the path parameter, at least one."""
+        return max(1, round(width * (len(self.sample_parameter) - 1)))
+
+    def between(self, values: Array) -> Array:
+        """Values (n, k) on samples, interpolated to all places (m, k)."""
+        return np.column_stack(
+            [np.interp(self.parameter, self.sample_parameter, column) for column in values.T]
+        )
+
+    def movable(self, place: int) -> bool:
+        """Whether a place is not one of both ends, which are fixed."""
+        return 0 < place < len(self.parameter) - 1
+
+
+class SmoothCell:
+    """What all programs of a cell share.
+
+    Attributes:
+        evaluator, functions: the full model, and what programs are assembled from.
+        workcell, task, grid: the evaluator's.
+        clearance: to be kept from obstacles beyond the checker's tolerance [m].
+        robust: robust forces at samples where they are minimised, None for the planned ones.
+        centre, half: (n_var,) x = centre + half * xi scales the decision vector by its bounds to
+            [-1, 1]; half is 1 where a variable is fixed.
+        free: rows and columns of the variables among the extended waypoints.
+        blocks: how samples are divided among functions.
+        coefficients: (2, branches, 2) those of `branch_coefficients`.
+        still: (n_waypoints, 6 + m) extended waypoints without the variables.
+    """
+
+    def __init__(
+        self, evaluator: CandidateEvaluator, functions: PolishFunctions, clearance: float
+    ) -> None:
+        """Read what is shared.
+
+        Raises:
+            SettingsError: robust forces are minimised, and there are none of the cell's pads.
+        """
+        self.evaluator, self.functions, self.clearance = evaluator, functions, clearance
+        self.workcell, self.task = evaluator.workcell, evaluator.workcell.task
+        is_robust = evaluator.objective_names == ROBUST_OBJECTIVES
+        self.robust = RobustSamples(self.workcell) if is_robust else None
+        self.grid = Grid(self.task)
+        half = (self.task.upper - self.task.lower) / 2.0
+        self.centre = (self.task.upper + self.task.lower) / 2.0
+        self.half = np.where(half > 0.0, half, 1.0)
+        self.blocks = sample_blocks(self.task)
+        self.coefficients = branch_coefficients(self.workcell)
+        self.free = self.task.free_entries
+        self._n_path = self.task.n_path
+        fixed = [waypoint.lower for waypoint in self.task.waypoints]
+        self.still = np.column_stack([fixed, *[joint.lower for joint in self.task.redundant]])
+
+    def scaled(self, x: Array) -> Array:
+        """From x to xi."""
+        return (x - self.centre) / self.half
+
+    def unscaled(self, xi: Array) -> Array:
+        """From xi to x."""
+        return self.centre + self.half * xi
+
+    def step(self, start: Array, end: Array) -> float:
+        """Largest change of a scaled variable between two decision vectors."""
+        return float(np.max(np.abs(end - start) / self.half))
+
+    def waypoints(self, x: Array) -> Array:
+        """As `extended_waypoints`, which looks up what is known here and unwraps what need not
+        be."""
+        points = self.still.copy()
+        points[self.free] = x[: self._n_path]
+        turns = points[1:, 3:POSE_SIZE] - points[:-1, 3:POSE_SIZE]
+        return extended_waypoints(self.task, x) if np.abs(turns).max() > np.pi else points

@@ -1,0 +1,387 @@
+"""The step and the judge of drivable carries: a quadratic model of path and timing together.
+
+First a program without the Lagrangian's curvature finds multipliers: they owe nothing to earlier
+rounds, which may have been elsewhere. With them the quadratic model is formed and solved, and where
+geometric rows bend along the step, it is corrected for that. The judge is the compiled timing of
+the path that the step leads to, not the program: a path that is driven no better is refused before
+its geometry is looked at. The polish ends where the program's optimality conditions hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_opt.polishing.carry import CarryReader
+from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.constraints.active import ActiveSet
+from hybrid_opt.polishing.intervals import IntervalGrid, IntervalValues
+from hybrid_opt.polishing.joint_program import NEGLIGIBLE, JointProgram, Linear
+from hybrid_opt.polishing.point import (
+    HALVED,
+    QUARTERED,
+    Climb,
+    Judged,
+    Reached,
+    Solution,
+    Step,
+    Way,
+)
+from hybrid_opt.polishing.rows import Row
+from hybrid_opt.polishing.settings import DrivableSettings
+from hybrid_opt.polishing.solvers.base import Residuals
+from hybrid_opt.polishing.solvers.quadratic import (
+    BorderedMatrix,
+    QuadraticAnswer,
+    QuadraticProgram,
+    convex,
+    quadratic_method,
+)
+from hybrid_opt.robust.path_force import PathPoints, robust_path
+from hybrid_opt.timing.drive import Driver
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.records.task import Task, waypoints_of
+
+FIRST_RADIUS, LEAST_RADIUS = 0.3, 1e-4
+"""Of the box of trust, in halves of the ranges of the waypoints; below the least a point is
+left."""
+
+STATIONARY, FEASIBLE = 1e-4, 5e-3
+"""Residuals of stationarity and of complementarity, and of feasibility, at which a point counts as
+optimal: what is asked of distances moves with the path."""
+
+NOISE = 5e-4
+"""Relative change of a timing that counts as none: what the timing rounds off."""
+
+CLOSER = 0.1
+"""Share of the promised gain that a step has to bring, unless the timing may have rounded it
+off."""
+
+NEWTON = 0.05
+"""Steps shorter than this keep the program's squared speeds, longer ones take those of the new
+timing."""
+
+ROW_ROUNDS, ROW_TOLERANCE = 3, 1e-6
+"""Times that rows are added to one quadratic program, and the predicted excess of a limit that adds
+its row."""
+
+STEADINESS = 1.0
+"""Curvature by the path of the program that finds multipliers."""
+
+CORRECTIONS, BEND = 3, 0.01
+"""Of a step by how geometric rows bend along it, at most, and what of a scaled row is left."""
+
+FARTHER = (2.0, 4.0, 8.0)
+"""Times a step that brought more than it promised: judging costs a tenth of a round."""
+
+LEAST_SQUARED, LARGEST_SQUARED = 0.9, 3.0
+"""How far a squared speed may fall and rise in a step, as shares of it."""
+
+STILL = 1e-3
+"""The least force limit is this share above the force that holds the box at rest."""
+
+
+def is_polishable(task: Task) -> bool:
+    """Whether drivable carries of a task can be polished: those whose forces have a closed form."""
+    return task.allocation != "joint"
+
+
+@dataclass(frozen=True)
+class TimedPath:
+    """A path with its fastest timing within a force limit.
+
+    Attributes:
+        duration: [s], infinite where there is none.
+        squared: (intervals + 1,) u'^2 at the grid points.
+        joints: of both arms at the grid points (intervals + 1, n) [rad].
+    """
+
+    duration: float
+    squared: Array
+    joints: tuple[Array, Array]
+
+
+class PathJudge:
+    """Times paths by the compiled passes.
+
+    Attributes:
+        force_limit: least and largest [N].
+    """
+
+    def __init__(self, driver: Driver) -> None:
+        self._timer, self._limits, self.force_limit = (
+            driver.timer,
+            driver.limits,
+            force_range(driver),
+        )
+
+    def timed(self, path: Array, force: float) -> TimedPath:
+        """The fastest timing of free waypoints (n_path,) within a force limit [N]."""
+        known = self._timer.path_limits(path[None])
+        (found,) = self._timer.time_known(path[None], known, [self._limits(force)])
+        duration = found.duration if found.ok else float("inf")
+        joints = [np.ascontiguousarray(known[f"q_{arm}"][0][::2]) for arm in (1, 2)]
+        return TimedPath(duration, found.grid_speed**2, (joints[0], joints[1]))
+
+    def durations(self, paths: Array, force: float) -> Array:
+        """(n,) [s] of paths (n, n_path) within a force, infinite where there is none."""
+        limits = [self._limits(force)] * len(paths)
+        found = self._timer.time_all(np.ascontiguousarray(paths), limits)
+        return np.array([t.duration if t.ok else np.inf for t in found])
+
+
+def force_range(driver: Driver) -> tuple[float, float]:
+    """The task's least and largest force limit [N]; of robust forces the least is at least what
+    holds the box at both ends of every path."""
+    workcell = driver.timer.workcell
+    least, most = workcell.task.force_limit
+    if driver.robust:
+        ends = waypoints_of(workcell.task, workcell.task.lower)[[0, -1]]
+        (first, second), (a, w) = np.zeros((2, 2, 6)), np.zeros((2, 2))
+        held, _ = robust_path(workcell).at(PathPoints(ends, first, second, a, w))
+        least = max(least, (1.0 + STILL) * float(held.max()))
+    return least, most
+
+
+@dataclass(frozen=True)
+class DriveReached(Reached):
+    """A carry whose level is its duration [s].
+
+    Attributes:
+        joints: as of its timing.
+        squared: (intervals + 1,) u'^2, its timing's or those that a program promised.
+        lowest: the least level so far: what the timing rounds off must not add up.
+    """
+
+    joints: tuple[Array, Array]
+    squared: Array
+    lowest: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveStep(Step):
+    """A step of a path.
+
+    Attributes:
+        d: (n_path,) scaled.
+        squared: (intervals + 1,) u'^2 that its program promises.
+        gain: the share of the duration that it promises to take off.
+    """
+
+    d: Array
+    squared: Array
+    gain: float
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A quadratic program's answer, and the rows that it was given."""
+
+    answer: QuadraticAnswer
+    linear: Linear
+
+
+class DriveWay(Way[DriveReached, DriveStep]):
+    """The least duration within the force limit of the start. A resource: one per process.
+
+    Attributes:
+        driver, paths: how carries and paths are timed.
+        settings: of the polish of drivable carries.
+    """
+
+    least_radius, farther = LEAST_RADIUS, FARTHER
+    refused_by_length = stays_lenient = True
+
+    def __init__(self, cell: SmoothCell, settings: DrivableSettings) -> None:
+        """Prepare programs.
+
+        Raises:
+            SettingsError: the time law is not 'optimal', or forces are allocated jointly.
+        """
+        driver, task = cell.evaluator.driver, cell.task
+        if driver is None or not is_polishable(task):
+            raise SettingsError(
+                "the polish of drivable carries needs the time law 'optimal' and the allocation "
+                "'soft-finger' or 'paper': switch the polish off"
+            )
+        super().__init__(cell, ActiveSet(cell), CarryReader(cell))
+        self.driver, self.settings, self._n = driver, settings, task.n_path
+        self.half = cell.half[: task.n_path]
+        self.paths = PathJudge(driver)
+        self._intervals = IntervalGrid(cell.workcell, driver.timer.intervals, driver.robust)
+        self._method = quadratic_method(cell.evaluator.compiled.cache)
+
+    def start(self, x: Array) -> DriveReached:
+        """See `Way`."""
+        timed = self.paths.timed(x[: self._n], float(x[-1]))
+        return self._reached(x, timed, timed.squared, np.inf)
+
+    def _reached(self, x: Array, timed: TimedPath, squared: Array, lowest: float) -> DriveReached:
+        lowest = min(lowest, timed.duration)
+        return DriveReached(x, self.reader.read(x), timed.duration, timed.joints, squared, lowest)
+
+    def _moved(self, x: Array, d: Array) -> Array:
+        """(n_var,) after a scaled step of the path."""
+        n, task = self._n, self.cell.task
+        return np.append(np.clip(x[:n] + self.half * d, task.lower[:n], task.upper[:n]), x[n:])
+
+    def judge(self, best: DriveReached, step: DriveStep) -> Judged[DriveReached]:
+        """See `Way`. What the timing rounds off may hide a small gain, but must not add up."""
+        x = self._moved(best.x, step.d)
+        timed = self.paths.timed(x[: self._n], float(x[-1]))
+        gain = 1.0 - timed.duration / best.level
+        tiny = step.gain <= NOISE
+        kept = timed.duration <= best.lowest * (1.0 + NOISE)
+        if gain < CLOSER * step.gain and not (tiny and kept):
+            finite = np.isfinite(timed.duration)
+            return Judged(None, closer=False, factor=HALVED if finite else QUARTERED)
+        share = gain / max(step.gain, 1e-300)
+        is_short = step.length <= NEWTON
+        squared = step.squared if is_short else timed.squared
+        return Judged(
+            self._reached(x, timed, squared, best.lowest),
+            closer=True,
+            kept=max(share, 0.5) if tiny else share,
+            surprising=gain > step.gain and not tiny,
+            is_short=is_short,
+        )
+
+    def along(
+        self, begin: DriveReached, best: DriveReached, step: DriveStep, share: float
+    ) -> DriveReached | None:
+        """See `Way`."""
+        x = self._moved(begin.x, share * step.d)
+        timed = self.paths.timed(x[: self._n], float(x[-1]))
+        if timed.duration >= best.level * (1.0 - NOISE):
+            return None
+        return self._reached(x, timed, timed.squared, best.lowest)
+
+    def propose(
+        self, best: DriveReached, required: Mapping[Row, float], radius: float
+    ) -> DriveStep | None:
+        """Form the joint program about the best carry so far, and solve its quadratic model."""
+        grid = self._intervals
+        values = IntervalValues.at(grid, self.cell.functions, best.x, best.squared, best.joints)
+        program = JointProgram(grid, values, best.x, best.squared, self.cell, required, best.carry)
+        box, chosen = self._box(best, radius), program.near()
+        steady = np.zeros(program.n)
+        steady[: self._n] = STEADINESS
+        plain = program.curvature().raised(steady)
+        first = self._solved(program, chosen, (plain, np.zeros(program.n)), box)
+        if first is None:
+            return None
+        H = program.curvature(first.linear, first.answer.rows)
+        active = first.answer.rows > NEGLIGIBLE
+        model = convex(H, first.linear.A.of(active), first.linear.b[active])
+        second = self._solved(program, chosen, model, box)
+        if second is None:
+            return None
+        residuals = min(
+            (self._residuals(program, best, found) for found in (first, second)),
+            key=lambda known: known.stationarity + known.complementarity,
+        )
+        bent = np.zeros(len(program.geometry))
+        for _ in range(CORRECTIONS):
+            change = program.geometry_after(second.answer.d) - bent
+            if np.abs(change).max(initial=0.0) <= BEND:
+                break
+            bent = bent + change
+            corrected = self._solved(program, chosen, model, box, bent)
+            if corrected is None:
+                break
+            second = corrected
+        d = second.answer.d
+        squared = best.squared.copy()
+        squared[1:-1] *= 1.0 + d[program.speeds]
+        rows = program.place_rows
+        presses = second.answer.rows[len(second.linear.point) :][: len(rows)] > NEGLIGIBLE
+        path = d[: self._n]
+        return DriveStep(
+            length=float(np.abs(path).max()),
+            required=required,
+            residuals=lambda _: residuals,
+            iterations=1,
+            is_end=_is_optimal(residuals),
+            pressing=tuple(row for row, own in zip(rows, presses, strict=True) if own),
+            d=path,
+            squared=squared,
+            gain=max(program.gain(d), 0.0),
+        )
+
+    def _solved(
+        self,
+        program: JointProgram,
+        chosen: NDArray[np.bool_],
+        model: tuple[BorderedMatrix, Array],
+        box: tuple[Array, Array],
+        bent: Array | float = 0.0,
+    ) -> _Found | None:
+        """Solve a quadratic model; rows that its answer violates are added. `chosen` grows."""
+        g = program.gradient() + model[1]
+        found: _Found | None = None
+        for left in reversed(range(ROW_ROUNDS)):
+            linear = program.linear(chosen, bent)
+            asked = QuadraticProgram(model[0], g, linear.A, linear.b, *box)
+            answer = self._method(asked)
+            if answer is None:
+                # What the box has no room for is asked for as far as it is kept now.
+                answer = self._method(replace(asked, b=np.maximum(linear.b, 0.0)))
+            if answer is None:
+                return None
+            found = _Found(answer, linear)
+            fresh = (program.predicted(answer.d) > ROW_TOLERANCE) & ~chosen
+            if not fresh.any():
+                break
+            chosen |= fresh
+            if not left:
+                chosen &= ~fresh
+        return found
+
+    def _box(self, best: DriveReached, radius: float) -> tuple[Array, Array]:
+        """Bounds of a step."""
+        n, task, xi = self._n, self.cell.task, best.x[: self._n]
+        speeds = np.ones(self._intervals.intervals - 1)
+        low = np.maximum((task.lower[:n] - xi) / self.half, -radius)
+        high = np.minimum((task.upper[:n] - xi) / self.half, radius)
+        return (
+            np.concatenate([low, -LEAST_SQUARED * speeds]),
+            np.concatenate([high, LARGEST_SQUARED * speeds]),
+        )
+
+    def _residuals(self, program: JointProgram, best: DriveReached, found: _Found) -> Residuals:
+        """Of the program at its iterate, with the multipliers of a step. Of those of its bounds the
+        variables' own count, not those of the box of trust."""
+        n, task, answer = self._n, self.cell.task, found.answer
+        x, edge, own = best.x[:n], 1e-6 * self.half, answer.bounds[:n]
+        reached = x + self.half * answer.d[:n]
+        at_low = (own < 0.0) & (reached < task.lower[:n] + edge)
+        at_high = (own > 0.0) & (reached > task.upper[:n] - edge)
+        bounds = np.zeros(program.n)
+        bounds[:n] = np.where(at_low | at_high, own, 0.0)
+        return program.residuals(bounds, found.linear, answer.rows)
+
+    def climb(self, x: Array) -> Climb[DriveReached, DriveStep]:
+        """From a decision vector (n_var,), with none of its rounds done."""
+        return Climb(self, x, FIRST_RADIUS)
+
+    def finish(self, climb: Climb[DriveReached, DriveStep]) -> Solution:
+        """The rounds of a point, and more of them while these bring much."""
+        settings, solution = self.settings, climb.go_on(self.settings.rounds)
+        most = solution.rounds - settings.rounds + settings.most_rounds
+        while not climb.ended and climb.last_gain > settings.worth * climb.best.level:
+            if solution.rounds >= most:
+                break
+            climb.go_on(2 * settings.turn)
+        return solution
+
+
+def _is_optimal(residuals: Residuals) -> bool:
+    return (
+        residuals.stationarity <= STATIONARY
+        and residuals.complementarity <= STATIONARY
+        and residuals.feasibility <= FEASIBLE
+    )

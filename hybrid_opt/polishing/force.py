@@ -1,0 +1,360 @@
+"""The step and the judge of both peak forces: one nonlinear program with exact derivatives.
+
+Variables z = (xi, phi, a): the decision vector scaled to [-1, 1] by its bounds, both robots' peak
+forces f (the epigraph of the paper's Eq. 60) as phi = (f - anchor) / span, and a level. With the
+target's anchor, span, direction, offset and cost,
+
+    minimise    cost . (a, phi_1, phi_2)
+    subject to  (N_i,k(x) / N_ref,i - anchor_i) / span_i <= phi_i    chosen samples k, robot i
+                phi_j <= direction_j a + offset_j                    both objectives
+                1 - (shift_i,k(x) / patch radius_i)^2 >= margin      chosen robots and samples
+                c_r(x) / scale_r >= required_r / scale_r             chosen rows at chosen places.
+
+That covers the scalarisation of Pascoletti and Serafini (direction of ones) and the epsilon
+constraint (a zero in the direction). Another set of rows costs no more than choosing them. Joints
+as variables with closure constraints lead to the same optima and take four times as long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hybrid_opt.polishing.carry import CarryReader, PlacedCarry
+from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.constraints.active import ActiveSet
+from hybrid_opt.polishing.constraints.kinds import Limits
+from hybrid_opt.polishing.point import Climb, Judged, Reached, Solution, Step, Way
+from hybrid_opt.polishing.rows import HELD, Layout, Row, Rows
+from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.solvers.base import (
+    Inequalities,
+    Residuals,
+    Solve,
+    estimated,
+    residuals,
+)
+from hybrid_opt.polishing.solvers.dense import dense_method
+from hybrid_opt.polishing.solvers.ipopt import ipopt
+from symbolic.array import Array
+
+NO_LIMIT = 1e3
+"""Offset that leaves an objective free, in units of the range."""
+
+CLOSED_SIDE = 1e-4
+"""By this share of the range a side may be exceeded: what the solver rounds off."""
+
+LARGER = 0.5
+"""Weight of the larger objective beside the sum of both in the balanced middle."""
+
+TIE = 1e-4
+"""Weight of the sum of both objectives beside the level: excludes weakly efficient points."""
+
+SLACK = 0.1
+"""What the epigraph variables start above the peak forces, in units of the span."""
+
+LEVEL_BOUND = 2e3
+"""Bound of |phi| and |a|; beyond anything the targets ask for."""
+
+LEAST_RADIUS = 1e-3
+"""Of the box of trust, below which a point is left."""
+
+PARTS = (3 / 4, 2 / 4, 1 / 4)
+"""Of a step that violates something, which are judged in its place."""
+
+BARRIER, WIDE_BARRIER, NEAR_BARRIER = 3e-4, 3e-2, 1e-5
+"""Of the solver at the start. A search's point is near the solution but has no multipliers; solves
+that look for other basins are led to the middle of what is feasible first."""
+
+NEAR_ROUNDS, NEAR_ITERATIONS = 12, 30
+"""Rounds of a start that is nearly an optimum, and the solver's iterations in each."""
+
+Reach = Literal["usual", "wide", "near", "brief"]
+"""usual. wide: whether to look farther than the nearest optimum. near: the start is nearly an
+optimum of the target, as a neighbour on the front is. brief: to end after
+`ProbeSettings.rounds`."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """What one solve aims at; see the module; all (2,) but cost (3,): of the level and both
+    peaks."""
+
+    anchor: Array
+    span: Array
+    direction: Array
+    offset: Array
+    cost: Array
+
+    @property
+    def limits(self) -> Limits:
+        """See `Limits`."""
+        first, second = (self.offset < NO_LIMIT).tolist()
+        return first, second
+
+    def needed(self, phi: Array) -> float:
+        """The least level a that scaled peak forces (2,) allow."""
+        ahead = self.direction > 0.0
+        return float(np.max((phi - self.offset)[ahead] / self.direction[ahead]))
+
+    def level(self, peak: Array) -> float:
+        """What the smooth problem minimises, at given peak forces (2,) over their references.
+
+        Infinite where a side that the direction does not open is exceeded.
+        """
+        phi = (peak - self.anchor) / self.span
+        if np.any((phi > self.offset + CLOSED_SIDE) & (self.direction <= 0.0)):
+            return float("inf")
+        return float(self.cost @ np.concatenate([[self.needed(phi)], phi]))
+
+
+def pascoletti_serafini(anchor: Array, span: Array) -> Target:
+    """Go from the anchor along the diagonal as far as possible, never above either side.
+
+    Args:
+        anchor, span: (2,) point started from, and the scale of each objective.
+    """
+    return Target(anchor, span, np.ones(2), np.zeros(2), np.array([1.0, TIE, TIE]))
+
+
+def epsilon_constraint(anchor: Array, span: Array, objective: int) -> Target:
+    """Minimise one objective while the other stays at most at the anchor."""
+    direction = np.eye(2)[objective]
+    return Target(anchor, span, direction, np.zeros(2), np.array([1.0, TIE, TIE]))
+
+
+def extreme(anchor: Array, span: Array, objective: int) -> Target:
+    """Minimise one objective; the other only breaks ties."""
+    free = np.where(np.arange(2) == objective, 0.0, NO_LIMIT)
+    return Target(anchor, span, np.eye(2)[objective], free, np.array([1.0, TIE, TIE]))
+
+
+def balance(anchor: Array, span: Array) -> Target:
+    """Minimise the sum of both objectives and half of the larger one: where one robot can relieve
+    the other at little cost, both carry alike, which leaves most room for payload."""
+    middle = np.full(2, anchor.mean())
+    return Target(middle, span, np.ones(2), np.zeros(2), np.array([LARGER, 1.0, 1.0]))
+
+
+def aimed(anchor: Array, span: Array, objective: int | None) -> Target:
+    """At an end of a front, or at its balanced middle."""
+    return balance(anchor, span) if objective is None else extreme(anchor, span, objective)
+
+
+class ForceProgram:
+    """The program of a set of rows near one candidate; attributes as of `solvers.base.Program`,
+    and:
+
+    Attributes:
+        layout: where rows stand.
+    """
+
+    def __init__(
+        self,
+        cell: SmoothCell,
+        required: Mapping[Row, float],
+        target: Target,
+        carry: PlacedCarry,
+        x: Array,
+        radius: float,
+    ) -> None:
+        """Around a candidate.
+
+        Args:
+            required: the rows, and what each has to keep; forces stay below their peaks.
+            carry: the candidate x (n_var,) on places.
+            radius: half the width of the box of trust, in halves of the variables' ranges.
+        """
+        self._cell, self._target, self._n = cell, target, cell.task.n_var
+        self.layout = layout = Layout(required, sides=2)
+        n, n_z = self._n, self._n + 3
+        robot, branch, sample = (
+            np.array([getattr(row, name) for row in layout.force_rows], dtype=np.intp)
+            for name in ("robot", "branch", "sample")
+        )
+        span, reference = target.span[robot], cell.task.reference_force[robot]
+        own = np.eye(2)[:, None]
+        coefficients = np.concatenate([cell.coefficients, own], axis=1)
+        mix = coefficients[robot, branch] / (reference * span)[:, None]
+        fixed = np.zeros((layout.n_rows, 3))
+        fixed[np.arange(layout.forces.stop), robot] = -1.0
+        fixed[layout.sides, :2], fixed[layout.sides, 2] = np.eye(2), -target.direction
+        self.rows = Rows(cell, layout, carry.q, mix, fixed)
+        # What the rows lack at the candidate: what the rounded time law takes off, what the joint
+        # allocation's barriers add, or what makes planned forces robust ones, with their slopes.
+        self.rows.values(x, np.zeros(3))
+        found = self.rows.forces
+        if cell.robust is None:
+            held = (branch == HELD)[:, None]
+            exact = np.where(held, carry.force[sample], carry.split[sample])
+            lacking = np.einsum("rk,rk->r", mix, exact - found)
+        else:
+            force, by_x = cell.robust.first(x)
+            unit = reference * span
+            lacking = force[sample, robot] / unit - np.einsum("rk,rk->r", mix, found)
+            slope = by_x[sample, robot] / unit[:, None]
+            self.rows.correct(slope - np.einsum("rk,rkx->rx", mix, self.rows.force_slopes), x)
+        pressed, at = (
+            np.array([getattr(row, name) for row in layout.pressure_rows], dtype=np.intp)
+            for name in ("robot", "sample")
+        )
+        offset = self.rows.offset
+        offset[layout.forces] = lacking - target.anchor[robot] / span
+        offset[layout.sides] = -target.offset
+        offset[layout.patches] = 1.0 - carry.shift[at, pressed] ** 2 - self.rows.left
+
+        phi = (carry.peak - target.anchor) / target.span + SLACK
+        xi, low, high = (cell.scaled(v) for v in (x, cell.task.lower, cell.task.upper))
+        self.cost = np.concatenate([np.zeros(n), target.cost[1:], target.cost[:1]])
+        self.start = np.concatenate([xi, phi, [target.needed(phi) + SLACK]])
+        self._own_bounds = np.full((2, n_z), LEVEL_BOUND) * np.array([[-1.0], [1.0]])
+        self._own_bounds[:, :n] = low, high
+        self.low, self.high = self._own_bounds.copy()
+        self.low[:n] = np.maximum(low, xi - radius)
+        self.high[:n] = np.minimum(high, xi + radius)
+        self.below = np.full(layout.n_rows, -np.inf)
+        self.above = np.full(layout.n_rows, np.inf)
+        self.above[: layout.sides.stop] = 0.0
+        self.below[layout.patches] = [required[row] for row in layout.pressure_rows]
+        self.below[layout.places] = [
+            required[row] / row.constraint.scale for row in layout.place_rows
+        ]
+        self._known, self._values = b"", offset
+        self._jacobian: Array | None = None
+
+    def values(self, z: Array) -> Array:
+        """See `solvers.base.Program`; what was evaluated last is remembered."""
+        key = z.tobytes()
+        if key != self._known:
+            self._values = self.rows.values(self._cell.unscaled(z[: self._n]), z[self._n :])
+            self._known, self._jacobian = key, None
+        return self._values
+
+    def constraints(self, z: Array) -> tuple[Array, Array]:
+        """See `solvers.base.Program`: what gave the values at z knows its slopes as well."""
+        values = self.values(z)
+        if self._jacobian is None:
+            self._jacobian = self.rows.slopes()
+            self._jacobian[:, : self._n] *= self._cell.half
+        return values, self._jacobian
+
+    def curvature(self, z: Array, multipliers: Array) -> Array:
+        """See `solvers.base.Program`."""
+        self.constraints(z)
+        n, half = self._n, self._cell.half
+        full = np.zeros((n + 3, n + 3))
+        full[:n, :n] = self.rows.curvature(multipliers) * np.outer(half, half)
+        return full
+
+    def residuals_at(self, x: Array, carry: PlacedCarry) -> Residuals:
+        """Residuals at a candidate x, with the multipliers that satisfy the conditions best there.
+        Only the variables' own bounds count: those of the box of trust would take up what is left
+        to be won."""
+        target = self._target
+        phi = (carry.peak - target.anchor) / target.span
+        z = np.concatenate([self._cell.scaled(x), phi, [target.needed(phi)]])
+        low, high = self._own_bounds
+        rows = Inequalities(self)
+        slacks = np.abs(rows.values(z)), np.abs(z - low), np.abs(high - z)
+        lam_z, y = estimated(self.cost, rows.slopes(z), slacks)
+        return residuals(self, z, lam_z, rows.multipliers(y), (low, high))
+
+    def candidate(self, z: Array) -> Array:
+        """(n_var,) the decision vector at z, within its bounds and the box of trust."""
+        n = self._n
+        return self._cell.unscaled(np.clip(z[:n], self.low[:n], self.high[:n]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceStep(Step):
+    """x: (n_var,) where it leads."""
+
+    x: Array
+
+
+class ForceWay(Way[Reached, ForceStep]):
+    """Towards one target."""
+
+    least_radius, parts = LEAST_RADIUS, PARTS
+
+    def __init__(
+        self,
+        solver: ForceSolver,
+        target: Target,
+        iterations: int,
+        barrier: float,
+    ) -> None:
+        super().__init__(solver.cell, solver.active, solver.reader)
+        self._solve, self._target, self.limits = solver.method, target, target.limits
+        self._iterations, self._barrier = iterations, barrier
+
+    def start(self, x: Array) -> Reached:
+        """See `Way`."""
+        carry = self.reader.read(x)
+        return Reached(x, carry, self._target.level(carry.peak))
+
+    def propose(
+        self, best: Reached, required: Mapping[Row, float], radius: float
+    ) -> ForceStep | None:
+        """Solve the program in the box."""
+        program = ForceProgram(self.cell, required, self._target, best.carry, best.x, radius)
+        answer = self._solve(program, self._iterations, self._barrier)
+        if not answer.usable:
+            return None
+        x = program.candidate(answer.z)
+        return ForceStep(
+            length=self.cell.step(best.x, x),
+            required=required,
+            residuals=lambda at: program.residuals_at(at.x, at.carry),
+            iterations=answer.iterations,
+            converged=answer.converged,
+            x=x,
+        )
+
+    def judge(self, best: Reached, step: ForceStep) -> Judged[Reached]:
+        """See `Way`."""
+        reached = self.start(step.x)
+        return Judged(reached, reached.level < best.level)
+
+    def along(self, begin: Reached, best: Reached, step: ForceStep, share: float) -> Reached | None:
+        """See `Way`."""
+        reached = self.start(begin.x + share * (step.x - begin.x))
+        return reached if reached.level < best.level else None
+
+    def missing(self, reached: Reached) -> set[Row]:
+        """Rows at peaks that are higher than the program foresaw."""
+        return set(self.active.forces.higher(reached.carry, self.limits))
+
+
+class ForceSolver:
+    """Solves for one evaluator's cell. A resource: one per process.
+
+    Attributes:
+        cell, active, reader: what all its solves share.
+        method: solves programs.
+    """
+
+    def __init__(self, cell: SmoothCell, settings: PolishSettings) -> None:
+        self.cell, self._settings = cell, settings
+        self.active, self.reader = ActiveSet(cell), CarryReader(cell)
+        cache = cell.evaluator.compiled.cache
+        self.method: Solve = ipopt if settings.solver == "ipopt" else dense_method(cache)
+
+    def solve(self, x: Array, target: Target, radius: float, reach: Reach = "usual") -> Solution:
+        """Improve a feasible decision vector (n_var,) towards a target.
+
+        Args:
+            radius: of the first box of trust, in halves of the decision variables' ranges.
+        """
+        rounds, iterations, barrier = self._settings.rounds, self._settings.max_iterations, BARRIER
+        if reach == "near":
+            rounds, iterations, barrier = NEAR_ROUNDS, NEAR_ITERATIONS, NEAR_BARRIER
+        elif reach == "brief":
+            rounds = self._settings.probe.rounds
+        elif reach == "wide":
+            barrier = WIDE_BARRIER
+        way = ForceWay(self, target, iterations, barrier)
+        return Climb(way, x, radius).go_on(rounds)

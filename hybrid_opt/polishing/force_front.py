@@ -1,0 +1,499 @@
+"""The front of both peak forces: its points, its ends, its middle and its gaps.
+
+Points of the front are improved first, each against its own start, so that neither objective gets
+worse. From the improved ones the solver goes on to the ends of the front and to its balanced
+middle, and then along the front into the widest gaps between neighbours.
+
+What a gap between neighbours is worth is the root of the area between them that a point could still
+win, in units of the front's extent; along flat tails, where that is next to nothing, at least a
+share of its length. In the widest gap a point is found by Pascoletti and Serafini's method, along
+the diagonal through a point beside a neighbour that is nearly there: a continuation along the
+front, each attempt the corrector of the last. Sequential quadratic programming from a neighbour's
+solution and multipliers finds the same points in about three times the time. The best carries of
+one basin hardly bend away from the straight line between two neighbours' decision vectors, the
+chord: the error grows with the square of its length. What the full model finds on a chord is nearly
+as good as what a solve would find there, and costs a fiftieth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import partial
+from math import ceil
+
+import numpy as np
+
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.polishing.force import (
+    ForceSolver,
+    Reach,
+    Target,
+    aimed,
+    epsilon_constraint,
+    pascoletti_serafini,
+)
+from hybrid_opt.polishing.front import LEAST_SPAN, OWN_SHARE, Attempt, GrowingFront, Lost, PolishRun
+from hybrid_opt.polishing.point import Solution
+from hybrid_opt.polishing.records import Aim, PolishOutcome
+from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.starts import Start, kicked, mirror_of, random_starts
+from symbolic.array import Array
+
+ENOUGH = 0.9
+"""Share of the points that a front is to have with which it is left."""
+
+PROGRESS = 2e-5
+"""Least gain of an attempt that counts as coming further, in units of the reference force."""
+
+MIDDLE_STALLS = 1
+"""Attempts at the balanced middle in a row that came no further, after which it is left."""
+
+RADIUS, SMALL_RADIUS, NEAR_RADIUS = 1.0, 0.1, 0.4
+"""First boxes of trust: usually, where an attempt goes on where the last came no further, and of
+one from a neighbour on the front, in halves of the decision variables' ranges."""
+
+STRIDE = 0.2
+"""From the neighbour that an attempt starts from, along both objectives, at most, in units of the
+front's extent."""
+
+FAR = 0.1
+"""Width beyond which a gap that no neighbour leads into is looked at from afar."""
+
+TAIL = 0.125
+"""Share of its length that a gap is wide at least."""
+
+CREEP = 0.3
+"""Share of its step that an attempt has to come along the front."""
+
+CHORD = 16
+"""Points that are evaluated on each chord."""
+
+Edge = tuple[bytes, bytes, bool]
+"""A gap as seen from one side: decision vectors there and across, as bytes, and whether an attempt
+stays near."""
+
+Chord = tuple[bytes, bytes]
+"""Its ends, by increasing first objective: decision vectors as bytes."""
+
+Kick = Callable[[Array, int], tuple[Array, Array] | None]
+"""From a decision vector and the objective that matters to another start and its objectives; None
+where none was found."""
+
+
+@dataclass(frozen=True)
+class ForceAttempt(Attempt):
+    """An attempt at a target; see `hybrid_opt.polishing.force.ForceSolver.solve`."""
+
+    target: Target
+    radius: float = RADIUS
+    reach: Reach = "usual"
+
+
+def points(archive: GrowingFront, settings: PolishSettings) -> list[ForceAttempt]:
+    """Evenly spread points of the front, the balanced one among them."""
+    rows = archive.rows()
+    count = min(len(rows), ceil(settings.attempts * OWN_SHARE))
+    chosen = {rows[int(k)] for k in np.round(np.linspace(0, len(rows) - 1, count))}
+    middle, _ = archive.best(None)
+    if middle not in chosen and count > 2:
+        inner = sorted(chosen - {rows[0], rows[-1]}, key=rows.index)
+        chosen.remove(min(inner, key=lambda k: abs(rows.index(k) - rows.index(middle))))
+        chosen.add(middle)
+    span = archive.span()
+    attempts = []
+    for k in sorted(chosen, key=rows.index):
+        start = archive.objectives[k]
+        if settings.method == "epsilon":
+            objective = int(rows.index(k) >= len(rows) / 2.0)
+            target = epsilon_constraint(start, span, objective)
+        else:
+            target = pascoletti_serafini(start, span)
+        attempts.append(ForceAttempt("point", archive.parent[k], archive.x[k], start, target))
+    return attempts
+
+
+def further(
+    archive: GrowingFront,
+    objective: int | None,
+    tried: Collection[tuple[int | None, bytes]],
+    stalled: bool,
+    kick: Kick,
+    rng: np.random.Generator,
+) -> ForceAttempt:
+    """An attempt at an end of the front or at its balanced middle.
+
+    It goes on from the best point. Where that was tried, or came no further, ends start from a kick
+    away from it: they lie in several basins. The middle starts from any other point then, those
+    that are dominated by now included.
+
+    Args:
+        objective: whose end of the front; None for its balanced middle.
+        tried: all attempts so far, as objective and bytes of the start.
+        stalled: whether the last attempt came no further.
+    """
+    radius, k = RADIUS, archive.best(objective)[0]
+    fresh = [row for row, x in enumerate(archive.x) if (objective, x.tobytes()) not in tried]
+    span, away = np.full(2, LEAST_SPAN), stalled or k not in fresh
+    if away and objective is not None and (found := kick(archive.x[k], objective)) is not None:
+        x, start = found
+        return ForceAttempt("extreme", -1, x, start, aimed(start, span, objective))
+    if away and fresh:
+        k = fresh[int(rng.integers(len(fresh)))]
+    elif not fresh:
+        radius = SMALL_RADIUS
+    x, start = archive.x[k], archive.objectives[k]
+    target = aimed(start, span, objective)
+    if objective is None:
+        return ForceAttempt("balance", -1, x, start, target, radius)
+    return ForceAttempt("extreme", -1, x, start, target, radius, "wide" if away else "usual")
+
+
+def finishing(archive: GrowingFront, objective: int | None) -> ForceAttempt:
+    """An attempt from the best point at an end, or at the balanced middle, to the last digits."""
+    k, span = archive.best(objective)[0], archive.span()
+    x, start = archive.x[k], archive.objectives[k]
+    target = aimed(start, span, objective)
+    aim: Aim = "balance" if objective is None else "extreme"
+    return ForceAttempt(aim, -1, x, start, target, NEAR_RADIUS, "near")
+
+
+def probing(start: Start, objective: int | None) -> ForceAttempt:
+    """A short solve from a start towards an end of the front, or its balanced middle."""
+    target = aimed(start.objectives, np.full(2, LEAST_SPAN), objective)
+    return ForceAttempt("probe", -1, start.x, start.objectives, target, reach="brief")
+
+
+def halve(pool: list[Start], objective: int | None, solve: Callable[[Start], Start]) -> None:
+    """Solve from all starts, then from the better half of what was reached, until one is left."""
+    while pool:
+        reached = [start if start.spent else solve(start) for start in pool]
+        pool = better_half(reached, objective)
+
+
+def better_half(reached: list[Start], objective: int | None) -> list[Start]:
+    """Those that go on, the best first; none after the last."""
+    ranked = sorted(reached, key=lambda start: start.value(objective))
+    return ranked[: len(reached) // 2]
+
+
+@dataclass(frozen=True)
+class Filling:
+    """An attempt in a gap.
+
+    Attributes:
+        attempt: what it is.
+        edge: the side that it starts from.
+        step: how far along the front it aims, in units of its extent.
+    """
+
+    attempt: ForceAttempt
+    edge: Edge
+    step: float
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Neighbours on a front: indices into the archive, and how far apart they are.
+
+    Attributes:
+        first, second: by increasing first objective.
+        width: see the module.
+        length: sum of the differences of both objectives, in units of the front's extent.
+    """
+
+    first: int
+    second: int
+    width: float
+    length: float
+
+
+def gaps(archive: GrowingFront) -> list[Gap]:
+    """All of a front, in its order."""
+    rows = archive.rows()
+    scaled = np.array([archive.objectives[k] for k in rows]) / archive.span()
+    sides = np.abs(np.diff(scaled, axis=0))
+    lengths = sides.sum(axis=1)
+    widths = np.maximum(np.sqrt(sides.prod(axis=1)), TAIL * lengths)
+    ends = zip(rows[:-1], rows[1:], widths.tolist(), lengths.tolist(), strict=True)
+    return [Gap(*gap) for gap in ends]
+
+
+def filling(
+    archive: GrowingFront,
+    tried: Collection[Edge],
+    solved: int,
+    *,
+    stride: float = STRIDE,
+    far: float = FAR,
+) -> Filling | None:
+    """An attempt in the widest gap, from the side that was not tried.
+
+    Where both sides' continuations failed, because the front jumps there, a gap that is far too
+    wide is aimed at half way, without staying near.
+
+    Args:
+        archive: the front so far.
+        tried: sides of gaps that attempts started from.
+        solved: points with which the front has enough.
+        stride, far: see `STRIDE` and `FAR`.
+
+    Returns:
+        The attempt; None where the front has enough points, or no side of a gap is left.
+    """
+    found = gaps(archive)
+    if len(found) + 1 >= solved:
+        return None
+    for gap in sorted(found, key=lambda gap: -gap.width):
+        sides = (gap.first, gap.second, 1), (gap.second, gap.first, -1)
+        for near in (True, False) if gap.width > far else (True,):
+            edges = [
+                (archive.x[start].tobytes(), archive.x[across].tobytes(), near)
+                for start, across, _ in sides
+            ]
+            step = min(gap.length / 2.0, stride) if near else gap.length / 2.0
+            for (start, _, sign), edge in zip(sides, edges, strict=True):
+                if edge in tried or not archive.polished[start]:
+                    continue
+                target = _target(archive, start, sign * step)
+                radius = NEAR_RADIUS if near else RADIUS
+                x, objectives = archive.x[start], archive.objectives[start]
+                reach: Reach = "near" if near else "usual"
+                attempt = ForceAttempt("gap", -1, x, objectives, target, radius, reach)
+                return Filling(attempt, edge, step)
+    return None
+
+
+def crept(archive: GrowingFront, filling: Filling, objectives: Array) -> bool:
+    """Whether what an attempt found is hardly farther along the front than where it started."""
+    moved = np.abs(objectives - filling.attempt.start) / archive.span()
+    return float(moved.sum()) < CREEP * filling.step
+
+
+def _target(archive: GrowingFront, k: int, step: float) -> Target:
+    """From a member to a distance along the front."""
+    span = archive.span()
+    aside = np.array([0.5, -0.5]) * step * span
+    return pascoletti_serafini(archive.objectives[k] + aside, span)
+
+
+def widest(archive: GrowingFront, tried: Collection[Chord]) -> Gap | None:
+    """The widest gap whose chord was not tried; None where none is left. Points of the given front
+    have no chords."""
+    for gap in sorted(gaps(archive), key=lambda gap: -gap.width):
+        is_polished = archive.polished[gap.first] and archive.polished[gap.second]
+        if is_polished and chord_of(archive, gap) not in tried:
+            return gap
+    return None
+
+
+def chord_of(archive: GrowingFront, gap: Gap) -> Chord:
+    """The chord across a gap."""
+    return archive.x[gap.first].tobytes(), archive.x[gap.second].tobytes()
+
+
+def between(
+    evaluator: CandidateEvaluator, archive: GrowingFront, gap: Gap
+) -> tuple[Array, Array] | None:
+    """The feasible point on a chord that wins most area from its gap: decision vector (n_var,) and
+    objectives (2,); None where every one is dominated or infeasible."""
+    share = np.arange(1, CHORD + 1)[:, None] / (CHORD + 1)
+    x = (1.0 - share) * archive.x[gap.first] + share * archive.x[gap.second]
+    found = evaluator.evaluate(x)
+    corner = archive.objectives[gap.second][0], archive.objectives[gap.first][1]
+    won = np.maximum(np.array(corner) - found.objectives, 0.0).prod(axis=1)
+    won[~found.feasible] = 0.0
+    best = int(won.argmax())
+    if won[best] == 0.0 or archive.dominates(found.objectives[best]):
+        return None
+    return x[best], found.objectives[best]
+
+
+class ForceRun(PolishRun[ForceAttempt]):
+    """The polish of both peak forces."""
+
+    def __init__(
+        self,
+        solver: ForceSolver,
+        settings: PolishSettings,
+        archive: GrowingFront,
+        recorded: list[PolishOutcome | Lost],
+        emit: Callable[[PolishOutcome], None],
+    ) -> None:
+        super().__init__(solver.cell.evaluator, settings, archive, recorded, emit)
+        self._solver, self._mirror = solver, mirror_of(solver.cell.workcell)
+        self._tried: set[tuple[int | None, bytes]] = set()
+        self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
+        self._unproven = set[bytes]()
+        self._probed = set[bytes]()
+        self._ahead = 0
+
+    def _solution(self, attempt: ForceAttempt) -> Solution:
+        found = self._solver.solve(attempt.x, attempt.target, attempt.radius, attempt.reach)
+        # Ends and middles have a finer scale of their own.
+        unit = float((attempt.target.span / self._archive.span()).max())
+        found.residuals = found.residuals.scaled(unit)
+        return found
+
+    def all(self, rng: np.random.Generator) -> None:
+        """The front's points, then probes far from it, then ends and middle in turns while attempts
+        last; then what lies between. Mirror images are taken in all the way, and certified together
+        with points on chords in the end."""
+        self._do(points(self._archive, self._settings))
+        self._ahead = self._left()
+        aims = (0, 1, None) if self._mirror is None else (0, None)
+        for objective in aims:
+            self._probe(objective, rng)
+        while self._left() > 0:
+            self._turn((0, 1), rng)
+            if self._stalls[None] < MIDDLE_STALLS:
+                self._turn((None,), rng)
+        for objective in aims:
+            self._most += 1
+            self._do([finishing(self._archive, objective)])
+        probed = self._without_probes()
+        self._fill(self._settings.fill.solved)
+        self._take_back(probed)
+        self._certify_unproven()
+        if len(self._archive.rows()) < ENOUGH * self._settings.fill.members:
+            # Chords lead nowhere, or where nothing is proven.
+            self._fill(self._settings.fill.members)
+            self._certify_unproven()
+
+    def _probe(self, objective: int | None, rng: np.random.Generator) -> None:
+        """Short solves from random feasible candidates and from the front's best point, then again
+        from the better half of what they reached, until one is left. Never from more starts than
+        twice the attempts that are ahead."""
+        probe = self._settings.probe
+        count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
+        count = min(2 * self._ahead, probe.middle_starts if objective is None else count)
+        if not count:
+            return
+        k = self._archive.best(objective)[0]
+        pool = [Start(self._archive.x[k], self._archive.objectives[k])]
+        pool += random_starts(self._evaluator, count - 1, rng)
+
+        def solve(start: Start) -> Start:
+            self._most += 1
+            self._do([probing(start, objective)])
+            outcome = self.outcomes[-1]
+            return Start(outcome.x, outcome.objectives, spent=outcome.status != "accepted")
+
+        halve(pool, objective, solve)
+
+    def _without_probes(self) -> list[tuple[Array, Array]]:
+        """Take out what probes reached, but for the ends and the middle: cut short on purpose, they
+        would stand where a gap is to be filled."""
+        archive = self._archive
+        kept = {archive.best(objective)[0] for objective in (0, 1, None)}
+        probed = [k for k, x in enumerate(archive.x) if x.tobytes() in self._probed]
+        left = [k for k in probed if k not in kept]
+        found = [(archive.x[k], archive.objectives[k]) for k in left]
+        archive.drop(left)
+        return found
+
+    def _take_back(self, probed: list[tuple[Array, Array]]) -> None:
+        """What lies in gaps that stayed far too wide is not given up, nor what a front lacks."""
+        for x, objectives in probed:
+            wanted = self._is_short or self._is_far(objectives)
+            if wanted and not self._archive.dominates(objectives):
+                self._archive.add(x, objectives)
+
+    @property
+    def _is_short(self) -> bool:
+        """Whether the front has fewer points than it is to have."""
+        return len(self._archive.rows()) < self._settings.fill.members
+
+    def _is_far(self, objectives: Array) -> bool:
+        """Whether a point lies beyond the ends of the front, or in a gap that is far too wide."""
+        f = [self._archive.objectives[k][0] for k in self._archive.rows()]
+        place = int(np.searchsorted(f, objectives[0]))
+        if place in (0, len(f)):
+            return True
+        return gaps(self._archive)[place - 1].width > FAR
+
+    def _fill(self, solved: int) -> None:
+        """Attempts between the ends, until the front has so many points or no side of a gap is
+        left; then points on chords between neighbours."""
+        tried: set[Edge] = set()
+        self._most += self._settings.fill.attempts * self._settings.attempts
+        while self._left() > 0:
+            found = filling(self._archive, tried, solved)
+            if found is None:
+                break
+            tried |= {found.edge, self._reflected(found.edge)}
+            self._do([found.attempt])
+            outcome = self.outcomes[-1]
+            if outcome.status == "accepted" and crept(self._archive, found, outcome.objectives):
+                edge = outcome.x.tobytes(), *found.edge[1:]
+                tried |= {edge, self._reflected(edge)}
+        self._fill_by_chords()
+
+    def _fill_by_chords(self) -> None:
+        archive, tried = self._archive, set[Chord]()
+        while self._is_short and (gap := widest(archive, tried)) is not None:
+            first, second = chord_of(archive, gap)
+            image = self._reflected_bytes(second), self._reflected_bytes(first)
+            tried |= {(first, second), image}
+            found = between(self._evaluator, archive, gap)
+            if found is not None:
+                archive.add(*found)
+                self._unproven.add(found[0].tobytes())
+                self._take_image(found[0])
+
+    def _reflected(self, edge: Edge) -> Edge:
+        """The mirror image of a side of a gap, itself where it has none."""
+        start, across, near = edge
+        return self._reflected_bytes(start), self._reflected_bytes(across), near
+
+    def _reflected_bytes(self, x: bytes) -> bytes:
+        image = self._image(np.frombuffer(x))
+        return x if image is None else image.tobytes()
+
+    def _image(self, x: Array) -> Array | None:
+        return None if self._mirror is None else self._mirror.image(x)
+
+    def _take(self, attempt: ForceAttempt, outcome: PolishOutcome) -> None:
+        super()._take(attempt, outcome)
+        if outcome.status == "accepted":
+            if attempt.reach == "brief":
+                self._unproven.add(outcome.x.tobytes())
+                self._probed |= {outcome.x.tobytes(), self._reflected_bytes(outcome.x.tobytes())}
+            self._take_image(outcome.x)
+
+    def _evaluated(self, attempt: ForceAttempt, x: Array) -> Evaluations:
+        """Most of what probes reach is dominated soon: what then stands is certified in the end."""
+        if attempt.reach == "brief":
+            return self._evaluator.evaluate(x)
+        return super()._evaluated(attempt, x)
+
+    def _take_image(self, x: Array) -> None:
+        if (image := self._image(x)) is None:
+            return
+        found = self._evaluator.evaluate(image)
+        if found.feasible[0] and not self._archive.dominates(found.objectives[0]):
+            self._archive.add(image, found.objectives[0])
+            self._unproven.add(image.tobytes())
+
+    def _certify_unproven(self) -> None:
+        """Leave out what no solve made and is not proven free of collisions between the samples."""
+        rows, known = self._archive.rows(), self._unproven
+        standing = [k for k in rows if self._archive.x[k].tobytes() in known]
+        if standing:
+            x = np.array([self._archive.x[k] for k in standing])
+            proven = self._evaluator.certified(self._evaluator.evaluate(x)).feasible
+            self._archive.drop([k for k, good in zip(standing, proven, strict=True) if not good])
+
+    def _turn(self, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
+        """An attempt at each of some aims, and whether it came further."""
+        kick = partial(kicked, self._evaluator, rng=rng)
+        for objective in objectives:
+            before, stalls = self._archive.best(objective)[1], self._stalls[objective]
+            attempt = further(self._archive, objective, self._tried, stalls > 0, kick, rng)
+            self._tried.add((objective, attempt.x.tobytes()))
+            if (image := self._image(attempt.x)) is not None:
+                self._tried.add((None if objective is None else 1 - objective, image.tobytes()))
+            self._do([attempt])
+            gained = self._archive.best(objective)[1] < before - PROGRESS
+            self._stalls[objective] = 0 if gained else stalls + 1

@@ -1,0 +1,118 @@
+"""Robust forces in the polish: at the samples of a carry, and along a driven path.
+
+The smooth problem knows planned forces with two derivatives. Of robust ones it takes the values and
+slopes at the candidate of each round, exact for the cases that rule, and bends them as planned
+forces bend: every round's model agrees with the truth to first order, so that where rounds come to
+rest the true first-order conditions hold. At every point of a driven path the cases that ask for
+most have a row each: where two cases rule in turn one row alone would let a step through that the
+other forbids.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from codegen.build import compile_function
+from codegen.interpreted import InterpretedFunction
+from hybrid_opt.robust.cases import worst_cases
+from hybrid_opt.robust.force import BoxMotion, check_set, robust_model
+from hybrid_opt.robust.path_force import PathPoints, robust_path
+from hybrid_opt.robust.ruling import RulingCases, ruling_cases
+from symbolic.array import Array
+from symbolic.contact.worst_cases import case_gradient_function
+from symbolic.records.cell import Workcell
+from symbolic.smooth.driven import planned_branches
+from symbolic.smooth.samples import motion_function
+
+LEADER = 0
+"""The arm that keeps its place, as in the objectives."""
+
+CASES = 3
+"""Cases per robot and point of a driven path."""
+
+ROBUST_ROWS = 2 * CASES
+
+
+class RobustSamples:
+    """Robust forces along carries of one workcell."""
+
+    def __init__(self, workcell: Workcell) -> None:
+        """Load or build the compiled functions.
+
+        Raises:
+            SettingsError: there are no robust forces of its pads, or its uncertainty leaves no
+                friction or patch.
+            DualArmError: a function cannot be built.
+        """
+        check_set(workcell, workcell.uncertainty)
+        self._workcell, self._model = workcell, robust_model(workcell)
+        self._cases = worst_cases(workcell, workcell.uncertainty)
+        self._gradient = compile_function(case_gradient_function(workcell))
+        self._motion = InterpretedFunction(motion_function(workcell.task))
+
+    def forces(self, found: Mapping[str, Array]) -> Array:
+        """(n, 2) normal forces [N] from the evaluator's outputs for one candidate."""
+        motion = BoxMotion(*[found[name] for name in ("pose", "rate", "second_rate")])
+        return self._ruling(motion).force
+
+    def first(self, x: Array) -> tuple[Array, Array]:
+        """Forces (n, 2) [N] of a decision vector (n_var,) and their derivatives (n, 2, n_var)."""
+        out = self._motion.batch(np.ascontiguousarray(x)[None])
+        rows = out["motion"][0]
+        by_x = out["slope"][0].reshape(*rows.shape, len(x))
+        parts = [np.ascontiguousarray(rows[:, at : at + 6]) for at in (0, 6, 12)]
+        ruling = self._ruling(BoxMotion(*parts))
+        slopes = ruling.slopes(
+            *[
+                self._gradient.batch(*parts, self._cases[case])["slope"]
+                for case in (ruling.commanded, ruling.felt)
+            ]
+        )
+        return ruling.force, np.einsum("nrm,nmx->nrx", slopes, by_x)
+
+    def _ruling(self, motion: BoxMotion) -> RulingCases:
+        worst = self._model.least_squeeze(motion, self._cases)
+        return ruling_cases(worst, self._workcell.uncertainty, LEADER)
+
+
+class RobustForces:
+    """Robust forces at driven points of one workcell, robot by robot."""
+
+    def __init__(self, workcell: Workcell, pose: int) -> None:
+        """pose: entries of the extended pose."""
+        self._forces, self._pose = robust_path(workcell), pose
+        self._branches = planned_branches(workcell)
+
+    def at(self, path: tuple[Array, ...], a: Array, w: Array) -> tuple[Array, Array]:
+        """(points, ROBUST_ROWS) [N], and their slopes (points, ROBUST_ROWS, 3 pose + 2) by the
+        extended pose and its derivatives, u'' and u'^2.
+
+        Args:
+            path: extended poses and their derivatives by u (points, pose).
+        """
+        pose, first, second = (np.ascontiguousarray(part[:, :6]) for part in path)
+        force, slope = self._forces.most_demanding(PathPoints(pose, first, second, a, w), CASES)
+        n = len(a)
+        found = np.zeros((n, ROBUST_ROWS, 3 * self._pose + 2))
+        by = slope.reshape(n, ROBUST_ROWS, -1)
+        for k in range(3):
+            found[:, :, k * self._pose : k * self._pose + 6] = by[:, :, 6 * k : 6 * k + 6]
+        found[:, :, -2:] = by[:, :, -2:]
+        return force.reshape(n, ROBUST_ROWS), found
+
+    def as_planned(self, weight: Array, value: Array) -> Array:
+        """Weights (points, quantities) that bend the planned forces as those of robust ones, given
+        behind them, are taken to bend.
+
+        Args:
+            weight, value: (points, quantities and robust forces).
+        """
+        size = weight.shape[1] - ROBUST_ROWS
+        found = weight[:, :size].copy()
+        shares = weight[:, size:].reshape(-1, 2, CASES).sum(axis=2)
+        for arm, branches in enumerate(self._branches):
+            ruling = branches[np.argmax(value[:, :size] @ branches.T, axis=1)]
+            found += shares[:, arm, None] * ruling
+        return found

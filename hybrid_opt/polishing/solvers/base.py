@@ -1,0 +1,233 @@
+"""What is solved, and what comes of it, whichever solver is chosen.
+
+A solver's word is not trusted: an answer's multipliers and residuals are recomputed from the
+program.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from scipy.optimize import nnls
+
+from codegen.build import c_text, load_or_build_library
+from codegen.cache import Cache
+from symbolic.array import Array
+
+TOLERANCE = 1e-6
+"""Of the optimality conditions, in a program's scaled rows and variables."""
+
+FEASIBLE = 1e-3
+"""Violation of a scaled row at which an iterate counts as feasible."""
+
+PATIENCE = 3
+"""Times the wanted number of iterations that a solve may take to become feasible: cut off wherever
+it stands, it ends in an obstacle more often than not."""
+
+MOST_SECONDS = 60.0
+"""Wall time after which a solve is given up. Generous, because a result that depends on it cannot
+be repeated."""
+
+NEAR = 0.1
+"""Slack of inequalities that may have a multiplier."""
+
+TURNS = 30
+"""Iterations of the least squares for every inequality."""
+
+
+class Program(Protocol):
+    """A nonlinear program: minimise cost . z within bounds, constraints within theirs.
+
+    Attributes:
+        cost: (n_variables,) gradient of the objective, which is linear.
+        start, low, high: (n_variables,).
+        below, above: (n_rows,) bounds of the constraints, infinite where there is none.
+    """
+
+    cost: Array
+    start: Array
+    low: Array
+    high: Array
+    below: Array
+    above: Array
+
+    def values(self, z: Array) -> Array:
+        """(n_rows,) of the constraints at z."""
+
+    def constraints(self, z: Array) -> tuple[Array, Array]:
+        """Values (n_rows,) and Jacobian (n_rows, n_variables) at z."""
+
+    def curvature(self, z: Array, multipliers: Array) -> Array:
+        """(n_variables, n_variables) second derivatives of multipliers . constraints at z."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """How well a solution satisfies the optimality conditions of its program.
+
+    Attributes:
+        stationarity: largest entry of the Lagrangian's gradient (scaled variables).
+        feasibility: largest violation of a constraint or bound.
+        complementarity: largest product of a multiplier and its constraint's slack.
+    """
+
+    stationarity: float
+    feasibility: float
+    complementarity: float
+
+    def scaled(self, unit: float) -> Residuals:
+        """With the objective in units that are so many times smaller."""
+        return Residuals(unit * self.stationarity, self.feasibility, unit * self.complementarity)
+
+
+UNKNOWN = Residuals(np.nan, np.nan, np.nan)
+"""Of a solve that returned nothing."""
+
+Conditions = tuple[tuple[Array, Array], Residuals]
+"""Multipliers and residuals."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a solver of nonlinear programs returned.
+
+    Attributes:
+        z: (n_variables,) where it ended.
+        message: its status.
+        converged: whether it claims an optimum.
+        usable: whether z is finite.
+        iterations: its own.
+        conditions: tells the multipliers and the residuals, when somebody asks for them.
+    """
+
+    z: Array
+    message: str
+    converged: bool
+    usable: bool
+    iterations: int
+    conditions: Callable[[], Conditions] = field(repr=False)
+
+    @cached_property
+    def _told(self) -> Conditions:
+        return self.conditions()
+
+    @property
+    def multipliers(self) -> tuple[Array, Array]:
+        """Of the variables' bounds (n_variables,) and of the rows (n_rows,), in CasADi's
+        convention."""
+        return self._told[0]
+
+    @property
+    def residuals(self) -> Residuals:
+        """Recomputed from the program."""
+        return self._told[1]
+
+
+Solve = Callable[[Program, int, float], Answer]
+"""A solver: from a program, the wanted number of iterations and the barrier at the start."""
+
+
+class Inequalities:
+    """A program's rows as one set h(z) >= 0: the upper sides that have a bound, then the lower.
+
+    Attributes:
+        rows, sign, shift: (m,) each is sign * the program's row + shift.
+    """
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._upper = np.flatnonzero(np.isfinite(program.above))
+        self._lower = np.flatnonzero(np.isfinite(program.below))
+        self.rows = np.concatenate([self._upper, self._lower])
+        self.sign = np.concatenate([-np.ones(len(self._upper)), np.ones(len(self._lower))])
+        self.shift = np.concatenate([program.above[self._upper], -program.below[self._lower]])
+
+    def values(self, z: Array) -> Array:
+        """(m,) at z."""
+        return np.asarray(self._program.values(z)[self.rows] * self.sign + self.shift)
+
+    def slopes(self, z: Array) -> Array:
+        """(m, n_variables) gradients at z."""
+        return np.asarray(self._program.constraints(z)[1][self.rows] * self.sign[:, None])
+
+    def multipliers(self, y: Array) -> Array:
+        """(n_rows,) multipliers of the rows in CasADi's convention, from those (m,) of the
+        inequalities."""
+        multipliers = np.zeros(len(self._program.below))
+        multipliers[self._upper] = y[: len(self._upper)]
+        multipliers[self._lower] -= y[len(self._upper) :]
+        return multipliers
+
+
+def residuals(
+    program: Program,
+    z: Array,
+    lam_z: Array,
+    lam_g: Array,
+    bounds: tuple[Array, Array] | None = None,
+) -> Residuals:
+    """Residuals of the optimality conditions at z with the given multipliers.
+
+    In CasADi's convention: positive multipliers belong to upper bounds, negative to lower ones.
+
+    Args:
+        bounds: lower and upper (n_variables,) in place of the program's.
+    """
+    values, jacobian = program.constraints(z)
+    lagrangian = program.cost + jacobian.T @ lam_g + lam_z
+    low, high = bounds or (program.low, program.high)
+    sides = (z, low, high, lam_z), (values, program.below, program.above, lam_g)
+    violation, product = 0.0, 0.0
+    for value, low, high, multiplier in sides:
+        violation = max(
+            violation, np.max(low - value, initial=0.0), np.max(value - high, initial=0.0)
+        )
+        slack = np.where(multiplier > 0.0, high - value, value - low)
+        # A multiplier of an absent bound has nothing to be complementary to: it must vanish.
+        scaled = np.where(np.isfinite(slack), np.abs(slack), 1.0)
+        product = max(product, np.max(np.abs(multiplier) * scaled, initial=0.0))
+    return Residuals(float(np.max(np.abs(lagrangian))), float(violation), float(product))
+
+
+def estimated(cost: Array, A: Array, slacks: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Multipliers that satisfy the conditions of optimality best, in least squares: better than
+    an iteration's own where it was cut off.
+
+    Args:
+        cost, A: gradients of the objective (n,) and of the inequalities (m, n).
+        slacks: of the inequalities (m,), of the lower and of the upper bounds (n,).
+
+    Returns:
+        Of the bounds (n,) in CasADi's convention, and of the inequalities (m,), not negative.
+    """
+    n, m = len(cost), len(A)
+    slack = np.concatenate(slacks)
+    near = np.flatnonzero(slack < NEAR)
+    found = np.zeros(len(slack))
+    if not len(near):
+        # Nothing can have a multiplier; SciPy ends the process at a matrix without columns.
+        return np.zeros(n), np.zeros(m)
+    slopes = np.hstack([A.T, np.eye(n), -np.eye(n)])[:, near]
+    conditions = np.vstack([slopes, np.diag(np.abs(slack[near]))])
+    try:
+        right = np.concatenate([cost, np.zeros(len(near))])
+        found[near], _ = nnls(conditions, right, maxiter=TURNS * len(near))
+    except RuntimeError:
+        # Its iterations ran out: no multipliers, which the residuals tell.
+        pass
+    y, low, high = np.split(found, [m, m + n])
+    return high - low, y
+
+
+def compiled(name: str, package: str, sources: Sequence[str], cache: Cache) -> ctypes.CDLL:
+    """C of the polish as a library, see `codegen.library`.
+
+    Raises:
+        CodegenError: there is no compiler, or it cannot be compiled, cached or loaded.
+    """
+    return load_or_build_library(name, c_text(package, sources), cache)

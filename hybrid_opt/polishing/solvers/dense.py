@@ -1,0 +1,227 @@
+"""A dense interior-point method for programs of few variables and many inequalities.
+
+The polish's programs have about twenty variables and two hundred rows, nearly all of them
+inequalities. Condensed to the variables, Newton's system is a matrix of twenty by twenty, where a
+sparse solver factorises one of four hundred. The barrier falls as its problems are solved, as with
+Waechter and Biegler (2006), but rows that hold go on to hold in every iterate, in place of their
+filter: a step is shortened until they do, and its slacks are what the rows keep (Byrd, Nocedal and
+Waltz 2003 call it the feasible mode). A solve may then be cut off anywhere, and large steps do not
+wander through obstacles. Rows that do not hold yet have slacks of their own and a price.
+
+With h(z) >= 0 all inequalities, h(z) - s = 0 and the multipliers y, each step solves
+
+    (W + A^T D A + E) dz = -c + A^T (mu / s - D r) + mu / (z - low) - mu / (high - z),
+
+A = dh/dz, D = y / s, r = h - s, W the curvature of the Lagrangian, E that of the bounds' barrier.
+What does not call the program is in `dense.c`, which works on the iterate's own arrays.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache as remembered
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codegen.cache import Cache
+from hybrid_opt.polishing.solvers.base import (
+    FEASIBLE,
+    PATIENCE,
+    TOLERANCE,
+    UNKNOWN,
+    Answer,
+    Conditions,
+    Inequalities,
+    Program,
+    Solve,
+    compiled,
+    estimated,
+    residuals,
+)
+from symbolic.array import Array
+
+PUSH = 1e-4
+"""Least distance of the start from bounds, as a share of their width."""
+
+HAIR = 1e-8
+"""By this share of their width bounds are wider for the solver; its answer is clipped."""
+
+SLACK = 1e-2
+"""Least slack at the start: rows nearer than that to their limit may come nearer for a while."""
+
+RENEWALS = 3
+"""Times that the least slacks may be renewed where no step was found."""
+
+LINEAR, POWER = 0.2, 1.5
+"""The barrier falls to the smaller one of this share of it and this power."""
+
+SOLVED = 10.0
+"""A barrier's problem counts as solved at this many times the barrier."""
+
+TRIALS = 8
+"""Trials of a line search before it gives up."""
+
+_INTEGERS = ("n", "m")
+_GIVEN = ("row", "sign", "shift", "cost", "low", "high", "inner_low", "inner_high")
+_CALLED = ("values", "jacobian", "W")
+_STATE = ("z", "slack", "dual", "h", "A")
+_FOUND = ("trial", "ruling", "errors", "blocking")
+_VECTOR, _TAKEN = 8, 0
+"""As in `dense.c`."""
+
+
+class _Step(ctypes.Structure):
+    """As in `dense.c`."""
+
+    _fields_ = (
+        *((name, ctypes.c_longlong) for name in _INTEGERS),
+        *((name, ctypes.c_void_p) for name in (*_GIVEN, *_CALLED, *_STATE, *_FOUND)),
+        ("mu", ctypes.c_double),
+        ("work", ctypes.c_void_p),
+        *((name, ctypes.c_double) for name in ("price", "before", "slope", "alpha")),
+    )
+
+
+def dense_method(cache: Cache | None = None) -> Solve:
+    """The method.
+
+    Args:
+        cache: where its library is kept; by default the user's.
+
+    Raises:
+        CodegenError: it cannot be compiled, cached or loaded.
+    """
+    library = _library((cache or Cache()).folder)
+    return lambda program, iterations, barrier: _Solver(library, program, barrier).solve(iterations)
+
+
+@remembered
+def _library(folder: Path) -> ctypes.CDLL:
+    package = "hybrid_opt.polishing.solvers"
+    library = compiled("dense_interior", package, ["dense.c"], Cache(folder))
+    library.dual_arm_dense_work.argtypes = [ctypes.c_longlong] * 2
+    library.dual_arm_dense_work.restype = ctypes.c_longlong
+    for name in ("ruling", "direction", "judge", "heed", "move", "errors"):
+        function = library[f"dual_arm_dense_{name}"]
+        answers = name in ("direction", "judge", "heed")
+        function.argtypes = [ctypes.c_void_p]
+        function.restype = ctypes.c_longlong if answers else None
+        setattr(library, name, function)
+    return library
+
+
+class _Solver:
+    """One solve of one program.
+
+    The iterate has n variables z and m inequalities with values h and slopes A. Its slacks and
+    multipliers (m + 2 n,) are of the inequalities, then of the lower and of the upper bounds.
+    """
+
+    def __init__(self, library: ctypes.CDLL, program: Program, barrier: float) -> None:
+        self._c, self._program, self._mu = library, program, barrier
+        self._rows, self._renewals = Inequalities(program), 0
+        # Bounds are a hair wider than they are, so that no rounding puts an iterate on one.
+        hair = HAIR * (program.high - program.low)
+        low, high = self._low, self._high = program.low - hair, program.high + hair
+        push = PUSH * (high - low)
+        self.z = np.clip(program.start, low + push, high - push)
+        self.h, A = self._rows.values(self.z), self._rows.slopes(self.z)
+        m, n = A.shape
+        slack = np.concatenate([np.maximum(self.h, SLACK), self.z - low, high - self.z])
+        self.slack, self.dual = slack, barrier / slack
+        wide = np.zeros((m, -(-n // _VECTOR) * _VECTOR))
+        wide[:, :n] = A
+        self.A, n_rows = wide[:, :n], len(program.below)
+        self._arrays: dict[str, Any] = {
+            "row": self._rows.rows.astype(np.int64),
+            "sign": self._rows.sign,
+            "shift": self._rows.shift,
+            "cost": np.ascontiguousarray(program.cost),
+            "low": low,
+            "high": high,
+            "inner_low": low + 1e-3 * hair,
+            "inner_high": high - 1e-3 * hair,
+            "values": np.empty(n_rows),
+            "jacobian": np.empty((n_rows, n)),
+            "W": np.empty((n, n)),
+            "z": self.z,
+            "slack": self.slack,
+            "dual": self.dual,
+            "h": self.h,
+            "A": wide,
+            "trial": np.empty(n),
+            "ruling": np.zeros(n_rows),
+            "errors": np.empty(4),
+            "blocking": np.zeros(m, dtype=np.int8),
+            "work": np.empty(library.dual_arm_dense_work(n, m)),
+        }
+        addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
+        self._step = _Step(n, m, mu=self._mu, price=0.0, **addresses)
+        self._address = ctypes.addressof(self._step)
+
+    def solve(self, wanted: int) -> Answer:
+        """Iterate until an optimum, or as often as wanted and until an iterate is feasible."""
+        iterations, message = 0, "Maximum_Iterations_Exceeded"
+        for iterations in range(PATIENCE * wanted + 1):
+            self._c.errors(self._address)
+            if self._error(0.0) <= TOLERANCE:
+                message = "Solve_Succeeded"
+                break
+            if iterations >= wanted and np.max(-self.h, initial=0.0) <= FEASIBLE:
+                message = "Stopped_Feasible"
+                break
+            least = TOLERANCE / SOLVED
+            while self._mu > least and self._error(self._mu) <= SOLVED * self._mu:
+                self._mu = max(least, min(LINEAR * self._mu, self._mu**POWER))
+            if not self._advance() and not self._renew():
+                message = "Step_Too_Short"
+                break
+        z = np.clip(self.z, self._program.low, self._program.high)
+        usable = bool(np.isfinite(z).all())
+        return Answer(
+            z=z,
+            message=message if usable else "Not_Finite",
+            converged=usable and message == "Solve_Succeeded",
+            usable=usable,
+            iterations=iterations,
+            conditions=lambda: self._conditions(z, usable),
+        )
+
+    def _conditions(self, z: Array, usable: bool) -> Conditions:
+        """Multipliers that satisfy the conditions best where the solve ended, and residuals."""
+        slacks = self.h, self.z - self._low, self._high - self.z
+        lam_z, y = estimated(self._program.cost, self.A, slacks)
+        multipliers = lam_z, self._rows.multipliers(y)
+        return multipliers, residuals(self._program, z, *multipliers) if usable else UNKNOWN
+
+    def _error(self, mu: float) -> float:
+        """The largest residual of a barrier's conditions, multipliers scaled as in the paper."""
+        rest, least, most, scale = self._arrays["errors"].tolist()
+        return float(max(rest, max(most - mu, mu - least) / scale))
+
+    def _advance(self) -> bool:
+        """One step; whether one was found, or will be with other multipliers."""
+        c, step, program, arrays = self._c, self._address, self._program, self._arrays
+        self._step.mu = self._mu
+        c.ruling(step)
+        arrays["W"][...] = program.curvature(self.z, arrays["ruling"])
+        if not c.direction(step):
+            return False
+        for _ in range(TRIALS):
+            arrays["values"][...] = program.values(arrays["trial"])
+            if c.judge(step) == _TAKEN:
+                arrays["jacobian"][...] = program.constraints(arrays["trial"])[1]
+                c.move(step)
+                return True
+        return bool(c.heed(step))
+
+    def _renew(self) -> bool:
+        """Slacks as large as at the start; whether that changes anything."""
+        m = len(self.h)
+        s, old = np.maximum(self.h, min(SLACK, 10.0 * self._mu)), self.slack[:m].copy()
+        self.dual[:m] = np.where(s > old, self._mu / s, self.dual[:m])
+        self.slack[:m] = s
+        self._renewals += 1
+        return not np.allclose(s, old, rtol=1e-6) and self._renewals <= RENEWALS

@@ -1,0 +1,160 @@
+"""IPOPT on one program, through CasADi's callbacks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from hybrid_opt.polishing.solvers.base import (
+    FEASIBLE,
+    MOST_SECONDS,
+    PATIENCE,
+    TOLERANCE,
+    UNKNOWN,
+    Answer,
+    Program,
+    residuals,
+)
+from symbolic.array import Array
+
+OPTIONS: dict[str, Any] = {
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "print_time": False,
+    # A metaheuristic's point is near the solution but has no multipliers: a small barrier, little
+    # push off the bounds.
+    "ipopt.bound_push": 1e-4,
+    "ipopt.bound_frac": 1e-4,
+    "ipopt.slack_bound_push": 1e-4,
+    "ipopt.mu_linear_decrease_factor": 0.5,
+    "ipopt.mu_superlinear_decrease_power": 1.2,
+    "ipopt.honor_original_bounds": "yes",
+    "no_nlp_grad": True,
+    "calc_lam_p": False,
+    "calc_lam_x": False,
+    "calc_f": False,
+    "calc_g": False,
+    "error_on_fail": False,
+    "ipopt.tol": TOLERANCE,
+    "ipopt.max_wall_time": MOST_SECONDS,
+}
+
+Shapes = Mapping[str, ca.Sparsity]
+
+
+class _Called(ca.Callback):  # type: ignore[misc]  # CasADi has no types
+    """A Python function of vectors (n,) as CasADi calls it; the first methods are its questions."""
+
+    def __init__(
+        self, name: str, inputs: Shapes, outputs: Shapes, evaluate: Callable[..., list[Any]]
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._inputs, self._outputs = list(inputs.items()), list(outputs.items())
+        self._evaluate = evaluate
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        """How many inputs."""
+        return len(self._inputs)
+
+    def get_n_out(self) -> int:
+        """How many outputs."""
+        return len(self._outputs)
+
+    def get_name_in(self, index: int) -> str:
+        """Of an input."""
+        return self._inputs[index][0]
+
+    def get_name_out(self, index: int) -> str:
+        """Of an output."""
+        return self._outputs[index][0]
+
+    def get_sparsity_in(self, index: int) -> ca.Sparsity:
+        """Of an input."""
+        return self._inputs[index][1]
+
+    def get_sparsity_out(self, index: int) -> ca.Sparsity:
+        """Of an output."""
+        return self._outputs[index][1]
+
+    def eval(self, arguments: Sequence[ca.DM]) -> list[Any]:
+        """The outputs."""
+        return self._evaluate(*[argument.full().ravel() for argument in arguments])
+
+
+def _functions(program: Program, wanted: int) -> tuple[_Called, dict[str, _Called]]:
+    """A program as nlpsol wants it, and its derivatives with what ends a solve.
+
+    A solve that is cut off wherever it stands ends in an obstacle more often than not: it ends
+    after the wanted number of iterations, as soon as an iterate is feasible.
+    """
+    n, m, iterations = len(program.start), len(program.below), 0
+    x, p, g = ca.Sparsity.dense(n), ca.Sparsity(0, 0), ca.Sparsity.dense(m)
+    one, upper = ca.Sparsity.dense(1), ca.Sparsity.upper(n)
+    given, multiplied = {"x": x, "p": p}, {"lam_f": one, "lam_g": g}
+
+    def values(z: Array, _: Array) -> list[Any]:
+        return [program.cost @ z, program.values(z)]
+
+    def gradient(z: Array, _: Array) -> list[Any]:
+        return [program.cost @ z, program.cost]
+
+    def jacobian(z: Array, _: Array) -> list[Any]:
+        return list(program.constraints(z))
+
+    def hessian(z: Array, _: Array, __: Array, lam_g: Array) -> list[Any]:
+        return [ca.triu(ca.DM(program.curvature(z, lam_g)))]
+
+    def stop(_: Array, __: Array, g: Array, *___: Array) -> list[Any]:
+        nonlocal iterations
+        iterations += 1
+        violation = max(np.max(program.below - g), np.max(g - program.above))
+        return [float(iterations > wanted and violation <= FEASIBLE)]
+
+    slopes = {"g": g, "jac_g_x": ca.Sparsity.dense(m, n)}
+    bent = {"triu_hess_gamma_x_x": upper}
+    reached = {"x": x, "f": one, "g": g, "lam_x": x, "lam_g": g, "lam_p": p}
+    return _Called("nlp", given, {"f": one, "g": g}, values), {
+        "grad_f": _Called("nlp_grad_f", given, {"f": one, "grad_f_x": x}, gradient),
+        "jac_g": _Called("nlp_jac_g", given, slopes, jacobian),
+        "hess_lag": _Called("nlp_hess_l", given | multiplied, bent, hessian),
+        "iteration_callback": _Called("stop", reached, {"ret": one}, stop),
+    }
+
+
+def ipopt(program: Program, iterations: int, barrier: float) -> Answer:
+    """Solve a program with IPOPT; arguments as of `solvers.base.Solve`."""
+    nlp, functions = _functions(program, iterations)
+    limits = {"ipopt.mu_init": barrier, "ipopt.max_iter": PATIENCE * iterations}
+    solver = ca.nlpsol("polish", "ipopt", nlp, OPTIONS | functions | limits)
+    try:
+        found = solver(
+            x0=program.start,
+            lbx=program.low,
+            ubx=program.high,
+            lbg=program.below,
+            ubg=program.above,
+        )
+    except RuntimeError as error:
+        # CasADi's way to report that a function failed outright.
+        message = str(error).strip().splitlines()[-1]
+        nowhere = np.full(len(program.start), np.nan)
+        none = np.zeros(len(program.start)), np.zeros(len(program.below))
+        return Answer(nowhere, message, False, False, 0, lambda: (none, UNKNOWN))
+    statistics = solver.stats()
+    z, lam_z, lam_g = (found[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
+    usable = bool(np.isfinite(z).all())
+    return Answer(
+        z=z,
+        message=str(statistics["return_status"]),
+        converged=statistics["return_status"] == "Solve_Succeeded",
+        usable=usable,
+        iterations=int(statistics["iter_count"]),
+        conditions=lambda: (
+            (lam_z, lam_g),
+            residuals(program, z, lam_z, lam_g) if usable else UNKNOWN,
+        ),
+    )

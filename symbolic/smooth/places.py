@@ -1,0 +1,318 @@
+"""Rows at places of the path: what each kind asks for, and how joints follow the box there.
+
+A row holds one value above a required one. The value depends on the box pose, where the payload
+passes an edge (`symbolic.smooth.passage`) also on the pose's rate along the path, and on the joints
+that hold the box there. With the closure F(pose, q) = 0, zero where the joints hold the box at the
+pose, the joints follow the pose by the implicit function, and a row c(pose, q) has the derivatives
+
+    dq/dpose = -F_q^-1 F_pose,     nu = -F_q^-T c_q,     T = [I; dq/dpose],
+    grad = T^T c_y,                Hessian = T^T (c_yy + sum_k nu_k F_k,yy) T,     y = (pose, q),
+
+where pose stands for the extended pose and F for as many equations as there are joints: six hold
+the box, one more ties each redundant joint to its value. They hold at a solution of F only: no
+derivative is taken through Newton's steps, so the joints only need to be right, not differentiable.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Literal
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.cell_model import CellBodies, CellModel
+from symbolic.geometry.clearance import Scene
+from symbolic.geometry.expressions import EXACT, Softness
+from symbolic.path.rotation import rotation_matrix
+from symbolic.records.cell import PAYLOAD
+from symbolic.robot.arm import (
+    flange_target,
+    following_columns,
+    manipulability,
+    newton_step,
+    pose_error,
+)
+
+Order = Literal["first", "second"]
+"""Values with their first derivatives, or weighted second derivatives."""
+
+ORDERS: tuple[Order, ...] = ("first", "second")
+
+Side = Literal["lower", "upper"]
+
+SOLVE_STEPS = 5
+"""Newton steps from the reference joints, which the solver renews in every round."""
+
+WIDTH = 2e-4
+"""Width of the smoothed kinks of clearances [m]; what the smooth bounds fall short is made up for
+by measured distances (`hybrid_opt.polishing.constraints`)."""
+
+TURN = 3e-3
+"""Width of the kinks where a face of a box becomes parallel to another [1]: the best carries lie
+in these kinks, and a solver that sees them sharp creeps along."""
+
+
+class Place:
+    """The symbols of one place and what is built from them once.
+
+    Attributes:
+        model: of the cell's arms and bodies.
+        pose: (6,) of the box [m, rad].
+        rate: (6,) change of the pose with the path parameter.
+        q: both arms' joints, (n,) each [rad].
+    """
+
+    def __init__(self, model: CellBodies) -> None:
+        self.model = model
+        self.pose, self.rate = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6)
+        first, second = (arm.joints for arm in model.geometry.arms)
+        self.q = ca.SX.sym("q_1", first), ca.SX.sym("q_2", second)
+
+    @cached_property
+    def rotation(self) -> ca.SX:
+        """(3, 3) of the box in the world."""
+        return rotation_matrix(self.model.workcell.task.orientation, self.pose[3:])
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The bodies, with the kinks of their distances rounded."""
+        return self._scene(Softness(WIDTH, TURN))
+
+    @cached_property
+    def sharp_scene(self) -> Scene:
+        """The bodies as they are."""
+        return self._scene(EXACT)
+
+    def _scene(self, softness: Softness) -> Scene:
+        placed = [self.model.robots[arm].joint_placements(self.q[arm]) for arm in (0, 1)]
+        geometry = self.model.geometry
+        return Scene(geometry, self.rotation, self.pose[:3], (placed[0], placed[1]), softness)
+
+    @property
+    def payload(self) -> int:
+        """The payload among the bodies."""
+        return [body.name for body in self.model.geometry.bodies].index(PAYLOAD)
+
+    def obstacle(self, pair: int) -> Array:
+        """The numbers of the box of a separable pair."""
+        return self.scene.box_numbers(self.model.geometry.active[pair].second)
+
+    def separable(self) -> tuple[int, ...]:
+        """The active pairs of the payload and an obstacle of one box."""
+        active = self.model.geometry.active
+        return tuple(k for k, p in enumerate(active) if self.scene.separable(p.first, p.second))
+
+
+@dataclass(frozen=True)
+class PlaceConstraint(ABC):
+    """One kind of row at a place.
+
+    Constraints of one family share their functions and differ by the numbers handed to them.
+
+    Attributes:
+        scale: what the value is divided by, so that 1 matters [m, rad, 1]: a solver that sees
+            metres takes a centimetre for a trifle.
+        moving: whether the value depends on the rate.
+    """
+
+    scale: ClassVar[float]
+    moving: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def family(self) -> str:
+        """Name of those that share their functions."""
+
+    @abstractmethod
+    def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
+        """The value, by the numbers (n,) of a member of the family."""
+
+    def count(self, place: Place) -> int:
+        """How many numbers the family's functions take."""
+        return 0
+
+    def numbers(self, place: Place) -> Array:
+        """(count,) what tells this one from others of its family."""
+        return np.zeros(0)
+
+    def arms(self, model: CellBodies) -> tuple[int, ...]:
+        """The arms whose joints the value depends on."""
+        return ()
+
+
+@dataclass(frozen=True, order=True)
+class Clearance(PlaceConstraint):
+    """Smooth lower bound of the distance of an active pair [m]."""
+
+    pair: int
+
+    scale: ClassVar[float] = 0.01
+
+    @property
+    def family(self) -> str:
+        """Every pair is its own."""
+        return f"clearance_{self.pair}"
+
+    def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
+        """The bound of `symbolic.geometry.clearance`, its kinks rounded."""
+        bodies = place.model.geometry.active[self.pair]
+        return place.scene.bound(bodies.first, bodies.second)
+
+    def arms(self, model: CellBodies) -> tuple[int, ...]:
+        """Those whose links are in the pair."""
+        geometry = model.geometry
+        bodies = geometry.active[self.pair]
+        frames = [geometry.bodies[body].frame for body in (bodies.first, bodies.second)]
+        return tuple(sorted({frame.robot for frame in frames if frame.kind == "link"}))
+
+
+@dataclass(frozen=True, order=True)
+class JointLimit(PlaceConstraint):
+    """Distance of a joint to its lower or upper limit [rad]."""
+
+    arm: int
+    joint: int
+    side: Side
+
+    scale: ClassVar[float] = 0.1
+
+    @property
+    def family(self) -> str:
+        """All limits of one arm."""
+        return f"joint_limit_{self.arm + 1}"
+
+    def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
+        """The margin, negative beyond the limit."""
+        return numbers[0] + ca.dot(numbers[1:], place.q[self.arm])
+
+    def count(self, place: Place) -> int:
+        """A margin and a slope per joint."""
+        return 1 + int(place.q[self.arm].numel())
+
+    def numbers(self, place: Place) -> Array:
+        """The margin at zero joints, and its gradient."""
+        robot = place.model.workcell.robots[self.arm]
+        slope = np.zeros(len(robot.position_lower))
+        slope[self.joint] = 1.0 if self.side == "lower" else -1.0
+        limit = robot.position_lower if self.side == "lower" else robot.position_upper
+        return np.concatenate([[-slope[self.joint] * limit[self.joint]], slope])
+
+    def arms(self, model: CellBodies) -> tuple[int, ...]:
+        """The joint's own."""
+        return (self.arm,)
+
+
+@dataclass(frozen=True, order=True)
+class Reach(PlaceConstraint):
+    """(|det J| / least)^2 - 1 of an arm.
+
+    The square matters: at the edge of the reach the determinant falls like a root of the
+    distance, its square evenly.
+    """
+
+    arm: int
+
+    scale: ClassVar[float] = 1.0
+
+    @property
+    def family(self) -> str:
+        """Every arm is its own."""
+        return f"reach_{self.arm + 1}"
+
+    def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
+        """Zero at the least manipulability that the workcell allows."""
+        least = place.model.workcell.robots[self.arm].min_manipulability
+        model = place.model.robots[self.arm]
+        jacobian = following_columns(model, model.jacobian(place.q[self.arm]))
+        return (manipulability(jacobian) / least) ** 2 - 1.0
+
+    def arms(self, model: CellBodies) -> tuple[int, ...]:
+        """The one."""
+        return (self.arm,)
+
+
+def row_name(family: str, order: Order) -> str:
+    """Of `row_function`."""
+    return f"row_{family}_{order}"
+
+
+def closure_name(arm: int, order: Order) -> str:
+    """Of `closure_functions`."""
+    return f"closure_{arm + 1}_{order}"
+
+
+def row_function(place: Place, constraint: PlaceConstraint, order: Order) -> ca.Function:
+    """The value and gradient, or the Hessian, of a constraint's family by what it depends on.
+
+    With y = pose, then the rate where it is `moving`, then the joints of its `arms`:
+
+    first: pose, rate, q_1, q_2, numbers -> value, gradient (n_y,).
+    second: pose, rate, q_1, q_2, numbers, weight -> weight times the Hessian (n_y, n_y).
+
+    Where the family has one member, there are no numbers.
+    """
+    numbers = ca.SX.sym("numbers", constraint.count(place))
+    value = constraint.expression(place, numbers)
+    arms = constraint.arms(place.model)
+    rate = [place.rate] if constraint.moving else []
+    y = ca.vertcat(place.pose, *rate, *[place.q[arm] for arm in arms])
+    inputs, names = [place.pose, place.rate, *place.q], ["pose", "rate", "q_1", "q_2"]
+    if numbers.numel():
+        inputs, names = [*inputs, numbers], [*names, "numbers"]
+    name = row_name(constraint.family, order)
+    if order == "first":
+        results = ca.cse([value, ca.densify(ca.gradient(value, y))])
+        return ca.Function(name, inputs, results, names, ["value", "gradient"])
+    weight = ca.SX.sym("weight")
+    curvature = ca.cse([ca.densify(weight * ca.hessian(value, y)[0])])
+    return ca.Function(name, [*inputs, weight], curvature, [*names, "weight"], ["hessian"])
+
+
+def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
+    """An arm's joints from a box pose, with what the derivatives of rows need.
+
+    first: pose (6 + m,), q_reference (n,) -> q (n,) that hold the box; follow dq/dpose
+        (n, 6 + m); pull -F_q^-1 (n, n), so that nu = pull^T c_q.
+    second: pose, q, nu (n,) -> hessian (6 + m + n, 6 + m + n) of nu . F by (pose, q).
+    """
+    own = model.robots[arm]
+    n = own.n_joints
+    pose, nu = ca.SX.sym("pose", own.pose_size), ca.SX.sym("nu", n)
+    reference = ca.SX.sym("q_reference", n)
+    cell, rotation = model.workcell, rotation_matrix(own.orientation, pose[3:6])
+    target = flange_target(cell.robots[arm], cell.contacts[arm], pose[:3], rotation)
+
+    joints = ca.SX.sym("q", n)
+    held = pose_error(*target, *own.placement(joints))[0]
+    tied = [pose[place] - joints[joint] for joint, place in own.redundant]
+    closure = ca.vertcat(held, *tied)
+    pull = -ca.solve(ca.jacobian(closure, joints), ca.SX.eye(n))
+    follow = ca.mtimes(pull, ca.jacobian(closure, pose))
+    slopes = ca.Function("slopes", [pose, joints], [follow, pull])
+
+    q = own.with_redundant(reference, pose)
+    for _ in range(SOLVE_STEPS):
+        q = newton_step(own, q, *target)
+    first, second = closure_name(arm, "first"), closure_name(arm, "second")
+    results = ca.cse([ca.densify(result) for result in (q, *slopes(pose, q))])
+    curvature, _ = ca.hessian(ca.dot(nu, closure), ca.vertcat(pose, joints))
+    return {
+        first: ca.Function(
+            first,
+            [pose, reference],
+            results,
+            ["pose", "q_reference"],
+            ["q", "follow", "pull"],
+        ),
+        second: ca.Function(
+            second,
+            [pose, joints, nu],
+            ca.cse([ca.densify(curvature)]),
+            ["pose", "q", "nu"],
+            ["hessian"],
+        ),
+    }

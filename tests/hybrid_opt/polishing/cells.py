@@ -1,0 +1,102 @@
+"""Cells of the tests, their evaluators and polishers built once per test process."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell, polish_functions
+from hybrid_opt.polishing.drive import DriveReached, DriveStep, DriveWay
+from hybrid_opt.polishing.point import Climb, Solution
+from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
+from symbolic.array import Array
+from symbolic.read.cell import load
+from symbolic.records import Workcell
+from symbolic.records.task import initial_decision
+from tests.symbolic.read.samples import RACK
+
+
+@cache
+def drivable_rack() -> Workcell:
+    """Timed as robots drive it."""
+    return driven(load(RACK))
+
+
+def driven(cell: Workcell) -> Workcell:
+    """A cell of the rack's payload and robots, timed as robots drive it."""
+    still = cell.payload.mass * 9.81 / 2.0
+    task = replace(cell.task, time_law="optimal", force_limit=(1.001 * still, 117.68))
+    return replace(cell, task=task)
+
+
+@cache
+def evaluator() -> CandidateEvaluator:
+    """Of the drivable rack."""
+    cell = drivable_rack()
+    return CandidateEvaluator(cell, DRIVABLE_OBJECTIVES, compiled=CompiledCell(cell))
+
+
+@cache
+def functions() -> PolishFunctions:
+    """Of the drivable rack."""
+    return polish_functions(evaluator().compiled)
+
+
+@cache
+def polisher(rounds: int = 40) -> Polisher:
+    """Of the drivable rack."""
+    settings = PolishSettings(
+        attempts=3, drivable=DrivableSettings(rounds=rounds, most_rounds=rounds, turn=2, members=8)
+    )
+    return Polisher(evaluator(), settings, functions())
+
+
+def way(rounds: int = 40) -> DriveWay:
+    """Of the drivable rack."""
+    return way_of(polisher(rounds))
+
+
+def way_of(owner: Polisher) -> DriveWay:
+    """How a polisher of drivable carries polishes one."""
+    assert owner.way is not None
+    return owner.way
+
+
+def solved(by: DriveWay, x: Array) -> Solution:
+    """All rounds of a point from a decision vector."""
+    return by.finish(by.climb(x))
+
+
+DriveClimb = Climb[DriveReached, DriveStep]
+
+
+def smooth_cell(judge: CandidateEvaluator) -> SmoothCell:
+    """What programs of an evaluator's cell share."""
+    return SmoothCell(judge, polish_functions(judge.compiled), PolishSettings().clearance)
+
+
+def start(force: float, seed: int = 0) -> Array:
+    """(n_var,) the hand-made path, moved a little, with a force limit [N]."""
+    return start_in(drivable_rack(), force, seed)
+
+
+def start_in(cell: Workcell, force: float, seed: int) -> Array:
+    """The same in another cell."""
+    x = initial_decision(cell.task)
+    x[:-1] += 0.004 * np.random.default_rng(seed).normal(size=len(x) - 1)
+    x[-1] = force
+    return np.clip(x, cell.task.lower, cell.task.upper)
+
+
+def tilted(force: float) -> Array:
+    """(n_var,) a fast path that tilts the box until rest nearly uses the patches."""
+    x = np.zeros((3, 6))
+    x[:, [0, 2, 4]] = [[-0.40, 0.965, 0.48], [-0.29, 1.16, 0.56], [-0.20, 1.19, 0.37]]
+    x += 0.001 * np.random.default_rng(0).normal(size=x.shape)
+    return np.append(x.ravel(), force)

@@ -1,0 +1,83 @@
+"""One drivable point: driven better, judged by independent timings, stationary."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hybrid_opt.polishing.drive import DriveWay
+from hybrid_opt.polishing.drive_front import second_opinion
+from hybrid_opt.polishing.point import Solution
+from hybrid_opt.polishing.settings import DrivableSettings
+from hybrid_opt.timing import TimingLimits, TimingModel, time_path
+from tests.hybrid_opt.polishing.cells import evaluator, smooth_cell, solved, start, way
+
+
+@cache
+def answer(force: float) -> Solution:
+    return solved(way(), start(force))
+
+
+@cache
+def timing_model() -> TimingModel:
+    return TimingModel(evaluator().compiled, 100)
+
+
+def duration(x: np.ndarray) -> float:
+    return time_path(timing_model(), x, TimingLimits(force=float(x[-1]))).duration
+
+
+def test_the_least_duration_at_a_force_is_far_below_the_hand_made() -> None:
+    solution = answer(52.0)
+    assert solution.x[-1] == 52.0
+    assert duration(solution.x) < 0.85 * duration(start(52.0))
+
+
+def test_answers_are_feasible_certified_and_believed_by_the_independent_timing() -> None:
+    x = answer(52.0).x
+    found = evaluator().certified(evaluator().evaluate(x))
+    assert found.feasible[0]
+    driver = evaluator().driver
+    assert driver is not None
+    assert second_opinion(driver, timing_model(), x) == ""
+
+
+def test_an_answer_is_nearly_stationary() -> None:
+    solution = answer(52.0)
+    assert solution.residuals.stationarity < 5e-3
+    assert solution.residuals.feasibility < 2e-2
+
+
+def test_most_points_end_stationary() -> None:
+    """In what is recomputed from the program, whichever way they came there."""
+    forces = (50.0, 51.0, 53.0)
+    residuals = [answer(force).residuals for force in forces]
+    worst = sorted(max(r.stationarity, r.complementarity) for r in residuals)
+    assert worst[1] <= 1e-4
+
+
+@pytest.mark.parametrize(("worth", "goes_on"), [(1.0, False), (1e-6, True)])
+def test_a_point_goes_on_while_that_brings_much(worth: float, goes_on: bool) -> None:
+    driven = DrivableSettings(rounds=2, worth=worth, turn=1, most_rounds=5)
+    rounds = solved(DriveWay(smooth_cell(evaluator()), driven), start(53.0)).rounds
+    assert 3 <= rounds <= 6 if goes_on else rounds == 2
+
+
+def test_a_start_that_cannot_be_driven_is_told() -> None:
+    x = np.append(evaluator().lower[:-1], 52.0)
+    assert not np.isfinite(way().paths.timed(x[:-1], 52.0).duration)
+    solution = solved(way(), x)
+    assert not solution.usable
+    assert solution.message == "the start cannot be judged"
+    np.testing.assert_array_equal(solution.x, x)
+
+
+def test_a_climb_that_is_left_goes_on_as_if_it_had_not_been() -> None:
+    whole, parts = way().climb(start(55.0)), way().climb(start(55.0))
+    whole.go_on(6)
+    parts.go_on(2)
+    parts.go_on(4)
+    np.testing.assert_array_equal(whole.best.x, parts.best.x)
+    assert whole.solution.rounds == parts.solution.rounds

@@ -1,0 +1,295 @@
+"""Targets by what they prefer; the assembled program: values against the full model, all
+derivatives against differences."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.polishing.carry import CarryReader
+from hybrid_opt.polishing.force import (
+    CLOSED_SIDE,
+    ForceProgram,
+    Target,
+    balance,
+    epsilon_constraint,
+    extreme,
+    pascoletti_serafini,
+)
+from hybrid_opt.polishing.rows import ForceRow, PlaceRow, PressureRow, Row
+from hybrid_opt.polishing.settings import FillSettings, PolishSettings
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.read.cell import load
+from symbolic.records.task import initial_decision
+from symbolic.smooth.passage import Passing, Separation
+from symbolic.smooth.places import Clearance, JointLimit, PlaceConstraint, Reach
+from tests.hybrid_opt.polishing.cells import smooth_cell
+from tests.redundant_cells import rack_on_rail
+from tests.symbolic.read.samples import RACK
+
+TRANSFER = RACK.with_name("transfer.toml")
+
+TARGET = Target(
+    anchor=np.array([0.42, 0.43]),
+    span=np.array([0.01, 0.02]),
+    direction=np.array([1.0, 0.7]),
+    offset=np.array([0.0, 0.1]),
+    cost=np.array([1.0, 1e-4, 2e-4]),
+)
+
+
+CELLS = pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(RACK, id="rack"),
+        # The ramped time law is differentiated as a whole, which takes long to compile.
+        pytest.param(TRANSFER, id="transfer", marks=pytest.mark.slow),
+    ],
+)
+
+
+@cache
+def evaluator(path: Path) -> CandidateEvaluator:
+    return CandidateEvaluator(load(path))
+
+
+@cache
+def made(path: Path) -> tuple[ForceProgram, Array]:
+    """`program_of` a cell."""
+    return program_of(evaluator(path))
+
+
+def program_of(judge: CandidateEvaluator) -> tuple[ForceProgram, Array]:
+    """A program with rows of every kind around the hand-made trajectory, and a point near it."""
+    task, cell = judge.workcell.task, smooth_cell(judge)
+    x = initial_decision(task)
+    carry = CarryReader(cell).read(x)
+    box, *_ = sorted(cell.functions.rows.separable)
+    separable, pairs = cell.functions.rows.separable, carry.distances.bounds.shape[1]
+    arms = [k for k in range(pairs) if k not in separable]
+    rows: list[Row] = [
+        ForceRow(robot, branch, sample)
+        for sample in range(0, task.samples, 7)
+        for robot in (0, 1)
+        for branch in (0, 3)
+    ]
+    rows += [
+        PressureRow(1, 0),
+        PressureRow(0, 40),
+        PressureRow(1, 40),
+        PressureRow(0, task.samples - 1),
+    ]
+    kinds: list[PlaceConstraint] = [
+        Clearance(pair) for pair in (arms[0], arms[len(arms) // 2], arms[-1])
+    ]
+    kinds += [Separation(box, 3), Passing(box, 5, 0), Reach(0), Reach(1)]
+    kinds += [JointLimit(0, 2, "lower"), JointLimit(1, 4, "upper")]
+    rows += [PlaceRow(kind, place) for kind in kinds for place in (44, 120, 222)]
+    program = ForceProgram(cell, dict.fromkeys(rows, 0.01), TARGET, carry, x, 1.0)
+    z = program.start.copy()
+    z[: task.n_var] += np.random.default_rng(0).uniform(-0.05, 0.05, task.n_var)
+    return program, np.clip(z, program.low, program.high)
+
+
+@CELLS
+def test_jacobian_is_that_of_the_constraints(path: Path) -> None:
+    require_jacobian(*made(path))
+
+
+@CELLS
+def test_curvature_is_that_of_the_constraints(path: Path) -> None:
+    require_curvature(*made(path))
+
+
+@pytest.mark.slow
+def test_derivatives_by_the_path_of_a_slide_are_exact(tmp_path: Path) -> None:
+    judge = CandidateEvaluator(rack_on_rail(tmp_path, 0.3, 0.1))
+    program, z = program_of(judge)
+    assert len(z) == 18 + 5 + 3
+    require_jacobian(program, z)
+    require_curvature(program, z)
+
+
+@CELLS
+def test_a_whole_turn_more_is_none(path: Path) -> None:
+    program, z = made(path)
+    task, turned = evaluator(path).workcell.task, z.copy()
+    turned[5] += 4.0 * np.pi / (task.upper[5] - task.lower[5])
+    places = program.layout.places
+    values = program.constraints(z)[0][places].copy()
+    np.testing.assert_allclose(program.constraints(turned)[0][places], values, atol=1e-9)
+
+
+def require_jacobian(program: ForceProgram, z: Array) -> None:
+    """It is that of differences."""
+    step = 1e-6
+    columns = [
+        (program.constraints(z + step * d)[0] - program.constraints(z - step * d)[0]) / (2 * step)
+        for d in np.eye(len(z))
+    ]
+    exact = program.constraints(z)[1]
+    np.testing.assert_allclose(np.array(columns).T, exact, rtol=1e-5, atol=1e-4)
+
+
+def require_curvature(program: ForceProgram, z: Array) -> None:
+    """It is that of differences."""
+    multipliers = np.random.default_rng(1).normal(size=program.layout.n_rows)
+
+    def slope(at: Array) -> Array:
+        return program.constraints(at)[1].T @ multipliers
+
+    step = 1e-6
+    rows = [(slope(z + step * d) - slope(z - step * d)) / (2 * step) for d in np.eye(len(z))]
+    np.testing.assert_allclose(
+        np.array(rows), program.curvature(z, multipliers), rtol=1e-4, atol=1e-3
+    )
+
+
+@CELLS
+def test_rows_of_samples_are_what_the_evaluator_finds(path: Path) -> None:
+    program, z = made(path)
+    cell, layout = evaluator(path).workcell, program.layout
+    found = {k: v[0] for k, v in evaluator(path).outputs(program.candidate(z)[None]).items()}
+    values = program.constraints(z)[0]
+
+    leave = [
+        1.0
+        - (found["pressure_shift"][row.sample, row.robot] / cell.contacts[row.robot].patch_radius)
+        ** 2
+        for row in layout.pressure_rows
+    ]
+    # The time law's kinks are rounded, which is corrected at the program's candidate alone.
+    np.testing.assert_allclose(values[layout.patches], leave, rtol=1e-6)
+
+    # The ruling branch is the evaluator's force; the others lie below it.
+    highest: dict[tuple[int, int], float] = {}
+    for row, value in zip(layout.force_rows, values[layout.forces].tolist(), strict=True):
+        key = (row.robot, row.sample)
+        scaled = (value + z[-3:][row.robot]) * TARGET.span[row.robot]
+        highest[key] = max(highest.get(key, -np.inf), scaled + TARGET.anchor[row.robot])
+    forces = [
+        found["normal_force"][sample, robot] / cell.task.reference_force[robot]
+        for robot, sample in highest
+    ]
+    np.testing.assert_allclose(list(highest.values()), forces, rtol=1e-6)
+
+
+def test_rows_at_places_are_in_the_order_of_the_layout() -> None:
+    program, z = made(RACK)
+    layout = program.layout
+    values = program.constraints(z)[0][layout.places]
+    box = next(
+        row.constraint.pair for row in layout.place_rows if isinstance(row.constraint, Separation)
+    )
+    cell = smooth_cell(evaluator(RACK))
+    grid, carry = cell.grid, CarryReader(cell).read(program.candidate(z))
+    checked = 0
+    for row, value in zip(layout.place_rows, values.tolist(), strict=True):
+        kind = row.constraint
+        if isinstance(kind, JointLimit):
+            robot = evaluator(RACK).workcell.robots[kind.arm]
+            q = carry.q[kind.arm][row.place, kind.joint]
+            limit = robot.position_lower if kind.side == "lower" else robot.position_upper
+            expected = abs(q - limit[kind.joint])
+        elif isinstance(kind, Reach):
+            expected = carry.manipulability[row.place, kind.arm] ** 2 - 1.0
+            if row.place % grid.per_sample:
+                continue
+        elif isinstance(kind, Clearance):
+            assert value * kind.scale <= carry.distances.bounds[row.place, kind.pair] + 1e-9
+            continue
+        else:
+            assert value * kind.scale <= carry.distances.bounds[row.place, box] + 0.01
+            continue
+        assert value * kind.scale == pytest.approx(expected, rel=1e-6)
+        checked += 1
+    assert checked >= 6
+
+
+def test_the_box_of_trust_bounds_the_decision_vector() -> None:
+    program, _ = made(RACK)
+    task = evaluator(RACK).workcell.task
+    for z in (program.low, program.high):
+        x = program.candidate(z)
+        assert np.all(x >= task.lower - 1e-12)
+        assert np.all(x <= task.upper + 1e-12)
+
+
+ANCHOR, SPAN = np.array([0.42, 0.43]), np.array([0.01, 0.02])
+shifts = st.tuples(*[st.floats(-0.02, 0.02)] * 2).map(np.array)
+
+
+@given(shifts)
+def test_pascoletti_serafini_is_better_only_where_neither_side_is_worse(shift: np.ndarray) -> None:
+    target = pascoletti_serafini(ANCHOR, SPAN)
+    better = target.level(ANCHOR + shift) < target.level(ANCHOR) - 1e-3
+    if better:
+        assert np.all(shift <= 0.0)
+    # The level is the larger of both scaled shifts.
+    assert target.needed(shift / SPAN) == pytest.approx(float(np.max(shift / SPAN)))
+
+
+@given(shifts)
+def test_epsilon_constraint_improves_one_side_and_holds_the_other(shift: np.ndarray) -> None:
+    for objective in (0, 1):
+        target = epsilon_constraint(ANCHOR, SPAN, objective)
+        other = 1 - objective
+        value = target.level(ANCHOR + shift)
+        if shift[other] > 1.01 * CLOSED_SIDE * SPAN[other]:
+            assert value == float("inf")
+        elif shift[objective] < -1e-4 and shift[other] < 0.0:
+            assert value < target.level(ANCHOR)
+
+
+@given(shifts, shifts)
+def test_an_end_compares_one_objective_and_breaks_ties(a: np.ndarray, b: np.ndarray) -> None:
+    for objective in (0, 1):
+        target = extreme(ANCHOR, SPAN, objective)
+        if a[objective] < b[objective] - 1e-4:
+            assert target.level(ANCHOR + a) < target.level(ANCHOR + b)
+        a_tied = a.copy()
+        a_tied[1 - objective] -= 0.01
+        assert target.level(ANCHOR + a_tied) < target.level(ANCHOR + a)
+
+
+@given(shifts, shifts)
+def test_the_middle_compares_sums_and_the_larger(a: np.ndarray, b: np.ndarray) -> None:
+    target = balance(ANCHOR, np.full(2, 0.01))
+    first, second = ANCHOR + a, ANCHOR + b
+    if a.sum() < b.sum() - 1e-4 and first.max() <= second.max():
+        assert target.level(first) < target.level(second)
+    even = np.full(2, first.mean())
+    assert target.level(even) <= target.level(first) + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("attempts", -1),
+        ("attempts", 2.5),
+        ("max_iterations", 0),
+        ("rounds", 0),
+        ("clearance", 0.0),
+        ("clearance", float("nan")),
+        ("method", "weights"),
+        ("solver", "simplex"),
+        ("fill", FillSettings(members=-1)),
+    ],
+)
+def test_wrong_settings_are_told(name: str, value: object) -> None:
+    with pytest.raises(SettingsError, match=f"polish {name}"):
+        PolishSettings(**{name: value})  # type: ignore[arg-type]
+
+
+def test_settings_are_the_same_after_json() -> None:
+    settings = asdict(PolishSettings())
+    assert json.loads(json.dumps(settings)) == settings

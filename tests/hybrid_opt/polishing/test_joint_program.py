@@ -1,0 +1,152 @@
+"""The joint program's values against the compiled timing, its derivatives against differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hybrid_opt.polishing.carry import CarryReader
+from hybrid_opt.polishing.intervals import IntervalGrid, IntervalValues
+from hybrid_opt.polishing.joint_program import JointProgram
+from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.rows import PlaceRow, Row
+from symbolic.array import Array
+from symbolic.records.task import initial_decision
+from symbolic.smooth.places import Reach
+from tests.hybrid_opt.polishing.cells import (
+    drivable_rack,
+    polisher,
+    smooth_cell,
+    start,
+    tilted,
+    way_of,
+)
+
+FORCE = 52.0
+ROWS = (PlaceRow(Reach(0), 150), PlaceRow(Reach(1), 250))
+
+
+class Programs:
+    """Programs about points near one timed path."""
+
+    def __init__(self, x: Array, owner: Polisher | None = None) -> None:
+        """owner: of another cell than the rack."""
+        owner = owner or polisher()
+        self.cell = smooth_cell(owner.evaluator)
+        self.half, self.x = self.cell.half[:-1], x
+        self.timed = way_of(owner).paths.timed(x[:-1], FORCE)
+        self.carry = CarryReader(self.cell).read(x)
+        self.intervals = IntervalGrid(self.cell.workcell, 100)
+
+    def at(self, d: Array | None = None) -> JointProgram:
+        """The program after a step d of the scaled variables from the path."""
+        x, squared = self.x.copy(), self.timed.squared.copy()
+        if d is not None:
+            n = len(self.half)
+            x[:n] += self.half * d[:n]
+            squared[1:-1] *= 1.0 + d[-len(squared) + 2 :]
+        functions, joints = self.cell.functions, self.timed.joints
+        values = IntervalValues.at(self.intervals, functions, x, squared, joints)
+        required: dict[Row, float] = dict.fromkeys(ROWS, 0.01)
+        grid = self.intervals
+        return JointProgram(grid, values, x, squared, self.cell, required, self.carry)
+
+
+def direction(program: JointProgram, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    d = rng.normal(size=program.n)
+    d[: program.n_path] *= 0.1
+    return d
+
+
+def test_the_compiled_timing_satisfies_the_program() -> None:
+    programs = Programs(start(FORCE))
+    program = programs.at()
+    assert program.total == pytest.approx(programs.timed.duration, rel=1e-12)
+    assert program.rows.max() < 2e-3
+    # Time-optimal: some limit is used fully in nearly every interval.
+    by_interval = program.rows.max(axis=1).reshape(-1, 2).max(axis=1)
+    assert np.mean(by_interval > -0.01) > 0.9
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_rows_have_exact_slopes(seed: int) -> None:
+    assert_slopes(Programs(start(FORCE, seed)), seed)
+
+
+def assert_slopes(programs: Programs, seed: int) -> None:
+    """Rows by differences along a random direction."""
+    program = programs.at()
+    d, h = direction(program, seed), 1e-6
+    difference = (programs.at(h * d).rows - programs.at(-h * d).rows) / (2.0 * h)
+    foretold = program.predicted(d) - program.rows
+    assert np.abs(difference - foretold).max() < 1e-6 * np.abs(foretold).max()
+    chosen = program.near()
+    linear = program.linear(chosen)
+    rows = linear.A.times(d) * linear.scale
+    m = int(chosen.sum())
+    np.testing.assert_allclose(rows[:m], foretold[chosen], atol=1e-12 * np.abs(foretold).max())
+    geometry = (programs.at(h * d).geometry - programs.at(-h * d).geometry) / (2.0 * h)
+    np.testing.assert_allclose(rows[m:], geometry, rtol=1e-5, atol=1e-8)
+
+
+def test_pressure_at_rest_has_rows_with_exact_slopes() -> None:
+    programs = Programs(tilted(FORCE))
+    program, h = programs.at(), 1e-6
+    assert len(program.geometry) > len(ROWS)
+    d = direction(program, 2)
+    chosen = program.near()
+    linear = program.linear(chosen)
+    rows = (linear.A.times(d) * linear.scale)[int(chosen.sum()) :]
+    difference = (programs.at(h * d).geometry - programs.at(-h * d).geometry) / (2.0 * h)
+    np.testing.assert_allclose(rows, difference, rtol=1e-5, atol=1e-7)
+
+
+def test_slopes_exist_where_the_box_does_not_turn() -> None:
+    x = initial_decision(drivable_rack().task)
+    x[-1] = FORCE
+    program = Programs(x).at()
+    assert np.isfinite(program.linear(program.near()).A.dense()).all()
+
+
+def test_the_lagrangian_has_exact_curvature() -> None:
+    assert_curvature(Programs(start(FORCE)))
+
+
+def assert_curvature(programs: Programs) -> None:
+    """Gradients by differences along a random direction."""
+    program = programs.at()
+    chosen = program.near()
+    step = program.linear(chosen)
+    multipliers = np.random.default_rng(3).random(len(step.b))
+    # Rows of the pressure at rest count as straight.
+    multipliers[len(step.point) + len(ROWS) :] = 0.0
+    d, h = direction(program, 5), 1e-6
+
+    def gradient(sign: float) -> Array:
+        moved = programs.at(sign * h * d)
+        linear = moved.linear(chosen)
+        A = linear.A.dense() * linear.scale[:, None]
+        total = A[: len(step.b)].T @ (multipliers / step.scale)
+        total[program.speeds] += moved.cost * moved.total / program.total
+        # Slopes by omega there are slopes by w times another w.
+        total[program.speeds] /= 1.0 + sign * h * d[program.speeds]
+        return np.asarray(total)
+
+    difference = (gradient(1.0) - gradient(-1.0)) / (2.0 * h)
+    curvature = program.curvature(step, multipliers).dense()
+    np.testing.assert_allclose(curvature, curvature.T, atol=1e-9 * np.abs(curvature).max())
+    found = curvature @ d
+    times = program.curvature(step, multipliers).times(d)
+    np.testing.assert_allclose(times, found, atol=1e-12 * np.abs(found).max())
+    assert np.abs(difference - found).max() < 1e-5 * np.abs(found).max()
+
+
+def test_geometry_after_a_step_is_what_its_slopes_do_not_foretell() -> None:
+    programs = Programs(start(FORCE))
+    program = programs.at()
+    d = 0.1 * direction(program, 1)
+    after = programs.at(d).geometry
+    linear = program.linear(program.near())
+    foretold = program.geometry + linear.A.times(d)[-len(ROWS) :]
+    np.testing.assert_allclose(program.geometry_after(d), after - foretold, atol=1e-8)
