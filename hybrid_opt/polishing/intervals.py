@@ -192,16 +192,21 @@ class IntervalValues:
             functions,
         )
 
-    def pressure_at_rest(self) -> tuple[Array, Array]:
-        """Shares (rows,) of the patches that standing still uses, at every interval's beginning,
-        and their slopes (rows, moving) by the extended pose."""
+    def at_rest(self, force: float) -> tuple[Array, Array]:
+        """Shares (rows,) of what standing still uses at every interval's beginning: of the patches,
+        or of a force limit [N] where pads press evenly; and their slopes (rows, moving) by the
+        extended pose."""
         begins = [values[::2] for values in self._inputs]
         still = np.zeros(len(begins[-1]))
         out = self._functions.built[DRIVEN_FIRST].batch(*begins[:-2], still, still)
         follow = tuple(along[::2] for along in self._follow)
-        block = self.grid.layout.block("pressure")
+        soft = self.grid.workcell.task.allocation == "soft-finger"
+        block = self.grid.layout.block("force" if soft else "pressure")
         slope = _followed(self.grid, out["slope"][:, block], follow)[:, :, : self.grid.moving]
-        return out["value"][:, block].reshape(-1), slope.reshape(-1, self.grid.moving)
+        whole = force if soft else 1.0
+        return out["value"][:, block].reshape(-1) / whole, slope.reshape(
+            -1, self.grid.moving
+        ) / whole
 
     def rows(self) -> Array:
         """(points, kinds) mix . quantities of every inequality."""

@@ -37,8 +37,8 @@ NEAR_FORCE = 0.6
 """The same for the normal forces, of what the limit leaves above the force at rest."""
 
 REST_MARGIN = 2e-3
-"""Share of the patches that is kept free standing still: only the intervals' beginnings have rows,
-and where rest uses a patch up there is no timing at all."""
+"""Share of the patches, or of the force limit, that is kept free standing still: only the intervals'
+beginnings have rows, and where rest uses all of it there is no timing at all."""
 
 NEGLIGIBLE = 1e-8
 """Scaled multipliers below this count as none."""
@@ -113,8 +113,8 @@ class JointProgram:
         self._speeds(squared)
 
     def _still(self, values: IntervalValues) -> None:
-        """Rows of the pressure at rest, after the geometric ones; they bend little."""
-        share, slope = values.pressure_at_rest()
+        """Rows of what rest uses, after the geometric ones; they bend little."""
+        share, slope = values.at_rest(self._force)
         near = np.flatnonzero(share > NEAR)
         begins = 2 * (near // (len(share) // self._grid.intervals))
         by_path = self._grid.by_path(slope[near], begins) * self._half
