@@ -74,10 +74,12 @@ def read_task(table: Table) -> Task:
 
 
 def _allocation(table: Table, time_law: TimeLaw) -> Allocation:
-    """The allocation of forces; what robots drive may have one of its own."""
-    usual = table.choice("allocation", ALLOCATIONS, "paper")
-    driven = table.choice("drivable_allocation", ALLOCATIONS, usual)
-    return cast("Allocation", driven if time_law == "optimal" else usual)
+    """The allocation of forces. What robots drive is held by soft fingers where nothing else is
+    stated."""
+    driven = time_law == "optimal"
+    usual = table.choice("allocation", ALLOCATIONS, "soft-finger" if driven else "paper")
+    own = table.choice("drivable_allocation", ALLOCATIONS, usual)
+    return cast("Allocation", own if driven else usual)
 
 
 def _check_vectors(task: Task, problems: Problems) -> None:
