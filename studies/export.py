@@ -72,8 +72,8 @@ def _parser() -> argparse.ArgumentParser:
         "--squeeze",
         type=float,
         metavar="FACTOR",
-        help="commanded over planned squeeze (default: the robust forces of the cell's "
-        f"[uncertainty], {FACTOR:g} where it has none)",
+        help="commanded squeeze over the least that holds pads that press evenly (default: what "
+        f"holds them in every case of the cell's [uncertainty], {FACTOR:g} where it has none)",
     )
     add_leader(parser)
     parser.add_argument(
