@@ -37,8 +37,8 @@ NEAR_FORCE = 0.6
 """The same for the normal forces, of what the limit leaves above the force at rest."""
 
 REST_MARGIN = 2e-3
-"""Share of the patches, or of the force limit, that is kept free standing still: only the intervals'
-beginnings have rows, and where rest uses all of it there is no timing at all."""
+"""Share of the patches, or of the force limit, that is kept free standing still: only the
+intervals' beginnings have rows, and where rest uses all of it there is no timing at all."""
 
 NEGLIGIBLE = 1e-8
 """Scaled multipliers below this count as none."""
