@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from hybrid_opt.metaheuristics.carries import SearchSettings
     from hybrid_opt.polishing.settings import PolishSettings
     from hybrid_opt.proposing.proposal import Proposal, ProposeSettings, propose
+    from hybrid_opt.recommending.choice import Wish
     from hybrid_opt.recommending.recommendation import Recommendation, recommend
-    from hybrid_opt.recommending.wish import Wish
     from hybrid_opt.robust.squeeze import SqueezeSettings
     from hybrid_opt.store.export.formats import export
     from hybrid_opt.store.export.options import BundleOptions
@@ -97,7 +97,7 @@ _HOMES = {
     "SearchSettings": "hybrid_opt.metaheuristics.carries",
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",
-    "Wish": "hybrid_opt.recommending.wish",
+    "Wish": "hybrid_opt.recommending.choice",
     "Workcell": "symbolic.records",
     "export": "hybrid_opt.store.export.formats",
     "plan_job": "hybrid_opt.job.plan",

@@ -22,7 +22,7 @@ from hybrid_opt.polishing.settings import (
     PolishSettings,
     quick_settings,
 )
-from hybrid_opt.recommending.wish import Wish
+from hybrid_opt.recommending.choice import Wish
 from studies.program import Parser
 from symbolic.errors import SettingsError
 

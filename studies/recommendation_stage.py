@@ -27,17 +27,15 @@ from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.evaluate.evaluations import concatenated
 from hybrid_opt.evaluate.explanation import explain
-from hybrid_opt.recommending.driven_paths import DrivenPaths
-from hybrid_opt.recommending.force_table import (
+from hybrid_opt.recommending.choice import DrivenPaths
+from hybrid_opt.recommending.comparison import (
     front_durations,
     over_replicas,
     spread_members,
     table_forces,
 )
-from hybrid_opt.recommending.recommendation import HAND_MADE, Recommendation
-from hybrid_opt.recommending.unsure import LEADER
-from hybrid_opt.robust.force import robust_model
-from hybrid_opt.robust.price import robust_price
+from hybrid_opt.recommending.recommendation import HAND_MADE, LEADER, Recommendation
+from hybrid_opt.robust.force import robust_model, robust_price
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_figures import trajectory_figures

@@ -12,8 +12,7 @@ import numpy as np
 
 from hybrid_opt.campaign.recommended import set_text
 from hybrid_opt.cell import Cell
-from hybrid_opt.robust.force import RobustModel, allowed_factor
-from hybrid_opt.robust.price import USUAL
+from hybrid_opt.robust.force import USUAL, RobustModel, allowed_factor
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingLimits, time_path
 from studies.options import add_leader, force, seed, whole

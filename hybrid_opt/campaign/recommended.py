@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 from hybrid_opt.campaign.documents import Count, Pair, Vector
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ROBUST_FORCE, ForceKind
-from hybrid_opt.recommending.recommendation import Recommendation
-from hybrid_opt.robust.price import RobustPrice
+from hybrid_opt.recommending.recommendation import Recommendation, Unsure
+from hybrid_opt.robust.force import RobustPrice
 from hybrid_opt.store.json_records import Figure
 from hybrid_opt.timing.document import StoredJerk
+from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array
 from symbolic.records import Uncertainty
 
@@ -36,26 +37,6 @@ class StoredRival:
     label: str
     duration_at_force: Figure
     force_at_duration: Figure
-
-
-@dataclass(frozen=True)
-class StoredMargin:
-    """How far one assumption may be off, see `hybrid_opt.timing.robustness.Margin`."""
-
-    quantity: str
-    unit: str
-    nominal: float
-    limit: float
-    fails: str
-
-
-@dataclass(frozen=True)
-class StoredUnsure:
-    """Normal forces [N] that hold if the cell is less sure than stated."""
-
-    doubt: str
-    peak_force: Pair
-    within_reference: bool
 
 
 @dataclass(frozen=True)
@@ -194,8 +175,8 @@ class StoredRecommendation:
     squeeze_reason: str
     payload_limit: float
     rivals: tuple[StoredRival, ...]
-    margins: tuple[StoredMargin, ...]
-    unsure: tuple[StoredUnsure, ...]
+    margins: tuple[Margin, ...]
+    unsure: tuple[Unsure, ...]
     warnings: tuple[str, ...]
     considered: Count
     durations: ForceTable
@@ -242,15 +223,15 @@ def stored_recommendation(found: Recommendation, told: Told) -> StoredRecommenda
         duration=found.timing.duration,
         force_limit=found.force,
         peak_force=found.carry.peak_normal_force,
-        squeeze=found.squeeze.peak,
-        squeeze_reason=found.squeeze.reason,
+        squeeze=found.commanded,
+        squeeze_reason=str(found.squeeze),
         payload_limit=found.carry.payload_limit,
         rivals=tuple(
             StoredRival(rival.label, rival.duration_at_force, rival.force_at_duration)
             for rival in found.rivals
         ),
-        margins=tuple(StoredMargin(**vars(margin)) for margin in found.margins),
-        unsure=tuple(StoredUnsure(**vars(doubt)) for doubt in found.unsure),
+        margins=found.margins,
+        unsure=found.unsure,
         warnings=found.warnings,
         jerk=None if found.jerk is None else StoredJerk.of(found.jerk),
         robust_force=found.limited_force if found.force_kind.robust else None,

@@ -16,10 +16,9 @@ import numpy as np
 
 from codegen.build import compile_function
 from codegen.interpreted import InterpretedFunction
-from hybrid_opt.robust.cases import worst_cases
+from hybrid_opt.robust.cases import RulingCases, ruling_cases, worst_cases
 from hybrid_opt.robust.force import BoxMotion, check_set, robust_model
 from hybrid_opt.robust.path_force import PathPoints, robust_path
-from hybrid_opt.robust.ruling import RulingCases, ruling_cases
 from symbolic.array import Array
 from symbolic.contact.worst_cases import case_gradient_function
 from symbolic.records.cell import Workcell

@@ -1,23 +1,22 @@
-"""The carry to run, and why: what `hybrid_opt.recommend` gives."""
+"""The carry to run, how hard to press, and why: what `hybrid_opt.recommend` gives."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
+from typing import Annotated
 
 import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import ForceKind
-from hybrid_opt.recommending.choice import Choice, choices
-from hybrid_opt.recommending.driven_paths import DrivenPaths
-from hybrid_opt.recommending.rival import BETTER, Reference, Rival, comparison_forces, rivals
-from hybrid_opt.recommending.squeeze import Commanded, commanded
-from hybrid_opt.recommending.unsure import Unsure, unsure_forces
-from hybrid_opt.recommending.wish import Wish
-from hybrid_opt.robust.squeeze import FACTOR, SqueezeSettings
+from hybrid_opt.recommending.choice import Choice, DrivenPaths, Wish, choices
+from hybrid_opt.recommending.comparison import BETTER, Rival, rivals
+from hybrid_opt.robust.force import RobustModel, robust_model
+from hybrid_opt.robust.squeeze import FACTOR, Squeeze, SqueezeSettings, commanded_forces
+from hybrid_opt.store.json_records import Shape
 from hybrid_opt.timing.jerk import drive_with_jerk
 from hybrid_opt.timing.records import JerkTiming, Timing
 from hybrid_opt.timing.robustness import Margin, robustness_margins
@@ -25,6 +24,7 @@ from hybrid_opt.timing.solve import time_path
 from hybrid_opt.timing.use import limited_force
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.records import Uncertainty, Workcell
 
 HAND_MADE = "hand-made"
 """Name of the workcell file's own trajectory."""
@@ -40,6 +40,25 @@ TRIED = 8
 """Answers to a wish that are held against the independent timing before giving up."""
 
 
+LEADER = 0
+"""The arm that keeps its place; the other's force is commanded."""
+
+
+@dataclass(frozen=True)
+class Unsure:
+    """One doubt, and the forces that hold all the same.
+
+    Attributes:
+        doubt: what may be off, and by how much.
+        peak_force: (2,) largest normal force of each robot along the carry [N].
+        within_reference: whether both stay within their reference forces.
+    """
+
+    doubt: str
+    peak_force: Annotated[Array, Shape((2,))]
+    within_reference: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Recommendation:
     """The carry to run.
@@ -53,7 +72,8 @@ class Recommendation:
         jerk: the same path and force within the cell's limits on jerk as well, None without any.
         force_kind: which forces its limit is about, and the front's.
         limited_force: (2,) largest of them of each robot along the carry [N].
-        squeeze: how hard to press.
+        commanded: (2,) largest normal force to command of each robot [N].
+        squeeze: how these forces came about; an exported job commands the same.
         margins: how wrong the cell's description may be.
         rivals: the hand-made path, and others, at the same force and in the same time.
         unsure: forces that hold if the cell is less sure than stated.
@@ -67,7 +87,8 @@ class Recommendation:
     jerk: JerkTiming | None
     force_kind: ForceKind
     limited_force: Array
-    squeeze: Commanded
+    commanded: Array
+    squeeze: Squeeze
     margins: tuple[Margin, ...]
     rivals: tuple[Rival, ...]
     unsure: tuple[Unsure, ...]
@@ -89,7 +110,7 @@ class Recommendation:
         held = f"{self.force_kind.pressing} {first:.2f} and {second:.2f} N"
         lines = [
             f"Recommended: {self.timing.duration:.3f} s, {held}; press with "
-            f"{self.squeeze.peak.max():.1f} N ({self.squeeze.reason})",
+            f"{self.commanded.max():.1f} N ({self.squeeze})",
             f"  {self.wish}",
         ]
         if self.jerk is not None:
@@ -136,11 +157,12 @@ def recommend(
     choice, timing, jerk = _answer(cell, x, paths, points, wish)
     assert timing.carry is not None, "the timing respects every limit"
     named = {HAND_MADE: cell.initial[:-1]} | dict(others or {})
-    reference = Reference(paths, choice.index, choice.force, comparison_forces(points))
-    beside = rivals(cell, named, reference)
+    beside = rivals(
+        cell, named, front=paths, points=points, member=choice.index, force=choice.force
+    )
     forces = limited_force(timing.carry, cell.workcell, timing.limits)
     margins = robustness_margins(cell.timing_model, timing.carry)
-    squeeze, doubt = _commanded(timing.carry)
+    peak, squeeze, doubt = _commanded(timing.carry)
     return Recommendation(
         wish=wish,
         member=choice.index,
@@ -149,6 +171,7 @@ def recommend(
         jerk=jerk,
         force_kind=cell.force_kind,
         limited_force=forces.max(axis=0),
+        commanded=peak,
         squeeze=squeeze,
         margins=margins,
         rivals=beside,
@@ -205,26 +228,27 @@ def _driven(cell: Cell, x: Array, wanted: Iterable[Choice]) -> tuple[Choice, Tim
     raise SettingsError(f"no carry of the front can be driven as wished for: {reason}")
 
 
-def _commanded(carry: Carry) -> tuple[Commanded, tuple[str, ...]]:
-    """The forces to press with, and warnings about them."""
+def _commanded(carry: Carry) -> tuple[Array, Squeeze, tuple[str, ...]]:
+    """The largest forces to press with (2,) [N], how they came about, and warnings about them."""
     doubts = []
     try:
-        found = commanded(carry)
+        forces, squeeze = commanded_forces(carry, SqueezeSettings())
     except SettingsError as error:
-        found = commanded(carry, SqueezeSettings(FACTOR))
+        forces, squeeze = commanded_forces(carry, SqueezeSettings(FACTOR))
         doubts.append(f"no robust forces: {error}")
-    if not found.squeeze.even_pads:
+    peak = np.asarray(forces.max(axis=0))
+    if not squeeze.even_pads:
         doubts.append(
             "the squeeze holds pads that choose their pressure; what pads that press evenly need "
             "is known for two pads with opposite normals only"
         )
     allowed = carry.workcell.task.reference_force
-    if (found.peak > allowed).any():
+    if (peak > allowed).any():
         doubts.append(
-            f"pressing with {found.peak.max():.1f} N exceeds the reference force of "
+            f"pressing with {peak.max():.1f} N exceeds the reference force of "
             f"{allowed.min():.1f} N; wish for a longer carry or less force"
         )
-    return found, tuple(doubts)
+    return peak, squeeze, tuple(doubts)
 
 
 def _warnings(beside: Iterable[Rival], timing: Timing, force: float) -> Iterator[str]:
@@ -270,3 +294,37 @@ def _without_room(margins: Iterable[Margin]) -> Iterator[str]:
 def _whole(margin: Margin) -> float:
     """Scale of a margin: a tenth of a coefficient, a length of a centimetre."""
     return 1e-2 if margin.unit == "m" else 0.1 * margin.nominal
+
+
+def usual_doubts(workcell: Workcell) -> dict[str, Uncertainty]:
+    """Doubts by what they are called; the cell's own set comes first where it has one."""
+    doubts = {
+        "friction 10 % off": Uncertainty(friction=0.1),
+        "friction 20 % off": Uncertainty(friction=0.2),
+        "mass 5 % off": Uncertainty(mass=0.05),
+        "centre of mass 10 mm off": Uncertainty(centre_of_mass=np.full(3, 0.01)),
+    }
+    own = workcell.uncertainty
+    return ({} if own.is_empty else {"all that [uncertainty] states": own}) | doubts
+
+
+def unsure_forces(carry: Carry, model: RobustModel | None = None) -> tuple[Unsure, ...]:
+    """The forces that hold a carry under each of the usual doubts.
+
+    A doubt that leaves no friction or no patch is left out; so are all where the pads cannot hold
+    whatever happens.
+    """
+    workcell = carry.workcell
+    try:
+        model = model or robust_model(workcell)
+    except SettingsError:
+        return ()
+    found = []
+    for doubt, uncertainty in usual_doubts(workcell).items():
+        try:
+            peak = model.robust_force(carry, uncertainty, LEADER).peak
+        except SettingsError:
+            continue
+        fits = bool((peak <= workcell.task.reference_force).all())
+        found.append(Unsure(doubt, peak, fits))
+    return tuple(found)

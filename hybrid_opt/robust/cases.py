@@ -1,4 +1,5 @@
-"""Cases of an uncertainty set: the worst ones, and random ones.
+"""Cases of an uncertainty set: the worst ones, random ones, the compiled forces that each
+asks for, and the cases that decide both robots' forces.
 
 Which are worst follows from the least squeeze that a case asks for:
 
@@ -18,12 +19,27 @@ Which are worst follows from the least squeeze that a case asks for:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
+from codegen.build import compile_function
+from codegen.cache import Cache
+from codegen.function import NumericFunction
 from symbolic.array import Array
-from symbolic.contact.worst_cases import least_reaches
+from symbolic.contact.worst_cases import (
+    GraspSqueeze,
+    case_grasp_function,
+    case_grasp_slack_function,
+    case_slack_function,
+    case_squeeze_function,
+    least_reaches,
+)
+from symbolic.errors import SettingsError
+from symbolic.read.checks import PATCH_OVERLAP, pads_beside
 from symbolic.records import Uncertainty, Workcell
 
 
@@ -78,3 +94,173 @@ def random_cases(
     displaced = np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=2)
     cases[:, 11:15] = displaced.reshape(n, 4)
     return cases
+
+
+class CaseForces:
+    """Least forces that hold single cases.
+
+    Attributes:
+        workcell: the cell.
+    """
+
+    def __init__(self, workcell: Workcell, cache: Cache | None = None) -> None:
+        """Load or build the functions of facing pads; those of others when first asked.
+
+        Raises:
+            SettingsError: some cases cannot be held, however hard the pads press.
+            DualArmError: a function cannot be built.
+        """
+        check_pads(workcell)
+        self.workcell, self._cache = workcell, cache
+        self._general: dict[int, tuple[NumericFunction, NumericFunction]] = {}
+        self._squeezed = is_squeezed(workcell)
+        if self._squeezed:
+            self._facing = [
+                compile_function(function(workcell), cache, lanes=0)
+                for function in (case_squeeze_function, case_slack_function)
+            ]
+
+    def least(
+        self, motion: tuple[Array, ...], cases: Array, leader: int, threads: int = 1
+    ) -> Array:
+        """(m, 2) least normal forces [N]: what is to be commanded of one robot, and what the
+        leading one then presses with.
+
+        Args:
+            motion: poses and their time derivatives (m, 6) each.
+            cases: (m, 15).
+            leader: index of the robot whose force is not commanded.
+            threads: 0 for one per core.
+        """
+        function = self._functions(1 - leader)[0]
+        return function.batch(*motion, cases, threads=threads)["normal_force"]
+
+    def surely_held(
+        self,
+        motion: tuple[Array, ...],
+        cases: Array,
+        force: Array,
+        leader: int,
+        threads: int = 1,
+    ) -> NDArray[np.bool_]:
+        """(m,) whether a pressure that is known beforehand holds under commanded forces (m,) [N];
+        where not, another one still may."""
+        slack = self._functions(1 - leader)[1]
+        arm = (float(1 - leader),) if self._squeezed else ()
+        found = slack.batch(*motion, cases, force, *arm, threads=threads)["slack"]
+        return np.asarray(found.ravel() > 0.0, dtype=np.bool_)
+
+    def leading_share(self, leader: int) -> float:
+        """Rise of the leading robot's force per newton of the commanded one."""
+        if self._squeezed:
+            return 1.0
+        normals = self._squeeze_normals
+        return float(normals[leader] / normals[1 - leader])
+
+    @cached_property
+    def _squeeze_normals(self) -> Array:
+        return GraspSqueeze(self.workcell, 1).squeeze_normals()
+
+    def _functions(self, commanded: int) -> tuple[NumericFunction, NumericFunction]:
+        if self._squeezed:
+            return self._facing[0], self._facing[1]
+        if commanded not in self._general:
+            first, second = (
+                compile_function(function(self.workcell, commanded), self._cache, lanes=0)
+                for function in (case_grasp_function, case_grasp_slack_function)
+            )
+            self._general[commanded] = first, second
+        return self._general[commanded]
+
+
+def is_squeezed(workcell: Workcell) -> bool:
+    """Whether the force of one pad decides that of the other, so that a least squeeze says all."""
+    soft = workcell.task.allocation == "soft-finger"
+    return workcell.has_facing_pads or (soft and workcell.has_opposite_pads)
+
+
+def check_pads(workcell: Workcell) -> None:
+    """Refuse pads that cannot hold whatever happens.
+
+    Raises:
+        SettingsError: some cases cannot be held, however hard both press.
+    """
+    if not workcell.has_facing_pads:
+        return  # a grasp that is not closed is refused where its squeeze is looked for
+    room = PATCH_OVERLAP * sum(contact.patch_radius for contact in workcell.contacts)
+    if pads_beside(workcell) >= room:
+        raise SettingsError(
+            f"the contacts lie {pads_beside(workcell):g} m beside one another; robust forces "
+            f"need less than {room:g} m, so that pressing harder holds whatever happens"
+        )
+
+
+@dataclass(frozen=True)
+class RulingCases:
+    """The worst cases that decide the forces; n samples.
+
+    Attributes:
+        leader: index of the arm that keeps its place.
+        force: (n, 2) what is commanded of the force-controlled arm, and the largest that the other
+            feels [N].
+        commanded: (n,) the case that decides the first.
+        felt: (n,) the case in which the leading arm feels most beyond it.
+        share: (n,) of the difference of both forces there that it feels.
+    """
+
+    leader: int
+    force: Array
+    commanded: NDArray[np.intp]
+    felt: NDArray[np.intp]
+    share: Array
+
+    def at(self, rows: NDArray[np.intp]) -> RulingCases:
+        """At some of the samples."""
+        cases = self.commanded[rows], self.felt[rows]
+        return RulingCases(self.leader, self.force[rows], *cases, self.share[rows])
+
+    def slopes(self, commanded: Array, felt: Array) -> Array:
+        """(n, 2, m) derivatives of `force` from those of both robots' forces (n, 2, m) in the cases
+        `commanded` and `felt`."""
+        follower = 1 - self.leader
+        found = np.empty_like(commanded)
+        found[:, follower] = commanded[:, follower]
+        step = felt[:, self.leader] - felt[:, follower]
+        found[:, self.leader] = commanded[:, follower] + self.share[:, None] * step
+        return found
+
+
+def felt_share(difference: Array, uncertainty: Uncertainty) -> Array:
+    """Largest share that the leading arm feels of differences between leading and commanded force
+    under the largest mass: all of one that loads it, the least mass's share of one that relieves
+    it."""
+    lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
+    return np.where(difference > 0.0, 1.0, lightest)
+
+
+def ruling_cases(
+    worst: Array,
+    uncertainty: Uncertainty,
+    leader: int,
+    difference: Array | None = None,
+    leading_share: float = 1.0,
+) -> RulingCases:
+    """The cases that decide among the least normal forces (k, n, 2) [N] of the worst ones.
+
+    The difference of both forces is the motion's, whatever the squeeze, and proportional to the
+    mass.
+
+    Args:
+        difference: (k, n) leading less commanded force [N], where `worst` does not tell all.
+        leading_share: what the leading arm presses more for each newton more that is commanded.
+    """
+    follower, every = 1 - leader, np.arange(worst.shape[1])
+    if difference is None:
+        difference = worst[:, :, leader] - leading_share * worst[:, :, follower]
+    share = felt_share(difference, uncertainty)
+    commanded = worst[:, :, follower].argmax(axis=0)
+    felt = (share * difference).argmax(axis=0)
+    force = np.empty(worst.shape[1:])
+    force[:, follower] = worst[commanded, every, follower]
+    force[:, leader] = leading_share * force[:, follower] + (share * difference)[felt, every]
+    return RulingCases(leader, force, commanded, felt, share[felt, every])

@@ -1,4 +1,5 @@
-"""The least commanded forces that hold for every case of a set, and what they cost.
+"""The least commanded forces that hold for every case of a set, and the price of robustness: forces
+against the size of a set, and the largest that arms allow.
 
 One arm leads: its pad keeps its place and presses as hard as the motion asks. The other is
 force-controlled: its normal force is commanded beforehand, the same in all cases. With N_1 - N_2
@@ -13,15 +14,15 @@ import numpy as np
 
 from codegen.cache import Cache
 from hybrid_opt.carry import Carry
-from hybrid_opt.robust.case_forces import CaseForces
+from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.cases import (
+    CaseForces,
     friction_by_displacement,
     nominal_case,
     random_cases,
+    ruling_cases,
     worst_cases,
 )
-from hybrid_opt.robust.ruling import ruling_cases
-from hybrid_opt.static_hold import kept_per_workcell
 from symbolic.array import Array
 from symbolic.contact.worst_cases import least_reaches
 from symbolic.errors import SettingsError
@@ -117,11 +118,6 @@ class RobustModel:
         """
         self.workcell = workcell
         self._cases = CaseForces(workcell, cache)
-
-    @property
-    def allowed_factor(self) -> float:
-        """Bound of the multiples of the workcell's set that leave friction and patches."""
-        return allowed_factor(self.workcell, self.workcell.uncertainty)
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
         """(k, n, 2) least normal forces [N] that hold each of k cases (k, 15) at n samples; of pads
@@ -313,3 +309,92 @@ def _soft_model(workcell: Workcell) -> RobustModel:
 soft_model = kept_per_workcell(_soft_model)
 """The model of a workcell whose pads press evenly, whatever its own allocation: two pads with
 opposite normals."""
+
+
+USUAL = Uncertainty(
+    friction=0.10,
+    mass=0.05,
+    centre_of_mass=np.full(3, 0.005),
+    pad_position=0.003,
+    disturbance=np.full(3, 0.2),
+)
+"""A set to think of where the workcell states none."""
+
+FACTORS = np.linspace(0.0, 2.0, 9)
+"""Multiples of the set whose forces are given."""
+
+CASES = 100_000
+"""Random cases that every priced carry is held against."""
+
+SAMPLES = 100
+"""Samples of a carry that are judged, beside those of its largest forces."""
+
+
+@dataclass(frozen=True)
+class RobustPrice:
+    """The price of robustness of one carry.
+
+    Attributes:
+        uncertainty: the set.
+        stated: whether the workcell states it.
+        factors: (k,) multiples of the set.
+        peak: (k, 2) largest normal force of each robot under them [N].
+        commanded: (2,) under the set itself [N].
+        limit: (2,) reference forces [N].
+        largest_factor: the largest multiple that they allow.
+        check: random cases of the set itself under its forces.
+    """
+
+    uncertainty: Uncertainty
+    stated: bool
+    factors: Array
+    peak: Array
+    commanded: Array
+    limit: Array
+    largest_factor: float
+    check: SampledCheck
+
+
+def robust_price(
+    model: RobustModel,
+    carry: Carry,
+    rng: np.random.Generator,
+    leader: int = 0,
+    cases: int = CASES,
+    threads: int = 1,
+) -> RobustPrice:
+    """The cost of robustness against the workcell's set for a carry; against `USUAL` without one.
+
+    Args:
+        model: of the carry's workcell.
+        rng: draws the random cases.
+        leader: index of the arm that keeps its place.
+        cases: how many.
+        threads: that hold them against the forces, 0 for one per core.
+
+    Raises:
+        SettingsError: the set leaves no friction or patch, or there is no such arm.
+    """
+    workcell = model.workcell
+    stated = not workcell.uncertainty.is_empty
+    uncertainty = workcell.uncertainty if stated else USUAL
+    motion, limit = thinned(carry), workcell.task.reference_force
+    force = model.robust_force(motion, uncertainty, leader)
+    factors = FACTORS[allowed_factor(workcell, uncertainty) > FACTORS]
+    return RobustPrice(
+        uncertainty=uncertainty,
+        stated=stated,
+        factors=factors,
+        peak=model.price(motion, factors, leader, uncertainty),
+        commanded=force.peak,
+        limit=limit,
+        largest_factor=model.largest_factor(motion, limit, leader, uncertainty),
+        check=model.check(motion, force, cases, rng, threads),
+    )
+
+
+def thinned(carry: Carry) -> BoxMotion:
+    """`SAMPLES` evenly spread samples of a carry, and those of its largest normal forces."""
+    even = np.linspace(0, len(carry) - 1, min(len(carry), SAMPLES)).round().astype(int)
+    rows = np.union1d(even, carry.normal_force.argmax(axis=0))
+    return BoxMotion(carry.pose[rows], carry.rate[rows], carry.second_rate[rows])

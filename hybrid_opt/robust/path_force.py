@@ -14,11 +14,16 @@ from numpy.typing import NDArray
 
 from codegen.build import compile_function
 from codegen.cache import Cache
-from hybrid_opt.robust.case_forces import check_pads, is_squeezed
-from hybrid_opt.robust.cases import worst_cases
+from hybrid_opt.per_workcell import kept_per_workcell
+from hybrid_opt.robust.cases import (
+    RulingCases,
+    check_pads,
+    felt_share,
+    is_squeezed,
+    ruling_cases,
+    worst_cases,
+)
 from hybrid_opt.robust.force import check_set
-from hybrid_opt.robust.ruling import RulingCases, felt_share, ruling_cases
-from hybrid_opt.static_hold import kept_per_workcell
 from symbolic.array import Array
 from symbolic.contact.worst_cases import (
     case_difference_function,
@@ -117,7 +122,8 @@ class RobustPath:
             derivatives by u, u'' and u'^2.
         """
         every = np.ones((len(self._cases), len(points)), dtype=bool)
-        return self._ruled(points, self._least(points, every))
+        ruling = ruling_cases(self._least(points, every), self._set, self.leader)
+        return ruling.force, self.slopes(points, ruling)
 
     def beyond(self, points: PathPoints, level: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """The points where a force of either robot is above a level (n,) [N], their forces and
@@ -186,10 +192,6 @@ class RobustPath:
             motion = [values[row] for values in points.motion]
             found[case, row] = self._squeeze.batch(*motion, self._cases[case])["normal_force"]
         return found
-
-    def _ruled(self, points: PathPoints, least: Array) -> tuple[Array, Array]:
-        ruling = ruling_cases(least, self._set, self.leader)
-        return ruling.force, self.slopes(points, ruling)
 
     def slopes(self, points: PathPoints, ruling: RulingCases) -> Array:
         """(n, 2, 20) of the forces that these cases decide."""

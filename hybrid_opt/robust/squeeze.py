@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
+from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import HeldMotion, robust_model, soft_model
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -132,6 +133,17 @@ def extra_force(
             least = np.maximum(least, soft_model(workcell).nominal(motion))
         needed = least[:, follower] + (squeeze.factor - 1.0) * least.mean(axis=1)
     return smooth_above(time, needed, squeeze.smoothing) - planned
+
+
+def commanded_forces(carry: Carry, settings: SqueezeSettings) -> tuple[Array, Squeeze]:
+    """(n, 2) normal forces to command of both robots along a carry [N], and how they came about.
+
+    Raises:
+        SettingsError: the cell's uncertainty leaves no friction or patch.
+    """
+    squeeze = chosen_squeeze(carry.workcell, settings)
+    extra = extra_force(carry.workcell, squeeze, carry.time, carry, carry.normal_force)
+    return carry.normal_force + extra[:, None], squeeze
 
 
 def smooth_above(time: Array, values: Array, width: float) -> Array:

@@ -20,7 +20,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.selection import selected_row
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.recommending.force_table import level_force
+from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.timing import TimingLimits, timed_trajectory
 from hybrid_opt.timing.robustness import payload_sensitivity
 from hybrid_opt.work.job import Emit, Executor, Job, answer_all

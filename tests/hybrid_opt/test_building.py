@@ -13,7 +13,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.robust.case_forces import CaseForces
+from hybrid_opt.robust.cases import CaseForces
 from hybrid_opt.timing.model import TimingModel
 
 RACK = Path("studies/workcells/rack.toml")

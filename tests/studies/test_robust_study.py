@@ -17,7 +17,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
-from hybrid_opt.recommending.force_table import level_force
+from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.squeeze import RESERVE
 from hybrid_opt.store.json_records import read_record

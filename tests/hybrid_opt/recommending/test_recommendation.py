@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.indicators.knee import knee
-from hybrid_opt.recommending.choice import force_for_payload
-from hybrid_opt.recommending.driven_paths import DrivenPaths
-from hybrid_opt.recommending.force_table import front_durations, spread_members, table_forces
-from hybrid_opt.recommending.recommendation import HAND_MADE
-from hybrid_opt.recommending.rival import Rival
-from hybrid_opt.recommending.unsure import usual_doubts
+from hybrid_opt.recommending.choice import DrivenPaths, force_for_payload
+from hybrid_opt.recommending.comparison import Rival, front_durations, spread_members, table_forces
+from hybrid_opt.recommending.recommendation import HAND_MADE, usual_doubts
+from hybrid_opt.robust.squeeze import commanded_forces
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.records import Uncertainty
 from tests.symbolic.read.samples import RACK
 
 
@@ -199,3 +200,17 @@ def test_a_drivable_cell_is_the_same_cell(drivable: ho.Cell) -> None:
     assert drivable.workcell.source.is_file()
     assert not drivable.force_kind.robust
     assert ho.Cell.load(RACK, ROBUST_OBJECTIVES).drivable().force_kind.robust
+
+
+@pytest.mark.parametrize("uncertainty", [Uncertainty(), Uncertainty(friction=0.1, mass=0.03)])
+def test_the_job_presses_as_hard_as_recommended(
+    drivable: ho.Cell, uncertainty: Uncertainty
+) -> None:
+    cell = ho.Cell(replace(drivable.workcell, uncertainty=uncertainty))
+    timing = ho.time_path(cell, cell.initial)
+    assert timing.carry is not None
+    forces, squeeze = commanded_forces(timing.carry, ho.SqueezeSettings())
+    assert (squeeze.uncertainty is None) == uncertainty.is_empty
+    (carry,) = (phase for phase in ho.plan_job(timing).phases if phase.name == "carry")
+    # The job's window of smoothing reaches into what it does before and after.
+    np.testing.assert_allclose(carry.force.normal.max(axis=0), forces.max(axis=0), rtol=0.02)

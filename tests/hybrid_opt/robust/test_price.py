@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_opt.robust.force import RobustModel
-from hybrid_opt.robust.price import SAMPLES, USUAL, RobustPrice, robust_price, thinned
+from hybrid_opt.robust.force import SAMPLES, USUAL, RobustModel, RobustPrice, robust_price, thinned
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty
 from tests.hybrid_opt.job.jobs import rack_job

@@ -12,9 +12,8 @@ pytest.importorskip("mujoco")
 from hybrid_opt.campaign.simulated import MOST_SAMPLES, Whose, stored_simulation
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
-from hybrid_opt.recommending.squeeze import commanded
 from hybrid_opt.robust.force import RobustModel
-from hybrid_opt.robust.squeeze import FACTOR, RESERVE
+from hybrid_opt.robust.squeeze import FACTOR, RESERVE, SqueezeSettings, commanded_forces
 from hybrid_opt.witness.account import Account, driven_carry, pressed_reference
 from hybrid_opt.witness.arms import CellWitness
 from symbolic.array import Array
@@ -51,7 +50,7 @@ def test_forces_beside_what_was_told_are_stored_from_the_carrys_beginning() -> N
     assert len(found.time) <= MOST_SAMPLES
     assert found.factor == FACTOR
     assert not found.robust
-    told = commanded(carry).peak
+    told = commanded_forces(carry, SqueezeSettings())[0].max(axis=0)
     np.testing.assert_allclose(found.peaks[0], told, rtol=0.01)
     assert found.largest_error < 0.1
 
