@@ -12,12 +12,13 @@ from hybrid_opt.job.compliance import (
     STIFFNESSES,
     largest_skew,
     position_control,
+    position_text,
+    skew_text,
     skewed,
 )
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import WIDTH
-from hybrid_opt.job.text import job_text, position_text, skew_text
 from hybrid_opt.robust.squeeze import FACTOR, SqueezeSettings
 from hybrid_opt.store.export import FORMATS, BundleOptions, Origin, export
 from hybrid_opt.store.export.manifest import warnings_of
@@ -150,7 +151,7 @@ def _timing(
 def _report(job: Job, stiffness: float) -> str:
     """The job's phases, what position control and a late arm do, and warnings."""
     parts = [
-        job_text(job),
+        repr(job),
         "\nPosition control, by the arms' stiffness at their pads",
         position_text([position_control(job, each) for each in STIFFNESSES]),
         f"\nEither arm late, at {stiffness:g} N/m: up to "

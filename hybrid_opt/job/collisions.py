@@ -5,6 +5,9 @@ at the grasp, and wherever the pad is moved away from it along the contact norma
 separates both. Every other body of an arm has to stay clear of the box, also those that a grasp
 keeps apart. The box may touch the bodies that it stands on until it is lifted off, and sink into
 them by no more than `RESTING_TOLERANCE`.
+
+`what_blocks` says whether pads get to the box before a carry, and away from it afterwards, before
+anything is timed.
 """
 
 from __future__ import annotations
@@ -15,15 +18,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from codegen.function import NumericFunction
+from hybrid_opt.carry import joints_of
 from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
 from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.errors import JobError
+from hybrid_opt.job.motions import SAMPLES, followed, lines_around, rise
 from symbolic.array import Array
 from symbolic.geometry.bodies import CollisionBody
 from symbolic.geometry.pairs import (
     ActivePair,
     CellGeometry,
-    ExcludedPair,
     build_geometry,
     ignored_pairs,
 )
@@ -40,6 +46,10 @@ LARGEST_DROP = 0.3
 
 MOST_STEPS = 300
 BEHIND_PAD = "behind the pad: the contact plane keeps them apart"
+
+
+EVERY = 10
+"""Stride of the samples of a straight motion that are judged."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +161,8 @@ def job_geometry(workcell: Workcell) -> CellGeometry:
     ignored = ignored_pairs(workcell, bodies)
     active, excluded = list(geometry.active), []
     for pair in geometry.excluded:
-        other = bodies[pair.first + pair.second - payload] if payload in _both(pair) else None
+        of_box = payload in (pair.first, pair.second)
+        other = bodies[pair.first + pair.second - payload] if of_box else None
         if (
             other is None
             or not other.group.startswith("robot")
@@ -163,10 +174,6 @@ def job_geometry(workcell: Workcell) -> CellGeometry:
         else:
             active.append(ActivePair(pair.first, pair.second))
     return replace(geometry, active=tuple(active), excluded=tuple(excluded))
-
-
-def _both(pair: ExcludedPair) -> tuple[int, int]:
-    return pair.first, pair.second
 
 
 def _behind_pad(body: CollisionBody, geometry: CellGeometry) -> bool:
@@ -184,3 +191,42 @@ def _lowered(pose: Array, drop: float) -> Array:
     lowered = np.array(pose, dtype=float)
     lowered[2] -= drop
     return lowered
+
+
+def what_blocks(
+    workcell: Workcell,
+    collisions: JobCollisions,
+    posture: NumericFunction,
+    pose: Array,
+    q: Array,
+) -> str:
+    """The first straight motion around a carry that an arm does not follow, or on which something
+    collides, with what does; '' where all are free on their samples.
+
+    Args:
+        workcell: two round pads of it face one another.
+        collisions: of its jobs.
+        posture: `symbolic.robot.arm.posture_function`.
+        pose: (2, 6) of the box where the carry begins and ends.
+        q: (2, joints) of both arms there [rad or m].
+    """
+    handling = workcell.handling
+    places = (
+        collisions.standing(pose[0], handling.lift_height),
+        collisions.standing(pose[1], handling.set_down_height),
+    )
+    checker = collisions.checker(places)
+    share = rise(1.0, SAMPLES).value[::EVERY]
+    around = lines_around(workcell, handling, (places[0].pose, places[1].pose), pose)
+    for lines, known, end in zip(around, q, (0, -1), strict=True):
+        for line in lines:
+            try:
+                path = followed(workcell, posture, line, known, at_end=end == 0)
+            except JobError as error:
+                return str(error)
+            poses, joints = line.at(share)[0], joints_of(workcell, path[::EVERY])
+            touch = checker.check(poses, *joints, share).first_touch
+            if touch is not None:
+                return f"{line.name.replace('_', ' ')}: {touch.first} meets {touch.second}"
+            known = path[end]
+    return ""

@@ -7,11 +7,13 @@ pads changes the squeeze by k d / 2.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
+from hybrid_opt.display.table import text_table
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import Job, Phase
 from symbolic.array import Array
@@ -219,3 +221,36 @@ def require_delay(delay: float) -> None:
     """Refuse a delay [s] out of range."""
     if not 0.0 <= delay <= LARGEST_SKEW:
         raise SettingsError(f"skew of {delay:g} s: allowed is 0 to {LARGEST_SKEW:g} s")
+
+
+def position_text(found: Sequence[PositionControl]) -> str:
+    """Forces under position control, by stiffness."""
+    rows = [
+        [
+            f"{each.stiffness:g}",
+            " / ".join(f"{1e3 * value:.2f}" for value in each.penetration),
+            f"{each.force_error:.1f}",
+            f"{100.0 * each.share:.1f} %",
+            each.verdict,
+        ]
+        for each in found
+    ]
+    head = ["stiffness [N/m]", "aim into the box [mm]", "0.1 mm each [N]", "of force", "enough"]
+    return text_table([head, *rows], left=(4,))
+
+
+def skew_text(found: Sequence[Skew]) -> str:
+    """Effect of a late arm, by delay: the worse of both."""
+    rows = [
+        [
+            f"{1e3 * each.delay:g}",
+            f"{1e3 * each.displacement:.2f}",
+            f"{each.force_change:.1f}",
+            f"{100.0 * each.share:.0f} %",
+            f"{each.margin:.1f}",
+            "holds" if each.survived else "SLIPS",
+        ]
+        for each in found
+    ]
+    head = ["late [ms]", "pads apart [mm]", "force [N]", "of force", "left [N]", "the box"]
+    return text_table([head, *rows], left=(5,))

@@ -2,7 +2,7 @@
 
 Pads approach along the contact normals, press while the box stands, take over its weight with the
 press, lift it off, carry it, set it down, let go, and retreat. Every phase but the carry follows a
-smooth profile from rest to rest (`hybrid_opt.job.profile`).
+smooth profile from rest to rest (`hybrid_opt.job.motions`).
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from hybrid_opt.collision.certify import Certificate, SampledPath, certificates,
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import JobError
-from hybrid_opt.job.carry_motion import carry_motion
+from hybrid_opt.evaluate.certification import SampledPath, certificates
 from hybrid_opt.job.collisions import JobCollisions
-from hybrid_opt.job.forces import held, pressing, without_force
-from hybrid_opt.job.limits import EXCESS, phase_use
-from hybrid_opt.job.profile import rise
-from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
-from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, smoothed
-from hybrid_opt.job.straight import (
+from hybrid_opt.job.forces import EXCESS, held, phase_use, pressing, without_force
+from hybrid_opt.job.motions import (
     SAMPLES,
     Straight,
+    carry_motion,
     followed,
     held_at,
     lines_around,
+    rise,
     standing_still,
     timed,
 )
+from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
+from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, smoothed
+from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.squeeze import SqueezeSettings, chosen_squeeze
 from hybrid_opt.static_hold import kept_per_workcell
 from hybrid_opt.timing.jerk import time_with_jerk

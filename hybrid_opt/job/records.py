@@ -1,15 +1,21 @@
-"""A whole job: from the pads away from the box, through the carry, to the pads away again."""
+"""A whole job: from the pads away from the box, through the carry, to the pads away again; and the
+same at even time steps, as robot controllers take it.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 from hybrid_opt.collision.certify import Certificate
+from hybrid_opt.display.table import text_table
 from hybrid_opt.robust.squeeze import Squeeze
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
+from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 
 PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat")
@@ -18,6 +24,12 @@ PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat"
 
 _STATIC = ("friction", "path speed", "joint position", "least normal force")
 """Uses that say nothing of how hard a phase drives the cell."""
+
+
+LEAST_STEP = 1e-3
+
+LARGEST_STEP = 1.0
+"""Range of the time step [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,22 +167,136 @@ class Job:
         peaks = [phase.force.normal.max(axis=0) for phase in self.phases]
         return np.asarray(np.max(peaks, axis=0))
 
-    @property
-    def prefixed_joints(self) -> tuple[str, ...]:
-        """Names of all joints, each behind its robot's."""
-        return tuple(
-            f"{robot_prefix(robot.name)}{joint}"
-            for robot, joints in zip(self.workcell.robots, self.joint_names, strict=True)
-            for joint in joints
-        )
-
     def __repr__(self) -> str:
-        from hybrid_opt.job.text import job_text
-
-        return job_text(self)
+        rows = [
+            [
+                phase.name.replace("_", " "),
+                f"{phase.begin:.3f}",
+                f"{phase.duration:.3f}",
+                f"{phase.force.normal.max():.1f}",
+                f"{100.0 * phase.use[phase.most_used]:.1f} % {phase.most_used}",
+            ]
+            for phase in self.phases
+        ]
+        head = ["phase", "begins [s]", "takes [s]", "presses [N]", "most used"]
+        stands = [" and ".join(names) or "nothing" for names in self.stands_on]
+        return "\n".join(
+            [
+                f"Job, {self.duration:.3f} s; the box stands on {stands[0]}, then on {stands[1]}",
+                text_table([head, *rows], left=(0, 4)),
+                f"commanded: {self.squeeze}; robot "
+                f"{self.workcell.robots[1 - self.squeeze.leader].name!r} is force-controlled",
+            ]
+        )
 
 
 def robot_prefix(name: str) -> str:
     """A robot's name as the beginning of names in ROS and RAPID: letters, digits, underscores."""
     plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name.lower())
     return f"{'r' if not plain[:1].isalpha() else ''}{plain}_"
+
+
+@dataclass(frozen=True, eq=False)
+class SampledJob:
+    """A job at n samples; both arms' joints side by side, world frame, read-only.
+
+    Where two phases meet stands one sample, the last of the earlier one.
+
+    Attributes:
+        job: the job.
+        time: (n,) from the beginning of the job [s].
+        last: per phase the index of its last sample.
+        pose: (n, 6) of the box [m, rad].
+        q, q_rate, q_second: (n, joints) [rad, s].
+        effort: (n, joints) torques of arms and commanded contact wrenches [N m].
+        normal_force: (n, 2) commanded [N].
+        wrench: (n, 2, 6) of each robot on the box about its nominal contact point [N, N m].
+    """
+
+    job: Job
+    time: Array
+    last: tuple[int, ...]
+    pose: Array
+    q: Array
+    q_rate: Array
+    q_second: Array
+    effort: Array
+    normal_force: Array
+    wrench: Array
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    def span(self, index: int) -> slice:
+        """The samples of a phase, both ends included."""
+        return slice(self.last[index - 1] if index else 0, self.last[index] + 1)
+
+    @property
+    def phase_names(self) -> tuple[str, ...]:
+        """(n,) the phase that leads to each sample."""
+        names: list[str] = []
+        for phase, last in zip(self.job.phases, self.last, strict=True):
+            names += [phase.name] * (last + 1 - len(names))
+        return tuple(names)
+
+    def arm(self, index: int, values: Array) -> Array:
+        """The columns of one arm (0 or 1) of (n, joints)."""
+        first = len(self.job.joint_names[0])
+        return values[:, :first] if index == 0 else values[:, first:]
+
+
+def sample_job(job: Job, step: float) -> SampledJob:
+    """A job at even time steps within each phase, from time 0.
+
+    Joints and box follow cubic Hermite pieces between the job's own samples, which are denser than
+    any sensible step; accelerations, torques and forces are interpolated linearly.
+
+    Args:
+        step: time between samples [s]; it is shrunk so that whole steps fill each phase.
+
+    Raises:
+        SettingsError: the step is out of range.
+    """
+    if not LEAST_STEP <= step <= LARGEST_STEP:
+        raise SettingsError(f"time step {step:g} s; allowed is {LEAST_STEP:g} to {LARGEST_STEP:g}")
+    parts = [_sampled(phase, step) for phase in job.phases]
+    last = np.cumsum([len(part["time"]) for part in parts]) - 1
+    # The sample where two phases meet is the earlier one's last.
+    last -= np.arange(len(parts))
+    joined = {
+        name: np.concatenate(
+            [part[name] if k == 0 else part[name][1:] for k, part in enumerate(parts)]
+        )
+        for name in parts[0]
+    }
+    return SampledJob(job, last=tuple(last.tolist()), **joined)
+
+
+def _sampled(phase: Phase, step: float) -> dict[str, Array]:
+    motion, force = phase.motion, phase.force
+    keep = np.concatenate([[True], np.diff(motion.time) > 0.0])
+    time = motion.time[keep]
+    grid = np.linspace(0.0, motion.duration, math.ceil(motion.duration / step - 1e-9) + 1)
+
+    def between(values: Array) -> Array:
+        flat = values[keep].reshape(len(time), -1)
+        rows = np.stack([np.interp(grid, time, column) for column in flat.T], axis=1)
+        found = rows.reshape(len(grid), *values.shape[1:])
+        found[-1] = values[-1]
+        return found
+
+    joints = CubicHermiteSpline(time, motion.q[keep], motion.q_rate[keep])
+    box = CubicHermiteSpline(time, motion.pose[keep], motion.rate[keep])
+    return {
+        "time": phase.begin + grid,
+        "pose": box(grid),
+        "q": joints(grid),
+        "q_rate": joints(grid, 1),
+        "q_second": between(motion.q_second),
+        "effort": between(phase.effort),
+        "normal_force": between(force.normal),
+        "wrench": between(force.wrench),
+    }

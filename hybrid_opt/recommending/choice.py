@@ -20,6 +20,12 @@ from symbolic.records import Workcell
 _UNITS = {"duration": "s", "force": "N", "payload": "kg"}
 
 
+BISECTIONS = 30
+
+LEAST_ABOVE_STILL = 1e-4
+"""Where the search for a force begins, as a share above that of holding still."""
+
+
 @dataclass(frozen=True)
 class Wish:
     """At most one of three wishes; without any, the knee of the front is meant.
@@ -64,11 +70,6 @@ class Wish:
                 "payload": f"the shortest of all carries that would bear {value:g} kg",
             }[name]
         return "the knee of the front: one per cent less time costs more than a per cent of force"
-
-
-BISECTIONS = 30
-LEAST_ABOVE_STILL = 1e-4
-"""Where the search for a force begins, as a share above that of holding still."""
 
 
 class DrivenPaths:

@@ -43,6 +43,25 @@ HOLDS = 1e-6
 """Excess over the commanded force that counts as rounding, as a share of it."""
 
 
+USUAL = Uncertainty(
+    friction=0.10,
+    mass=0.05,
+    centre_of_mass=np.full(3, 0.005),
+    pad_position=0.003,
+    disturbance=np.full(3, 0.2),
+)
+"""A set to think of where the workcell states none."""
+
+FACTORS = np.linspace(0.0, 2.0, 9)
+"""Multiples of the set whose forces are given."""
+
+CASES = 100_000
+"""Random cases that every priced carry is held against."""
+
+SAMPLES = 100
+"""Samples of a carry that are judged, beside those of its largest forces."""
+
+
 @dataclass(frozen=True)
 class BoxMotion:
     """Box poses and their time derivatives at n samples, (n, 6) each."""
@@ -309,25 +328,6 @@ def _soft_model(workcell: Workcell) -> RobustModel:
 soft_model = kept_per_workcell(_soft_model)
 """The model of a workcell whose pads press evenly, whatever its own allocation: two pads with
 opposite normals."""
-
-
-USUAL = Uncertainty(
-    friction=0.10,
-    mass=0.05,
-    centre_of_mass=np.full(3, 0.005),
-    pad_position=0.003,
-    disturbance=np.full(3, 0.2),
-)
-"""A set to think of where the workcell states none."""
-
-FACTORS = np.linspace(0.0, 2.0, 9)
-"""Multiples of the set whose forces are given."""
-
-CASES = 100_000
-"""Random cases that every priced carry is held against."""
-
-SAMPLES = 100
-"""Samples of a carry that are judged, beside those of its largest forces."""
 
 
 @dataclass(frozen=True)

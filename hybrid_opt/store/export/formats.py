@@ -8,8 +8,7 @@ from pathlib import Path
 
 from hybrid_opt.job.compliance import require_skew
 from hybrid_opt.job.plan import plan_job
-from hybrid_opt.job.records import Job
-from hybrid_opt.job.sampling import SampledJob, sample_job
+from hybrid_opt.job.records import Job, SampledJob, sample_job
 from hybrid_opt.store.export.bundle import Contents, write_bundle
 from hybrid_opt.store.export.manifest import manifest
 from hybrid_opt.store.export.mcap_file import mcap_files

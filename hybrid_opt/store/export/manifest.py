@@ -14,8 +14,7 @@ from hybrid_opt.job.compliance import (
     position_control,
     skewed,
 )
-from hybrid_opt.job.records import Job
-from hybrid_opt.job.sampling import SampledJob
+from hybrid_opt.job.records import Job, SampledJob
 from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
 from hybrid_opt.store.export.options import BundleOptions
 from hybrid_opt.store.export.origin import Origin, job_digest

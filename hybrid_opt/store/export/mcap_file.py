@@ -11,7 +11,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.job.sampling import SampledJob
+from hybrid_opt.job.records import SampledJob
 from hybrid_opt.store.export.description import WORLD, description, prefixes
 from hybrid_opt.store.export.options import BundleOptions
 from hybrid_opt.store.export.ros2 import (

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.job.sampling import SampledJob
+from hybrid_opt.job.records import SampledJob
 from hybrid_opt.store.export.makers import ABB, SEVEN, SIX, require_axes, require_maker
 from hybrid_opt.store.export.options import BundleOptions
 from symbolic.array import Array

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from hybrid_opt.job.records import Job
-from hybrid_opt.job.sampling import SampledJob
+from hybrid_opt.job.records import Job, SampledJob
 from hybrid_opt.store.export.description import description, prefixes
 from hybrid_opt.store.export.options import BundleOptions
 from hybrid_opt.store.export.ros2_programs import LAUNCH, RUN

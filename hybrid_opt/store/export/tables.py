@@ -8,7 +8,7 @@ import json
 
 import numpy as np
 
-from hybrid_opt.job.sampling import SampledJob
+from hybrid_opt.job.records import SampledJob
 from symbolic.read.arms import arm_model, turning_joints
 from symbolic.records.task import components
 

@@ -13,9 +13,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.job.records import robot_prefix
-from hybrid_opt.job.sampling import SampledJob
-from hybrid_opt.job.straight import TICK
+from hybrid_opt.job.motions import TICK
+from hybrid_opt.job.records import SampledJob, robot_prefix
 from hybrid_opt.store.export.makers import UR, require_axes, require_maker
 from hybrid_opt.store.export.options import BundleOptions
 from symbolic.array import Array

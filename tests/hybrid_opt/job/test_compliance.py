@@ -11,10 +11,11 @@ from hybrid_opt.job.compliance import (
     force_margin,
     largest_skew,
     position_control,
+    position_text,
     require_skew,
+    skew_text,
     skewed,
 )
-from hybrid_opt.job.text import job_text, position_text, skew_text
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.poses import pose_matrix
@@ -101,7 +102,7 @@ def test_a_stiffness_is_positive() -> None:
 
 def test_a_job_shows_itself() -> None:
     job = rack_job()
-    text = job_text(job)
+    text = repr(job)
     assert repr(job) == text
     for name in ("approach", "press", "lift", "carry", "set down", "release", "retreat"):
         assert name in text

@@ -11,8 +11,7 @@ import yaml
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.job.records import Job
-from hybrid_opt.job.sampling import sample_job
+from hybrid_opt.job.records import Job, sample_job
 from hybrid_opt.store.export import FORMATS, BundleOptions, export
 from hybrid_opt.store.export.rapid import rapid_files
 from hybrid_opt.timing import TimingLimits, time_path

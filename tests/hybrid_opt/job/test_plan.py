@@ -10,10 +10,9 @@ import pinocchio as pin
 import pytest
 
 from hybrid_opt.errors import JobError
+from hybrid_opt.job.motions import lift_line, timed
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.job.records import PHASES, Job, Phase
-from hybrid_opt.job.sampling import sample_job
-from hybrid_opt.job.straight import lift_line, timed
+from hybrid_opt.job.records import PHASES, Job, Phase, sample_job
 from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.timing import JerkLimits, TimingLimits, time_path, time_with_jerk
 from symbolic.array import Array

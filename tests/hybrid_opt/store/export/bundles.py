@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
-from hybrid_opt.job.sampling import SampledJob, sample_job
+from hybrid_opt.job.records import SampledJob, sample_job
 from hybrid_opt.store.export import FORMATS, BundleOptions
 from hybrid_opt.store.export.bundle import Contents
 from tests.hybrid_opt.job.jobs import rack_job

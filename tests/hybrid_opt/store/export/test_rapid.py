@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_opt.job.sampling import sample_job
+from hybrid_opt.job.records import sample_job
 from hybrid_opt.store.export.makers import ABB, UR, require_maker
 from hybrid_opt.store.export.options import BundleOptions
 from hybrid_opt.store.export.rapid import rapid_files

@@ -18,7 +18,7 @@ import yaml
 
 pytest.importorskip("mujoco")
 
-from hybrid_opt.job.sampling import sample_job
+from hybrid_opt.job.records import sample_job
 from hybrid_opt.store.export import FORMATS, BundleOptions
 from hybrid_opt.store.export.manifest import phase_documents
 from hybrid_opt.store.files import sha256

@@ -10,7 +10,7 @@ import math
 import numpy as np
 import pytest
 
-from hybrid_opt.job.sampling import sample_job
+from hybrid_opt.job.records import sample_job
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.job.jobs import rack_job
 from tests.hybrid_opt.store.export.bundles import sampled, text_of

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybrid_opt.job.sampling import sample_job
+from hybrid_opt.job.records import sample_job
 from hybrid_opt.store.export.options import BundleOptions
 from hybrid_opt.store.export.urscript import urscript_files
 from symbolic.errors import SettingsError

@@ -1,4 +1,12 @@
-"""Straight motions of box and pads: approach and retreat, lift and set-down."""
+"""How box and arms move in the phases of a job: in straight lines, not at all, in the timed carry.
+
+Every phase beside the carry takes a smooth way from 0 to 1, h(t/T) with
+
+    h = 35 s^4 - 84 s^5 + 70 s^6 - 20 s^7,
+
+the polynomial of least degree whose first three derivatives vanish at both ends: a phase begins and
+ends at rest in position, in acceleration and in jerk, so that torques and forces have no corner.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +16,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from codegen.function import NumericFunction
-from hybrid_opt.carry import joints_of
+from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.errors import JobError
-from hybrid_opt.job.profile import PEAK_RATE, at_even_steps, rise
 from hybrid_opt.job.records import PhaseMotion
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
@@ -32,6 +39,47 @@ their ends."""
 LIFTING_ACCELERATION = 0.5
 """Largest of the box when it is lifted off and set down [m/s^2]: a twentieth of gravity, so that
 these short ways ask for no more force than the carry."""
+
+
+PEAK_RATE = 35.0 / 16.0
+"""Largest h' over s in [0, 1]."""
+
+_H = np.polynomial.Polynomial([0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0])
+
+
+_MOVING = ("rate", "second_rate", "q_rate", "q_second")
+
+
+@dataclass(frozen=True)
+class Rise:
+    """The profile and its derivatives by time at n samples, evenly spaced over a duration.
+
+    Attributes:
+        time: (n,) from 0 [s].
+        value, rate, second, third: (n,) h and its derivatives by time.
+    """
+
+    time: Array
+    value: Array
+    rate: Array
+    second: Array
+    third: Array
+
+
+def rise(duration: float, samples: int) -> Rise:
+    """The way from 0 to 1 within a duration [s]."""
+    share = np.linspace(0.0, 1.0, samples)
+    # Rounding must not leave [0, 1]; the last values of a polynomial of degree 7 would.
+    value = np.clip(_H(share), 0.0, 1.0)
+    derivatives = [_H.deriv(k)(share) / duration**k for k in (1, 2, 3)]
+    for derivative in derivatives:
+        derivative[[0, -1]] = 0.0
+    return Rise(duration * share, value, *derivatives)
+
+
+def at_even_steps(duration: float, step: float) -> float:
+    """The duration rounded up to whole steps [s]."""
+    return float(np.ceil(duration / step - 1e-9) * step)
 
 
 @dataclass(frozen=True)
@@ -234,26 +282,14 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
 
 def standing_still(motion: PhaseMotion, sample: int, duration: float) -> PhaseMotion:
     """The state of a motion at one sample, held for a duration [s]."""
-    k = sample % len(motion.time)
-
-    def still(values: Array) -> Array:
-        return np.zeros((SAMPLES, *values.shape[1:]))
-
-    def same(values: Array) -> Array:
-        return np.repeat(values[k][None], SAMPLES, axis=0)
-
-    return PhaseMotion(
-        first=motion.first,
-        time=np.linspace(0.0, duration, SAMPLES),
-        pose=same(motion.pose),
-        rate=still(motion.rate),
-        second_rate=still(motion.second_rate),
-        q=same(motion.q),
-        q_rate=still(motion.q_rate),
-        q_second=still(motion.q_second),
-        own_torque=same(motion.own_torque),
-        wrench_torque=same(motion.wrench_torque),
-    )
+    arrays = {
+        name: np.repeat(values[sample][None], SAMPLES, axis=0)
+        for name, values in vars(motion).items()
+        if isinstance(values, np.ndarray)
+    }
+    arrays |= {name: np.zeros_like(arrays[name]) for name in _MOVING}
+    arrays["time"] = np.linspace(0.0, duration, SAMPLES)
+    return PhaseMotion(motion.first, **arrays)
 
 
 @dataclass(frozen=True)
@@ -274,3 +310,42 @@ class _Limits:
         jerk = JerkLimits.of(workcell) or JerkLimits(np.full(len(joints[0]), np.inf))
         gentle = min(payload.acceleration_max, LIFTING_ACCELERATION)
         return cls(joints[0], joints[1], payload.velocity_max, gentle, jerk)
+
+
+def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:
+    """The carry as it is timed, then at rest until a whole number of ticks is over."""
+    q = np.ascontiguousarray(carry.q)
+    pose = np.ascontiguousarray(carry.pose)
+    values = {
+        "pose": pose,
+        "rate": carry.rate,
+        "second_rate": carry.second_rate,
+        "q": q,
+        "q_rate": carry.side_by_side("q_rate"),
+        "q_second": carry.side_by_side("q_second"),
+        "own_torque": carry.side_by_side("own_torque"),
+        "wrench_torque": model.wrench_torque(q, pose),
+    }
+    time = carry.time - carry.time[0]
+    still = _standing_torque(model, q[-1], pose[-1])
+    last = {
+        name: 0.0 * array[-1] if name in _MOVING else array[-1] for name, array in values.items()
+    }
+    last["own_torque"] = still
+    ends = np.array([time[-1], max(at_even_steps(float(time[-1]), TICK), time[-1])])
+    return PhaseMotion(
+        first=carry.arms[0].q.shape[1],
+        time=np.concatenate([time, ends]),
+        **{
+            name: np.concatenate([array, [last[name]] * len(ends)])
+            for name, array in values.items()
+        },
+    )
+
+
+def _standing_torque(model: TimingModel, q: Array, pose: Array) -> Array:
+    """(joints,) torques that hold the bare arms still [N m]."""
+    still = np.zeros((1, 6))
+    own = joints_of(model.workcell, q[None])
+    parts = [model.arm_motion(arm, own[arm], pose[None], still) for arm in (0, 1)]
+    return np.concatenate([part["torque_at_rest"][0] for part in parts])

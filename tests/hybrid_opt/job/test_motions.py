@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid_opt.job.profile import PEAK_RATE, at_even_steps, rise
+from hybrid_opt.job.motions import PEAK_RATE, at_even_steps, rise
 
 
 def test_the_profile_goes_from_rest_to_rest() -> None:
