@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hybrid_opt.branches import search_branches
+    from hybrid_opt.bundles.bundle import export
+    from hybrid_opt.bundles.manifest import BundleOptions, Origin
     from hybrid_opt.carry import Carry
     from hybrid_opt.cell import Cell
     from hybrid_opt.door import (
@@ -37,9 +39,6 @@ if TYPE_CHECKING:
     from hybrid_opt.recommending.choice import Wish
     from hybrid_opt.recommending.recommendation import Recommendation, recommend
     from hybrid_opt.robust.squeeze import SqueezeSettings
-    from hybrid_opt.store.export.formats import export
-    from hybrid_opt.store.export.options import BundleOptions
-    from hybrid_opt.store.export.origin import Origin
     from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
     from symbolic.errors import DualArmError
     from symbolic.records import Workcell
@@ -79,7 +78,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "BundleOptions": "hybrid_opt.store.export.options",
+    "BundleOptions": "hybrid_opt.bundles.manifest",
     "Carry": "hybrid_opt.carry",
     "Cell": "hybrid_opt.cell",
     "DualArmError": "symbolic.errors",
@@ -88,7 +87,7 @@ _HOMES = {
     "JerkTiming": "hybrid_opt.timing.records",
     "Job": "hybrid_opt.job.records",
     "Objective": "hybrid_opt.evaluate.objectives",
-    "Origin": "hybrid_opt.store.export.origin",
+    "Origin": "hybrid_opt.bundles.manifest",
     "PolishSettings": "hybrid_opt.polishing.settings",
     "Proposal": "hybrid_opt.proposing.proposal",
     "ProposeSettings": "hybrid_opt.proposing.proposal",
@@ -99,7 +98,7 @@ _HOMES = {
     "TimingLimits": "hybrid_opt.timing.records",
     "Wish": "hybrid_opt.recommending.choice",
     "Workcell": "symbolic.records",
-    "export": "hybrid_opt.store.export.formats",
+    "export": "hybrid_opt.bundles.bundle",
     "plan_job": "hybrid_opt.job.plan",
     "polish": "hybrid_opt.door",
     "propose": "hybrid_opt.proposing.proposal",

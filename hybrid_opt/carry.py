@@ -26,6 +26,9 @@ from symbolic.records.task import waypoints_of
 if TYPE_CHECKING:
     from hybrid_opt.display.view import CarryView
 
+OBJECTIVE = "objective_"
+"""Before the name of an objective among a carry's figures."""
+
 
 FORCE_LIMIT = "force_limit"
 JOINT_TORQUE = "joint_torque"
@@ -219,6 +222,31 @@ class Carry(Shown):
         """(n, all joints) a quantity of `ArmMotion` with the second arm's joints after the
         first's."""
         return np.concatenate([getattr(arm, name) for arm in self.arms], axis=1)
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """What a judged carry is stored with and reported by, SI units.
+
+        `feasible` is 1 or 0; `objective_<name>` are without penalty; means are over time.
+        """
+        judgement = self.judgement
+        assert judgement is not None, "figures are those of a carry that the evaluator judged"
+        figures = {
+            "feasible": float(judgement.feasible),
+            "duration": self.duration,
+            "payload_limit": self.payload_limit,
+        }
+        figures |= {f"{OBJECTIVE}{name}": value for name, value in judgement.objectives.items()}
+        per_robot = {
+            "peak_normal_force": self.peak_normal_force,
+            "mean_normal_force": self.mean_normal_force,
+            "peak_resultant_force": self.peak_resultant_force,
+            "peak_pressure_shift": self.peak_pressure_shift,
+            "peak_contact_torque_use": self.peak_contact_torque_use,
+        }
+        for i in range(len(self.arms)):
+            figures |= {f"{name}_{i + 1}": float(values[i]) for name, values in per_robot.items()}
+        return figures
 
     def view(self, height: int = 480) -> CarryView:
         """The carry in three dimensions: shown in a notebook's cell, or saved as a page.

@@ -16,7 +16,6 @@ from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings, usual_settings
-from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk
 from hybrid_opt.timing.overview import TimedTrajectory, timed_trajectory
@@ -162,7 +161,7 @@ def save(carry: Carry, path: str | Path, provenance: Mapping[str, Any] | None = 
     Raises:
         ResultsError: the workcell was changed after reading, or the file cannot be written.
     """
-    write_trajectory(path, carry.workcell, carry.x, trajectory_figures(carry), provenance or {})
+    write_trajectory(path, carry.workcell, carry.x, carry.figures, provenance or {})
 
 
 def _decision(carry: Carry | Array) -> Array:

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from hybrid_opt.bundles import FORMATS, BundleOptions, Origin, export
+from hybrid_opt.bundles.manifest import SKEW, warnings_of
 from hybrid_opt.job.compliance import (
     SKEWS,
     STIFFNESSES,
@@ -20,9 +22,6 @@ from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import WIDTH
 from hybrid_opt.robust.squeeze import FACTOR, SqueezeSettings
-from hybrid_opt.store.export import FORMATS, BundleOptions, Origin, export
-from hybrid_opt.store.export.manifest import warnings_of
-from hybrid_opt.store.export.start import SKEW
 from hybrid_opt.store.files import read_bytes
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing import (

@@ -38,7 +38,6 @@ from hybrid_opt.recommending.recommendation import HAND_MADE, LEADER, Recommenda
 from hybrid_opt.robust.force import robust_model, robust_price
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
-from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.work.job import Emit, Executor, Job, answer_all
 from hybrid_opt.work.processes import ProcessExecutor
@@ -157,7 +156,7 @@ def recommend_from(
         "source": source,
         "settings": to_json(campaign.configuration.settings),
     }
-    figures = trajectory_figures(cell.carry(found.x))
+    figures = cell.carry(found.x).figures
     write_trajectory(path, cell.compiled, found.x, figures, provenance)
     inside = path.resolve().is_relative_to(root.resolve())
     file = path.resolve().relative_to(root.resolve()).as_posix() if inside else str(path)

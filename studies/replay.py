@@ -10,8 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from hybrid_opt.store.json_records import to_json
-from hybrid_opt.store.replay import Replay, replay
-from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
+from hybrid_opt.store.trajectory_file import Replay, StoredTrajectory, read_trajectory, replay
 from hybrid_opt.timing import timed_trajectory
 from hybrid_opt.timing.document import timing_document
 from studies.program import Parser, add_verbose, program_of, run_program

@@ -26,7 +26,6 @@ from hybrid_opt.indicators.attainment import attainment_surfaces
 from hybrid_opt.indicators.selection import Selected, select
 from hybrid_opt.store.files import storing, write_atomically, write_json
 from hybrid_opt.store.json_records import to_json
-from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.recommendation_stage import read_recommendation
 from studies.summary import (
@@ -112,7 +111,7 @@ def _store_hand_made(folder: CampaignFolder) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     provenance = {"source": "the workcell file's initial trajectory"}
     # An infeasible one may be without some of its figures.
-    figures = trajectory_figures(carry).items()
+    figures = carry.figures.items()
     known = {name: value for name, value in figures if np.isfinite(value)}
     write_trajectory(path, folder.cell.compiled, carry.x, known, provenance)
 

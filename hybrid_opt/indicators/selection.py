@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from hybrid_opt.carry import Carry
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators.knee import knee
-from hybrid_opt.store.trajectory_figures import trajectory_figures
 from symbolic.array import Array
 
 TIE = 3e-4
@@ -74,7 +73,7 @@ class Selected:
     @property
     def figures(self) -> Mapping[str, float]:
         """Figures that are stored with its trajectory."""
-        return trajectory_figures(self.carry)
+        return self.carry.figures
 
 
 def balanced(peak_normal_force: Array) -> int:

@@ -190,12 +190,6 @@ class Job:
         )
 
 
-def robot_prefix(name: str) -> str:
-    """A robot's name as the beginning of names in ROS and RAPID: letters, digits, underscores."""
-    plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name.lower())
-    return f"{'r' if not plain[:1].isalpha() else ''}{plain}_"
-
-
 @dataclass(frozen=True, eq=False)
 class SampledJob:
     """A job at n samples; both arms' joints side by side, world frame, read-only.

@@ -1,4 +1,5 @@
-"""A trajectory stored as one self-contained JSON file. docs/export.md describes the format.
+"""A trajectory stored as one self-contained JSON file, and evaluated again from it alone.
+docs/export.md describes the format.
 
 The file holds the decision vector, the start postures, the figures it was reported with, how it
 came about, and the whole workcell with every file that the workcell names. Reading it executes
@@ -16,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt.carry import OBJECTIVE
 from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.store.files import AGAIN, storing
-from hybrid_opt.store.trajectory_figures import OBJECTIVE
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import BundleError, OutsideError
@@ -47,6 +48,15 @@ LARGEST_FORCE = 1e5
 
 MOST_NUMBERS = 10_000
 _KEYS = {"format", "version", "decision", "start", "figures", "provenance", "cell"}
+
+
+START_TOLERANCE = 1e-6
+"""Largest difference of the start postures [rad]."""
+
+ABSOLUTE_TOLERANCE = 1e-9
+
+RELATIVE_TOLERANCE = 1e-6
+"""Two evaluations of one trajectory may differ by this much: other compiler, other machine."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +125,7 @@ def write_trajectory(
         path: the file to write; its folder has to exist.
         cell: as read from its file; compiled, where several are stored.
         x: (n_var,) decision vector.
-        figures: finite numbers by name, as from `hybrid_opt.store.trajectory_figures`.
+        figures: finite numbers by name, as from `Carry.figures`.
         provenance: JSON values: algorithm, seed, versions and whatever else explains it.
 
     Raises:
@@ -232,3 +242,65 @@ def _figure(name: str, value: Any) -> float:
         if math.isfinite(number):
             return number
     raise ResultsError(f"{name}: found {shown(value)}; expected a finite number")
+
+
+@dataclass(frozen=True)
+class FigureComparison:
+    """A stored figure beside the recomputed one, which is None where nothing computes it."""
+
+    name: str
+    stored: float
+    recomputed: float | None
+
+    @property
+    def same(self) -> bool:
+        """Whether both agree to the tolerances of a re-evaluation."""
+        if self.recomputed is None:
+            return False
+        allowed = ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(self.stored)
+        return abs(self.stored - self.recomputed) <= allowed
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A re-evaluated trajectory.
+
+    Attributes:
+        cell: as unpacked from the file.
+        figures: every stored figure, compared.
+        start_difference: largest difference of the start postures [rad].
+    """
+
+    cell: Cell
+    figures: tuple[FigureComparison, ...]
+    start_difference: float
+
+    @property
+    def reproduced(self) -> bool:
+        """Whether every stored figure and the start postures came out again."""
+        return self.start_difference <= START_TOLERANCE and all(
+            figure.same for figure in self.figures
+        )
+
+
+def replay(stored: StoredTrajectory, folder: Path) -> Replay:
+    """Unpack a stored trajectory's workcell into a folder and evaluate the trajectory again.
+
+    Raises:
+        DualArmError: the stored workcell is not valid, or its model cannot be built.
+    """
+    cell = stored.open_cell(folder)
+    carry = cell.carry(stored.x)
+    recomputed = carry.figures
+    differences = [
+        float(np.abs(arm.q[0] - start).max())
+        for arm, start in zip(carry.arms, stored.start, strict=True)
+    ]
+    return Replay(
+        cell,
+        tuple(
+            FigureComparison(name, value, recomputed.get(name))
+            for name, value in stored.figures.items()
+        ),
+        max(differences),
+    )

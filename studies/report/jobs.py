@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt.bundles.manifest import phase_documents
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase, contact_effort
-from hybrid_opt.store.export.manifest import phase_documents
 from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, time_path
 from hybrid_opt.work.job import Emit
 from symbolic.array import Array

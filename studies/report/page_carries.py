@@ -17,7 +17,6 @@ from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.display.scene import packed
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.timing import drivable_timing, time_path
 from hybrid_opt.timing.jerk import drive_with_jerk
 from hybrid_opt.work.job import Emit
@@ -162,7 +161,7 @@ class PageCarries:
         name, values = shown.label, judged.judgement.objectives
         if not judged.judgement.feasible:
             name = f"{name} (infeasible)"
-        figures = trajectory_figures(judged).items()
+        figures = judged.figures.items()
         found = {
             "label": f"{name}: {_values(cell, judged, timing)}",
             "objectives": [float(value) for value in values.values()],

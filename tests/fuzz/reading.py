@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from codegen.cache import Cache
+from hybrid_opt.bundles.bundle import read_manifest
 from hybrid_opt.campaign.documents import FinishedReplica, PolishDocument, StageMark
 from hybrid_opt.campaign.evaluations_file import decode
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.results import read_configuration
 from hybrid_opt.campaign.summary import CampaignSummary
-from hybrid_opt.store.export.bundle import read_manifest
 from hybrid_opt.store.files import read_bytes
 from hybrid_opt.store.json_records import read_record
 from hybrid_opt.store.trajectory_file import read_trajectory

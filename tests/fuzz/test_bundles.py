@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import strategies as st
 
-from hybrid_opt.store.export.bundle import MANIFEST, read_manifest, write_bundle
+from hybrid_opt.bundles.bundle import MANIFEST, read_manifest, write_bundle
 from hybrid_opt.store.files import sha256
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
 from tests.fuzz.promises import MANY, Checks, all_kept, kept

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
+from hybrid_opt.bundles.bundle import read_manifest
 from hybrid_opt.campaign.replica import ReplicaRequest, run_replica
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.indicators import metrics
-from hybrid_opt.store.export.bundle import read_manifest
 from hybrid_opt.store.files import sha256
 from hybrid_opt.store.trajectory_file import read_trajectory
 from symbolic.array import Array

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid_opt.store.export.bundle import read_manifest
+from hybrid_opt.bundles.bundle import read_manifest
 from tests.studies.test_examples import ROOT, SMALL, blocks
 
 

@@ -13,7 +13,6 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.store.trajectory_figures import trajectory_figures
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.replay import main
 from tests.symbolic.cells import rack_cell
@@ -23,7 +22,7 @@ from tests.symbolic.cells import rack_cell
 def document() -> str:
     cell = rack_cell()
     x = cell.task.initial.reshape(-1)
-    figures = trajectory_figures(CandidateEvaluator(cell).carry(x))
+    figures = CandidateEvaluator(cell).carry(x).figures
     with TemporaryDirectory() as folder:
         path = Path(folder) / "t.json"
         write_trajectory(path, cell, x, figures, {"algorithm": "hand-made", "seed": 1})

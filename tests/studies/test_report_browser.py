@@ -12,8 +12,7 @@ from selenium import webdriver
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 
-from hybrid_opt.store.replay import replay
-from hybrid_opt.store.trajectory_file import read_trajectory
+from hybrid_opt.store.trajectory_file import read_trajectory, replay
 from studies.report import page_groups
 from studies.report.generate import write_report
 from studies.report.records import ReportData

@@ -21,8 +21,7 @@ from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.squeeze import RESERVE
 from hybrid_opt.store.json_records import read_record
-from hybrid_opt.store.replay import replay
-from hybrid_opt.store.trajectory_file import read_trajectory
+from hybrid_opt.store.trajectory_file import read_trajectory, replay
 from hybrid_opt.timing.document import read_timing
 from hybrid_opt.witness.account import driven_carry
 from studies import export

@@ -23,8 +23,7 @@ from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.recommending.choice import Wish
-from hybrid_opt.store.replay import replay
-from hybrid_opt.store.trajectory_file import read_trajectory
+from hybrid_opt.store.trajectory_file import read_trajectory, replay
 from hybrid_opt.timing.document import read_timing
 from studies import rack, recommend, run
 from studies.cli import campaign_parser, campaign_settings, polish_settings

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import yaml
 
+from hybrid_opt.bundles import FORMATS, BundleOptions, export
+from hybrid_opt.bundles.rapid import rapid_files
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, sample_job
-from hybrid_opt.store.export import FORMATS, BundleOptions, export
-from hybrid_opt.store.export.rapid import rapid_files
 from hybrid_opt.timing import TimingLimits, time_path
 from symbolic.errors import SettingsError
-from tests.hybrid_opt.store.export.rapid_parser import parse
+from tests.hybrid_opt.bundles.rapid_parser import parse
 from tests.symbolic.cells import RACK
 
 CELLS = ["transfer", "pandas"]

@@ -18,9 +18,9 @@ import yaml
 
 pytest.importorskip("mujoco")
 
+from hybrid_opt.bundles import FORMATS, BundleOptions
+from hybrid_opt.bundles.manifest import phase_documents
 from hybrid_opt.job.records import sample_job
-from hybrid_opt.store.export import FORMATS, BundleOptions
-from hybrid_opt.store.export.manifest import phase_documents
 from hybrid_opt.store.files import sha256
 from hybrid_opt.timing import TimingLimits, time_path
 from hybrid_opt.witness.arms import ArmOutcome, CellWitness

@@ -12,8 +12,8 @@ import yaml
 from rosbags.typesys import Stores, get_typestore
 
 from symbolic.records.poses import pose_matrix
+from tests.hybrid_opt.bundles.bundles import contents, sampled, text_of
 from tests.hybrid_opt.job.jobs import rack, rack_job
-from tests.hybrid_opt.store.export.bundles import contents, sampled, text_of
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINTS = [f"{arm}_joint_{k}" for arm in ("left", "right") for k in range(1, 7)]

@@ -12,8 +12,8 @@ import pytest
 
 from hybrid_opt.job.records import sample_job
 from symbolic.errors import SettingsError
+from tests.hybrid_opt.bundles.bundles import sampled, text_of
 from tests.hybrid_opt.job.jobs import rack_job
-from tests.hybrid_opt.store.export.bundles import sampled, text_of
 
 
 def test_samples_lie_on_the_job() -> None:

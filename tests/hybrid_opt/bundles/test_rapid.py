@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybrid_opt.bundles.arms import ABB, UR, require_maker
+from hybrid_opt.bundles.manifest import BundleOptions
+from hybrid_opt.bundles.rapid import rapid_files
 from hybrid_opt.job.records import sample_job
-from hybrid_opt.store.export.makers import ABB, UR, require_maker
-from hybrid_opt.store.export.options import BundleOptions
-from hybrid_opt.store.export.rapid import rapid_files
 from symbolic.errors import SettingsError
+from tests.hybrid_opt.bundles.bundles import sampled, text_of
+from tests.hybrid_opt.bundles.rapid_parser import Call, Module, RapidError, parse
 from tests.hybrid_opt.job.jobs import rack, rack_job
-from tests.hybrid_opt.store.export.bundles import sampled, text_of
-from tests.hybrid_opt.store.export.rapid_parser import Call, Module, RapidError, parse
 from tests.robots import ur10_urdf
 
 NAMES = ("T_ROB1/Carry1.mod", "T_ROB2/Carry2.mod")

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hybrid_opt.bundles.manifest import BundleOptions
+from hybrid_opt.bundles.urscript import urscript_files
 from hybrid_opt.job.records import sample_job
-from hybrid_opt.store.export.options import BundleOptions
-from hybrid_opt.store.export.urscript import urscript_files
 from symbolic.errors import SettingsError
+from tests.hybrid_opt.bundles.bundles import contents, sampled, text_of
 from tests.hybrid_opt.job.jobs import rack_job
-from tests.hybrid_opt.store.export.bundles import contents, sampled, text_of
 
 BLOCK = re.compile(r"^(\s*)(def|if|while|elif|else)\b.*:$")
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from functools import cache
 
+from hybrid_opt.bundles import FORMATS, BundleOptions
+from hybrid_opt.bundles.manifest import Contents
 from hybrid_opt.job.records import SampledJob, sample_job
-from hybrid_opt.store.export import FORMATS, BundleOptions
-from hybrid_opt.store.export.bundle import Contents
 from tests.hybrid_opt.job.jobs import rack_job
 
 STEPS = {"rapid": 0.1, "urscript": 0.008}

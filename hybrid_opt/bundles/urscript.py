@@ -13,10 +13,10 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybrid_opt.bundles.arms import UR, comment, require_axes, require_maker, robot_prefix
+from hybrid_opt.bundles.manifest import BundleOptions
 from hybrid_opt.job.motions import TICK
-from hybrid_opt.job.records import SampledJob, robot_prefix
-from hybrid_opt.store.export.makers import UR, require_axes, require_maker
-from hybrid_opt.store.export.options import BundleOptions
+from hybrid_opt.job.records import SampledJob
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.poses import inverse
@@ -76,7 +76,7 @@ def _program(sampled: SampledJob, arm: int) -> Iterator[str]:
     job = sampled.job
     robot, first = job.workcell.robots[arm], sampled.arm(arm, sampled.q)[0]
     yield "def carry_job():"
-    yield f"  # {_comment(job.workcell.name)}: robot {_comment(robot.name)}"
+    yield f"  # {comment(job.workcell.name)}: robot {comment(robot.name)}"
     yield "  # Both programs wait for one another before each phase, over a digital line each way."
     yield f"  set_tcp({_pose(robot.T_flange_pad)})"
     yield f"  set_target_payload({_payload(sampled, arm, loaded=False)})"
@@ -167,8 +167,3 @@ def _pose(T: Array) -> str:
 
 def _list(values: Array) -> str:
     return f"[{', '.join(f'{value:.7f}' for value in values)}]"
-
-
-def _comment(text: str) -> str:
-    """Text that cannot leave a comment line."""
-    return "".join(c if " " <= c <= "~" else "?" for c in text)[:60]

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from hybrid_opt.bundles import FORMATS, BundleOptions, Origin, export
+from hybrid_opt.bundles.bundle import read_manifest, write_bundle
 from hybrid_opt.errors import JobError, ResultsError
 from hybrid_opt.robust.squeeze import SqueezeSettings
-from hybrid_opt.store.export import FORMATS, BundleOptions, Origin, export
-from hybrid_opt.store.export.bundle import read_manifest, write_bundle
 from hybrid_opt.store.files import sha256
 from hybrid_opt.timing import TimingLimits, time_path
 from symbolic.errors import SettingsError

@@ -12,9 +12,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybrid_opt.bundles.arms import ABB, SEVEN, SIX, comment, require_axes, require_maker
+from hybrid_opt.bundles.manifest import BundleOptions
 from hybrid_opt.job.records import SampledJob
-from hybrid_opt.store.export.makers import ABB, SEVEN, SIX, require_axes, require_maker
-from hybrid_opt.store.export.options import BundleOptions
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.poses import inverse
@@ -44,8 +44,6 @@ FORCE_EVERY = 5
 
 REFERENCES = 100
 """Entries of the table of force references."""
-
-_LINE_LENGTH = 60
 
 
 def rapid_files(sampled: SampledJob, options: BundleOptions) -> dict[str, str | bytes]:
@@ -82,8 +80,8 @@ def _module(sampled: SampledJob, arm: int) -> Iterator[str]:
     job, robot, tasks = sampled.job, sampled.job.workcell.robots[arm], _tasks(sampled)
     degrees = np.rad2deg(sampled.arm(arm, sampled.q))
     yield f"MODULE Carry{arm + 1}"
-    yield f"  ! {_comment(job.workcell.name)}"
-    yield f"  ! Robot {_comment(robot.name)} in task {tasks[arm]}"
+    yield f"  ! {comment(job.workcell.name)}"
+    yield f"  ! Robot {comment(robot.name)} in task {tasks[arm]}"
     yield f"  ! {len(degrees)} positions, {float(sampled.time[-1]):.3f} s"
     yield "  ! Positions alone do not squeeze: CarryForce has to make this arm press."
     yield f'  PERS tasks carryTasks{{2}} := [["{tasks[0]}"],["{tasks[1]}"]];'
@@ -212,8 +210,3 @@ def _target(degrees: Array) -> str:
 
 def _numbers(values: Array) -> str:
     return f"[{','.join(f'{value:.6f}' for value in values)}]"
-
-
-def _comment(text: str) -> str:
-    """Text that cannot end or leave a RAPID comment line."""
-    return "".join(c if " " <= c <= "~" else "?" for c in text)[:_LINE_LENGTH]

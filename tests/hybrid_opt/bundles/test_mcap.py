@@ -13,8 +13,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from tests.hybrid_opt.bundles.bundles import contents, sampled, text_of
 from tests.hybrid_opt.job.jobs import rack_job
-from tests.hybrid_opt.store.export.bundles import contents, sampled, text_of
 
 
 def recording() -> io.BytesIO:

@@ -10,17 +10,17 @@ from typing import Any
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.errors import ResultsError
-from hybrid_opt.job.records import SampledJob
-from hybrid_opt.store.export.description import WORLD, description, prefixes
-from hybrid_opt.store.export.options import BundleOptions
-from hybrid_opt.store.export.ros2 import (
+from hybrid_opt.bundles.arms import WORLD, description, prefixes
+from hybrid_opt.bundles.manifest import BundleOptions
+from hybrid_opt.bundles.ros2 import (
     duration,
     job_joints,
     pad_frame,
     pad_wrench,
     wrench_message,
 )
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.job.records import SampledJob
 from symbolic.array import Array
 from symbolic.read.arms import arm_model, link_frame
 from symbolic.records.poses import box_placement
