@@ -107,7 +107,7 @@ def least_force(campaign: CampaignResults) -> dict[str, Array]:
             fronts.append(polished.x)
     evaluator = CandidateEvaluator(campaign.workcell, campaign.objectives)
     chosen = select(evaluator, np.concatenate(fronts))
-    return {} if chosen is None else {LEAST_FORCE: chosen.x[: campaign.workcell.task.n_path]}
+    return {} if chosen is None else {LEAST_FORCE: chosen.carry.x[: campaign.workcell.task.n_path]}
 
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:

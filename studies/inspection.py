@@ -17,7 +17,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
-from hybrid_opt.indicators.bounds import BindingBound, binding_bounds
+from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
 from studies.inspection_branches import Branch, branches_of
 from studies.inspection_pictures import draw, show
 from symbolic.array import Array

@@ -39,9 +39,8 @@ from hybrid_opt.robust.force import robust_model, robust_price
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
-from hybrid_opt.work.job import Emit, Executor, Job, answer_all
+from hybrid_opt.work.job import Emit, Executor, Job, SerialExecutor, answer_all
 from hybrid_opt.work.processes import ProcessExecutor
-from hybrid_opt.work.serial import SerialExecutor
 from studies.drivable import (
     DrivableFronts,
     drivable_fronts,

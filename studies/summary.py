@@ -29,7 +29,7 @@ from hybrid_opt.campaign.summary import (
     StoredTest,
 )
 from hybrid_opt.indicators import metrics
-from hybrid_opt.indicators.bounds import binding_bounds
+from hybrid_opt.indicators.metrics import binding_bounds
 from hybrid_opt.indicators.selection import Selected
 from hybrid_opt.indicators.statistics import corrected, rank_test, summarise
 from hybrid_opt.static_hold import StaticHold
@@ -81,14 +81,15 @@ def front_indicators(
     front: Array, reference: Array, selected: Selected | None, file: str | None
 ) -> dict[str, Any]:
     """The fields of `FrontFigures` for a front's objectives (k, n_obj)."""
+    carry = None if selected is None else selected.carry
     return {
         "non_dominated": len(front),
         "hypervolume": metrics.hypervolume(front, metrics.reference_point(reference.shape[1])),
         "igd": metrics.igd(front, reference),
         "igd_plus": metrics.igd_plus(front, reference),
         "spacing": metrics.spacing(front),
-        "mean_excess_above_static": selected.mean_excess_above_static if selected else math.nan,
-        "payload_limit": selected.figures["payload_limit"] if selected else math.nan,
+        "mean_excess_above_static": math.nan if carry is None else carry.mean_excess_above_static,
+        "payload_limit": math.nan if carry is None else carry.payload_limit,
         "selected": _selected_entry(selected, file),
     }
 
@@ -131,15 +132,16 @@ def best_steps(history: Array) -> tuple[Array, ...]:
 def _selected_entry(selected: Selected | None, file: str | None) -> SelectedEntry | None:
     if selected is None:
         return None
+    carry = selected.carry
     return SelectedEntry(
         evaluation=selected.row + 1,
         file=file,
         objectives=selected.objectives,
-        peak_normal_force=selected.peak_normal_force,
-        minimum_normal_force=selected.minimum_normal_force,
-        excess_above_static=selected.excess_above_static,
-        payload_limit=selected.figures["payload_limit"],
-        duration=selected.figures["duration"],
+        peak_normal_force=carry.peak_normal_force,
+        minimum_normal_force=carry.normal_force.min(axis=0),
+        excess_above_static=carry.excess_above_static,
+        payload_limit=carry.payload_limit,
+        duration=carry.duration,
     )
 
 

@@ -22,8 +22,8 @@ from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.recommended import NoRecommendation
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.summary import ReplicaFigures
-from hybrid_opt.indicators.attainment import attainment_surfaces
 from hybrid_opt.indicators.selection import Selected, select
+from hybrid_opt.indicators.statistics import attainment_surfaces
 from hybrid_opt.store.files import storing, write_atomically, write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
@@ -130,7 +130,8 @@ def _store_selected(
         "row": selected.row,
         "settings": folder.settings.effective(),
     }
-    write_trajectory(path, folder.cell.compiled, selected.x, selected.figures, provenance)
+    carry = selected.carry
+    write_trajectory(path, folder.cell.compiled, carry.x, carry.figures, provenance)
     return path.relative_to(folder.root).as_posix()
 
 

@@ -182,7 +182,7 @@ class StoredFront:
 
 @dataclass(frozen=True)
 class StoredBound:
-    """A bound of the decision variables that solutions lie on, see `hybrid_opt.indicators.bounds`.
+    """A bound of the decision variables that solutions lie on, see `hybrid_opt.indicators.metrics`.
 
     Attributes:
         variable, side, value: which bound [m, rad].

@@ -1,5 +1,5 @@
 """Figures of fronts.
 
-metrics: hypervolume, IGD, spacing, counts. statistics: medians, rank tests, effect sizes.
-attainment: surfaces over replicas. selection: one carry of a front.
+metrics: hypervolume, IGD, spacing, counts, bounds that decide. statistics: medians, rank tests,
+effect sizes, surfaces over replicas. selection: one carry of a front.
 """

@@ -8,17 +8,15 @@ fronts reach down to forces at which a carry hardly moves; their knee is selecte
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.indicators.knee import knee
 from symbolic.array import Array
+from symbolic.errors import SettingsError
 
 TIE = 3e-4
 """Relative difference below which two mean forces are equal to any robot: 15 mN on the rack."""
@@ -40,40 +38,10 @@ class Selected:
     carry: Carry
 
     @property
-    def x(self) -> Array:
-        """(n_var,) decision vector."""
-        return self.carry.x
-
-    @property
     def objectives(self) -> Array:
         """(n_obj,) without penalty."""
         assert self.carry.judgement is not None
         return np.array(list(self.carry.judgement.objectives.values()))
-
-    @property
-    def peak_normal_force(self) -> Array:
-        """(2,) of each robot along the carry [N]."""
-        return self.carry.peak_normal_force
-
-    @property
-    def minimum_normal_force(self) -> Array:
-        """(2,) of each robot along the carry [N]."""
-        return np.asarray(self.carry.normal_force.min(axis=0))
-
-    @cached_property
-    def excess_above_static(self) -> Array:
-        """(2,) of the peaks above the static hold [%]."""
-        return self.carry.excess_above_static
-
-    @cached_property
-    def mean_excess_above_static(self) -> float:
-        """Excess of the mean of both peaks over that of the static hold [%]."""
-        return self.carry.mean_excess_above_static
-
-    @property
-    def figures(self) -> Mapping[str, float]:
-        """Figures that are stored with its trajectory."""
-        return self.carry.figures
 
 
 def balanced(peak_normal_force: Array) -> int:
@@ -82,6 +50,24 @@ def balanced(peak_normal_force: Array) -> int:
     mean = peak_normal_force.mean(axis=1)
     equal = mean <= mean.min() * (1.0 + TIE)
     return int(np.argmin(np.where(equal, peak_normal_force.max(axis=1), np.inf)))
+
+
+def knee(points: Array) -> int:
+    """Index of the point (k, 2) whose objectives, both positive, have the least product.
+
+    Beside it one per cent of either objective buys at most one per cent of the other. The distance
+    from the line between the front's ends (Das 1999) would depend on how far the ends were
+    explored: one long carry at almost the least force moves it by a newton.
+
+    Raises:
+        SettingsError: there are no points, or an objective is not positive.
+    """
+    points = np.asarray(points, dtype=float)
+    if len(points) == 0:
+        raise SettingsError("the front is empty: it has no knee")
+    if not (points > 0.0).all():
+        raise SettingsError("the knee needs objectives above zero")
+    return int(np.argmin(np.log(points).sum(axis=1)))
 
 
 def select(

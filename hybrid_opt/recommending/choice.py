@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.indicators.knee import knee
+from hybrid_opt.indicators.selection import knee
 from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array

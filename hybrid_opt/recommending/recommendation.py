@@ -232,9 +232,9 @@ def _commanded(carry: Carry) -> tuple[Array, Squeeze, tuple[str, ...]]:
     """The largest forces to press with (2,) [N], how they came about, and warnings about them."""
     doubts = []
     try:
-        forces, squeeze = commanded_forces(carry, SqueezeSettings())
+        forces, squeeze = commanded_forces(carry.workcell, carry, SqueezeSettings())
     except SettingsError as error:
-        forces, squeeze = commanded_forces(carry, SqueezeSettings(FACTOR))
+        forces, squeeze = commanded_forces(carry.workcell, carry, SqueezeSettings(FACTOR))
         doubts.append(f"no robust forces: {error}")
     peak = np.asarray(forces.max(axis=0))
     if not squeeze.even_pads:

@@ -135,14 +135,19 @@ def extra_force(
     return smooth_above(time, needed, squeeze.smoothing) - planned
 
 
-def commanded_forces(carry: Carry, settings: SqueezeSettings) -> tuple[Array, Squeeze]:
+def commanded_forces(
+    workcell: Workcell, carry: Carry, settings: SqueezeSettings
+) -> tuple[Array, Squeeze]:
     """(n, 2) normal forces to command of both robots along a carry [N], and how they came about.
+
+    Args:
+        workcell: states what is uncertain.
 
     Raises:
         SettingsError: the cell's uncertainty leaves no friction or patch.
     """
-    squeeze = chosen_squeeze(carry.workcell, settings)
-    extra = extra_force(carry.workcell, squeeze, carry.time, carry, carry.normal_force)
+    squeeze = chosen_squeeze(workcell, settings)
+    extra = extra_force(workcell, squeeze, carry.time, carry, carry.normal_force)
     return carry.normal_force + extra[:, None], squeeze
 
 

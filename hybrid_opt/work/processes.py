@@ -34,9 +34,9 @@ from hybrid_opt.work.job import (
     Job,
     Ledger,
     Request,
+    SerialExecutor,
     attempt,
 )
-from hybrid_opt.work.serial import SerialExecutor
 
 _TICK = 1.0
 """Longest wait [s]; while this process is stopped, patience does not run out."""

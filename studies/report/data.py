@@ -23,8 +23,7 @@ from hybrid_opt.job.plan import JobModel
 from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.timing import TimingLimits, timed_trajectory
 from hybrid_opt.timing.robustness import payload_sensitivity
-from hybrid_opt.work.job import Emit, Executor, Job, answer_all
-from hybrid_opt.work.serial import SerialExecutor
+from hybrid_opt.work.job import Emit, Executor, Job, SerialExecutor, answer_all
 from studies.report.data_drivable import gather_drivable
 from studies.report.jobs import (
     RECOMMENDED_LABEL,

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hybrid_opt.store.files import write_atomically
-from hybrid_opt.work.job import Emit, Executor, Job, answer_all
-from hybrid_opt.work.serial import SerialExecutor
+from hybrid_opt.work.job import Emit, Executor, Job, SerialExecutor, answer_all
 from studies.report.page import render_page
 from studies.report.page_data import PageData
 from studies.report.pictures import ReportPicture, report_pictures

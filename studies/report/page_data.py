@@ -10,8 +10,7 @@ import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.display.scene import packed, scene_data
-from hybrid_opt.work.job import Executor, Job, answer_all
-from hybrid_opt.work.serial import SerialExecutor
+from hybrid_opt.work.job import Executor, Job, SerialExecutor, answer_all
 from studies.drivable import is_drivable
 from studies.report.page_carries import (
     PageCarriesSource,

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from hybrid_opt.indicators.attainment import attainment_surfaces
 from hybrid_opt.indicators.metrics import front_of
+from hybrid_opt.indicators.statistics import attainment_surfaces
 from studies.report.records import AlgorithmRuns, ReportData
 from studies.report.style import FULL_WIDTH, new_figure, panel_label, series
 from studies.text_table import counted

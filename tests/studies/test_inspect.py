@@ -15,7 +15,7 @@ from hybrid_opt.display.solids import cell_solids
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.explanation import explain
-from hybrid_opt.indicators.bounds import BindingBound
+from hybrid_opt.indicators.metrics import BindingBound
 from studies import inspection
 from studies.inspect import main, told
 from studies.inspection import Inspection, Optimum

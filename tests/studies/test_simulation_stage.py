@@ -14,8 +14,7 @@ from hybrid_opt.campaign.simulated import StoredSimulation, Whose, not_simulated
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
-from hybrid_opt.work.job import Job
-from hybrid_opt.work.serial import SerialExecutor
+from hybrid_opt.work.job import Job, SerialExecutor
 from studies import run
 from studies.simulation_stage import Simulated, Written, is_done, wanted_carries
 from studies.simulation_text import simulation_text

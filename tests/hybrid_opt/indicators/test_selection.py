@@ -13,14 +13,16 @@ from hybrid_opt.campaign.replica import front_rows
 from hybrid_opt.campaign.results import Replica
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.indicators.knee import knee
+from hybrid_opt.evaluate.static_hold import payload_limit, static_hold
 from hybrid_opt.indicators.selection import (
     balanced,
+    knee,
     peak_normal_forces,
     select,
     selected_row,
 )
-from hybrid_opt.static_hold import payload_limit, static_hold
+from symbolic.array import Array
+from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
@@ -57,16 +59,16 @@ def test_selected_is_the_least_mean_of_the_front(evaluator: CandidateEvaluator) 
     reference = evaluator.workcell.task.reference_force
     means = (replica.front * reference).mean(axis=1)
     assert selected.row == replica.front_rows[np.argmin(means)]
-    np.testing.assert_allclose(selected.peak_normal_force, selected.objectives * reference)
-    outputs = evaluator.outputs(selected.x[None])
+    np.testing.assert_allclose(selected.carry.peak_normal_force, selected.objectives * reference)
+    outputs = evaluator.outputs(selected.carry.x[None])
     normal = outputs["normal_force"][0]
-    np.testing.assert_array_equal(selected.minimum_normal_force, normal.min(axis=0))
-    excess = 100.0 * (selected.peak_normal_force / static.normal_force - 1.0)
-    np.testing.assert_allclose(selected.excess_above_static, excess)
-    assert excess.min() <= selected.mean_excess_above_static <= excess.max()
+    np.testing.assert_array_equal(selected.carry.normal_force.min(axis=0), normal.min(axis=0))
+    excess = 100.0 * (selected.carry.peak_normal_force / static.normal_force - 1.0)
+    np.testing.assert_allclose(selected.carry.excess_above_static, excess)
+    assert excess.min() <= selected.carry.mean_excess_above_static <= excess.max()
     whole = np.linalg.norm(outputs["contact_force"][0].reshape(-1, 2, 3), axis=2).max(axis=0)
     expected = payload_limit(evaluator.workcell, whole)
-    assert selected.figures["payload_limit"] == pytest.approx(expected, rel=1e-12)
+    assert selected.carry.figures["payload_limit"] == pytest.approx(expected, rel=1e-12)
 
 
 def test_peaks_do_not_depend_on_how_many_are_asked_for(evaluator: CandidateEvaluator) -> None:
@@ -110,3 +112,45 @@ def test_static_payload_of_the_paper() -> None:
     # 2 * 117.68 N / (9.81 m/s^2 * sqrt 2)
     hold = static_hold(with_friction(load(RACK), 1.0, 10.0))
     assert hold.payload_limit == pytest.approx(16.965, abs=5e-4)
+
+
+def front(n: int, still: float = 49.0) -> Array:
+    """Durations and forces: nearer to the force at rest a carry takes ever longer."""
+    force = still * (1.0 + np.linspace(0.004, 0.5, n))
+    return np.column_stack([2.0 + np.sqrt(0.05 * still / (force - still)), force])
+
+
+def test_beside_it_a_per_cent_buys_no_more_than_a_per_cent() -> None:
+    points = np.log(front(400))
+    at = knee(front(400))
+    assert 0 < at < len(points) - 1
+    duration, force = (points - points[at]).T
+    assert (duration + force >= 0.0).all()
+    # It is where the slope in logarithms passes through one.
+    slopes = -np.diff(points[:, 0]) / np.diff(points[:, 1])
+    assert slopes[at - 1] >= 1.0 >= slopes[at]
+
+
+@given(st.integers(3, 40), st.tuples(st.floats(0.01, 100.0), st.floats(0.01, 100.0)))
+def test_units_do_not_matter(n: int, scale: tuple[float, float]) -> None:
+    points = front(n)
+    product = points.prod(axis=1)
+    found = knee(points * np.array(scale))
+    assert product[found] == pytest.approx(product.min(), rel=1e-12)
+
+
+@given(st.integers(10, 60), st.integers(0, 3), st.integers(0, 3))
+def test_how_far_the_ends_were_explored_does_not_matter(n: int, low: int, high: int) -> None:
+    points = front(n)
+    at = knee(points)
+    low, high = min(low, at), min(high, n - 1 - at)
+    assert knee(points[low : n - high]) == at - low
+
+
+def test_small_fronts() -> None:
+    assert knee(np.array([[2.0, 5.0]])) == 0
+    assert knee(np.array([[2.0, 5.0], [2.0, 4.0]])) == 1
+    with pytest.raises(SettingsError, match="empty"):
+        knee(np.zeros((0, 2)))
+    with pytest.raises(SettingsError, match="above zero"):
+        knee(np.array([[1.0, 0.0]]))

@@ -10,8 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import PermutationMethod, mannwhitneyu
 
-from hybrid_opt.indicators.attainment import attainment_surfaces
-from hybrid_opt.indicators.statistics import corrected, holm, magnitude_of, rank_test, summarise
+from hybrid_opt.indicators.statistics import (
+    attainment_surfaces,
+    corrected,
+    holm,
+    magnitude_of,
+    rank_test,
+    summarise,
+)
 from symbolic.errors import SettingsError
 
 samples = st.lists(st.integers(0, 6).map(float), min_size=1, max_size=7)

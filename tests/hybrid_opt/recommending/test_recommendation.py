@@ -9,7 +9,7 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
-from hybrid_opt.indicators.knee import knee
+from hybrid_opt.indicators.selection import knee
 from hybrid_opt.recommending.choice import DrivenPaths, force_for_payload
 from hybrid_opt.recommending.comparison import Rival, front_durations, spread_members, table_forces
 from hybrid_opt.recommending.recommendation import HAND_MADE, usual_doubts
@@ -209,7 +209,7 @@ def test_the_job_presses_as_hard_as_recommended(
     cell = ho.Cell(replace(drivable.workcell, uncertainty=uncertainty))
     timing = ho.time_path(cell, cell.initial)
     assert timing.carry is not None
-    forces, squeeze = commanded_forces(timing.carry, ho.SqueezeSettings())
+    forces, squeeze = commanded_forces(cell.workcell, timing.carry, ho.SqueezeSettings())
     assert (squeeze.uncertainty is None) == uncertainty.is_empty
     (carry,) = (phase for phase in ho.plan_job(timing).phases if phase.name == "carry")
     # The job's window of smoothing reaches into what it does before and after.

@@ -50,7 +50,7 @@ def test_forces_beside_what_was_told_are_stored_from_the_carrys_beginning() -> N
     assert len(found.time) <= MOST_SAMPLES
     assert found.factor == FACTOR
     assert not found.robust
-    told = commanded_forces(carry, SqueezeSettings())[0].max(axis=0)
+    told = commanded_forces(cell.workcell, carry, SqueezeSettings())[0].max(axis=0)
     np.testing.assert_allclose(found.peaks[0], told, rtol=0.01)
     assert found.largest_error < 0.1
 

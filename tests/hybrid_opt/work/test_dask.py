@@ -14,8 +14,7 @@ import pytest
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.errors import WorkerError
 from hybrid_opt.work.dask_cluster import DaskExecutor
-from hybrid_opt.work.job import KILLED, SILENT, Job
-from hybrid_opt.work.serial import SerialExecutor
+from hybrid_opt.work.job import KILLED, SILENT, Job, SerialExecutor
 from symbolic.errors import DualArmError, SettingsError
 from tests.hybrid_opt.campaign.fake import FakeSource, files_of, logged, run_search
 from tests.hybrid_opt.work import jobs

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 from hybrid_opt.errors import WorkerError
-from hybrid_opt.work.job import KILLED, SILENT, Executor, Job, answer_all, give_up
+from hybrid_opt.work.job import KILLED, SILENT, Executor, Job, SerialExecutor, answer_all, give_up
 from hybrid_opt.work.processes import LocalExecutor, ProcessExecutor
-from hybrid_opt.work.serial import SerialExecutor
 from symbolic.errors import DualArmError
 from tests.hybrid_opt.work import jobs
 from tests.hybrid_opt.work.jobs import run
@@ -61,3 +62,17 @@ def test_a_list_is_answered_in_order_and_every_answer_told() -> None:
 def test_what_is_lost_is_told(reason: str, text: str) -> None:
     with pytest.raises(WorkerError, match=text):
         give_up(reason)
+
+
+def threads() -> list[int]:
+    """Of every linear algebra library that is loaded."""
+    np.linalg.norm(np.eye(2))
+    return [int(found["num_threads"]) for found in threadpool_info() if found["user_api"] == "blas"]
+
+
+def test_a_request_is_answered_in_one_thread_and_the_others_return() -> None:
+    before = threads()
+    assert before
+    job: Job[None, None, list[int]] = Job(lambda: None, lambda context, request, emit: threads())
+    assert job.answer(None, None, lambda message: None) == [1] * len(before)
+    assert threads() == before
