@@ -33,7 +33,7 @@ def main(
     from hybrid_opt.cell import Cell
     from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, FORCE_PAIRS, PAPER_OBJECTIVES
     from hybrid_opt.polishing.settings import usual_settings
-    from hybrid_opt.witness.outcome import mujoco_module
+    from hybrid_opt.witness.box import mujoco_module
     from studies.cli import (
         campaign_parser,
         campaign_settings,

@@ -15,10 +15,8 @@ from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.witness.account import driven_carry
-from hybrid_opt.witness.cell_scene import ArmSettings
-from hybrid_opt.witness.controller import CONTROLS
-from hybrid_opt.witness.scene import SimulationSettings
+from hybrid_opt.witness.reference import CONTROLS, driven_carry
+from hybrid_opt.witness.scene import ArmSettings, SimulationSettings
 from studies.options import add_leader, force, number, seed, whole
 from studies.program import Parser, program_of, run_program
 from studies.simulate_arms import simulate_arms

@@ -12,12 +12,10 @@ from scipy.spatial.transform import Rotation
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.cases import random_cases
-from hybrid_opt.witness.account import BISECTIONS, HIGH, LOW, account_of
-from hybrid_opt.witness.arms import ArmOutcome, CellWitness
-from hybrid_opt.witness.cases import workcell_of_case
-from hybrid_opt.witness.cell_scene import ArmSettings
-from hybrid_opt.witness.controller import Control
-from hybrid_opt.witness.reference import Reference, carry_reference, with_tracking_error
+from hybrid_opt.witness.arms import BISECTIONS, HIGH, LOW, ArmOutcome, CellWitness, account_of
+from hybrid_opt.witness.box import workcell_of_case
+from hybrid_opt.witness.reference import Control, Reference, carry_reference, with_tracking_error
+from hybrid_opt.witness.scene import ArmSettings
 from studies.report.animation import Film, write_animation
 from studies.simulate_pads import threshold_text, worst_friction
 from symbolic.array import Array
@@ -46,11 +44,11 @@ def simulate_arms(
                 reference, control, LOW, HIGH, BISECTIONS
             )
             print(f"  with a time step of {step:g} s: {swept.factor:.4f}")
-    peak = found.pressed.reference.normal_force.max(axis=0)
-    print(f"  pressed up to {peak[0]:.2f} / {peak[1]:.2f} N, {found.pressed.squeeze}:")
+    peak = found.reference.normal_force.max(axis=0)
+    print(f"  pressed up to {peak[0]:.2f} / {peak[1]:.2f} N, {found.squeeze}:")
     _tell(found.shown, carry)
-    if found.pressed.squeeze.uncertainty is not None:
-        _cases(cell, found.pressed.reference, settings, options)
+    if found.squeeze.uncertainty is not None:
+        _cases(cell, found.reference, settings, options)
         rubs_less = CellWitness(
             workcell_of_case(cell.workcell, worst_friction(cell.workcell)), settings
         )

@@ -10,11 +10,8 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.cases import nominal_case, random_cases
 from hybrid_opt.robust.force import RobustModel
-from hybrid_opt.witness.cases import witness_of_case
-from hybrid_opt.witness.drive import drive_of
-from hybrid_opt.witness.outcome import Shown, Threshold
+from hybrid_opt.witness.box import Shown, Threshold, Witness, drive_of, witness_of_case
 from hybrid_opt.witness.scene import SimulationSettings
-from hybrid_opt.witness.simulate import Witness
 from symbolic.array import Array
 from symbolic.records import Workcell
 

@@ -28,9 +28,8 @@ from hybrid_opt.errors import ResultsError, WitnessError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
-from hybrid_opt.witness.account import account_of, driven_carry
-from hybrid_opt.witness.arms import CellWitness
-from hybrid_opt.witness.controller import Control
+from hybrid_opt.witness.arms import CellWitness, account_of
+from hybrid_opt.witness.reference import Control, driven_carry
 from hybrid_opt.work.job import Emit, Job, ListLedger
 from studies.terminal_summary import title
 from symbolic.errors import SettingsError

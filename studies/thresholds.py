@@ -18,9 +18,8 @@ from hybrid_opt.errors import WitnessError
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.witness.drive import drive_of, planned_moments
+from hybrid_opt.witness.box import Witness, drive_of, planned_moments
 from hybrid_opt.witness.scene import SimulationSettings
-from hybrid_opt.witness.simulate import Witness
 from studies.options import seed, whole
 from studies.program import Parser, program_of, run_program
 from symbolic.array import Array

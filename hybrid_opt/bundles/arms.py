@@ -34,7 +34,6 @@ PLUGIN = "mock_components/GenericSystem"
 COMMANDS = ("position", "effort")
 STATES = ("position", "velocity", "effort")
 
-
 ABB = "ABB"
 
 UR = "UR e-series"

@@ -31,7 +31,6 @@ GOAL_TIME = 0.5
 JOINT_STATES = "joint_state_broadcaster"
 CONTROLLER = "joint_trajectory_controller/JointTrajectoryController"
 
-
 LAUNCH = '''"""Mock hardware, controllers, description: ros2 launch launch/bringup.launch.py"""
 
 from pathlib import Path

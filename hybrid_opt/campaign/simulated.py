@@ -10,7 +10,7 @@ import numpy as np
 
 from hybrid_opt.campaign.layout import SIMULATED
 from hybrid_opt.store.json_records import Figure, Shape, read_record
-from hybrid_opt.witness.account import Account
+from hybrid_opt.witness.arms import Account
 from symbolic.array import Array
 
 MOST_SAMPLES = 240
@@ -115,14 +115,14 @@ def not_simulated(whose: Whose, problem: str) -> StoredSimulation:
 def stored_simulation(found: Account, whose: Whose) -> StoredSimulation:
     """An account as a study stores it: from the beginning of the carry on."""
     nan, threshold, shown = float("nan"), found.threshold, found.shown
-    squeeze = found.pressed.squeeze
-    begin = float(found.pressed.reference.motion.time[2])
+    squeeze, motion = found.squeeze, found.reference.motion
+    begin = float(motion.time[2])
     rows = np.flatnonzero(shown.time >= begin)
     even = np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).round().astype(int)
     rows = rows[even] if len(rows) else np.array([len(shown.time) - 1])
     return StoredSimulation(
         **vars(whose),
-        duration=float(found.pressed.reference.motion.time[-1] - begin),
+        duration=float(motion.time[-1] - begin),
         slips=nan if threshold is None else threshold.slips.factor,
         holds=nan if threshold is None else threshold.holds.factor,
         pad=0 if threshold is None else threshold.slips.pad + 1,

@@ -26,7 +26,6 @@ Mask = NDArray[np.bool_]
 REFERENCE_POINT = (1.1, 1.1)
 """Reference point of the hypervolume, in normalised objectives (the paper's)."""
 
-
 ON_BOUND = 1e-3
 """Nearer to a bound than this share of the variable's range counts as on it: an interior-point
 method stops a little inside."""

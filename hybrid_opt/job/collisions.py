@@ -47,7 +47,6 @@ LARGEST_DROP = 0.3
 MOST_STEPS = 300
 BEHIND_PAD = "behind the pad: the contact plane keeps them apart"
 
-
 EVERY = 10
 """Stride of the samples of a straight motion that are judged."""
 

@@ -40,12 +40,10 @@ LIFTING_ACCELERATION = 0.5
 """Largest of the box when it is lifted off and set down [m/s^2]: a twentieth of gravity, so that
 these short ways ask for no more force than the carry."""
 
-
 PEAK_RATE = 35.0 / 16.0
 """Largest h' over s in [0, 1]."""
 
 _H = np.polynomial.Polynomial([0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0])
-
 
 _MOVING = ("rate", "second_rate", "q_rate", "q_second")
 

@@ -21,10 +21,8 @@ from symbolic.records import Workcell
 PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat")
 """Every phase of a job in order; without a height there is no lift or no set-down."""
 
-
 _STATIC = ("friction", "path speed", "joint position", "least normal force")
 """Uses that say nothing of how hard a phase drives the cell."""
-
 
 LEAST_STEP = 1e-3
 

@@ -19,7 +19,6 @@ from symbolic.records import Workcell
 
 _UNITS = {"duration": "s", "force": "N", "payload": "kg"}
 
-
 BISECTIONS = 30
 
 LEAST_ABOVE_STILL = 1e-4

@@ -22,7 +22,6 @@ BETTER = 1e-3
 FORCES = 12
 """Limits at which a front is held against a rival."""
 
-
 ABOVE_STILL = (1.02, 1.04, 1.06, 1.08, 1.12, 1.2)
 """Forces of the table over that of holding the payload level and still."""
 

@@ -39,7 +39,6 @@ within the cell's limits on jerk as well."""
 TRIED = 8
 """Answers to a wish that are held against the independent timing before giving up."""
 
-
 LEADER = 0
 """The arm that keeps its place; the other's force is commanded."""
 

@@ -42,7 +42,6 @@ SCREENED = 0.97
 HOLDS = 1e-6
 """Excess over the commanded force that counts as rounding, as a share of it."""
 
-
 USUAL = Uncertainty(
     friction=0.10,
     mass=0.05,

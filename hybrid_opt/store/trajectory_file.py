@@ -49,7 +49,6 @@ LARGEST_FORCE = 1e5
 MOST_NUMBERS = 10_000
 _KEYS = {"format", "version", "decision", "start", "figures", "provenance", "cell"}
 
-
 START_TOLERANCE = 1e-6
 """Largest difference of the start postures [rad]."""
 

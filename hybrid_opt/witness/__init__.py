@@ -1,1 +1,5 @@
-"""A simulator as witness: does a box that is pressed as planned stay where it is held?"""
+"""Simulated carries: does the box stay where the planned forces hold it?
+
+box: the box between pads that are driven. arms: a whole cell under its controllers. reference: what
+it is told, and its controllers. scene: both as MJCF.
+"""

@@ -1,31 +1,57 @@
 """A whole cell in MuJoCo: both arms under their controllers, the box between their pads.
 
-Nothing moves but by the joints' torques, gravity and contacts.
+Nothing moves but by the joints' torques, gravity and contacts. `account_of` says of a carry from
+which force on it holds, and how it presses.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.witness.cell_scene import ArmSettings, cell_text, joint_names, joint_torque_max
-from hybrid_opt.witness.controller import ArmCommand, ArmState, Control, controllers
-from hybrid_opt.witness.drive import SAME_TIME
-from hybrid_opt.witness.outcome import Outcome, Threshold, bisected, mujoco_module
-from hybrid_opt.witness.pads import Pads
-from hybrid_opt.witness.reference import Reference
-from hybrid_opt.witness.scene import quaternion
+from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
+from hybrid_opt.errors import WitnessError
+from hybrid_opt.robust.squeeze import Squeeze
+from hybrid_opt.witness.box import (
+    RIM_POINTS,
+    SAME_TIME,
+    Outcome,
+    Threshold,
+    bisected,
+    mujoco_module,
+)
+from hybrid_opt.witness.reference import (
+    ArmState,
+    Control,
+    Reference,
+    carry_reference,
+    controllers,
+    pressed_reference,
+)
+from hybrid_opt.witness.scene import (
+    ArmSettings,
+    cell_text,
+    joint_names,
+    joint_torque_max,
+    quaternion,
+    rim,
+)
 from symbolic.array import Array
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
 LOOKED_AT = 5e-3
 """Time between two looks at the box [s]."""
+
+LOW, HIGH, BISECTIONS = 0.9, 1.5, 8
+"""Factors between which a threshold is looked for, to about 0.2 %."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +78,110 @@ class ArmOutcome(Outcome):
     box_rotation: Array
     misses: float
     arrives: bool
+
+
+class HeldBox:
+    """Reads one simulation's state, and mends what its contacts neglect.
+
+    Attributes:
+        sites: of the two pads.
+        pose: where the box's pose (7,) is among the simulator's positions.
+    """
+
+    def __init__(self, mujoco: ModuleType, model: Any, data: Any, workcell: Workcell) -> None:
+        """Find pads and box in the model of `hybrid_opt.witness.scene`."""
+        self._mujoco, self._model, self._data = mujoco, model, data
+        self.sites = [int(model.site(f"pad_{i + 1}").id) for i in (0, 1)]
+        self._bodies = [int(model.site_bodyid[site]) for site in self.sites]
+        self._box_body = int(model.body("box").id)
+        first = int(model.joint("box").qposadr[0])
+        self.pose = slice(first, first + 7)
+        self._pad_of_geom = np.full(model.ngeom, -1)
+        for i, body in enumerate(self._bodies):
+            self._pad_of_geom[(model.geom_bodyid == body) & (model.geom_contype == 1)] = i
+        rims = np.array([rim(contact, RIM_POINTS) for contact in workcell.contacts])
+        self._rims = np.concatenate([rims, np.zeros((2, RIM_POINTS, 1))], axis=2)
+        self._contact_time = float(model.geom_solref[self._pad_of_geom >= 0, 0].max())
+        self._change = np.zeros((3, model.nv))
+
+    @property
+    def normal_forces(self) -> Array:
+        """(2,) what the points of each pad press together, in the last step [N]."""
+        pad, _, address, _ = self._contacts()
+        force = np.zeros(2)
+        np.add.at(force, pad, self._data.efc_force[address])
+        return force
+
+    def mend_contacts(self) -> None:
+        """Contacts of this step, all accelerations included.
+
+        MuJoCo takes J dv/dt for the acceleration of the box over a pad, which has dJ/dt v besides:
+        some tenths of m/s^2 where arms swing. Contacts that do not know it creep by millimetres
+        per second and lift off. Call it between the two halves of a step.
+
+        A step takes joints along arcs and the box along a line, which parts them by half of
+        dJ/dt v dt^2. The contacts' damping, 2 over their time constant, is told to make up for it.
+        """
+        pad, is_first, address, axes = self._contacts()
+        if not len(pad):
+            return
+        share = 1.0 - self._model.opt.timestep / self._contact_time
+        unseen = share * np.array([self._unseen(i) for i in (0, 1)])[pad]
+        sign = np.where(is_first, -1.0, 1.0)[:, None]  # the second body's less the first's
+        rows = address[:, None] + np.arange(3)
+        self._data.efc_aref[rows] -= sign * np.einsum("nij,nj->ni", axes, unseen)
+
+    @property
+    def rims_on_box(self) -> Array:
+        """(2, RIM_POINTS, 3) the patches' rims in the box frame [m]."""
+        (places, axes), (position, rotation) = self._placed(), self.box
+        world = self._rims @ np.swapaxes(axes, 1, 2) + places[:, None]
+        on_box: Array = (world - position) @ rotation
+        return on_box
+
+    def slip(self, on_box: Array) -> Array:
+        """(2,) how far points of the box, once on the rims, are from there in the planes of the
+        pads [m]."""
+        (places, axes), (position, rotation) = self._placed(), self.box
+        world = on_box @ rotation.T + position
+        moved = (world - places[:, None]) @ axes - self._rims
+        largest: Array = np.linalg.norm(moved[..., :2], axis=2).max(axis=1)
+        return largest
+
+    @property
+    def box(self) -> tuple[Array, Array]:
+        """Position (3,) [m] and rotation (3, 3) of the box frame in the world."""
+        pose = self._data.qpos[self.pose]
+        return pose[:3].copy(), Rotation.from_quat(pose[[4, 5, 6, 3]]).as_matrix()
+
+    @property
+    def box_in_pad(self) -> Array:
+        """(3, 3) rotation of the box in the axes of the first pad."""
+        in_pad: Array = self._placed()[1][0].T @ self.box[1]
+        return in_pad
+
+    def _unseen(self, pad: int) -> Array:
+        """(3,) dJ/dt v of a pad less that of the box beneath it, world axes [m/s^2]."""
+        place, found = self._data.site_xpos[self.sites[pad]], []
+        for body in (self._bodies[pad], self._box_body):
+            self._mujoco.mj_jacDot(self._model, self._data, self._change, None, place, body)
+            found.append(self._change @ self._data.qvel)
+        less: Array = found[0] - found[1]
+        return less
+
+    def _contacts(self) -> tuple[Indices, NDArray[np.bool_], Indices, Array]:
+        """The pads' active contacts: the pad (n,), whether it is the first body (n,), the first of
+        three rows among the constraints (n,), the contact's axes as rows (n, 3, 3)."""
+        contact = self._data.contact
+        sides = self._pad_of_geom[contact.geom]
+        pad = sides.max(axis=1)
+        active = (pad >= 0) & (contact.efc_address >= 0)
+        axes = contact.frame[active].reshape(-1, 3, 3)
+        return pad[active], sides[active, 0] >= 0, contact.efc_address[active], axes
+
+    def _placed(self) -> tuple[Array, Array]:
+        """Places (2, 3) and axes (2, 3, 3) of both pads in the world."""
+        return self._data.site_xpos[self.sites], self._data.site_xmat[self.sites].reshape(2, 3, 3)
 
 
 class CellWitness:
@@ -109,7 +239,7 @@ class CellWitness:
         high: float,
         steps: int,
     ) -> Threshold[ArmOutcome]:
-        """The least factor that holds, by bisection; see `hybrid_opt.witness.outcome.bisected`.
+        """The least factor that holds, by bisection; see `hybrid_opt.witness.box.bisected`.
 
         Raises:
             WitnessError: the box holds at the lower or slips at the higher factor.
@@ -132,13 +262,12 @@ class _Run:
         self._shares_squeeze = control == "both"
         self._mujoco, self._model = witness.mujoco, witness.model
         self._data = self._mujoco.MjData(self._model)
-        self._pads = Pads(self._mujoco, self._model, self._data, self._workcell)
+        self._pads = HeldBox(self._mujoco, self._model, self._data, self._workcell)
         names = joint_names(self._workcell)
         self._q = np.array([int(self._model.joint(name).qposadr[0]) for name in names])
         self._v = np.array([int(self._model.joint(name).dofadr[0]) for name in names])
-        box = self._model.joint("box")
-        self._box_q = slice(int(box.qposadr[0]), int(box.qposadr[0]) + 7)
-        self._box_v = slice(int(box.dofadr[0]), int(box.dofadr[0]) + 6)
+        box = int(self._model.joint("box").dofadr[0])
+        self._box_v = slice(box, box + 6)
         split = len(self._workcell.robots[0].torque_max)
         self._arms = (slice(0, split), slice(split, None))
         self._ticks = _Ticks.of(reference, factor, self._settings)
@@ -216,7 +345,7 @@ class _Run:
         displaced = np.mean([real.T_box_pad - told.T_box_pad for real, told in pairs], axis=0)
         position = job.start[:3] - rotation @ displaced[:3, 3]
         standing = np.concatenate([position, quaternion(rotation)])
-        data.qpos[self._box_q] = standing
+        data.qpos[self._pads.pose] = standing
         box = int(self._model.body("box").id)
         data.xfrc_applied[box, :3] = -self._workcell.payload.mass * disturbance
         self._mujoco.mj_forward(self._model, data)
@@ -225,7 +354,7 @@ class _Run:
     def _begin_step(self, time: float) -> None:
         """First half of a step: places and contacts of this very moment."""
         if time < self._reference.job.stands:
-            self._data.qpos[self._box_q] = self._standing
+            self._data.qpos[self._pads.pose] = self._standing
             self._data.qvel[self._box_v] = 0.0
         self._mujoco.mj_step1(self._model, self._data)
         self._pads.mend_contacts()
@@ -250,8 +379,8 @@ class _Run:
                 data.site_xmat[site].reshape(3, 3)[:, 2],
                 float(felt[i]),
             )
-            command = ArmCommand(ticks.effort[k, arm], float(asked[i]))
-            torque[arm] = self._controllers[i].torque(command, state)
+            effort = ticks.effort[k, arm]
+            torque[arm] = self._controllers[i].torque(state, effort, float(asked[i]))
         np.maximum(self._torque_use, np.abs(torque) / self._limit, out=self._torque_use)
         return np.clip(torque, -self._limit, self._limit)
 
@@ -298,3 +427,50 @@ class _Ticks:
             effort=linear(reference.effort + motors + more * reference.press_torque),
             normal_force=factor * linear(reference.normal_force),
         )
+
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Account:
+    """Simulations of one carry.
+
+    Attributes:
+        threshold: the least multiple of the planned forces that holds; None where there is none
+            between `LOW` and `HIGH`.
+        problem: why there is none, '' where there is.
+        reference: what the cell is told in the run that is shown.
+        squeeze: how its forces came about.
+        shown: that run.
+    """
+
+    threshold: Threshold[ArmOutcome] | None
+    problem: str
+    reference: Reference
+    squeeze: Squeeze
+    shown: ArmOutcome
+
+
+def account_of(
+    cell: Cell, carry: Carry, witness: CellWitness, control: Control = "leader", leader: int = 0
+) -> Account:
+    """Simulate a carry at its threshold, and as it would be pressed.
+
+    Args:
+        carry: from rest to rest.
+        witness: of the cell.
+        leader: index of the arm that keeps its place.
+
+    Raises:
+        SettingsError: the carry does not start and end at rest.
+    """
+    reference = carry_reference(cell, carry, leader=leader)
+    threshold, problem = None, ""
+    try:
+        threshold = witness.threshold(reference, control, LOW, HIGH, BISECTIONS)
+    except WitnessError as error:
+        problem = str(error)
+    pressed, squeeze = pressed_reference(cell, carry, leader)
+    shown = witness.simulate(pressed, control)
+    return Account(threshold, problem, pressed, squeeze, shown)

@@ -1,15 +1,29 @@
-"""References of a simulated cell: where its joints have to be, how hard its pads press."""
+"""References of a simulated cell, and the controllers that follow them.
+
+References say where joints have to be, and how hard pads press. Controllers are as a cell has them:
+joint impedance, and force control along the contact normal. All feed the planned torques forward.
+`impedance`: every joint is a spring and a damper about its reference. `leader`: so is the leading
+arm; the other has no stiffness along the normal and an integral control of its normal force
+instead. `both`: both are so, with the mean of their force errors and a weak spring along the normal
+each, since nothing else keeps the box in its place between them.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 import pinocchio as pin
 
-from hybrid_opt.carry import Carry
+from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.cell import Cell
+from hybrid_opt.errors import WitnessError
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
+from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.model import contact_torque
+from hybrid_opt.timing.solve import time_path
+from hybrid_opt.witness.scene import ArmSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Contact, Robot, Workcell
@@ -21,6 +35,9 @@ SETTLE = 0.3
 
 STANDS = 0.1
 """Time of it for which something else still holds the box [s]."""
+
+TOUCHES = 5.0
+"""Reference of a normal force from which on force control has taken over whole [N]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +215,7 @@ def press_torque(workcell: Workcell, q: Array) -> Array:
         for contact in workcell.contacts
     ]
     found = []
-    for i, values in enumerate(_split(workcell, q)):
+    for i, values in enumerate(joints_of(workcell, q)):
         contact, line = workcell.contacts[i], middles[1 - i] - middles[i]
         pushed = line if not workcell.has_opposite_pads else contact.T_box_pad[:3, 2]
         force = contact.T_box_pad[:3, :3].T @ (pushed / (contact.T_box_pad[:3, 2] @ pushed))
@@ -209,7 +226,7 @@ def press_torque(workcell: Workcell, q: Array) -> Array:
 def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
     """(n, all joints) torques that move the bare arms [N m]."""
     found = []
-    parts = [_split(workcell, values) for values in (motion.q, motion.q_rate, motion.q_second)]
+    parts = [joints_of(workcell, values) for values in (motion.q, motion.q_rate, motion.q_second)]
     for robot, *rows in zip(workcell.robots, *parts, strict=True):
         model = build_robot_model(robot).model
         data = model.createData()
@@ -232,11 +249,6 @@ def _press_torque(robot: Robot, contact: Contact, pushed: Array, q: Array) -> Ar
     return torque
 
 
-def _split(workcell: Workcell, values: Array) -> tuple[Array, Array]:
-    first = _counts(workcell)[0]
-    return values[:, :first], values[:, first:]
-
-
 def _counts(workcell: Workcell) -> list[int]:
     return [len(robot.torque_max) for robot in workcell.robots]
 
@@ -244,3 +256,119 @@ def _counts(workcell: Workcell) -> list[int]:
 def _with_rest(values: Array, keep: float) -> Array:
     """Two rows before the others: the first one, times `keep`."""
     return np.concatenate([keep * values[:1], keep * values[:1], values])
+
+
+Control = Literal["impedance", "leader", "both"]
+CONTROLS: tuple[Control, ...] = get_args(Control)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmState:
+    """One arm at one moment.
+
+    Attributes:
+        error, error_rate: (n_joints,) reference less position, and its rate [rad, s].
+        jacobian: (6, n_joints) of the pad, linear velocities first, world axes.
+        normal: (3,) of the pad, into the box.
+        force: normal force, as measured or as both arms share it [N].
+    """
+
+    error: Array
+    error_rate: Array
+    jacobian: Array
+    normal: Array
+    force: float
+
+
+class ArmController:
+    """One arm's controller, which remembers the integral of its force error.
+
+    Attributes:
+        is_force_controlled: whether it controls its force along the normal.
+    """
+
+    def __init__(
+        self,
+        settings: ArmSettings,
+        gains: tuple[Array, Array],
+        is_force_controlled: bool,
+        drift_stiffness: float,
+    ) -> None:
+        """Start with no integral.
+
+        Args:
+            gains: stiffness and damping of the joints [N m/rad, N m s/rad].
+            drift_stiffness: what is left of it along the normal [N/m].
+        """
+        self.is_force_controlled = is_force_controlled
+        self._settings = settings
+        self._stiffness, self._damping = gains
+        self._drift_stiffness = drift_stiffness
+        self._integral = 0.0
+
+    def torque(self, state: ArmState, effort: Array, normal_force: float) -> Array:
+        """(n_joints,) joint torques [N m].
+
+        Args:
+            effort: (n_joints,) to feed forward [N m].
+            normal_force: reference [N].
+        """
+        error, pressed = state.error, 0.0
+        along = state.normal @ state.jacobian[:3]
+        touches = min(1.0, max(0.0, normal_force / TOUCHES))
+        if self.is_force_controlled and touches > 0.0:
+            distance = float(along @ error)
+            missing = normal_force - state.force
+            if touches == 1.0 and state.force > 0.0:
+                gain = self._settings.force_gain * self._settings.control_period
+                self._integral += gain * missing
+            pressed = touches * (self._integral + self._drift_stiffness * distance)
+            # Without the part that moves the pad along its normal.
+            moved = np.concatenate([distance * state.normal, np.zeros(3)])
+            error = error - touches * np.linalg.pinv(state.jacobian) @ moved
+        sprung: Array = self._stiffness * error + self._damping * state.error_rate
+        return effort + sprung + pressed * along
+
+
+def controllers(
+    control: Control,
+    leader: int,
+    settings: ArmSettings,
+    gains: tuple[tuple[Array, Array], tuple[Array, Array]],
+) -> tuple[ArmController, ArmController]:
+    """One controller per arm.
+
+    Args:
+        leader: index of the arm that keeps its place under `leader`.
+        gains: per arm stiffness and damping of its joints [N m/rad, N m s/rad].
+    """
+
+    def one(i: int) -> ArmController:
+        by_force = control == "both" or (control == "leader" and i != leader)
+        drift = settings.drift_stiffness if control == "both" else 0.0
+        return ArmController(settings, gains[i], by_force, drift)
+
+    return one(0), one(1)
+
+
+def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Reference, Squeeze]:
+    """As a job presses: with robust forces where the workcell states what is uncertain, smoothed so
+    that controllers can follow them and never below what is needed."""
+    forces, squeeze = commanded_forces(cell.workcell, carry, SqueezeSettings(leader=leader))
+    return carry_reference(cell, carry, forces[:, 1 - leader], leader), squeeze
+
+
+def driven_carry(cell: Cell, x: Array) -> Carry:
+    """A decision vector's carry from rest to rest: the fastest within its force limit where it has
+    one, else the closest to the reference speeds.
+
+    Raises:
+        WitnessError: there is none.
+    """
+    if cell.workcell.task.time_law == "optimal":
+        timing = time_path(cell.timing_model, x, cell.timing_model.drive_limits(float(x[-1])))
+    else:
+        timing = closest_to_reference_timing(cell.timing_model, x)
+    if not timing.ok or timing.carry is None:
+        raise WitnessError(f"the trajectory cannot be driven: {timing.reason}")
+    return timing.carry

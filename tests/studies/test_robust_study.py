@@ -23,7 +23,7 @@ from hybrid_opt.robust.squeeze import RESERVE
 from hybrid_opt.store.json_records import read_record
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
 from hybrid_opt.timing.document import read_timing
-from hybrid_opt.witness.account import driven_carry
+from hybrid_opt.witness.reference import driven_carry
 from studies import export
 from studies.report.data import gather
 from studies.report.page_data import PageData

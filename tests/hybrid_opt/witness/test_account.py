@@ -12,10 +12,10 @@ pytest.importorskip("mujoco")
 from hybrid_opt.campaign.simulated import MOST_SAMPLES, Whose, stored_simulation
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
-from hybrid_opt.robust.force import RobustModel
+from hybrid_opt.robust.force import RobustModel, soft_model
 from hybrid_opt.robust.squeeze import FACTOR, RESERVE, SqueezeSettings, commanded_forces
-from hybrid_opt.witness.account import Account, driven_carry, pressed_reference
-from hybrid_opt.witness.arms import CellWitness
+from hybrid_opt.witness.arms import Account, CellWitness
+from hybrid_opt.witness.reference import driven_carry, pressed_reference
 from symbolic.array import Array
 from symbolic.records import Uncertainty
 from symbolic.records.task import initial_decision
@@ -39,10 +39,12 @@ def test_forces_beside_what_was_told_are_stored_from_the_carrys_beginning() -> N
     """One short run of the whole cell, pressed as recommended where nothing is uncertain."""
     cell, x = made()
     carry = driven_carry(cell, x)
-    pressed = pressed_reference(cell, carry)
-    assert pressed.squeeze.factor == FACTOR
-    shown = CellWitness(cell.workcell).simulate(pressed.reference, "leader")
-    found = stored_simulation(Account(None, "none", pressed, shown), Whose("a", "b", "leader"))
+    pressed, squeeze = pressed_reference(cell, carry)
+    assert squeeze.factor == FACTOR
+    shown = CellWitness(cell.workcell).simulate(pressed, "leader")
+    found = stored_simulation(
+        Account(None, "none", pressed, squeeze, shown), Whose("a", "b", "leader")
+    )
     assert found.arrives
     assert found.duration == pytest.approx(carry.duration)
     assert 0.0 <= found.time[0] < 0.02
@@ -61,9 +63,12 @@ def test_an_uncertain_cell_is_pressed_with_its_robust_forces() -> None:
     unsure = replace(cell.workcell, uncertainty=Uncertainty(friction=0.1))
     other = Cell(unsure)
     other.compiled = cell.compiled  # which knows nothing of what is uncertain
-    pressed = pressed_reference(other, carry)
-    needed = (1.0 + RESERVE) * RobustModel(unsure).robust_force(carry).commanded
-    assert pressed.squeeze.factor is None
-    told = pressed.reference.normal_force[2:, 1]
+    pressed, squeeze = pressed_reference(other, carry)
+    needed = np.maximum(
+        (1.0 + RESERVE) * RobustModel(unsure).robust_force(carry).commanded,
+        soft_model(unsure).hold(carry, unsure.uncertainty)[0],
+    )
+    assert squeeze.factor is None
+    told = pressed.normal_force[2:, 1]
     assert (told >= needed - 1e-6).all()
     assert told.max() == pytest.approx(needed.max(), rel=1e-6)

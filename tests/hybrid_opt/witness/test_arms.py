@@ -18,11 +18,11 @@ from hybrid_opt.robust.cases import nominal_case
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.arms import CellWitness
-from hybrid_opt.witness.cases import workcell_of_case
-from hybrid_opt.witness.cell_scene import ArmSettings, joint_names
-from hybrid_opt.witness.controller import CONTROLS, Control
+from hybrid_opt.witness.box import workcell_of_case
 from hybrid_opt.witness.reference import (
+    CONTROLS,
     BoxJob,
+    Control,
     JointMotion,
     Reference,
     carry_reference,
@@ -30,6 +30,7 @@ from hybrid_opt.witness.reference import (
     press_torque,
     with_tracking_error,
 )
+from hybrid_opt.witness.scene import ArmSettings, joint_names
 from studies.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.errors import SettingsError

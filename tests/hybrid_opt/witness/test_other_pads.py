@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_opt.witness.drive import Drive
+from hybrid_opt.witness.box import Drive, Witness
 from hybrid_opt.witness.scene import (
     SimulationSettings,
     pressed_places,
@@ -15,7 +15,6 @@ from hybrid_opt.witness.scene import (
     rim,
     tilt_centre,
 )
-from hybrid_opt.witness.simulate import Witness
 from symbolic.contact.load import load_function
 from symbolic.read.cell import load
 from symbolic.records import Workcell

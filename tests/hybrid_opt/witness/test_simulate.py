@@ -14,10 +14,14 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.cases import nominal_case
 from hybrid_opt.robust.force import soft_model
-from hybrid_opt.witness.cases import witness_of_case, workcell_of_case
-from hybrid_opt.witness.drive import PlannedMoments, drive_of
+from hybrid_opt.witness.box import (
+    PlannedMoments,
+    Witness,
+    drive_of,
+    witness_of_case,
+    workcell_of_case,
+)
 from hybrid_opt.witness.scene import SimulationSettings
-from hybrid_opt.witness.simulate import Witness
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.witness.carries import carry_along, least_forces
