@@ -4,8 +4,8 @@
 `time_path` makes a `Timing` of it, `recommend` says which to run, `plan_job` plans the whole job
 around that, and `export` writes it for robots. `propose` makes the file of a cell that has no carry
 yet. Rooms, in the order of the data: evaluate, collision, proposing, metaheuristics, indicators,
-polishing, timing, robust, recommending, job, store; work and campaign carry out whole studies;
-display is how objects look in a notebook.
+polishing, timing, robust, recommending, job, bundles, store; work and campaign carry out whole
+studies; display is how objects look in a notebook.
 
 Names are imported when they are first used, so that `import hybrid_opt` takes no time.
 """

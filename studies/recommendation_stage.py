@@ -39,8 +39,8 @@ from hybrid_opt.robust.force import robust_model, robust_price
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
-from hybrid_opt.work.job import Emit, Executor, Job, SerialExecutor, answer_all
 from hybrid_opt.work.processes import ProcessExecutor
+from hybrid_opt.work.service import Emit, Executor, SerialExecutor, Service, answer_all
 from studies.drivable import (
     DrivableFronts,
     drivable_fronts,
@@ -59,7 +59,9 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
         request = _Request(folder.root, wish, folder.execution.jobs, progress)
-        (found,) = answer_all(_executor(folder.execution), Job(_nothing, _recommended), [request])
+        (found,) = answer_all(
+            _executor(folder.execution), Service(_nothing, _recommended), [request]
+        )
         none = isinstance(found, NoRecommendation)
         written, other = (NO_RECOMMENDATION, RECOMMENDATION)[:: 1 if none else -1]
         # Also after an earlier attempt that was interrupted.

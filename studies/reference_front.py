@@ -28,8 +28,8 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
-from hybrid_opt.work.job import Emit, Job, answer_all
 from hybrid_opt.work.processes import local_executor
+from hybrid_opt.work.service import Emit, Service, answer_all
 from studies.options import seed, whole
 from studies.program import Parser, add_verbose, carried_out, load_workcell, run_program
 from symbolic import outside
@@ -100,22 +100,22 @@ def compute_reference_front(
     executor = local_executor(jobs)
     parts = answer_all(
         executor,
-        _polish_job(cell, ATTEMPTS, FillSettings(attempts=0)),
+        _polish_service(cell, ATTEMPTS, FillSettings(attempts=0)),
         list(zip([start[None] for start in begins], rng.spawn(len(begins)), strict=True)),
         lambda: tell(f"start {next(count)} of {len(begins)}"),
     )
     union = np.concatenate([part.x for part in parts])
-    (front,) = answer_all(executor, _polish_job(cell, attempts, FillSettings()), [(union, rng)])
+    (front,) = answer_all(executor, _polish_service(cell, attempts, FillSettings()), [(union, rng)])
     tell(f"reference front: {len(front.x)} points")
     return ReferenceFront(evaluator.workcell.digest, front.objectives, front.x)
 
 
-def _polish_job(
+def _polish_service(
     cell: PackedCell, attempts: int, fill: FillSettings
-) -> Job[Polisher, tuple[Array, np.random.Generator], PolishedFront]:
+) -> Service[Polisher, tuple[Array, np.random.Generator], PolishedFront]:
     settings = PolishSettings(attempts=attempts, rounds=ROUNDS, fill=fill)
     source = PolisherSource(cell, PAPER_OBJECTIVES, settings)
-    return Job(source, _polished)
+    return Service(source, _polished)
 
 
 def _polished(

@@ -30,7 +30,7 @@ from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.witness.arms import CellWitness, account_of
 from hybrid_opt.witness.reference import Control, driven_carry
-from hybrid_opt.work.job import Emit, Job, ListLedger
+from hybrid_opt.work.service import Emit, ListLedger, Service
 from studies.terminal_summary import title
 from symbolic.errors import SettingsError
 
@@ -71,7 +71,7 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
         for _ in range(len(wanted) - len(left)):
             advance(1)
         ledger = Written(left, folder.root, lambda: advance(1))
-        executor_for(folder.execution).run(Job(_nothing, _simulated), ledger)
+        executor_for(folder.execution).run(Service(_nothing, _simulated), ledger)
 
 
 class Written(ListLedger[Simulated, StoredSimulation]):

@@ -14,7 +14,7 @@ from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingModel, timed_trajectory
 from hybrid_opt.timing.document import TimingDocument, timing_document
-from hybrid_opt.work.job import Emit, Job, answer_all
+from hybrid_opt.work.service import Emit, Service, answer_all
 from symbolic.array import Array
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
@@ -46,11 +46,13 @@ def _run(folder: CampaignFolder, progress: Progress, force_limit: float | None, 
             path for path in files if f"{path.parent}{POLISHED_SUFFIX}/{path.name}" not in known
         ]
     found = {file: read_trajectory(selected / file).x for file in files}
-    job = Job(TimingModelSource(PackedCell.of(folder.files), folder.settings.objectives), _document)
+    service = Service(
+        TimingModelSource(PackedCell.of(folder.files), folder.settings.objectives), _document
+    )
     requests = [(x, force_limit) for x in found.values()]
     with progress.stage(TIMING, len(requests), "trajectories") as advance:
         executor = executor_for(folder.execution)
-        documents = answer_all(executor, job, requests, lambda: advance(1))
+        documents = answer_all(executor, service, requests, lambda: advance(1))
     for file, document in zip(found, documents, strict=True):
         write_json(folder.root / TIMING / file, to_json(document))
 

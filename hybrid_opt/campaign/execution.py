@@ -9,8 +9,8 @@ from typing import Literal, get_args
 from hybrid_opt.campaign.identity import environment
 from hybrid_opt.campaign.settings import require_whole
 from hybrid_opt.work.dask_cluster import DaskExecutor
-from hybrid_opt.work.job import Executor
 from hybrid_opt.work.processes import local_executor
+from hybrid_opt.work.service import Executor
 from symbolic.errors import SettingsError
 
 ExecutorName = Literal["processes", "dask"]

@@ -43,7 +43,7 @@ from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.solvers.base import MOST_SECONDS
 from hybrid_opt.store.files import read_bytes, write_json
 from hybrid_opt.store.json_records import record_of, to_json
-from hybrid_opt.work.job import Job, give_up
+from hybrid_opt.work.service import Service, give_up
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError
@@ -229,7 +229,7 @@ class PolishLedger:
     ) -> None:
         self._folder, self._settings = folder, settings
         cell = PackedCell.of(folder.files)
-        self._job = Job(
+        self._service = Service(
             PolisherSource(cell, folder.settings.objectives, settings),
             polish_replica,
             patience=MOST_SECONDS + JUDGING_SECONDS,
@@ -250,10 +250,10 @@ class PolishLedger:
         try:
             if self._open:
                 # Compiles what is missing here, once, instead of in every worker.
-                self._job.make_context()
+                self._service.make_context()
             done = self._all - len(self._open)
             with progress.stage("polish", self._all, "fronts", done) as self._advance:
-                executor_for(self._folder.execution).run(self._job, self)
+                executor_for(self._folder.execution).run(self._service, self)
         finally:
             self.close()
 
@@ -279,7 +279,7 @@ class PolishLedger:
         return len(self._open)
 
     def request(self, index: int) -> PolishRequest:
-        """See `hybrid_opt.work.job.Ledger`."""
+        """See `hybrid_opt.work.service.Ledger`."""
         replica = self._open[index]
         return PolishRequest(
             self._folder.settings,
@@ -291,7 +291,7 @@ class PolishLedger:
         )
 
     def heard(self, index: int, message: bytes) -> None:
-        """See `hybrid_opt.work.job.Ledger`."""
+        """See `hybrid_opt.work.service.Ledger`."""
         self._journal(index).append(message)
 
     def lost(self, index: int, reason: str) -> None:
@@ -303,7 +303,7 @@ class PolishLedger:
         journal.append(_block_of(Lost(reason)))
 
     def answered(self, index: int, answer: PolishedFront) -> None:
-        """See `hybrid_opt.work.job.Ledger`."""
+        """See `hybrid_opt.work.service.Ledger`."""
         write_json(self._marker(self._open[index]), to_json(polish_document(answer)))
         self._journals.pop(index).discard()
         self._advance(1)

@@ -24,7 +24,7 @@ from hybrid_opt.campaign.stages import Stage
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.store.files import read_bytes, sha256, write_atomically, write_json
 from hybrid_opt.store.json_records import read_record, to_json
-from hybrid_opt.work.job import Executor, Job, give_up
+from hybrid_opt.work.service import Executor, Service, give_up
 from symbolic.records.task import initial_decision
 
 ANEW = "--resume computes it anew"
@@ -83,7 +83,7 @@ class _Search:
 
     def __init__(self, folder: CampaignFolder, source: EvaluatorSource) -> None:
         self._folder = folder
-        self._job = Job(source, run_replica)
+        self._service = Service(source, run_replica)
         self._identity = identity(folder.settings, folder.root, folder.workcell)
         every = _replicas(folder)
         self._open = [key for key in every if not is_whole(folder.root, *key)]
@@ -98,9 +98,9 @@ class _Search:
         try:
             if self._open:
                 # Compiles what is missing here, once, instead of in every worker.
-                self._job.make_context()
+                self._service.make_context()
             with progress.stage("search", total, "evaluations", recorded) as self._advance:
-                executor.run(self._job, self)
+                executor.run(self._service, self)
         finally:
             for journal in self._journals.values():
                 journal.close()
@@ -128,7 +128,7 @@ class _Search:
         return len(self._open)
 
     def request(self, index: int) -> ReplicaRequest:
-        """See `hybrid_opt.work.job.Ledger`."""
+        """See `hybrid_opt.work.service.Ledger`."""
         journal = self._journal(index)
         initial = initial_decision(self._folder.workcell.task)
         algorithm, replica = self._open[index]
@@ -137,16 +137,16 @@ class _Search:
         )
 
     def heard(self, index: int, message: bytes) -> None:
-        """See `hybrid_opt.work.job.Ledger`."""
+        """See `hybrid_opt.work.service.Ledger`."""
         self._journal(index).append(message)
         self._advance(candidates_in(message))
 
     def lost(self, index: int, reason: str) -> None:
-        """See `hybrid_opt.work.job.Ledger`."""
+        """See `hybrid_opt.work.service.Ledger`."""
         give_up(reason)
 
     def answered(self, index: int, answer: ReplicaOutcome) -> None:
-        """See `hybrid_opt.work.job.Ledger`."""
+        """See `hybrid_opt.work.service.Ledger`."""
         algorithm, replica = self._open[index]
         folder = replica_folder(self._folder.root, algorithm, replica)
         files = {EVALUATIONS: answer.evaluations, FRONT: answer.front}

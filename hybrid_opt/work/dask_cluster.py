@@ -21,15 +21,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from hybrid_opt.errors import WorkerError
-from hybrid_opt.work.job import (
+from hybrid_opt.work.service import (
     KILLED,
     MAX_DEATHS,
     SILENT,
     Answer,
     Context,
-    Job,
     Ledger,
     Request,
+    Service,
     attempt,
 )
 from symbolic.errors import SettingsError
@@ -68,8 +68,10 @@ class DaskExecutor:
         self.environment = dict(environment)
         self.probe = probe
 
-    def run(self, job: Job[Context, Request, Answer], ledger: Ledger[Request, Answer]) -> None:
-        """See `hybrid_opt.work.job.Executor`.
+    def run(
+        self, service: Service[Context, Request, Answer], ledger: Ledger[Request, Answer]
+    ) -> None:
+        """See `hybrid_opt.work.service.Executor`.
 
         Raises:
             SettingsError: Dask is not installed, or no scheduler or worker answers.
@@ -94,7 +96,7 @@ class DaskExecutor:
                 client.wait_for_workers(1, timeout=CONNECT_SECONDS)
             except TimeoutError as error:
                 raise SettingsError(f"the scheduler at {self.address} has no workers") from error
-            _Session(self, client, job, ledger).run()
+            _Session(self, client, service, ledger).run()
 
 
 def _require_address(address: str) -> None:
@@ -145,12 +147,21 @@ class _Order:
 
 
 class _Session:
-    """One job on the cluster. Every order has a number, so that news of cancelled ones is known."""
+    """One run on the cluster. Every order has a number, so that news of cancelled ones is known."""
 
     def __init__(
-        self, executor: DaskExecutor, client: Any, job: Job[Any, Any, Any], ledger: Ledger[Any, Any]
+        self,
+        executor: DaskExecutor,
+        client: Any,
+        service: Service[Any, Any, Any],
+        ledger: Ledger[Any, Any],
     ) -> None:
-        self._executor, self._client, self._job, self._ledger = executor, client, job, ledger
+        self._executor, self._client, self._service, self._ledger = (
+            executor,
+            client,
+            service,
+            ledger,
+        )
         self._topic = f"dual-arm-carry-{uuid.uuid4().hex}"
         self._news: queue.SimpleQueue[tuple[int, int, Any]] = queue.SimpleQueue()
         self._numbers = itertools.count()
@@ -159,7 +170,7 @@ class _Session:
         self._connected = time.monotonic()
         # Goes along with every request: shared data would be lost with the worker that holds it,
         # and would draw the requests to one worker, to be blamed for one another's deaths.
-        self._pickled = pickle.dumps(job)
+        self._pickled = pickle.dumps(service)
 
     def run(self) -> None:
         self._client.subscribe_topic(self._topic, lambda event: self._news.put(tuple(event[1])))
@@ -246,11 +257,11 @@ class _Session:
 
     def _be_patient(self, passed: float) -> None:
         """Count silence [s]; those who exceed the patience lose their worker."""
-        if self._job.patience is None:
+        if self._service.patience is None:
             return
         for number, order in list(self._orders.items()):
             order.silence += passed if order.worker else 0.0
-            if order.silence > self._job.patience:
+            if order.silence > self._service.patience:
                 del self._orders[number]
                 self._client.cancel([order.future])
                 self._client.run(_end, workers=[order.worker], wait=False, on_error="ignore")
@@ -282,10 +293,10 @@ def _work(pickled: bytes, request: Any, to: _Return) -> Any:
     def answer() -> Any:
         _check_environment(to.probe(), to.environment, address)
         # Per thread: a context may hold what only one thread at a time can use.
-        if getattr(_contexts, "job", None) != pickled:
+        if getattr(_contexts, "service", None) != pickled:
             _contexts.made = pickle.loads(pickled)
             _contexts.context = _contexts.made.make_context()
-            _contexts.job = pickled
+            _contexts.service = pickled
         send(address)
         return _contexts.made.answer(_contexts.context, request, send)
 

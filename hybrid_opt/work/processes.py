@@ -23,7 +23,7 @@ from threading import Thread
 from typing import Any
 
 from codegen.function import available_cores
-from hybrid_opt.work.job import (
+from hybrid_opt.work.service import (
     KILLED,
     MAX_DEATHS,
     SILENT,
@@ -31,10 +31,10 @@ from hybrid_opt.work.job import (
     Attempted,
     Context,
     Executor,
-    Job,
     Ledger,
     Request,
     SerialExecutor,
+    Service,
     attempt,
 )
 
@@ -63,12 +63,14 @@ class LocalExecutor:
     def __init__(self, jobs: int) -> None:
         self.jobs = jobs
 
-    def run(self, job: Job[Context, Request, Answer], ledger: Ledger[Request, Answer]) -> None:
-        """See `hybrid_opt.work.job.Executor`."""
+    def run(
+        self, service: Service[Context, Request, Answer], ledger: Ledger[Request, Answer]
+    ) -> None:
+        """See `hybrid_opt.work.service.Executor`."""
         count = min(self.jobs, len(ledger))
-        alone = count <= 1 and job.patience is None
+        alone = count <= 1 and service.patience is None
         executor: Executor = SerialExecutor() if alone else ProcessExecutor(count)
-        executor.run(job, ledger)
+        executor.run(service, ledger)
 
 
 class ProcessExecutor:
@@ -77,9 +79,11 @@ class ProcessExecutor:
     def __init__(self, jobs: int) -> None:
         self.jobs = jobs
 
-    def run(self, job: Job[Context, Request, Answer], ledger: Ledger[Request, Answer]) -> None:
-        """See `hybrid_opt.work.job.Executor`."""
-        workforce = _Workforce(job, ledger, self.jobs)
+    def run(
+        self, service: Service[Context, Request, Answer], ledger: Ledger[Request, Answer]
+    ) -> None:
+        """See `hybrid_opt.work.service.Executor`."""
+        workforce = _Workforce(service, ledger, self.jobs)
         try:
             workforce.run()
         finally:
@@ -89,8 +93,10 @@ class ProcessExecutor:
 class _Workforce:
     """The workers of one run."""
 
-    def __init__(self, job: Job[Any, Any, Any], ledger: Ledger[Any, Any], jobs: int) -> None:
-        self._job, self._ledger, self._jobs = job, ledger, jobs
+    def __init__(
+        self, service: Service[Any, Any, Any], ledger: Ledger[Any, Any], jobs: int
+    ) -> None:
+        self._service, self._ledger, self._jobs = service, ledger, jobs
         self._waiting = deque(range(len(ledger)))
         self._deaths: Counter[int] = Counter()
         self._workers: list[_Worker] = []
@@ -115,13 +121,13 @@ class _Workforce:
         return [worker for worker in self._workers if worker.index is not None]
 
     def _tick(self) -> float | None:
-        return None if self._job.patience is None else min(_TICK, self._job.patience)
+        return None if self._service.patience is None else min(_TICK, self._service.patience)
 
     def _give_out(self) -> None:
         while self._waiting and len(self._workers) < self._jobs:
             if len(self._busy()) < len(self._workers):
                 break
-            worker = _Worker(self._job)
+            worker = _Worker(self._service)
             self._workers.append(worker)
             self._give(worker)
         for worker in self._workers:
@@ -151,10 +157,10 @@ class _Workforce:
             self._ledger.heard(index, word)
 
     def _be_patient(self, worker: _Worker, passed: float) -> None:
-        if self._job.patience is None or not worker.working:
+        if self._service.patience is None or not worker.working:
             return
         worker.silence += passed
-        if worker.silence > self._job.patience:
+        if worker.silence > self._service.patience:
             index = self._dismiss(worker)
             assert index is not None
             self._ledger.lost(index, SILENT)
@@ -187,13 +193,13 @@ class _Worker:
         silence: seconds since it was heard.
     """
 
-    def __init__(self, job: Job[Any, Any, Any]) -> None:
+    def __init__(self, service: Service[Any, Any, Any]) -> None:
         self.connection, theirs = _server.Pipe()
         self.index: int | None = None
         self.working = False
         self.silence = 0.0
         self._process = _server.Process(
-            target=_serve, args=(theirs, job), name="worker", daemon=True
+            target=_serve, args=(theirs, service), name="worker", daemon=True
         )
         with _shielded():
             self._process.start()
@@ -230,15 +236,15 @@ def _shielded() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(connection: Connection, job: Job[Any, Any, Any]) -> None:
+def _serve(connection: Connection, service: Service[Any, Any, Any]) -> None:
     """A worker's life: ends with its pipe, that is at the latest with the parent."""
     Thread(target=_end_with_parent, daemon=True).start()
-    context = cache(job.make_context)
+    context = cache(service.make_context)
 
     def answer(request: Any) -> Any:
         held = context()
         connection.send(None)
-        return job.answer(held, request, connection.send)
+        return service.answer(held, request, connection.send)
 
     with suppress(EOFError, OSError):
         while True:

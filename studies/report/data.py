@@ -23,7 +23,7 @@ from hybrid_opt.job.plan import JobModel
 from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.timing import TimingLimits, timed_trajectory
 from hybrid_opt.timing.robustness import payload_sensitivity
-from hybrid_opt.work.job import Emit, Executor, Job, SerialExecutor, answer_all
+from hybrid_opt.work.service import Emit, Executor, SerialExecutor, Service, answer_all
 from studies.report.data_drivable import gather_drivable
 from studies.report.jobs import (
     RECOMMENDED_LABEL,
@@ -80,8 +80,8 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     requests = _job_requests(carries, drivable, results.cell)
     slow += [partial(_job, request) for request in requests]
     files = collect_cell(workcell)
-    job = Job(JobModelSource(PackedCell.of(files), results.objectives), _called)
-    reach, *found = answer_all(executor or SerialExecutor(), job, slow)
+    service = Service(JobModelSource(PackedCell.of(files), results.objectives), _called)
+    reach, *found = answer_all(executor or SerialExecutor(), service, slow)
     timings, jobs = found[: len(carries)], found[len(carries) :]
     return ReportData(
         root=results.root,

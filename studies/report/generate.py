@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hybrid_opt.store.files import write_atomically
-from hybrid_opt.work.job import Emit, Executor, Job, SerialExecutor, answer_all
+from hybrid_opt.work.service import Emit, Executor, SerialExecutor, Service, answer_all
 from studies.report.page import render_page
 from studies.report.page_data import PageData
 from studies.report.pictures import ReportPicture, report_pictures
@@ -43,8 +43,8 @@ def write_report(
         ReportError: the page cannot be made.
     """
     listed = list(report_pictures(data))
-    job = Job(DrawingBoard(data, pdf), _drawn)
-    drawn = answer_all(executor or SerialExecutor(), job, range(len(listed)), done)
+    service = Service(DrawingBoard(data, pdf), _drawn)
+    drawn = answer_all(executor or SerialExecutor(), service, range(len(listed)), done)
     pictures = []
     for picture, files in zip(listed, drawn, strict=True):
         for suffix, content in files.items():

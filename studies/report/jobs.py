@@ -14,7 +14,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase, contact_effort
 from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, time_path
-from hybrid_opt.work.job import Emit
+from hybrid_opt.work.service import Emit
 from symbolic.array import Array
 from symbolic.errors import DualArmError
 from symbolic.records import Workcell

@@ -19,7 +19,7 @@ from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.timing import drivable_timing, time_path
 from hybrid_opt.timing.jerk import drive_with_jerk
-from hybrid_opt.work.job import Emit
+from hybrid_opt.work.service import Emit
 from studies.report.jobs import DrawnJob, JobRequest, drawn
 from symbolic.array import Array
 from symbolic.records import Workcell

@@ -10,7 +10,7 @@ import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.display.scene import packed, scene_data
-from hybrid_opt.work.job import Executor, Job, SerialExecutor, answer_all
+from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all
 from studies.drivable import is_drivable
 from studies.report.page_carries import (
     PageCarriesSource,
@@ -96,7 +96,7 @@ class PageData:
             tuple((PackedCell.of(files), objectives) for files, objectives in self._cells)
         )
         shown = [one for group in groups for one in group.shown]
-        self._trajectories = answer_all(executor, Job(source, page_trajectory), shown)
+        self._trajectories = answer_all(executor, Service(source, page_trajectory), shown)
         numbers = iter(range(len(shown)))
         return [(group, list(islice(numbers, len(group.shown)))) for group in groups]
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
-from hybrid_opt.work.job import Executor
 from hybrid_opt.work.processes import local_executor
+from hybrid_opt.work.service import Executor
 
 # Drawing libraries are heavy: they are imported when something is drawn.
 

@@ -14,7 +14,7 @@ from hybrid_opt.campaign.simulated import StoredSimulation, Whose, not_simulated
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
-from hybrid_opt.work.job import Job, SerialExecutor
+from hybrid_opt.work.service import SerialExecutor, Service
 from studies import run
 from studies.simulation_stage import Simulated, Written, is_done, wanted_carries
 from studies.simulation_text import simulation_text
@@ -32,7 +32,7 @@ def test_every_answer_is_kept_and_not_asked_for_again(own_study: Path) -> None:
     assert not any(is_done(own_study, one) for one in wanted)
     told: list[int] = []
     ledger = Written(wanted[:3], own_study, lambda: told.append(1))
-    SerialExecutor().run(Job(lambda: None, same), ledger)
+    SerialExecutor().run(Service(lambda: None, same), ledger)
     assert len(told) == 3
     assert [is_done(own_study, one) for one in wanted] == [True, True, True, False]
     changed = replace(wanted[0], digest="another trajectory")

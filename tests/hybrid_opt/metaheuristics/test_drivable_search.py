@@ -13,8 +13,8 @@ from hybrid_opt.campaign.evaluations_file import decode
 from hybrid_opt.campaign.replica import CellEvaluatorSource, ReplicaRequest, run_replica
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
-from hybrid_opt.work.job import Job, answer_all
 from hybrid_opt.work.processes import ProcessExecutor
+from hybrid_opt.work.service import Service, answer_all
 from symbolic.read.cell_files import collect_cell
 from tests.symbolic.read.samples import RACK
 
@@ -47,7 +47,7 @@ def test_a_worker_elsewhere_searches_without_the_cells_files(
     settings = CampaignSettings(("random",), EVALUATIONS, 1, objectives=DRIVABLE_OBJECTIVES)
     request = ReplicaRequest(settings, "random", 0, cell.initial)
     monkeypatch.chdir(tmp_path)
-    (answer,) = answer_all(ProcessExecutor(1), Job(source, run_replica), [request])
+    (answer,) = answer_all(ProcessExecutor(1), Service(source, run_replica), [request])
     found = decode(answer.evaluations, tmp_path).evaluations
     assert len(found.x) == EVALUATIONS
     expected = cell.evaluate(found.x)

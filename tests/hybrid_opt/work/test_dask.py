@@ -14,10 +14,10 @@ import pytest
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.errors import WorkerError
 from hybrid_opt.work.dask_cluster import DaskExecutor
-from hybrid_opt.work.job import KILLED, SILENT, Job, SerialExecutor
+from hybrid_opt.work.service import KILLED, SILENT, SerialExecutor, Service
 from symbolic.errors import DualArmError, SettingsError
 from tests.hybrid_opt.campaign.fake import FakeSource, files_of, logged, run_search
-from tests.hybrid_opt.work import jobs
+from tests.hybrid_opt.work import services
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
@@ -79,7 +79,7 @@ def executor(cluster: Any, environment: dict[str, str] | None = None) -> DaskExe
 
 
 def test_messages_come_in_order_and_once(cluster: Any) -> None:
-    found = jobs.run(executor(cluster), jobs.echo, [0, 1, 2, 3, 4])
+    found = services.run(executor(cluster), services.echo, [0, 1, 2, 3, 4])
     assert [answer[0] for answer in found.answers] == [0, 1, 2, 3, 4]
     # Answers may overtake messages, which then no longer matter; what comes is in order.
     for messages in found.messages.values():
@@ -87,33 +87,35 @@ def test_messages_come_in_order_and_once(cluster: Any) -> None:
 
 
 def test_the_cluster_changes_no_bit(cluster: Any) -> None:
-    here = jobs.run(SerialExecutor(), jobs.numbers, [1, 2, 3])
-    assert jobs.run(executor(cluster), jobs.numbers, [1, 2, 3]).answers == here.answers
+    here = services.run(SerialExecutor(), services.numbers, [1, 2, 3])
+    assert services.run(executor(cluster), services.numbers, [1, 2, 3]).answers == here.answers
 
 
 def test_errors_arrive_as_they_are(cluster: Any) -> None:
     with pytest.raises(RuntimeError, match="OSError: a file of the request's own"):
-        jobs.run(executor(cluster), jobs.mistake, [1])
+        services.run(executor(cluster), services.mistake, [1])
     with pytest.raises(DualArmError, match="this cannot be done"):
-        jobs.run(executor(cluster), jobs.misuse, [1])
+        services.run(executor(cluster), services.misuse, [1])
 
 
 def test_a_hung_request_is_given_up_and_no_other(cluster: Any) -> None:
-    found = jobs.run(executor(cluster), jobs.moody, ["hang", "a"], patience=2.0, instead="instead")
+    found = services.run(
+        executor(cluster), services.moody, ["hang", "a"], patience=2.0, instead="instead"
+    )
     assert found.answers == ["instead", "a"]
     assert found.losses == [(0, SILENT)]
 
 
 def test_a_request_that_kills_its_workers_is_lost(cluster: Any) -> None:
     # Alone: Dask blames all that waits on a worker for its death.
-    found = jobs.run(executor(cluster), jobs.moody, ["die"], instead="instead")
+    found = services.run(executor(cluster), services.moody, ["die"], instead="instead")
     assert found.answers == ["instead"]
     assert found.losses == [(0, KILLED)]
 
 
 def test_workers_with_other_software_are_refused(cluster: Any) -> None:
     with pytest.raises(DualArmError, match=r"worker tcp.* has numpy .*, this campaign 1\.0"):
-        jobs.run(executor(cluster, {"numpy": "1.0"}), jobs.echo, [1])
+        services.run(executor(cluster, {"numpy": "1.0"}), services.echo, [1])
 
 
 def test_a_lost_scheduler_is_told(
@@ -126,7 +128,7 @@ def test_a_lost_scheduler_is_told(
         end = threading.Timer(3.0, own.close)
         end.start()
         with pytest.raises(WorkerError, match=r"scheduler at tcp.* not answer any more; .*--re"):
-            jobs.run(executor(own), jobs.moody, ["hang"])
+            services.run(executor(own), services.moody, ["hang"])
         end.join()
     assert "Traceback" not in capfd.readouterr().err
 
@@ -138,7 +140,7 @@ def test_a_lost_scheduler_is_told(
 def test_other_addresses_are_refused(address: str) -> None:
     nowhere = DaskExecutor(address, machine(), machine)
     with pytest.raises(SettingsError, match="is no address of a Dask scheduler") as caught:
-        nowhere.run(Job(jobs.context, jobs.echo), jobs.Kept([1]))
+        nowhere.run(Service(services.context, services.echo), services.Kept([1]))
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 600
 
@@ -147,4 +149,4 @@ def test_no_scheduler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hybrid_opt.work.dask_cluster.CONNECT_SECONDS", 0.5)
     nobody = DaskExecutor("tcp://127.0.0.1:9", machine(), machine)
     with pytest.raises(SettingsError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9"):
-        nobody.run(Job(jobs.context, jobs.echo), jobs.Kept([1]))
+        nobody.run(Service(services.context, services.echo), services.Kept([1]))

@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from hybrid_opt.errors import WorkerError
-from hybrid_opt.work.job import KILLED, MAX_DEATHS, SILENT, Job, answer_all
 from hybrid_opt.work.processes import LocalExecutor, ProcessExecutor, local_executor
+from hybrid_opt.work.service import KILLED, MAX_DEATHS, SILENT, Service, answer_all
 from tests.fuzz.promises import soon
-from tests.hybrid_opt.work import jobs
-from tests.hybrid_opt.work.jobs import Kept, run
+from tests.hybrid_opt.work import services
+from tests.hybrid_opt.work.services import Kept, run
 
 ROOT = Path(__file__).parents[3]
 
@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[3]
 def test_a_killed_worker_is_replaced_and_its_request_repeated(tmp_path: Path) -> None:
     requests = [tmp_path / "a", tmp_path / "b"]
     requests[1].touch()
-    found = run(ProcessExecutor(2), jobs.killed_once, requests)
+    found = run(ProcessExecutor(2), services.killed_once, requests)
     assert found.answers == ["alive", "alive"]
     assert found.messages == {0: [b"begun", b"begun"], 1: [b"begun"]}
     assert found.losses == []
@@ -38,51 +38,51 @@ def test_deaths_with_progress_in_between_lose_nothing() -> None:
             return len(self.messages[index])
 
     ledger = Progressing([None])
-    ProcessExecutor(1).run(Job(jobs.context, jobs.killed_step_by_step), ledger)
+    ProcessExecutor(1).run(Service(services.context, services.killed_step_by_step), ledger)
     assert ledger.answers == [5] > [MAX_DEATHS]
     assert ledger.losses == []
 
 
 def test_a_request_that_kills_its_workers_is_lost_and_no_other() -> None:
-    found = run(ProcessExecutor(2), jobs.moody, ["a", "die", "b", "c"], instead="instead")
+    found = run(ProcessExecutor(2), services.moody, ["a", "die", "b", "c"], instead="instead")
     assert found.answers == ["a", "instead", "b", "c"]
     assert found.losses == [(1, KILLED)]
     with pytest.raises(WorkerError, match="died 3 times"):
-        answer_all(ProcessExecutor(2), Job(jobs.context, jobs.moody), ["die", "a"])
+        answer_all(ProcessExecutor(2), Service(services.context, services.moody), ["die", "a"])
 
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_hung_request_is_given_up_and_no_other(processes: int) -> None:
     executor = LocalExecutor(processes)
     with soon():
-        found = run(executor, jobs.moody, ["hang", "a"], patience=0.3, instead="instead")
+        found = run(executor, services.moody, ["hang", "a"], patience=0.3, instead="instead")
     assert found.answers == ["instead", "a"]
     assert found.losses == [(0, SILENT)]
 
 
 def test_only_what_must_be_given_up_needs_a_process_of_its_own() -> None:
-    assert run(LocalExecutor(1), jobs.process, [1, 2]).answers == [os.getpid()] * 2
-    assert run(LocalExecutor(8), jobs.process, [1]).answers == [os.getpid()]
-    assert os.getpid() not in run(LocalExecutor(1), jobs.process, [1], patience=60.0).answers
+    assert run(LocalExecutor(1), services.process, [1, 2]).answers == [os.getpid()] * 2
+    assert run(LocalExecutor(8), services.process, [1]).answers == [os.getpid()]
+    assert os.getpid() not in run(LocalExecutor(1), services.process, [1], patience=60.0).answers
     assert isinstance(local_executor(3), LocalExecutor)
     assert local_executor(0).jobs >= 1  # type: ignore[attr-defined]
 
 
 def test_no_worker_is_left_behind() -> None:
-    run(ProcessExecutor(2), jobs.echo, [1, 2, 3])
+    run(ProcessExecutor(2), services.echo, [1, 2, 3])
     assert not [child for child in multiprocessing.active_children() if child.name == "worker"]
 
 
 PROGRAM = """
 import sys, time
-from hybrid_opt.work.job import Job
+from hybrid_opt.work.service import Service
 from hybrid_opt.work.processes import ProcessExecutor, warm_up
-from tests.hybrid_opt.work import jobs
-warm_up("tests.hybrid_opt.work.jobs")
-ledger = jobs.Kept(["hang", "hang"])
+from tests.hybrid_opt.work import services
+warm_up("tests.hybrid_opt.work.services")
+ledger = services.Kept(["hang", "hang"])
 print("started", flush=True)
 try:
-    ProcessExecutor(2).run(Job(jobs.context, jobs.moody), ledger)
+    ProcessExecutor(2).run(Service(services.context, services.moody), ledger)
 except KeyboardInterrupt:
     print("interrupted", flush=True)
 """

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.work.job import Emit, Executor, Job
+from hybrid_opt.work.service import Emit, Executor, Service
 from symbolic.errors import DualArmError
 
 
@@ -106,5 +106,5 @@ def run(
     instead: Any = None,
 ) -> Kept:
     ledger = Kept(requests, instead)
-    executor.run(Job(context, work, patience), ledger)
+    executor.run(Service(context, work, patience), ledger)
     return ledger

@@ -1,7 +1,7 @@
-"""Interface of independent work: jobs, executors, ledgers.
+"""Interface of independent work: services, executors, ledgers; and work in this process.
 
-A job makes a context once per worker (say, the loaded evaluator) and answers one request at a time
-with it. While it works it may emit messages. Answers do not depend on who works, or in which
+A service makes a context once per worker (say, the loaded evaluator) and answers one request at a
+time with it. While it works it may emit messages. Answers do not depend on who works, or in which
 order. A ledger holds the requests and takes what comes back; all of its methods are called in the
 process that asked. A worker that dies is replaced and its request is given out again.
 """
@@ -36,7 +36,7 @@ KILLED, SILENT = "killed", "timeout"
 
 
 @dataclass(frozen=True)
-class Job(Generic[Context, Request, Answer]):
+class Service(Generic[Context, Request, Answer]):
     """Work to do; both functions can be pickled.
 
     Attributes:
@@ -57,7 +57,7 @@ class Job(Generic[Context, Request, Answer]):
 
 
 class Ledger(Protocol[RequestOut, AnswerIn]):
-    """The requests 0 to len - 1 of a job, and what became of them."""
+    """The requests 0 to len - 1 of a service, and what became of them."""
 
     def __len__(self) -> int:
         """Number of requests."""
@@ -88,9 +88,11 @@ class Ledger(Protocol[RequestOut, AnswerIn]):
 
 
 class Executor(Protocol):
-    """Carries out a job."""
+    """Carries out a service."""
 
-    def run(self, job: Job[Context, Request, Answer], ledger: Ledger[Request, Answer]) -> None:
+    def run(
+        self, service: Service[Context, Request, Answer], ledger: Ledger[Request, Answer]
+    ) -> None:
         """Return when all requests are answered.
 
         Raises:
@@ -99,7 +101,7 @@ class Executor(Protocol):
 
 
 def give_up(reason: str) -> NoReturn:
-    """End a job over a lost request.
+    """End a run over a lost request.
 
     Raises:
         WorkerError: always.
@@ -116,7 +118,7 @@ def give_up(reason: str) -> NoReturn:
 
 
 class ListLedger(Generic[Request, Answer]):
-    """Requests of a list, answers in a list; a lost request ends the job.
+    """Requests of a list, answers in a list; a lost request ends the run.
 
     Attributes:
         answers: in the order of the requests.
@@ -151,7 +153,7 @@ class ListLedger(Generic[Request, Answer]):
 
 def answer_all(
     executor: Executor,
-    job: Job[Context, Request, Answer],
+    service: Service[Context, Request, Answer],
     requests: Sequence[Request],
     done: Callable[[], None] = lambda: None,
 ) -> list[Answer]:
@@ -159,7 +161,7 @@ def answer_all(
 
     Args:
         executor: who does it.
-        job: what to do.
+        service: what to do.
         requests: can be pickled.
         done: called in this process after every answer.
 
@@ -167,7 +169,7 @@ def answer_all(
         DualArmError: a request failed with this text, or was lost.
     """
     ledger: ListLedger[Request, Answer] = ListLedger(requests, done)
-    executor.run(job, ledger)
+    executor.run(service, ledger)
     return ledger.answers
 
 
@@ -209,13 +211,15 @@ def attempt(call: Callable[[], Any]) -> Attempted:
 class SerialExecutor:
     """Answers all requests in this process, which nothing shields from what the work does."""
 
-    def run(self, job: Job[Context, Request, Answer], ledger: Ledger[Request, Answer]) -> None:
-        """See `hybrid_opt.work.job.Executor`."""
+    def run(
+        self, service: Service[Context, Request, Answer], ledger: Ledger[Request, Answer]
+    ) -> None:
+        """See `hybrid_opt.work.service.Executor`."""
         if len(ledger) == 0:
             return
-        context = job.make_context()
+        context = service.make_context()
         for index in range(len(ledger)):
-            answer = job.answer(context, ledger.request(index), partial(ledger.heard, index))
+            answer = service.answer(context, ledger.request(index), partial(ledger.heard, index))
             ledger.answered(index, answer)
 
 
