@@ -43,7 +43,7 @@ DEVIATION = 0.02
 READY_OUT, READY_IN = 0, 0
 """Standard digital lines: each arm's output goes to the other's input."""
 
-_HELD = ("press", "lift", "carry", "set_down", "release")
+_PRESSED = ("press", "lift", "carry", "set_down", "release")
 
 
 def urscript_files(sampled: SampledJob, options: BundleOptions) -> dict[str, str | bytes]:
@@ -135,7 +135,7 @@ def _phase(sampled: SampledJob, arm: int, index: int, name: str) -> Iterator[str
     q, span = sampled.arm(arm, sampled.q), sampled.span(index)
     step = float(np.diff(sampled.time).mean())
     every = max(1, math.floor(FORCE_EVERY / step + 1e-9))
-    presses = arm != sampled.job.squeeze.leader and name in _HELD
+    presses = arm != sampled.job.squeeze.leader and name in _PRESSED
     yield f"  def {name}():"
     for count, k in enumerate(range(span.start + 1, span.stop)):
         if presses and (count % every == 0 or k == span.stop - 1):

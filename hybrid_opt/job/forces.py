@@ -31,7 +31,7 @@ _SAME_TIME = 1e-9
 _NO_JUMP = 1e-6
 
 
-def held(model: TimingModel, squeeze: Squeeze, motions: Sequence[PhaseMotion]) -> list[Force]:
+def holding(model: TimingModel, squeeze: Squeeze, motions: Sequence[PhaseMotion]) -> list[Force]:
     """Forces of phases that follow one another, with the box held in all of them.
 
     Raises:

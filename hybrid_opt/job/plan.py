@@ -20,7 +20,7 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.certification import SampledPath, certificates
 from hybrid_opt.job.collisions import JobCollisions
-from hybrid_opt.job.forces import EXCESS, held, phase_use, pressing, without_force
+from hybrid_opt.job.forces import EXCESS, holding, phase_use, pressing, without_force
 from hybrid_opt.job.motions import (
     SAMPLES,
     Straight,
@@ -152,7 +152,7 @@ class JobModel:
             _Part("carry", carry_motion(self.timing, carry), self._proof(around.checker, carry)),
             *after[:-1],
         ]
-        forces = held(self.timing, chosen, [part.motion for part in loaded])
+        forces = holding(self.timing, chosen, [part.motion for part in loaded])
         first, last = before[0], after[-1]
         press, release = (
             (name, *_pressed(motion, force, end, handling.pressing_rate))

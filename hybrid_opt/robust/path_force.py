@@ -37,7 +37,7 @@ from symbolic.records import Workcell
 BY_TIMING = slice(18, 20)
 """Where a slope's entries by u'' and u'^2 are."""
 
-HELD = -np.inf
+BELOW = -np.inf
 """Normal force that stands for a case that less than the limit holds."""
 
 
@@ -151,9 +151,9 @@ class RobustPath:
         rows = np.flatnonzero(least[:, :, follower].max(axis=0) > room)
         # A case that leaves the force below the level can yet be the one that the leader feels.
         known = least[:, rows]
-        missing = known[:, :, follower] == HELD
+        missing = known[:, :, follower] == BELOW
         known[:, :, self.leader] = np.where(
-            missing, HELD, known[:, :, follower] + sign * difference[:, rows]
+            missing, BELOW, known[:, :, follower] + sign * difference[:, rows]
         )
         return rows, ruling_cases(known, self._set, self.leader, sign * difference[:, rows])
 
@@ -185,9 +185,9 @@ class RobustPath:
         return self._difference.batch(*repeated, cases)["difference"].reshape(k, n)
 
     def _least(self, points: PathPoints, wanted: NDArray[np.bool_]) -> Array:
-        """(k, n, 2) least normal forces of the wanted (k, n) cases, `HELD` for the others."""
+        """(k, n, 2) least normal forces of the wanted (k, n) cases, `BELOW` for the others."""
         case, row = np.nonzero(wanted)
-        found = np.full((*wanted.shape, 2), HELD)
+        found = np.full((*wanted.shape, 2), BELOW)
         if len(row):
             motion = [values[row] for values in points.motion]
             found[case, row] = self._squeeze.batch(*motion, self._cases[case])["normal_force"]
