@@ -28,6 +28,7 @@ from hybrid_opt.polishing.drive import is_polishable
 from hybrid_opt.polishing.polisher import knows_forces
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.recommending.choice import Wish
+from hybrid_opt.static_hold import require_hold
 from studies.drivable import is_drivable, known_paths
 from studies.jerk_costs import jerk_costs, jerk_text
 from studies.recommendation_stage import recommendation_stage

@@ -18,7 +18,6 @@ from hybrid_opt.collision.certify import Certificate, SampledPath, certificates,
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import JobError
-from hybrid_opt.evaluate.certification import SampledPath, certificates
 from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.job.forces import EXCESS, holding, phase_use, pressing, without_force
 from hybrid_opt.job.motions import (
@@ -34,7 +33,6 @@ from hybrid_opt.job.motions import (
 )
 from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
 from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, smoothed
-from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.squeeze import SqueezeSettings, chosen_squeeze
 from hybrid_opt.static_hold import kept_per_workcell
 from hybrid_opt.timing.jerk import time_with_jerk

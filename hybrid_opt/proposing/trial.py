@@ -17,8 +17,8 @@ from hybrid_opt.collision.certify import LostPathError
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
-from hybrid_opt.evaluate.static_hold import unheld
 from hybrid_opt.job.collisions import JobCollisions, what_blocks
+from hybrid_opt.static_hold import unheld
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel, build_cell_bodies, build_cell_model
 from symbolic.functions import cell_functions, motion_function

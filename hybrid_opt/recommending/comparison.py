@@ -9,9 +9,9 @@ import numpy as np
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ForceKind
-from hybrid_opt.evaluate.static_hold import static_hold
 from hybrid_opt.recommending.choice import DrivenPaths
 from hybrid_opt.robust.force import BoxMotion, robust_model
+from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.records import Workcell

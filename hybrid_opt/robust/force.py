@@ -14,7 +14,6 @@ import numpy as np
 
 from codegen.cache import Cache
 from hybrid_opt.carry import Carry
-from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.cases import (
     CaseForces,
     friction_by_displacement,
@@ -23,6 +22,7 @@ from hybrid_opt.robust.cases import (
     ruling_cases,
     worst_cases,
 )
+from hybrid_opt.static_hold import kept_per_workcell
 from symbolic.array import Array
 from symbolic.contact.worst_cases import least_reaches
 from symbolic.errors import SettingsError

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from codegen.build import compile_function
 from codegen.cache import Cache
-from hybrid_opt.per_workcell import kept_per_workcell
 from hybrid_opt.robust.cases import (
     RulingCases,
     check_pads,
@@ -24,6 +23,7 @@ from hybrid_opt.robust.cases import (
     worst_cases,
 )
 from hybrid_opt.robust.force import check_set
+from hybrid_opt.static_hold import kept_per_workcell
 from symbolic.array import Array
 from symbolic.contact.worst_cases import (
     case_difference_function,

@@ -11,8 +11,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.collision.certify import SampledPath, configurations
 from hybrid_opt.evaluate.evaluation import LockedEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
-from hybrid_opt.evaluate.locked import LockedEvaluator
-from hybrid_opt.evaluate.sampled import one_by_one
+from hybrid_opt.evaluate.kernel import one_by_one
 from studies.plain.verdict import PlainJudge
 from symbolic.array import Array
 from symbolic.errors import SettingsError

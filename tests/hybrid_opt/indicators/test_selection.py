@@ -13,7 +13,6 @@ from hybrid_opt.campaign.replica import front_rows
 from hybrid_opt.campaign.results import Replica
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.static_hold import payload_limit, static_hold
 from hybrid_opt.indicators.selection import (
     balanced,
     knee,
@@ -21,6 +20,7 @@ from hybrid_opt.indicators.selection import (
     select,
     selected_row,
 )
+from hybrid_opt.static_hold import payload_limit, static_hold
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
