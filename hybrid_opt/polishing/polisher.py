@@ -20,7 +20,7 @@ from hybrid_opt.polishing.front import GrowingFront, Lost, PolishRun
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.work.threads import one_thread
+from hybrid_opt.work.service import one_thread
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.cell import Workcell
