@@ -1,49 +1,69 @@
-"""List the programs: `python -m studies`."""
+"""All programs: `dual-arm-carry PROGRAM ...`, or `python -m studies.PROGRAM ...`."""
 
 from __future__ import annotations
 
 import ast
 import sys
 from collections.abc import Sequence
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 from studies.program import BAD_INPUT, run_program
 from symbolic.records.problems import suggestion
 
+COMMAND = "dual-arm-carry"
+"""The command that `pyproject.toml` installs."""
+
 START = "sys.exit(run_program(main))"
 """What every program ends with."""
 
 
-def programs() -> dict[str, str]:
-    """Every program's name, as `python -m` takes it, and what it says of itself first."""
+def programs() -> dict[str, tuple[str, str]]:
+    """By every program's name its module, and what it says of itself first."""
     folder = Path(__file__).parent
     found = {}
-    for path in sorted([*folder.glob("*.py"), *folder.glob("*/__main__.py")]):
+    for path in sorted([*folder.glob("*.py"), *folder.glob("*/*.py")]):
         text = path.read_text("utf-8")
-        if (path.stem == "__main__" and path.parent == folder) or not text.rstrip().endswith(START):
+        if path == Path(__file__) or not text.rstrip().endswith(START):
             continue
-        parts = path.relative_to(folder.parent).with_suffix("").parts
+        parts = path.relative_to(folder).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__main__")
-        found[name] = (ast.get_docstring(ast.parse(text)) or "").partition("\n\n")[0]
+        said = (ast.get_docstring(ast.parse(text)) or "").partition("\n\n")[0]
+        # What it is called by stands in front.
+        told = " ".join(said.partition(": `")[0].split()).rstrip(".")
+        found[name] = (".".join(("studies", *parts)), told)
     return found
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; returns the exit code."""
+def main(arguments: Sequence[str] | None = None, called: str = "python -m studies") -> int:
+    """Run the program that the first word names, or list all; returns the exit code.
+
+    Args:
+        arguments: the command line, None for the process's own.
+        called: how it is called.
+    """
     known = programs()
-    given = sys.argv[1:] if arguments is None else arguments
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given and given[0] in known:
+        module, _ = known[given[0]]
+        code: int = import_module(module).main(given[1:], f"{called} {given[0]}")
+        return code
+    prefix = "" if called == COMMAND else "studies."
     for word in (word for word in given if word not in ("-h", "--help")):
-        meant = suggestion(f"studies.{word}", known)
-        print(f"python -m studies: {word} is no option of it{meant}", file=sys.stderr)
+        meant = suggestion(prefix + word, [prefix + name for name in known])
+        print(f"{called}: {word} is no program of it{meant}", file=sys.stderr)
         return BAD_INPUT
-    width = max(map(len, known))
+    front, width = f"{called} " if called == COMMAND else "python -m studies.", max(map(len, known))
     print("Programs; each explains itself with --help.\n")
-    for name, text in known.items():
-        # What it is called by stands in front.
-        print(
-            f"python -m {name:<{width}}  {' '.join(text.partition(': `')[0].split()).rstrip('.')}"
-        )
+    for name, (_, told) in known.items():
+        print(f"{front}{name:<{width}}  {told}")
     return 0
+
+
+def command() -> None:
+    """Run what the installed command is given, and end the process."""
+    sys.exit(run_program(partial(main, called=COMMAND)))
 
 
 if __name__ == "__main__":

@@ -1,39 +1,41 @@
-"""Types of command line options: what a number may be is said before any work begins."""
+"""Options of the programs: each is described once, what a number may be is said before any work."""
 
 from __future__ import annotations
 
 import argparse
-import math
+import ast
 from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, TypeVar
 
 LARGEST_SEED = 2**63 - 1
+
+Number = TypeVar("Number", int, float)
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
     """A type of options that takes whole numbers of a range, ends included."""
-
-    def read(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:  # also from thousands of digits
-            value = low - 1
-        if not low <= value <= high:
-            raise _refusal(text, f"a whole number {low} to {high}")
-        return value
-
-    return read
+    return _within(int, low, high, f"a whole number {low} to {high}")
 
 
 def number(low: float, high: float) -> Callable[[str], float]:
     """A type of options that takes finite numbers of a range, ends included."""
+    return _within(float, low, high, f"a number {low:g} to {high:g}")
 
-    def read(text: str) -> float:
+
+def _within(
+    kind: Callable[[str], Number], low: Number, high: Number, allowed: str
+) -> Callable[[str], Number]:
+    def read(text: str) -> Number:
         try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            raise _refusal(text, f"a number {low:g} to {high:g}")
+            value = kind(text)
+        except ValueError:  # also from thousands of digits
+            value = None
+        if value is None or not low <= value <= high:
+            shown = ascii(text) if len(text) <= 40 else f"{text[:37]!a}..."
+            raise argparse.ArgumentTypeError(f"found {shown}; allowed is {allowed}")
         return value
 
     return read
@@ -44,20 +46,132 @@ seed = whole(0, LARGEST_SEED)
 
 
 force = number(1e-3, 1e6)
-"""The type of normal forces [N]."""
+"""The type of normal forces [N], and of durations [s] and masses [kg] that are wished for."""
 
 
-def add_leader(parser: argparse._ActionsContainer) -> None:
-    """Add which arm keeps its place while the other is force-controlled; counted from 1."""
+_SHARED: dict[str, dict[str, Any]] = {
+    "WORKCELL": {"type": Path, "help": "the workcell file"},
+    "PROBLEM": {"type": Path, "help": "the problem file"},
+    "RESULTS": {"type": Path, "help": "results folder of a study"},
+    "FILE": {"help": "a trajectory file"},
+    "--force-limit": {"type": force, "metavar": "N"},
+    "--jobs": {
+        "type": whole(0, 4096),
+        "default": 0,
+        "metavar": "N",
+        "help": "worker processes, 0 for one per core",
+    },
+    "--json": {"action": "store_true", "help": "print JSON instead of text"},
+    "--leader": {
+        "type": int,
+        "choices": (1, 2),
+        "default": 1,
+        "help": "the arm that keeps its place",
+    },
+    "--output": {"type": Path},
+    "--quiet": {
+        "action": "store_true",
+        "help": "no progress on standard error (default: shown)",
+    },
+    "--seed": {"type": seed, "default": 1, "metavar": "N"},
+}
+
+
+def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
+    """Add options that several programs have.
+
+    Args:
+        names: of the table; of one that stands by its place in capitals.
+        own: what of it differs in this program.
+    """
+    for name in names:
+        place = {} if name.startswith("-") else {"metavar": name}
+        parser.add_argument(name.lower(), **(place | _SHARED[name] | own))
+
+
+def add_wishes(parser: argparse._ActionsContainer) -> None:
+    """Add what may be asked of the recommended carry; `Wish` takes it."""
     parser.add_argument(
-        "--leader",
-        type=int,
-        choices=(1, 2),
-        default=1,
-        help="the arm that keeps its place (default: %(default)s)",
+        "--duration",
+        type=force,
+        metavar="S",
+        help="recommend the least force of the carries of at most S seconds (default: the knee)",
+    )
+    add(
+        parser,
+        "--force-limit",
+        help="recommend the shortest carry with both normal forces below N newtons; a study also "
+        "times every selected trajectory with that limit (default: the knee)",
+    )
+    parser.add_argument(
+        "--payload",
+        type=force,
+        metavar="KG",
+        help="recommend the shortest carry on whose motion the robots would bear a box of KG "
+        "kilograms (default: the knee)",
     )
 
 
-def _refusal(text: str, allowed: str) -> argparse.ArgumentTypeError:
-    shown = ascii(text) if len(text) <= 40 else f"{text[:37]!a}..."
-    return argparse.ArgumentTypeError(f"found {shown}; allowed is {allowed}")
+def add_looks(parser: argparse.ArgumentParser) -> None:
+    """Add an animation file and the live view of a study's trajectories."""
+    group = parser.add_argument_group("looking at a trajectory")
+    group.add_argument(
+        "--animation",
+        type=Path,
+        metavar="FILE",
+        help="write the selected trajectory as FILE.gif or FILE.mp4 (default: none)",
+    )
+    group.add_argument(
+        "--view",
+        action="store_true",
+        help='show the trajectories live in a browser; needs pip install "dual-arm-carry[view]"',
+    )
+    group.add_argument("--port", type=whole(0, 65535), default=8080, metavar="N", help="of --view")
+
+
+def stated(name: str) -> Any:
+    """What the source of a module states, without importing the module, which may take seconds.
+
+    Args:
+        name: of a constant or of a settings' field, with module and class, as
+            'hybrid_opt.campaign.settings.CampaignSettings.seed'.
+
+    Returns:
+        The value; of a `Literal` what it allows, of a table its keys.
+
+    Raises:
+        LookupError: the source states no such value.
+    """
+    package, *parts = name.split(".")
+    place = Path(str(files(package)))
+    while (place / parts[0]).is_dir():
+        place /= parts.pop(0)
+    names = _statements(place / f"{parts.pop(0)}.py")
+    value = names[parts.pop(0)]
+    if isinstance(value, ast.ClassDef):
+        value = _named(value.body)[parts.pop(0)]
+    if isinstance(value, ast.Name):
+        value = names[value.id]
+    if isinstance(value, ast.Subscript):
+        return ast.literal_eval(value.slice)
+    if isinstance(value, ast.Dict):
+        return tuple(ast.literal_eval(key) for key in value.keys if key is not None)
+    return ast.literal_eval(value)
+
+
+@cache
+def _statements(path: Path) -> dict[str, ast.AST]:
+    return _named(ast.parse(path.read_text("utf-8")).body)
+
+
+def _named(body: list[ast.stmt]) -> dict[str, ast.AST]:
+    """The classes of some source, and the values that it gives to names."""
+    found: dict[str, ast.AST] = {}
+    for node in body:
+        if isinstance(node, ast.ClassDef):
+            found[node.name] = node
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value:
+            found[node.target.id] = node.value
+        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            found[node.targets[0].id] = node.value
+    return found

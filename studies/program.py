@@ -1,4 +1,4 @@
-"""Common parts of every program: how it ends, and its messages beside the results."""
+"""What every program has in common: its options, how it ends, its messages beside the results."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import threading
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import wraps
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TextIO
+from typing import TYPE_CHECKING, NoReturn, TextIO
 
 from symbolic import outside
 from symbolic.errors import DualArmError, DualArmWarning, OutsideError, WorkcellError
@@ -28,12 +29,32 @@ INTERRUPTED = 130
 VERBOSE = "--verbose"
 
 
+class _Help(argparse.HelpFormatter):
+    """Tells the default of every option that has one, unless its text does."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        # Python 3.11 and 3.12 write the default of --x and --no-x themselves.
+        told = (action.help or "").removesuffix(" (default: %(default)s)")
+        value = action.default
+        if "(default" in told or value in (None, [], argparse.SUPPRESS):
+            return told
+        if isinstance(value, bool):
+            value = "yes" if value else "off"
+        elif isinstance(value, list | tuple):
+            value = " ".join(map(str, value))
+        elif isinstance(value, float):
+            value = f"{value:g}"
+        return f"{told} (default: {value})"
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that says in one line what is wrong with a command, and what may be meant."""
 
-    def __init__(self, *, prog: str, description: str | None, **more: Any) -> None:
-        """Take what `argparse.ArgumentParser` takes; options are not abbreviated."""
-        super().__init__(prog=prog, description=description, allow_abbrev=False, **more)
+    def __init__(self, *, prog: str, description: str | None) -> None:
+        """Options are not abbreviated; `--help` tells their defaults."""
+        super().__init__(
+            prog=prog, description=description, allow_abbrev=False, formatter_class=_Help
+        )
 
     def error(self, message: str) -> NoReturn:
         """Print the message and end the program with code 2."""
@@ -45,6 +66,66 @@ class Parser(argparse.ArgumentParser):
             if word.startswith("-")
         ]
         self.exit(BAD_INPUT, f"{self.prog}: {message}{''.join(meant)}; see --help\n")
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program: `python -m studies.NAME`, or `dual-arm-carry NAME`.
+
+    What its work needs is imported by `run`, so that `--help` and a mistyped option are answered
+    at once.
+
+    Attributes:
+        name: below `studies`.
+        description: what it does, for its help.
+        add_options: adds its options; `--verbose` is there.
+        run: does its work with the options, returns the exit code. Beside the options it finds
+            `called`, as the program was called, and `arguments`, the words of its command line.
+        interrupted: what to say after Ctrl-C.
+    """
+
+    name: str
+    description: str | None
+    add_options: Callable[[Parser], None]
+    run: Callable[[argparse.Namespace], int]
+    interrupted: str = "interrupted"
+
+    @property
+    def module(self) -> str:
+        """Its door, as `python -m` takes it."""
+        return f"studies.{self.name}"
+
+    def parser(self, called: str = "") -> Parser:
+        """The parser of its options.
+
+        Args:
+            called: how it is called, '' for `python -m`.
+        """
+        parser = Parser(prog=called or f"python -m {self.module}", description=self.description)
+        self.add_options(parser)
+        parser.add_argument(
+            VERBOSE,
+            action="store_true",
+            help="also show what the libraries warn of (default: only this project's own warnings)",
+        )
+        return parser
+
+    def __call__(self, arguments: Sequence[str] | None = None, called: str = "") -> int:
+        """Run it; returns the exit code.
+
+        Args:
+            arguments: the command line, None for the process's own.
+            called: how it is called, '' for `python -m`.
+        """
+        parser = self.parser(called)
+        given = list(sys.argv[1:] if arguments is None else arguments)
+
+        def work() -> int:
+            options = parser.parse_args(given)
+            options.called, options.arguments = parser.prog, given
+            return self.run(options)
+
+        return carry_out(parser.prog, work, self.interrupted)
 
 
 def load_workcell(path: Path) -> Workcell:
@@ -69,20 +150,19 @@ def load_workcell(path: Path) -> Workcell:
         raise
 
 
-class Main(Protocol):
-    """A program's main function."""
+def later(work: str) -> Callable[[argparse.Namespace], int]:
+    """What a program does, imported when it is done.
 
-    def __call__(self, arguments: Sequence[str] | None = None) -> int:
-        """Run with the arguments, None for the process's own; returns the exit code."""
+    Args:
+        work: the function's name with its module's; it takes the options, returns the exit code.
+    """
 
+    def run(options: argparse.Namespace) -> int:
+        module, _, name = work.rpartition(".")
+        code: int = getattr(import_module(module), name)(options)
+        return code
 
-def add_verbose(parser: argparse._ActionsContainer) -> None:
-    """Add the option `--verbose`, which `run_program` looks at."""
-    parser.add_argument(
-        VERBOSE,
-        action="store_true",
-        help="also show what the libraries warn of (default: only this project's own warnings)",
-    )
+    return run
 
 
 def run_program(main: Callable[[], int]) -> int:
@@ -150,35 +230,6 @@ def carry_out(program: str, work: Callable[[], int], interrupted: str = "interru
     except KeyboardInterrupt:
         print(f"\n{interrupted}", file=sys.stderr)
         return INTERRUPTED
-
-
-def carried_out(
-    program: str, interrupted: str = "interrupted"
-) -> Callable[[Callable[[Sequence[str] | None], int]], Main]:
-    """Make a main function of a program end as `carry_out` does."""
-
-    def wrap(main: Callable[[Sequence[str] | None], int]) -> Main:
-        @wraps(main)
-        def carrying_out(arguments: Sequence[str] | None = None) -> int:
-            return carry_out(program, lambda: main(arguments), interrupted)
-
-        return carrying_out
-
-    return wrap
-
-
-def program_of(
-    program: str,
-    parser: Callable[[], argparse.ArgumentParser],
-    run: Callable[[argparse.Namespace], int],
-) -> Main:
-    """The main function of a program that parses its arguments and runs with them."""
-
-    @carried_out(program)
-    def main(arguments: Sequence[str] | None) -> int:
-        return run(parser().parse_args(arguments))
-
-    return main
 
 
 class _Warnings:

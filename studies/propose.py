@@ -8,42 +8,21 @@ search can start with.
 
 from __future__ import annotations
 
+import argparse
 import sys
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 
-import numpy as np
-
-import hybrid_opt as ho
-from hybrid_opt.proposing.proposal import worked
-from studies.options import number, seed
-from studies.program import Parser, add_verbose, carried_out, run_program
+from studies.options import add, number, stated
+from studies.program import Parser, Program, run_program
 from symbolic.errors import SettingsError
 from symbolic.replacing import replace_file
 
-PROGRAM = "python -m studies.propose"
 
-
-def _teller(begun: float) -> Callable[[str], None]:
-    """Prints what is being done and after how much work, every word once in a row."""
-    last = [""]
-
-    def tell(text: str) -> None:
-        if text != last[0]:
-            print(f"{worked() - begun:6.1f} s  {text}", file=sys.stderr, flush=True)
-            last[0] = text
-
-    return tell
-
-
-@carried_out(PROGRAM, "interrupted; nothing was written")
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; returns the exit code."""
-    parser = Parser(prog=PROGRAM, description=__doc__)
-    parser.add_argument("problem", type=Path, metavar="PROBLEM", help="the problem file")
-    parser.add_argument(
+def _add_options(parser: Parser) -> None:
+    add(parser, "PROBLEM")
+    add(
+        parser,
         "--output",
-        type=Path,
         metavar="FILE",
         help="the workcell file (default: NAME-proposed.toml beside the problem file)",
     )
@@ -55,17 +34,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--time",
         type=number(1.0, 1e6),
-        default=ho.ProposeSettings().seconds,
+        default=stated("hybrid_opt.proposing.proposal.ProposeSettings.seconds"),
         metavar="S",
-        help="seconds that it may work, its start included, whatever else the machine does "
-        "(default: %(default)g)",
+        help="seconds that it may work, its start included, whatever else the machine does",
     )
-    parser.add_argument(
-        "--seed", type=seed, default=1, metavar="N", help="of its randomness (default: 1)"
-    )
-    parser.add_argument("--quiet", action="store_true", help="do not say what is being done")
-    add_verbose(parser)
-    options = parser.parse_args(arguments)
+    add(parser, "--seed", help="of its randomness")
+    add(parser, "--quiet", help="do not say what is being done")
+
+
+def _run(options: argparse.Namespace) -> int:
+    import numpy as np
+
+    import hybrid_opt as ho
+    from hybrid_opt.proposing.proposal import worked
+
     problem = options.problem
     output = options.output or problem.with_name(f"{problem.stem}-proposed.toml")
     if output.resolve() == problem.resolve():
@@ -74,17 +56,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise SettingsError(
             f"{output.parent} is no folder; make it, or name another one by --output"
         )
-    begun = 0.0 if __name__ == "__main__" else worked()  # of a process of its own imports count
+    own = sys.argv[-len(options.arguments) :] == options.arguments
+    begun = 0.0 if own else worked()  # of a process of its own imports count
     left = max(options.time - (worked() - begun), 1.0)
     proposal = ho.propose(
         problem,
         rng=np.random.default_rng(options.seed),
         settings=ho.ProposeSettings(seconds=left, bases=options.bases),
-        tell=(lambda text: None) if options.quiet else _teller(begun),
+        tell=(lambda text: None) if options.quiet else _teller(lambda: worked() - begun),
     )
     replace_file(output, proposal.text(output.parent).encode())
     print(f"{output}: {proposal}")
     return 0
+
+
+def _teller(worked: Callable[[], float]) -> Callable[[str], None]:
+    """Prints what is being done and after how many seconds of work, every word once in a row."""
+    last = [""]
+
+    def tell(text: str) -> None:
+        if text != last[0]:
+            print(f"{worked():6.1f} s  {text}", file=sys.stderr, flush=True)
+            last[0] = text
+
+    return tell
+
+
+main = Program("propose", __doc__, _add_options, _run, "interrupted; nothing was written")
 
 
 if __name__ == "__main__":

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
-from collections.abc import Sequence
+from functools import partial
 from importlib.resources import as_file, files
 
-from studies.program import run_program
-from studies.run import main as run
+from studies.program import Program, run_program
+from studies.run import DESCRIPTION, add_options, study_of
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the study on the rack cell; returns the exit code."""
+def _run(options: argparse.Namespace) -> int:
     with as_file(files("studies")) as folder:
-        return run(arguments, folder / "workcells" / "rack.toml", "python -m studies.rack")
+        return study_of(folder / "workcells" / "rack.toml", options, with_paper=True)
+
+
+main = Program("rack", DESCRIPTION, partial(add_options, output="results/rack"), _run)
 
 
 if __name__ == "__main__":

@@ -2,94 +2,238 @@
 
 from __future__ import annotations
 
+import argparse
 import shlex
 import sys
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from studies.program import add_verbose, carry_out, load_workcell, run_program
-from studies.workers import start_workers
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, OBJECTIVES, PAPER_OBJECTIVES
+from hybrid_opt.polishing.settings import (
+    DRIVABLE_ATTEMPTS,
+    SOLVERS,
+    PolishSettings,
+    quick_settings,
+)
+from hybrid_opt.work.processes import warm_up
+from studies.options import add, add_looks, add_wishes, stated
+from studies.program import Parser, Program, carry_out, run_program
+from symbolic.errors import SettingsError
 
-PAGE = "report.html"
-"""The report in a results folder."""
+DESCRIPTION = "Search for the least-force carries of a dual-arm workcell."
+
+QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 2
+"""Evaluations and replicas of a small but complete study."""
+
+ALGORITHMS: tuple[str, ...] = stated("hybrid_opt.metaheuristics.registry.REGISTRY")
+
+WORKERS_LOAD = (
+    "hybrid_opt.campaign.polish_stage",
+    "studies.study.timing",
+    "studies.study.recommendation",
+    "studies.report.generate",
+)
+"""Modules that the work of a study needs."""
 
 
-def main(
-    arguments: Sequence[str] | None = None,
-    workcell: Path | None = None,
-    program: str = "python -m studies.run",
-) -> int:
-    """Run the program; returns the exit code.
+def add_options(parser: Parser, output: str) -> None:
+    """Add the options of a study.
 
     Args:
-        arguments: the command line, None for the process's own.
-        workcell: the cell of a program that has one; None to take it from the command line.
-        program: its name in messages.
+        output: the results folder where none is given, for the help.
     """
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    start_workers(arguments)
-    # Imported only now: meanwhile the server of the workers loads much of the same.
-    from hybrid_opt.campaign import Progress
-    from hybrid_opt.cell import Cell
-    from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, FORCE_PAIRS, PAPER_OBJECTIVES
-    from hybrid_opt.polishing.settings import usual_settings
-    from hybrid_opt.witness.box import mujoco_module
-    from studies.cli import (
-        campaign_parser,
-        campaign_settings,
-        execution_settings,
-        polish_settings,
-        wish,
+    search = parser.add_argument_group("search (decides the results)")
+    search.add_argument(
+        "--quick",
+        action="store_true",
+        help=f"a small but complete study: {QUICK_REPLICAS} replicas of {QUICK_EVALUATIONS} "
+        "evaluations where no other numbers are given, polished to a third as many points in fewer "
+        "attempts, its pictures as PNG only",
     )
-    from studies.drivable import is_drivable
-    from studies.report.stage import add_report_options, follow_report_options
-    from studies.study import StudySettings, run_study
+    search.add_argument(
+        "--recommend-only",
+        action="store_true",
+        help="only what the carry to run needs: the drivable search, one replica of one algorithm "
+        "where no other numbers are given, its polish and the recommendation; no experiment of the "
+        "paper, no pictures",
+    )
+    search.add_argument(
+        "--evaluations",
+        type=int,
+        metavar="N",
+        help=f"candidates that each replica may evaluate (default: {_stated('evaluations')})",
+    )
+    search.add_argument(
+        "--replicas",
+        type=int,
+        metavar="N",
+        help=f"independent runs per algorithm (default: {_stated('replicas')})",
+    )
+    search.add_argument(
+        "--algorithm",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help=f"which of {', '.join(ALGORITHMS)} (default: {' '.join(_stated('algorithms'))})",
+    )
+    search.add_argument(
+        "--population",
+        nargs="+",
+        action="extend",
+        type=_population,
+        metavar="NAME=N",
+        help="candidates per generation of an algorithm (default: each algorithm's own)",
+    )
+    search.add_argument(
+        "--objective",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help=f"what to minimise, of {', '.join(OBJECTIVES)} "
+        f"(default: {' '.join(PAPER_OBJECTIVES)}, in a cell under the time law 'optimal' "
+        f"{' '.join(DRIVABLE_OBJECTIVES)})",
+    )
+    search.add_argument(
+        "--first-generation",
+        choices=stated("hybrid_opt.campaign.settings.FirstGeneration"),
+        default=_stated("first_generation"),
+        help="what searches start from: random candidates and the workcell's hand-made initial "
+        "trajectory, or random ones alone",
+    )
+    search.add_argument(
+        "--constraint-handling",
+        choices=stated("hybrid_opt.metaheuristics.problem.ConstraintHandling"),
+        default=_stated("constraint_handling"),
+        help="how the search learns of infeasibility: by the paper's penalised objectives, or by "
+        "constraint domination",
+    )
+    add(
+        search,
+        "--seed",
+        type=int,
+        default=_stated("seed"),
+        help="the same seed gives the same results to the bit",
+    )
+    after = parser.add_argument_group("after the search (decides what is made of the results)")
+    after.add_argument(
+        "--polish",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="improve every front further (default: yes for the paper's two objectives and for "
+        "drivable carries)",
+    )
+    after.add_argument(
+        "--polish-attempts",
+        type=int,
+        metavar="N",
+        help="attempts that the polish of one front may take before it is filled between its ends "
+        f"(default: {PolishSettings().attempts}, for a drivable one {DRIVABLE_ATTEMPTS}, "
+        f"with --quick {quick_settings().attempts})",
+    )
+    after.add_argument(
+        "--polish-solver",
+        choices=SOLVERS,
+        default=PolishSettings().solver,
+        help="what solves the polish's programs of both peak forces: a dense interior-point "
+        "method, or IPOPT, for comparison",
+    )
+    after.add_argument(
+        "--drivable",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also search for carries as robots drive them, of least duration and force, and "
+        "recommend one",
+    )
+    add_wishes(after)
+    after.add_argument(
+        "--simulate",
+        action="store_true",
+        help="have the selected carries driven in the simulated cell, which needs MuJoCo: "
+        "pip install 'dual-arm-carry[sim]'",
+    )
+    after.add_argument(
+        "--report",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="write pictures, tables and report.html",
+    )
+    work = parser.add_argument_group("work (does not change the results)")
+    add(
+        work,
+        "--output",
+        metavar="DIR",
+        help=f"results folder (default: {output}, "
+        "with --recommend-only its name ends in -recommended)",
+    )
+    work.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue what the results folder holds (default: refuse to touch it)",
+    )
+    work.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="remove the results that the folder holds and begin anew (default: refuse to touch "
+        "it)",
+    )
+    add(work, "--jobs", type=int)
+    work.add_argument(
+        "--executor",
+        choices=stated("hybrid_opt.campaign.execution.ExecutorName"),
+        default="processes",
+        help="where the work is done: on this machine or on a Dask cluster",
+    )
+    work.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of Dask, as tcp://HOST:8786 (default: none)"
+    )
+    add(work, "--quiet")
+    add_looks(parser)
 
-    description = "Search for the least-force carries of a dual-arm workcell."
-    output = f"results/{'WORKCELL' if workcell is None else workcell.stem}"
-    parser = campaign_parser(program, description, output)
-    add_report_options(parser)
-    if workcell is None:
-        parser.add_argument("workcell", type=Path, metavar="WORKCELL", help="the workcell file")
-    add_verbose(parser)
-    again = [part for part in arguments if part not in ("--resume", "--overwrite")]
-    command = " ".join([program, shlex.join([*again, "--resume"])])
+
+def study_of(workcell: Path, options: argparse.Namespace, with_paper: bool = False) -> int:
+    """Make the study of a workcell that the options ask for; returns the exit code.
+
+    Args:
+        workcell: its file.
+        with_paper: whether the paper's figures stand beside those of the study.
+    """
+    again = [part for part in options.arguments if part not in ("--resume", "--overwrite")]
+    command = " ".join([options.called, shlex.join([*again, "--resume"])])
 
     def work() -> int:
-        options = parser.parse_args(arguments)
-        if options.simulate:
-            mujoco_module()  # told before hours of work
-        path: Path = options.workcell if workcell is None else workcell
-        cell = load_workcell(path)
-        if options.recommend_only:
-            drivable = Cell(cell).drivable()  # keeps the file of its workcell
-            cell = drivable.workcell
-        driven = cell.task.time_law == "optimal"
-        settings = campaign_settings(options, DRIVABLE_OBJECTIVES if driven else PAPER_OBJECTIVES)
-        alone = is_drivable(cell, settings.objectives)
-        polishable = alone or (not driven and settings.objectives in FORCE_PAIRS)
-        name = f"{path.stem}-recommended" if options.recommend_only else path.stem
-        execution = execution_settings(options, Path("results") / name)
-        study = StudySettings(
-            polish=polish_settings(options, polishable, usual_settings(cell.task.time_law)),
-            drivable=options.drivable,
-            drivable_polish=polish_settings(options, True, usual_settings("optimal")),
-            wish=wish(options),
-            simulate=options.simulate,
-            report=options.report and not options.recommend_only,
-            recommend_only=options.recommend_only,
-            with_paper=bool(workcell),
-            pdf=not options.quick,
-        )
-        print(run_study(cell, settings, execution, Progress(not options.quiet), study))
-        print(f"\nResults: {execution.output}")
-        if study.report:
-            print(f"Report: {execution.output / PAGE}")
-        follow_report_options(execution.output, options)
+        if options.executor == "processes":
+            warm_up(*WORKERS_LOAD)  # their server loads much of the same while this process does
+        from studies.programs.study import make_study
+
+        make_study(workcell, options, with_paper)
         return 0
 
     interrupted = f"interrupted, nothing is lost; continue with: {command}"
-    return carry_out(program, work, interrupted)
+    return carry_out(options.called, work, interrupted)
+
+
+def _stated(field: str) -> Any:
+    """The default of a campaign's setting."""
+    return stated(f"hybrid_opt.campaign.settings.CampaignSettings.{field}")
+
+
+def _population(text: str) -> tuple[str, int]:
+    name, separator, size = text.partition("=")
+    if not separator or not size.isdecimal():
+        raise argparse.ArgumentTypeError(f"found {text!r}; allowed is NAME=N, as nsga2=40")
+    if name not in ALGORITHMS:
+        raise SettingsError(f"unknown algorithm '{name}'; known are {', '.join(ALGORITHMS)}")
+    return name, int(size)
+
+
+def _add_options(parser: Parser) -> None:
+    add(parser, "WORKCELL")
+    add_options(parser, "results/WORKCELL")
+
+
+main = Program(
+    "run", DESCRIPTION, _add_options, lambda options: study_of(options.workcell, options)
+)
 
 
 if __name__ == "__main__":

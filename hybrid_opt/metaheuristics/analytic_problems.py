@@ -67,7 +67,7 @@ class AnalyticProblem:
 
 def names() -> tuple[str, ...]:
     """The problems that `make` knows."""
-    return tuple(_PROBLEMS)
+    return tuple(PROBLEMS)
 
 
 def make(name: str) -> AnalyticProblem:
@@ -76,9 +76,9 @@ def make(name: str) -> AnalyticProblem:
     Raises:
         SettingsError: the name is unknown.
     """
-    if name not in _PROBLEMS:
-        raise SettingsError(f"unknown test problem '{name}'; known are {', '.join(_PROBLEMS)}")
-    problem, curve = _PROBLEMS[name]
+    if name not in PROBLEMS:
+        raise SettingsError(f"unknown test problem '{name}'; known are {', '.join(PROBLEMS)}")
+    problem, curve = PROBLEMS[name]
     front = _evenly(curve())
     front.setflags(write=False)
     return AnalyticProblem(name, problem(), front, front.min(axis=0), front.max(axis=0))
@@ -158,7 +158,7 @@ def _osy_front() -> Array:
     return np.column_stack([f1, (x**2).sum(axis=1)])
 
 
-_PROBLEMS: dict[str, tuple[Callable[[], Problem], Callable[[], Array]]] = {
+PROBLEMS: dict[str, tuple[Callable[[], Problem], Callable[[], Array]]] = {
     "zdt1": (ZDT1, _zdt1_front),
     "zdt2": (ZDT2, _zdt2_front),
     "zdt3": (ZDT3, _zdt3_front),

@@ -23,7 +23,7 @@ class _Entry:
     defaults: Settings
 
 
-_REGISTRY: dict[str, _Entry] = {
+REGISTRY: dict[str, _Entry] = {
     "nsga2": _Entry(nsga2, GeneticSettings()),
     "mopso": _Entry(Mopso, MopsoSettings()),
     "mopso-turbulent": _Entry(Mopso, MopsoSettings(inertia=0.45, mutation_share=0.75)),
@@ -34,7 +34,7 @@ _REGISTRY: dict[str, _Entry] = {
 
 def names() -> tuple[str, ...]:
     """The names that `make` knows."""
-    return tuple(_REGISTRY)
+    return tuple(REGISTRY)
 
 
 def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> Settings:
@@ -43,9 +43,9 @@ def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> Set
     Raises:
         SettingsError: unknown algorithm or setting, or a value outside its range.
     """
-    if name not in _REGISTRY:
-        raise SettingsError(f"unknown algorithm '{name}'; known are {', '.join(_REGISTRY)}")
-    defaults = _REGISTRY[name].defaults
+    if name not in REGISTRY:
+        raise SettingsError(f"unknown algorithm '{name}'; known are {', '.join(REGISTRY)}")
+    defaults = REGISTRY[name].defaults
     known = [field.name for field in dataclasses.fields(defaults)]
     unknown = [key for key in overrides or {} if key not in known]
     if unknown:
@@ -78,4 +78,4 @@ def make(
     if dataclasses.is_dataclass(settings):
         settings = dataclasses.asdict(settings)
     effective = settings_of(name, settings)
-    return _REGISTRY[name].build(effective, initial)
+    return REGISTRY[name].build(effective, initial)

@@ -5,24 +5,16 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
-from hybrid_opt.campaign import Progress
-from hybrid_opt.work.processes import warm_up
-from studies.program import Parser, add_verbose, carried_out, run_program
-from studies.report.stage import add_report_options, follow_report_options, rewrite
-
-PROGRAM = "python -m studies.report"
+from studies.options import add, add_looks
+from studies.program import Parser, Program, run_program
 
 
-@carried_out(PROGRAM)
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; returns the exit code."""
-    parser = Parser(prog=PROGRAM, description=__doc__)
-    parser.add_argument("results", type=Path, metavar="RESULTS", help="results folder of a study")
-    parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
+def _add_options(parser: Parser) -> None:
+    add(parser, "RESULTS", "--quiet")
     parser.add_argument(
         "--into",
         type=Path,
@@ -34,20 +26,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         action="store_true",
         help="write pictures as PDF, too (default: as the study did, all but a --quick one)",
     )
-    add_report_options(parser)
-    add_verbose(parser)
-    options = parser.parse_args(arguments)
+    add_looks(parser)
+
+
+def _run(options: argparse.Namespace) -> int:
+    from hybrid_opt.campaign import Progress
+    from hybrid_opt.work.processes import warm_up
+    from studies.report.stage import follow_looks, rewrite
+
     if options.into:
         from studies.report.look import insert_tables
 
         insert_tables(options.results, options.into)
     elif options.animation or options.view:
-        follow_report_options(options.results, options)
+        follow_looks(options.results, options)
     else:
         warm_up("studies.report.generate")
         rewrite(options.results, Progress(not options.quiet), options.pdf)
         print(f"Report: {options.results / 'report.html'}")
     return 0
+
+
+main = Program("report", __doc__, _add_options, _run)
 
 
 if __name__ == "__main__":

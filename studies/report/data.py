@@ -43,7 +43,7 @@ from studies.report.records import (
     Run,
     TimedSelection,
 )
-from studies.terminal_summary import title
+from studies.study.terminal import title
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.read.cell_files import collect_cell

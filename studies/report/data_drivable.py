@@ -9,9 +9,8 @@ from hybrid_opt.campaign.results import CampaignResults, read_summary
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.evaluate.objectives import duration_unit
 from hybrid_opt.store.trajectory_file import read_trajectory
-from studies.drivable import ReplicaFront, drivable_fronts, drivable_root
-from studies.jerk_costs import jerk_costs
 from studies.report.records import DrivableFront, DrivableReport
+from studies.study.drivable import ReplicaFront, drivable_fronts, drivable_root, jerk_costs
 from symbolic.array import Array
 from symbolic.read.cell_files import collect_cell
 

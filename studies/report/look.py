@@ -11,7 +11,7 @@ from studies.report.animation import Film, write_animation
 from studies.report.data import gather_carries
 from studies.report.generate import TABLES
 from studies.report.live import LiveView
-from studies.text_table import counted
+from studies.study.terminal import counted
 
 BEGIN = "<!-- measured: begin -->"
 END = "<!-- measured: end -->"

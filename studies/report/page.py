@@ -18,10 +18,10 @@ from typing import Any
 from hybrid_opt.display.scene import embedded_json, scene_js, three_js
 from hybrid_opt.store.json_records import to_json
 from studies.errors import ReportError
-from studies.recommendation_text import study_words
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
-from studies.text_table import counted
+from studies.study.recommendation import study_words
+from studies.study.terminal import counted
 
 
 def render_page(

@@ -11,7 +11,6 @@ import numpy as np
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.display.scene import packed, scene_data
 from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all
-from studies.drivable import is_drivable
 from studies.report.page_carries import (
     PageCarriesSource,
     driven_point,
@@ -29,6 +28,7 @@ from studies.report.page_groups import (
 from studies.report.page_views import FrontView, drive_look
 from studies.report.records import DrivableReport, ReportData
 from studies.report.style import HAND_MADE, LineStyle, series
+from studies.study.drivable import is_drivable
 from symbolic.array import Array
 from symbolic.read.cell_files import CellFiles, cell_to_json
 

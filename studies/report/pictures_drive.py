@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hybrid_opt.campaign.recommended import StoredRecommendation
-from studies.drivable import POLISHED
 from studies.report.page_views import drive_look, limits
 from studies.report.pictures_carry import STATIC_COLOUR, styled
 from studies.report.records import DrivableReport, ReportData
@@ -19,7 +18,8 @@ from studies.report.style import (
     new_figure,
     series,
 )
-from studies.text_table import counted
+from studies.study.drivable import POLISHED
+from studies.study.terminal import counted
 from symbolic.array import Array
 
 

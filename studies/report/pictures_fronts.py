@@ -13,7 +13,7 @@ from hybrid_opt.indicators.metrics import front_of
 from hybrid_opt.indicators.statistics import attainment_surfaces
 from studies.report.records import AlgorithmRuns, ReportData
 from studies.report.style import FULL_WIDTH, new_figure, panel_label, series
-from studies.text_table import counted
+from studies.study.terminal import counted
 from symbolic.array import Array
 
 QUARTILES = (25.0, 75.0)

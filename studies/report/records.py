@@ -16,9 +16,8 @@ from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.objectives import ForceKind, force_kind
 from hybrid_opt.timing import ForceCurve, TimingReport
 from hybrid_opt.timing.robustness import Margin, PayloadSensitivity
-from studies.drivable import ReplicaFront
-from studies.jerk_costs import JerkCosts
 from studies.report.jobs import DrawnJob
+from studies.study.drivable import JerkCosts, ReplicaFront
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.read.cell_files import CellFiles

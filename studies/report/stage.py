@@ -28,27 +28,8 @@ def report_stage(with_paper: bool, pdf: bool = True) -> Stage:
     return Stage("report", run, settings)
 
 
-def add_report_options(parser: argparse.ArgumentParser) -> None:
-    """Options for an animation file and the live view."""
-    group = parser.add_argument_group("looking at a trajectory")
-    group.add_argument(
-        "--animation",
-        type=Path,
-        metavar="FILE",
-        help="write the selected trajectory as FILE.gif or FILE.mp4 (default: none)",
-    )
-    group.add_argument(
-        "--view",
-        action="store_true",
-        help='show the trajectories live in a browser; needs pip install "dual-arm-carry[view]"',
-    )
-    group.add_argument(
-        "--port", type=int, default=8080, metavar="N", help="of --view (default: %(default)s)"
-    )
-
-
-def follow_report_options(root: Path, options: argparse.Namespace) -> None:
-    """Do what `add_report_options` lets a user ask for; the live view ends with Ctrl-C.
+def follow_looks(root: Path, options: argparse.Namespace) -> None:
+    """Do what `studies.options.add_looks` lets a user ask for; the live view ends with Ctrl-C.
 
     Raises:
         DualArmError: the results or an optional library are missing.

@@ -8,7 +8,6 @@ import numpy as np
 
 from hybrid_opt.campaign.summary import FrontFigures
 from hybrid_opt.indicators.statistics import summarise
-from studies.drivable import is_drivable
 from studies.report.records import AlgorithmRuns, DrawnCarry, ReportData
 from studies.report.table_text import NOTHING, Table, number
 from studies.report.tables_drive import (
@@ -19,9 +18,9 @@ from studies.report.tables_drive import (
     timings,
 )
 from studies.report.tables_job import phases
-from studies.simulation_text import HEADINGS, MEANING, simulation_rows
-from studies.terminal_summary import PAPER
-from studies.text_table import counted
+from studies.study.drivable import is_drivable
+from studies.study.simulation import HEADINGS, MEANING, simulation_rows
+from studies.study.terminal import PAPER, counted
 
 MOST_BOUNDS = 8
 """Bounds of one experiment that are listed."""

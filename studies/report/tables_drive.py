@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation, set_text
-from studies.jerk_costs import HEAD, NOTE, JerkCosts
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
+from studies.study.drivable import HEAD, NOTE, JerkCosts
 
 
 def time_against_force(found: StoredRecommendation) -> Table:

@@ -22,7 +22,7 @@ from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.store.files import read_bytes
 from hybrid_opt.store.json_records import read_record
 from hybrid_opt.store.trajectory_file import read_trajectory
-from studies.reference_front import read_reference_front
+from studies.research.best_front import read_reference_front
 from symbolic.errors import DualArmError
 from symbolic.read.cell import load
 from symbolic.read.meshes import read_mesh

@@ -20,9 +20,9 @@ from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
 from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.polishing.settings import PolishSettings
-from studies.compare import compare
+from studies.programs.comparison import compare
 from studies.report.data import gather_carries
-from studies.study import StudySettings, run_study
+from studies.study.stages import StudySettings, run_study
 from symbolic.read.cell import load
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
 from tests.fuzz.promises import kept

@@ -12,7 +12,7 @@ from hybrid_opt.collision.certify import SampledPath, configurations
 from hybrid_opt.evaluate.evaluation import LockedEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.kernel import one_by_one
-from studies.plain.verdict import PlainJudge
+from studies.research.plain.verdict import PlainJudge
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.task import extended_waypoints

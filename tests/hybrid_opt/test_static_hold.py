@@ -13,9 +13,8 @@ import hybrid_opt as ho
 from hybrid_opt.static_hold import still_load, unheld
 from hybrid_opt.timing.model import TimingModel
 from studies import propose, run
-from studies.inspect import told
-from studies.inspection import Inspection
 from studies.program import BAD_INPUT
+from studies.programs.inspection import Inspection, told
 from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
 from symbolic.records import Workcell

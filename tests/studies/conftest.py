@@ -17,8 +17,8 @@ from hybrid_opt.campaign.summary import PolishedFigures
 from hybrid_opt.indicators.metrics import non_dominated
 from studies.report.data import gather
 from studies.report.records import Front, ReportData
-from studies.study import StudySettings, run_study
-from studies.summary import front_indicators
+from studies.study.stages import StudySettings, run_study
+from studies.study.summary import front_indicators
 from symbolic.read.cell import load
 from tests.symbolic.cells import ROOT
 

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Literal, get_args, get_origin
 
 import pytest
 
-from studies import inspect, reference_front, robust, simulate, thresholds
-from studies.options import force, number, seed, whole
+from studies import export, inspect, recommend, replay, robust, simulate
+from studies.options import force, number, seed, stated, whole
+from studies.research import reference_front, thresholds
+from tests.symbolic.cells import ROOT
+
+CAMPAIGN = (
+    *("algorithms", "evaluations", "replicas", "seed"),
+    *("constraint_handling", "first_generation"),
+)
+"""Settings whose defaults `studies.run` tells."""
 
 ODD = ("", " ", "a", "nan", "1e400", "-1", "9" * 5000, "\ud800", "1_000_000_000_000_000_000_000")
 
@@ -33,9 +44,38 @@ def test_the_ends_belong_to_the_range() -> None:
             whole(2, 5)(text)
 
 
+def test_the_source_states_what_the_module_says() -> None:
+    """Of every default and choice that an option of a program takes from the source."""
+    asked = {
+        name
+        for path in (ROOT / "studies").rglob("*.py")
+        for name in re.findall(r"""\bstated\(\s*["']([\w.]+)["']""", path.read_text("utf-8"))
+    }
+    asked |= {f"hybrid_opt.campaign.settings.CampaignSettings.{name}" for name in CAMPAIGN}
+    assert len(asked) > 15
+    for name in asked:
+        owner, _, last = name.rpartition(".")
+        package, _, kind = owner.rpartition(".")
+        within = getattr(import_module(package), kind) if kind[0].isupper() else None
+        value = getattr(within or import_module(owner), last)
+        if get_origin(value) is Literal:
+            value = get_args(value)
+        elif isinstance(value, Mapping):
+            value = tuple(value)
+        assert stated(name) == value
+
+
+def test_what_the_source_does_not_state_is_an_error() -> None:
+    with pytest.raises(LookupError):
+        stated("hybrid_opt.campaign.settings.CampaignSettings.wishes")
+
+
 @pytest.mark.parametrize(
     ("main", "arguments"),
     [
+        (replay.main, ["t.json", "--force-limit", "0"]),
+        (export.main, ["t.json", "--form", "csv", "--force-limit", "-1"]),
+        (recommend.main, ["results", "--force-limit", "nan"]),
         (robust.main, ["t.json", "--cases", "0"]),
         (robust.main, ["t.json", "--points", "-1"]),
         (robust.main, ["t.json", "--seed", "-1"]),

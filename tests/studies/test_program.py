@@ -6,18 +6,18 @@ import re
 import signal
 import subprocess
 import sys
+import tomllib
 from importlib import import_module
 
 import pytest
 
-from studies.program import carried_out, carry_out
+from studies.__main__ import command, programs
+from studies.program import Program, carry_out
 from symbolic.errors import DualArmError
 from tests.symbolic.cells import ROOT
 
-PROGRAMS = (
-    *("run", "rack", "compare", "control", "algorithms", "benchmark", "regenerate"),
-    *("inspect", "replay", "reference_front", "report.__main__"),
-)
+PROGRAMS = programs()
+HEAVY = ("casadi", "coal", "matplotlib", "mujoco", "pinocchio", "pymoo", "scipy", "toppra")
 HEAD = """
 import logging, sys, warnings
 import numpy as np
@@ -120,8 +120,55 @@ def test_an_interrupt_during_the_start_is_no_traceback(module: str) -> None:
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_every_program_knows_verbose(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        import_module(f"studies.{name}").main(["--help"])
+        import_module(PROGRAMS[name][0]).main(["--help"])
     assert "--verbose" in capsys.readouterr().out
+
+
+def test_help_imports_nothing_heavy() -> None:
+    """Of any program; what it would tell of heavy modules is read from their source."""
+    text = (
+        "import sys\n"
+        "from importlib import import_module\n"
+        "from studies.__main__ import programs\n"
+        "for module, _ in programs().values():\n"
+        "    import_module(module).main.parser().format_help()\n"
+        "print(len(programs()), *sorted(sys.modules))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    count, *imported = done.stdout.split()
+    assert (done.stderr, int(count)) == ("", len(PROGRAMS))
+    assert set(imported).isdisjoint(HEAVY)
+    assert "numpy" in imported
+
+
+def test_the_installed_command_runs_every_program(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert project["scripts"] == {"dual-arm-carry": f"{command.__module__}:{command.__name__}"}
+    for name in PROGRAMS:
+        monkeypatch.setattr(sys, "argv", ["dual-arm-carry", name, "--no-such-option"])
+        with pytest.raises(SystemExit) as end:
+            command()
+        assert end.value.code == 2
+        assert capsys.readouterr().err.startswith(f"dual-arm-carry {name}: ")
+    for words, said in (
+        (["rnu"], "dual-arm-carry: rnu is no program of it; did you mean 'run'?\n"),
+        (["inspect", "none.toml"], "dual-arm-carry inspect: none.toml: "),
+    ):
+        monkeypatch.setattr(sys, "argv", ["dual-arm-carry", *words])
+        with pytest.raises(SystemExit) as end:
+            command()
+        assert end.value.code == 2
+        assert capsys.readouterr().err.startswith(said)
+    monkeypatch.setattr(sys, "argv", ["dual-arm-carry"])
+    with pytest.raises(SystemExit) as end:
+        command()
+    assert end.value.code == 0
+    listed = capsys.readouterr().out.splitlines()[2:]
+    assert [line.split()[:2] for line in listed] == [["dual-arm-carry", name] for name in PROGRAMS]
 
 
 @pytest.mark.parametrize(
@@ -150,7 +197,7 @@ def test_every_program_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
     listing = import_module("studies.__main__")
     assert listing.main([]) == 0
     listed = capsys.readouterr().out.splitlines()[2:]
-    named = set(re.findall(r"`python -m (studies\.\w+)", (ROOT / "README.md").read_text()))
+    named = set(re.findall(r"`python -m (studies\.[\w.]+)", (ROOT / "README.md").read_text()))
     assert {line.split()[2] for line in listed} >= named | {"studies.report"}
     assert all(len(line.split()) > 5 and len(line) < 140 for line in listed)
     assert listing.main(["--help"]) == 0
@@ -182,4 +229,7 @@ def test_a_programs_name_stands_before_its_message(capsys: pytest.CaptureFixture
     assert capsys.readouterr().err == (
         "python -m studies.run: the file is wrong\n\ngo on with --resume\n"
     )
-    assert carried_out("any")(lambda arguments: 7)() == 7
+    program = Program("any", None, lambda parser: None, lambda options: wrong() + options.verbose)
+    assert program([], "dual-arm-carry any") == 2
+    assert capsys.readouterr().err == "dual-arm-carry any: the file is wrong\n"
+    assert Program("any", None, lambda parser: None, lambda options: 7)([]) == 7

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from studies.plain.arm import PlainArm
+from studies.research.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.functions import candidate_function

@@ -15,8 +15,8 @@ from hybrid_opt.collision.judge import FCL_RESOLUTION
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.evaluate.kernel import reached_samples
-from studies.plain.collisions import PlainCollisionChecker
-from studies.plain.verdict import PlainJudge, PlainVerdict
+from studies.research.plain.collisions import PlainCollisionChecker
+from studies.research.plain.verdict import PlainJudge, PlainVerdict
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
 from symbolic.functions import CONSTRAINTS

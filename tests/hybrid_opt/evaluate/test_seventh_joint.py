@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.cell import Cell
-from studies.benchmark_turns import interleaved
+from studies.research.turns import interleaved
 from symbolic.array import Array
 from symbolic.records import Workcell
 from tests.redundant_cells import free_pandas, locked_pandas

@@ -13,7 +13,7 @@ from pymoo.problems.multi.zdt import ZDT1
 from hybrid_opt.metaheuristics import make, search
 from hybrid_opt.metaheuristics.hypercube_archive import HypercubeArchive, hypercubes, thin
 from hybrid_opt.metaheuristics.mopso import reflect, replaces_best, turbulence
-from studies.algorithms import compare
+from studies.research.analytic import compare
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 

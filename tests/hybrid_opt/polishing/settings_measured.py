@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 import hybrid_opt as ho
+from hybrid_opt.display.table import text_table
 from hybrid_opt.indicators.metrics import hypervolume, reference_point
 from hybrid_opt.polishing.settings import PolishSettings
-from studies.text_table import text_table
 
 DEFAULT = PolishSettings()
 CHANGED: dict[str, PolishSettings] = {

@@ -8,7 +8,7 @@ import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators.metrics import front_of
-from studies.reference_front import read_reference_front
+from studies.research.best_front import read_reference_front
 from symbolic.read.cell import load
 from tests.symbolic.read.samples import RACK
 

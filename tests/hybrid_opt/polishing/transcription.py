@@ -16,7 +16,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from studies.plain.motion import evaluate_spline, natural_quintic
+from studies.research.plain.motion import evaluate_spline, natural_quintic
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.records import Workcell

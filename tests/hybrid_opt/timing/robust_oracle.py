@@ -13,8 +13,8 @@ import numpy as np
 
 from hybrid_opt.timing import TimingModel
 from hybrid_opt.timing.path_motion import PathMotion
-from studies.plain.load import GRAVITY
-from studies.plain.motion import angular_rates, rotation
+from studies.research.plain.load import GRAVITY
+from studies.research.plain.motion import angular_rates, rotation
 from symbolic.array import Array
 from symbolic.records import Workcell
 from tests.hybrid_opt.timing.convex_oracle import Affine, Program, Terms

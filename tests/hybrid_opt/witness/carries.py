@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybrid_opt.carry import ArmMotion, Carry
-from studies.plain.motion import angular_rates
+from studies.research.plain.motion import angular_rates
 from symbolic.array import Array
 from symbolic.records import Workcell
 

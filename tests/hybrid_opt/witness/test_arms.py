@@ -31,7 +31,7 @@ from hybrid_opt.witness.reference import (
     with_tracking_error,
 )
 from hybrid_opt.witness.scene import ArmSettings, joint_names
-from studies.plain.arm import PlainArm
+from studies.research.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell

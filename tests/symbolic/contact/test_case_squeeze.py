@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.plain.load import GRAVITY
-from studies.plain.motion import angular_rates, rotation
+from studies.research.plain.load import GRAVITY
+from studies.research.plain.motion import angular_rates, rotation
 from symbolic.contact.worst_cases import case_squeeze_function
 from tests.symbolic.cells import call
 from tests.symbolic.contact.joint_oracle import Case, least_wrenches

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from studies.plain.load import allocate as plain_allocate
+from studies.research.plain.load import allocate as plain_allocate
 from symbolic.array import Array
 from symbolic.contact.paper import allocate, normal_force_branches, required_force
 from tests.symbolic.cells import call

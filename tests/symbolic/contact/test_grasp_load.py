@@ -10,7 +10,7 @@ import pytest
 
 from codegen.lanes import lane_text
 from codegen.source import generated_c
-from studies.plain.motion import rotation
+from studies.research.plain.motion import rotation
 from symbolic.array import Array
 from symbolic.contact.grasp import Grasp, grasp_wrenches
 from symbolic.contact.load import load_function

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from codegen.lanes import lane_text
 from codegen.source import generated_c
-from studies.plain.load import GRAVITY
-from studies.plain.motion import angular_rates, rotation
+from studies.research.plain.load import GRAVITY
+from studies.research.plain.motion import angular_rates, rotation
 from symbolic.array import Array
 from symbolic.contact.load import RESIDUAL_TOLERANCE, load_function
 from symbolic.records import Workcell

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from studies.plain.load import sample_load
-from studies.plain.motion import angular_rates, rotation
+from studies.research.plain.load import sample_load
+from studies.research.plain.motion import angular_rates, rotation
 from symbolic.array import Array
 from symbolic.contact.load import load_function
 from symbolic.records import Contact, Workcell

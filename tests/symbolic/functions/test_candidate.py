@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from codegen.build import compile_function
-from studies.plain.candidate import PlainCandidate, PlainEvaluator
+from studies.research.plain.candidate import PlainCandidate, PlainEvaluator
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.functions import CONSTRAINTS, candidate_function

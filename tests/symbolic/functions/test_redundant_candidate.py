@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from studies.plain.candidate import evaluate
+from studies.research.plain.candidate import evaluate
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.functions import candidate_function

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from studies.plain.candidate import PlainEvaluator
+from studies.research.plain.candidate import PlainEvaluator
 from symbolic.array import Array
 from symbolic.functions import candidate_function
 from symbolic.path_motion import path_motion_function

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from studies.plain.motion import evaluate_spline, natural_quintic, waypoints
+from studies.research.plain.motion import evaluate_spline, natural_quintic, waypoints
 from symbolic.array import Array
 from symbolic.path.spline import path_basis, sample_basis, waypoint_matrix
 from symbolic.records import Task, Waypoint

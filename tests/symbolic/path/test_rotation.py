@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from studies.plain.motion import angular_rates, vector_rates
+from studies.research.plain.motion import angular_rates, vector_rates
 from symbolic.array import Array
 from symbolic.path.rotation import (
     angular_acceleration,

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from studies.plain.motion import angular_rates
+from studies.research.plain.motion import angular_rates
 from symbolic.array import Array
 from symbolic.path.spline import path_basis, sample_basis, waypoint_matrix
 from symbolic.path.time_law import STEP_TIME_FLOOR, timed_path

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from studies.plain.collisions import PlainCollisionChecker
+from studies.research.plain.collisions import PlainCollisionChecker
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
 from symbolic.functions import candidate_function

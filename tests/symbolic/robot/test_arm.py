@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from studies.plain.arm import PlainArm
-from studies.plain.motion import rotation
+from studies.research.plain.arm import PlainArm
+from studies.research.plain.motion import rotation
 from symbolic.array import Array
 from symbolic.path.rotation import rotation_matrix
 from symbolic.records.poses import Orientation

@@ -1,0 +1,1 @@
+"""What the programs do, apart from their options: imported when they run."""

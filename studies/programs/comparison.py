@@ -1,0 +1,251 @@
+"""Two campaigns beside one another, for `studies.compare`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.campaign.layout import DRIVABLE, SUMMARY
+from hybrid_opt.campaign.polish_stage import read_polished
+from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
+from hybrid_opt.campaign.summary import CampaignSummary
+from hybrid_opt.display.table import text_table
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.indicators import metrics
+from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
+from hybrid_opt.store.json_records import to_json
+from studies.study.summary import LEAST_TESTED, reference_front
+from studies.study.terminal import number, title
+from symbolic.array import Array
+
+SEARCHED = ("feasible_share", "non_dominated", "hypervolume", "igd", "spacing")
+"""Figures computed anew from the stored candidates."""
+
+OF_FRONTS = SEARCHED[1:]
+"""Those of them that a polished front has as well."""
+
+STORED = ("mean_excess_above_static", "payload_limit", "seconds")
+"""Figures taken from summary.json."""
+
+POLISHED = "polished_"
+"""In front of the figures of polished fronts."""
+
+
+@dataclass(frozen=True)
+class ComparedFigure:
+    """One figure of one algorithm in both campaigns.
+
+    Attributes:
+        algorithm, figure: which one.
+        first, second: its summary over each campaign's replicas.
+        test: rank test between them, None with few replicas or where one of them has no value.
+    """
+
+    algorithm: str
+    figure: str
+    first: Summary
+    second: Summary
+    test: RankTest | None
+
+
+@dataclass(frozen=True)
+class CampaignComparison:
+    """Two campaigns beside one another.
+
+    Attributes:
+        runs: the two folders.
+        same_workcell: whether both searched the same cell; figures of different cells say
+            little about the algorithms.
+        differences: configuration key, first and second value.
+        figures: of the algorithms that both ran.
+        only: per campaign the algorithms that the other lacks.
+        drivable: their drivable experiments, None where one has none beside its first.
+    """
+
+    runs: tuple[str, str]
+    same_workcell: bool
+    differences: tuple[tuple[str, str, str], ...]
+    figures: tuple[ComparedFigure, ...]
+    only: tuple[tuple[str, ...], tuple[str, ...]]
+    drivable: CampaignComparison | None
+
+
+def compare(first: Path, second: Path) -> CampaignComparison:
+    """Compare two results folders.
+
+    Raises:
+        ResultsError: a folder is not a finished campaign, they share no algorithm, or they
+            minimise different objectives.
+    """
+    folders = (first, second)
+    runs = tuple(read_campaign(folder) for folder in folders)
+    summaries = tuple(read_summary(folder) for folder in folders)
+    polished = tuple(_polished(run) for run in runs)
+    if runs[0].objectives != runs[1].objectives:
+        raise ResultsError(
+            f"{first} minimises {', '.join(runs[0].objectives)}, {second} "
+            f"{', '.join(runs[1].objectives)}: such fronts cannot be compared"
+        )
+    shared = [name for name in runs[0].algorithms if name in runs[1].algorithms]
+    if not shared:
+        raise ResultsError(f"{first} and {second} have no algorithm in common")
+    every = [replica.front for run in runs for replica in run.replicas]
+    every += [front for fronts in polished for front in fronts.values()]
+    reference = reference_front(every)
+    figures = [
+        figure
+        for name in shared
+        for figure in _algorithm_figures(name, runs, summaries, polished, reference)
+    ]
+    both = all((folder / DRIVABLE / SUMMARY).exists() for folder in folders)
+    return CampaignComparison(
+        (str(first), str(second)),
+        runs[0].workcell.digest == runs[1].workcell.digest,
+        tuple(_differences(*(to_json(run.configuration) for run in runs))),
+        _with_holm(figures),
+        tuple(  # type: ignore[arg-type]
+            tuple(name for name in run.algorithms if name not in shared) for run in runs
+        ),
+        compare(first / DRIVABLE, second / DRIVABLE) if both else None,
+    )
+
+
+def _polished(run: CampaignResults) -> dict[tuple[str, int], Array]:
+    """Objectives of a campaign's polished fronts, by algorithm and replica."""
+    found = {}
+    for replica in run.replicas:
+        polished = read_polished(run.root, replica, run.workcell)
+        if polished is not None:
+            found[replica.algorithm, replica.replica] = polished.objectives
+    return found
+
+
+def _algorithm_figures(
+    name: str,
+    runs: Sequence[CampaignResults],
+    summaries: Sequence[CampaignSummary],
+    polished: Sequence[Mapping[tuple[str, int], Array]],
+    reference: Array,
+) -> list[ComparedFigure]:
+    sides = []
+    for run, summary, fronts in zip(runs, summaries, polished, strict=True):
+        stored = summary.algorithms[name].replicas
+        values = {figure: [float(getattr(one, figure)) for one in stored] for figure in STORED}
+        values |= _columns([_searched(replica, reference) for replica in run.of(name)])
+        better = [one.polished for one in stored if one.polished is not None]
+        known = [front for (algorithm, _), front in fronts.items() if algorithm == name]
+        if better and known:
+            values |= _columns([_of_front(front, reference) for front in known], POLISHED)
+            values |= {
+                POLISHED + figure: [float(getattr(one, figure)) for one in better]
+                for figure in STORED
+            }
+        sides.append(values)
+    order = [prefix + figure for prefix in ("", POLISHED) for figure in (*SEARCHED, *STORED)]
+    return [
+        _compared(name, figure, *(np.array(side[figure]) for side in sides))
+        for figure in order
+        if all(figure in side for side in sides)
+    ]
+
+
+def _compared(name: str, figure: str, first: Array, second: Array) -> ComparedFigure:
+    known = all(np.isfinite(side).any() and len(side) >= LEAST_TESTED for side in (first, second))
+    test = rank_test(first, second, ("first", "second")) if known else None
+    return ComparedFigure(name, figure, summarise(first), summarise(second), test)
+
+
+def _columns(rows: Sequence[Mapping[str, float]], prefix: str = "") -> dict[str, list[float]]:
+    return {prefix + figure: [row[figure] for row in rows] for figure in rows[0]}
+
+
+def _searched(replica: Replica, reference: Array) -> dict[str, float]:
+    share = metrics.feasible_share(replica.evaluations.feasible)
+    return {"feasible_share": share, **_of_front(replica.front, reference)}
+
+
+def _of_front(front: Array, reference: Array) -> dict[str, float]:
+    """`OF_FRONTS` of a front (k, n_obj)."""
+    volume = metrics.hypervolume(front, metrics.reference_point(reference.shape[1]))
+    found = (float(len(front)), volume, metrics.igd(front, reference), metrics.spacing(front))
+    return dict(zip(OF_FRONTS, found, strict=True))
+
+
+def _with_holm(figures: list[ComparedFigure]) -> tuple[ComparedFigure, ...]:
+    """The figures with their tests corrected as one family."""
+    tests = iter(corrected([figure.test for figure in figures if figure.test is not None]))
+    return tuple(
+        figure
+        if figure.test is None
+        else ComparedFigure(
+            figure.algorithm, figure.figure, figure.first, figure.second, next(tests)
+        )
+        for figure in figures
+    )
+
+
+def _differences(
+    first: Mapping[str, Any], second: Mapping[str, Any], prefix: str = ""
+) -> list[tuple[str, str, str]]:
+    found = []
+    for key in sorted({*first, *second}):
+        name = f"{prefix}{key}"
+        a, b = first.get(key), second.get(key)
+        if isinstance(a, dict) and isinstance(b, dict):
+            found += _differences(a, b, f"{name}.")
+        elif a != b:
+            found.append((name, _short(a), _short(b)))
+    return found
+
+
+def _short(value: object) -> str:
+    text = "-" if value is None else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def as_text(found: CampaignComparison) -> str:
+    """A comparison for people."""
+    lines = [f"A: {found.runs[0]}", f"B: {found.runs[1]}", ""]
+    if not found.same_workcell:
+        lines += ["The workcells differ: the figures say more about them than about the runs.", ""]
+    lines += [f"{name}: A {a}, B {b}" for name, a, b in found.differences] or ["Same configuration"]
+    rows = [["median [quartiles]", "A", "B", "A12", "p (Holm)"]]
+    for figure in found.figures:
+        test = figure.test
+        rows.append(
+            [
+                f"{title(figure.algorithm)}, {figure.figure.replace('_', ' ')}",
+                _spread(figure.first),
+                _spread(figure.second),
+                "-" if test is None else number(test.a12, 2),
+                "-" if test is None else number(test.p_holm, 5),
+            ]
+        )
+    lines += ["", text_table(rows)]
+    for side, names in zip("AB", found.only, strict=True):
+        if names:
+            lines.append(f"only in {side}: {', '.join(title(name) for name in names)}")
+    lines.append(
+        "A12: chance that A has the larger figure. Exact Mann-Whitney tests from five replicas on."
+    )
+    if found.drivable is not None:
+        lines += ["", "The drivable experiments", "", as_text(found.drivable)]
+    return "\n".join(lines)
+
+
+def _spread(summary: Summary) -> str:
+    values = (summary.median, summary.quartile1, summary.quartile3)
+    return "{:.4g} [{:.4g}, {:.4g}]".format(*values)
+
+
+def compare_folders(options: argparse.Namespace) -> int:
+    """Compare the two results folders of the options, and print it; returns the exit code."""
+    found = compare(options.run_a, options.run_b)
+    print(json.dumps(to_json(found), indent=2) if options.json else as_text(found))
+    return 0

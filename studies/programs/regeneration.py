@@ -1,0 +1,115 @@
+"""What `studies.regenerate` does: a workcell's functions as C, compiled, kept and checked."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+
+from codegen.build import Build, FunctionReport, build
+from codegen.cache import Cache
+from codegen.interpreted import Agreement, compare
+from hybrid_opt.display.table import text_table
+
+DISAGREES = 1
+
+
+def regenerate(options: argparse.Namespace) -> int:
+    """Do what the options ask for, and print it; returns the exit code."""
+    cache = Cache()
+    removed = cache.clean() if options.clean else None
+    built: Build | None = None
+    comparisons: list[Agreement] = []
+    seconds: float | None = None
+    if options.study and options.workcell is not None:
+        from hybrid_opt.building import build_study
+        from hybrid_opt.campaign.progress import Progress
+        from hybrid_opt.cell import Cell
+
+        begin = time.perf_counter()
+        build_study(Cell.load(options.workcell), Progress())
+        seconds = time.perf_counter() - begin
+    elif options.workcell is not None:
+        from hybrid_opt.compiled_cell import EVALUATOR_LANES, EVALUATORS, CompiledCell
+        from symbolic.functions import cell_functions
+        from symbolic.read.cell import load
+
+        workcell = load(options.workcell)
+        cell = CompiledCell(workcell, cache)
+        made = cell_functions(cell.model)
+        key = cell.key(EVALUATORS)
+        built = build(made, cache, key=key, rebuild=options.check, lanes=EVALUATOR_LANES)
+        if options.check:
+            bounds = {"x": (workcell.task.lower, workcell.task.upper)}
+            rng = np.random.default_rng(options.seed)
+            comparisons = [
+                compare(function, built.functions[name], bounds, rng, options.samples, cache)
+                for name, function in made.items()
+            ]
+    if options.json:
+        _print_json(cache, removed, built, comparisons, seconds)
+    else:
+        _print_tables(cache, removed, built, comparisons)
+        if seconds is not None:
+            print(f"what a study needs is in {cache.folder}, after {seconds:.1f} s")
+    return 0 if all(comparison.agrees for comparison in comparisons) else DISAGREES
+
+
+def _print_json(
+    cache: Cache,
+    removed: int | None,
+    built: Build | None,
+    comparisons: Sequence[Agreement],
+    seconds: float | None,
+) -> None:
+    result: dict[str, object] = {"cache": str(cache.folder)}
+    if removed is not None:
+        result["removed"] = removed
+    if built is not None:
+        result["functions"] = [asdict(report) for report in built.reports]
+    if seconds is not None:
+        result["seconds"] = seconds
+    if comparisons:
+        result["check"] = [
+            asdict(comparison) | {"agrees": comparison.agrees} for comparison in comparisons
+        ]
+    print(json.dumps(result, indent=2))
+
+
+def _print_tables(
+    cache: Cache, removed: int | None, built: Build | None, comparisons: Sequence[Agreement]
+) -> None:
+    if removed is not None:
+        print(f"{removed} libraries removed from {cache.folder}")
+    if built is not None:
+        print(text_table([_HEADINGS, *[_row(report) for report in built.reports]]))
+    if comparisons:
+        print()
+        rows = [
+            (
+                c.name,
+                str(c.samples),
+                f"{c.outputs:.1e}",
+                f"{c.derivatives:.1e}",
+                "yes" if c.agrees else f"NO: {c.worst_output}",
+            )
+            for c in comparisons
+        ]
+        print(text_table([("function", "inputs", "outputs", "derivatives", "agrees"), *rows]))
+
+
+_HEADINGS = ("function", "operations", "C size", "compile time", "from cache")
+
+
+def _row(report: FunctionReport) -> tuple[str, ...]:
+    return (
+        report.name,
+        f"{report.operations:,}",
+        f"{report.c_bytes / 1000.0:,.1f} kB",
+        f"{report.compile_seconds:.2f} s (-O{report.level})",
+        "yes" if report.from_cache else "no",
+    )

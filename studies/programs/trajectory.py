@@ -1,0 +1,228 @@
+"""What programs do with a stored trajectory: replay it, export it, find forces that hold."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.bundles import BundleOptions, Origin, export
+from hybrid_opt.bundles.manifest import warnings_of
+from hybrid_opt.campaign.recommended import set_text
+from hybrid_opt.cell import Cell
+from hybrid_opt.display.table import text_table
+from hybrid_opt.job.compliance import (
+    SKEWS,
+    STIFFNESSES,
+    largest_skew,
+    position_control,
+    position_text,
+    skew_text,
+    skewed,
+)
+from hybrid_opt.job.plan import JobModel
+from hybrid_opt.job.records import Job
+from hybrid_opt.robust.force import USUAL, RobustModel, allowed_factor
+from hybrid_opt.robust.squeeze import SqueezeSettings
+from hybrid_opt.store.files import read_bytes
+from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.trajectory_file import Replay, StoredTrajectory, read_trajectory, replay
+from hybrid_opt.timing import (
+    Timing,
+    TimingLimits,
+    closest_to_reference_timing,
+    fastest_timing,
+    force_limited_timing,
+    time_path,
+    timed_trajectory,
+)
+from hybrid_opt.timing.document import timing_document
+from hybrid_opt.timing.model import TimingModel
+from studies.study.terminal import number
+from studies.study.timing import timing_text
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.records import Uncertainty
+
+EXIT_DIFFERENT = 1
+"""Where a replayed figure differs."""
+
+EXIT_DOES_NOT_HOLD = 1
+"""Where a random case fails."""
+
+NOT_STATED = "a usual one, because the workcell states no [uncertainty]"
+
+
+def replay_file(options: argparse.Namespace) -> int:
+    """Re-evaluate a trajectory file and print both figures; returns the exit code."""
+    stored = read_trajectory(options.file)
+    with TemporaryDirectory() as folder:
+        replayed = replay(stored, Path(folder))
+        document: dict[str, Any] = _replay_json(stored, replayed)
+        text = [_replay_text(stored, replayed)]
+        asked = (options.force_limit, options.force_curve)
+        if options.timing or any(option is not None for option in asked):
+            document["timing"], timing = _timings(stored, replayed, options)
+            text += ["", timing]
+    if options.json:
+        print(json.dumps(document, indent=1, allow_nan=False))
+    else:
+        print("\n".join(text))
+    return 0 if replayed.reproduced else EXIT_DIFFERENT
+
+
+def _timings(
+    stored: StoredTrajectory, replayed: Replay, options: argparse.Namespace
+) -> tuple[dict[str, Any], str]:
+    model = replayed.cell.timing_model
+    timed = timed_trajectory(model, stored.x, options.force_limit, options.force_curve)
+    return to_json(timing_document(timed)), timing_text(timed)
+
+
+def _replay_json(stored: StoredTrajectory, replayed: Replay) -> dict[str, Any]:
+    return {
+        "workcell": replayed.cell.workcell.name,
+        "digest": replayed.cell.workcell.digest,
+        "reproduced": replayed.reproduced,
+        "start_difference": replayed.start_difference,
+        "figures": {
+            figure.name: {
+                "stored": figure.stored,
+                "recomputed": figure.recomputed,
+                "same": figure.same,
+            }
+            for figure in replayed.figures
+        },
+        "provenance": dict(stored.provenance),
+    }
+
+
+def _replay_text(stored: StoredTrajectory, replayed: Replay) -> str:
+    rows = [("figure", "stored", "recomputed", "")]
+    for figure in replayed.figures:
+        recomputed = "-" if figure.recomputed is None else f"{figure.recomputed:.9g}"
+        mark = "" if figure.same else "DIFFERS"
+        rows.append((figure.name, f"{figure.stored:.9g}", recomputed, mark))
+    return "\n".join(
+        [
+            f"{replayed.cell.workcell.name}, {len(stored.x)} variables",
+            text_table(rows, left=(0, 3)),
+            f"start postures differ by at most {replayed.start_difference:.2e} rad",
+            "reproduced" if replayed.reproduced else "NOT reproduced",
+        ]
+    )
+
+
+def export_file(options: argparse.Namespace) -> int:
+    """Write the bundle of a trajectory file and print its job; returns the exit code."""
+    path = Path(options.file)
+    stored = read_trajectory(path)
+    bundle = BundleOptions(
+        options.step, options.per_arm, options.any_arm, options.stiffness, options.skew
+    )
+    squeeze = SqueezeSettings(options.squeeze, options.leader - 1)
+    with TemporaryDirectory() as folder:
+        job = _planned(stored, Path(folder), options, squeeze)
+        origin = Origin.of_file(path, read_bytes(path), stored.provenance)
+        files = export(job, options.form, options.output, origin=origin, options=bundle)
+        print(_report(job, options.stiffness))
+    print(f"\n{len(files)} files in {files[0].parent}")
+    return 0
+
+
+def _planned(
+    stored: StoredTrajectory, folder: Path, options: argparse.Namespace, squeeze: SqueezeSettings
+) -> Job:
+    cell = stored.open_cell(folder)
+    timing = _chosen(cell.timing_model, stored, options.use, options.force_limit)
+    return JobModel(cell.compiled, cell.timing_model).plan(timing, squeeze, options.smoothing)
+
+
+def _chosen(
+    model: TimingModel, stored: StoredTrajectory, use: str | None, force: float | None
+) -> Timing:
+    chosen = use or ("closest" if force is None else "force")
+    if chosen == "force":
+        if force is None:
+            raise SettingsError("--use force needs --force-limit")
+        return force_limited_timing(model, stored.x, force)
+    return {"closest": closest_to_reference_timing, "fastest": fastest_timing}[chosen](
+        model, stored.x
+    )
+
+
+def _report(job: Job, stiffness: float) -> str:
+    """The job's phases, what position control and a late arm do, and warnings."""
+    parts = [
+        repr(job),
+        "\nPosition control, by the arms' stiffness at their pads",
+        position_text([position_control(job, each) for each in STIFFNESSES]),
+        f"\nEither arm late, at {stiffness:g} N/m: up to "
+        f"{1e3 * largest_skew(job, stiffness):.1f} ms are survived",
+        skew_text([skewed(job, delay, stiffness) for delay in SKEWS]),
+    ]
+    parts += [f"\nwarning: {warning}" for warning in warnings_of(job)]
+    return "\n".join(parts)
+
+
+def robust_forces(options: argparse.Namespace) -> int:
+    """Print the forces that hold for a trajectory file; returns the exit code."""
+    stored = read_trajectory(options.file)
+    with TemporaryDirectory() as folder:
+        cell = stored.open_cell(Path(folder))
+        stated = not cell.workcell.uncertainty.is_empty
+        uncertainty = cell.workcell.uncertainty if stated else USUAL
+        carry = cell.carry(stored.x)
+        limit = options.force_limit
+        timed = [] if limit is None else _timed(cell, stored.x, limit, uncertainty)
+    model, leader = RobustModel(cell.workcell), options.leader - 1
+    reference = cell.workcell.task.reference_force
+    held = model.robust_force(carry, uncertainty, leader)
+    factors = np.linspace(0.0, 2.0, options.points)
+    factors = factors[factors < allowed_factor(cell.workcell, uncertainty)]
+    price = model.price(carry, factors, leader, uncertainty)
+    largest = model.largest_factor(carry, reference, leader, uncertainty)
+    check = model.check(carry, held, options.cases, np.random.default_rng(options.seed), threads=0)
+    named = "the workcell's [uncertainty]" if stated else NOT_STATED
+    print(f"{cell.workcell.name}: arm {options.leader} leads, the other's force is commanded")
+    print(f"  the set is {named}: {set_text(uncertainty)}")
+    print(f"  least peak forces, nothing uncertain {_both(held.nominal.max(axis=0))} N")
+    print(f"  peak forces that hold in all cases   {_both(held.peak)} N")
+    print(f"  reference forces                     {_both(reference)} N")
+    multiple = f"{largest:.3f} times" if np.isfinite(largest) else "any multiple of"
+    print(f"  they allow {multiple} the set")
+    rows = [("times the set", "peak force 1 [N]", "peak force 2 [N]")]
+    rows += [
+        (number(factor, 2), number(peak[0], 2), number(peak[1], 2))
+        for factor, peak in zip(factors, price, strict=True)
+    ]
+    print(f"\n{text_table(rows, left=())}")
+    verdict = "all hold" if check.holds else f"{check.failing} FAIL"
+    print(
+        f"\n  {check.cases} random cases (seed {options.seed}): {verdict}; the hardest needs "
+        f"{100.0 * check.closest:.2f} % of the commanded force"
+    )
+    for text in timed:
+        print(f"  {text}")
+    return 0 if check.holds else EXIT_DOES_NOT_HOLD
+
+
+def _timed(cell: Cell, x: Array, limit: float, uncertainty: Uncertainty) -> list[str]:
+    """How fast the path is within a force limit [N] on planned forces and on robust ones."""
+    if cell.workcell.uncertainty.is_empty:
+        cell = Cell(replace(cell.workcell, uncertainty=uncertainty))
+    found = []
+    for text, robust in (("planned forces", False), ("forces that hold in all cases", True)):
+        timing = time_path(cell.timing_model, x, TimingLimits(force=limit, robust=robust))
+        told = f"{timing.duration:.3f} s" if timing.ok else timing.reason
+        found.append(f"{text} below {limit:g} N: {told}")
+    return found
+
+
+def _both(values: Array) -> str:
+    return " / ".join(f"{value:.2f}" for value in values)

@@ -1,0 +1,333 @@
+"""Search algorithms on analytic problems, beside what a correct MOPSO reaches on them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from hybrid_opt import metaheuristics
+from hybrid_opt.display.table import text_table
+from hybrid_opt.indicators import metrics
+from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
+from hybrid_opt.metaheuristics import Evaluated, analytic_problems
+from hybrid_opt.metaheuristics.analytic_problems import AnalyticProblem
+from studies.research.algorithms import (
+    BAND_POPULATION,
+    SHIFTED,
+    SHIFTED_EVALUATIONS,
+    SHIFTED_POPULATION,
+)
+from studies.study.terminal import number
+from symbolic.errors import SettingsError
+
+Verdict = Literal["inside", "better", "worse"]
+
+
+@dataclass(frozen=True)
+class Band:
+    """Average figures of a correct MOPSO, see `BAND_SOURCE`.
+
+    Attributes:
+        hypervolume, igd: means over `BAND_SEEDS` seeds.
+        igd_std: standard deviation of the IGD over seeds, where known.
+    """
+
+    hypervolume: float
+    igd: float
+    igd_std: float | None = None
+
+
+BAND_SEEDS = 10
+BAND_SOURCE = (
+    "reference runs of an independent implementation of the 2002/2004 algorithm, made when this "
+    "program was specified: mean of 10 seeds, swarm and archive 100"
+)
+BANDS: dict[tuple[str, int], Band] = {
+    ("zdt1", 1000): Band(0.00, 1.49),
+    ("zdt2", 1000): Band(0.00, 2.34),
+    ("zdt3", 1000): Band(0.00, 0.92),
+    ("tnk", 1000): Band(0.465, 0.029),
+    ("srn", 1000): Band(0.738, 0.0068),
+    ("osy", 1000): Band(0.590, 0.241),
+    ("zdt1", 10_000): Band(0.278, 0.452),
+    ("zdt2", 10_000): Band(0.006, 0.871),
+    ("zdt3", 10_000): Band(0.248, 0.335),
+    ("tnk", 10_000): Band(0.507, 0.0072),
+    ("srn", 10_000): Band(0.741, 0.0060),
+    ("osy", 10_000): Band(0.846, 0.156),
+    ("zdt1", 25_000): Band(0.628, 0.166, 0.021),
+    ("zdt2", 25_000): Band(0.393, 0.091, 0.020),
+    ("zdt3", 25_000): Band(0.501, 0.121, 0.026),
+    ("tnk", 25_000): Band(0.509, 0.0061),
+    ("srn", 25_000): Band(0.739, 0.0067),
+    ("osy", 25_000): Band(0.892, 0.133),
+}
+
+
+def judge(
+    ours: Summary, reference: float, *, higher_is_better: bool, std: float | None = None
+) -> Verdict | None:
+    """Whether our mean agrees with a band's.
+
+    The band is the reference mean plus and minus three standard errors of the difference of
+    the two means. The reference's spread is taken as ours where it is not known.
+
+    Returns:
+        None where fewer than two seeds leave the spread unknown.
+    """
+    if ours.count < 2:
+        return None
+    reference_std = ours.std if std is None else std
+    error = math.sqrt(ours.std**2 / ours.count + reference_std**2 / BAND_SEEDS)
+    gain = ours.mean - reference if higher_is_better else reference - ours.mean
+    if abs(gain) <= 3.0 * error:
+        return "inside"
+    return "better" if gain > 0.0 else "worse"
+
+
+@dataclass(frozen=True)
+class Score:
+    """One algorithm on one problem with one budget, over all seeds.
+
+    Attributes:
+        hypervolume, igd: of the algorithm's final front, of limited size.
+        archive_hypervolume, archive_igd: of all non-dominated points that it evaluated.
+        overhead_us: the algorithm's own time per evaluation [us].
+        infeasible_in_front: members of final fronts that violate a constraint.
+        hypervolume_verdict, igd_verdict: against the band, None without one.
+    """
+
+    problem: str
+    evaluations: int
+    algorithm: str
+    population: int
+    hypervolume: Summary
+    igd: Summary
+    archive_hypervolume: Summary
+    archive_igd: Summary
+    overhead_us: float
+    infeasible_in_front: int
+    hypervolume_verdict: Verdict | None
+    igd_verdict: Verdict | None
+
+
+@dataclass(frozen=True)
+class _Run:
+    hypervolume: float
+    igd: float
+    archive_hypervolume: float
+    archive_igd: float
+    overhead_us: float
+    infeasible_in_front: int
+
+
+def _indicators(target: AnalyticProblem, points: Evaluated) -> tuple[float, float]:
+    front = target.normalise(metrics.front_of(points.objectives, points.feasible))
+    return metrics.hypervolume(front), metrics.igd(front, target.normalise(target.front))
+
+
+def _settings(name: str, population: int) -> dict[str, object]:
+    known = metaheuristics.settings_of(name)
+    size = next(key for key in ("swarm", "population", "batch") if hasattr(known, key))
+    return {size: population}
+
+
+def _run(target: AnalyticProblem, name: str, evaluations: int, population: int, seed: int) -> _Run:
+    algorithm = metaheuristics.make(name, _settings(name, population))
+    result = metaheuristics.search(target.problem, algorithm, evaluations, seed)
+    # Judged anew from the decisions: an algorithm's word for feasibility is not enough.
+    constraints = target.problem.evaluate(result.front.decisions, return_values_of=["G"])
+    return _Run(
+        *_indicators(target, result.front),
+        *_indicators(target, result.evaluated),
+        1e6 * result.algorithm_seconds / evaluations,
+        int((constraints > 0.0).any(axis=1).sum()) if target.problem.n_ieq_constr else 0,
+    )
+
+
+def _band(problem: str, evaluations: int, algorithm: str, population: int) -> Band | None:
+    """The band of Coello's MOPSO and of the variants of it, for the swarm that it holds for."""
+    applies = algorithm.startswith("mopso") and population == BAND_POPULATION
+    return BANDS.get((problem, evaluations)) if applies else None
+
+
+def _score(
+    problem: str, evaluations: int, algorithm: str, population: int, runs: Sequence[_Run]
+) -> Score:
+    hypervolume = summarise([run.hypervolume for run in runs])
+    distance = summarise([run.igd for run in runs])
+    band = _band(problem, evaluations, algorithm, population)
+    verdicts: tuple[Verdict | None, Verdict | None] = (None, None)
+    if band is not None:
+        verdicts = (
+            judge(hypervolume, band.hypervolume, higher_is_better=True),
+            judge(distance, band.igd, higher_is_better=False, std=band.igd_std),
+        )
+    return Score(
+        problem,
+        evaluations,
+        algorithm,
+        population,
+        hypervolume,
+        distance,
+        summarise([run.archive_hypervolume for run in runs]),
+        summarise([run.archive_igd for run in runs]),
+        sum(run.overhead_us for run in runs) / len(runs),
+        sum(run.infeasible_in_front for run in runs),
+        *verdicts,
+    )
+
+
+@dataclass(frozen=True)
+class AlgorithmTest:
+    """All scores, and the rank tests of the first algorithm against each other one on the
+    problem with its optimum inside the bounds (hypervolume, then IGD; Holm-corrected)."""
+
+    seeds: int
+    scores: tuple[Score, ...]
+    tests: tuple[RankTest, ...]
+
+
+def compare(
+    problems: Sequence[str],
+    budgets: Sequence[int],
+    names: Sequence[str],
+    seeds: int,
+    population: int = BAND_POPULATION,
+    progress: bool = False,
+) -> AlgorithmTest:
+    """Run every algorithm on every problem with every budget and seeds 0, 1, ...
+
+    The problem with its optimum inside the bounds has its own budget and population.
+
+    Raises:
+        SettingsError: unknown names, no seeds, or a budget below the population.
+    """
+    for name in names:
+        metaheuristics.settings_of(name)
+    targets = [analytic_problems.make(problem) for problem in problems]
+    if seeds < 1 or min(budgets) < population:
+        raise SettingsError(
+            f"{seeds} seeds of {min(budgets)} evaluations; at least 1 seed and {population} "
+            "evaluations (the population) are needed"
+        )
+    tasks = [
+        (target, budget, name, population)
+        for target in targets
+        if target.name != SHIFTED
+        for budget in budgets
+        for name in names
+    ] + [
+        (target, SHIFTED_EVALUATIONS, name, SHIFTED_POPULATION)
+        for target in targets
+        if target.name == SHIFTED
+        for name in names
+    ]
+    scores: list[Score] = []
+    shifted: dict[str, list[_Run]] = {}
+    start = time.perf_counter()
+    for done, (target, budget, name, size) in enumerate(tasks, 1):
+        runs = [_run(target, name, budget, size, seed) for seed in range(seeds)]
+        scores.append(_score(target.name, budget, name, size, runs))
+        if target.name == SHIFTED:
+            shifted[name] = runs
+        if progress:
+            elapsed = time.perf_counter() - start
+            print(
+                f"{done}/{len(tasks)} {target.name} {budget} {name}, {elapsed:.0f} s",
+                file=sys.stderr,
+            )
+    return AlgorithmTest(seeds, tuple(scores), _tests(shifted))
+
+
+def _tests(shifted: dict[str, list[_Run]]) -> tuple[RankTest, ...]:
+    tests = []
+    for name in list(shifted)[1:]:
+        first, others = next(iter(shifted)), shifted[name]
+        for figure in ("hypervolume", "igd"):
+            ours = [getattr(run, figure) for run in shifted[first]]
+            theirs = [getattr(run, figure) for run in others]
+            labels = (f"{first} {figure}", f"{name} {figure}")
+            tests.append(rank_test(ours, theirs, labels))
+    return corrected(tests)
+
+
+def table(result: AlgorithmTest) -> str:
+    """The comparison as text."""
+    lines = [
+        f"Mean over {result.seeds} seeds of the final front (limited size) and of all evaluated "
+        "points",
+        f"Bands: {BAND_SOURCE}",
+        text_table([_HEADINGS, *map(_cells, result.scores)], left=(0, 3, 7, 11)),
+    ]
+    for name in dict.fromkeys(score.algorithm for score in result.scores):
+        scores = [score for score in result.scores if score.algorithm == name]
+        judged = ((score.hypervolume_verdict, score.igd_verdict) for score in scores)
+        verdicts = [verdict for both in judged for verdict in both if verdict]
+        if verdicts:
+            counts = ", ".join(f"{verdicts.count(v)} {v}" for v in ("inside", "better", "worse"))
+            lines.append(f"{name} against the bands: {counts}")
+    infeasible = sum(score.infeasible_in_front for score in result.scores)
+    lines.append(f"infeasible members of final fronts: {infeasible}")
+    if result.tests:
+        lines.append(
+            f"{SHIFTED}, {SHIFTED_EVALUATIONS} evaluations, population {SHIFTED_POPULATION}:"
+        )
+    lines += [
+        f"  {test.first} against {test.second}: A12 {test.a12:.2f} ({test.magnitude}), "
+        f"exact Mann-Whitney p {test.p:.3g}, Holm {test.p_holm:.3g}"
+        for test in result.tests
+    ]
+    return "\n".join(lines)
+
+
+_HEADINGS = (
+    *("problem", "evals", "pop", "algorithm"),
+    *("HV", "sd", "band", "verdict", "IGD", "sd", "band", "verdict"),
+    *("HV all", "IGD all", "us/eval"),
+)
+
+
+def _cells(score: Score) -> tuple[str, ...]:
+    band = _band(score.problem, score.evaluations, score.algorithm, score.population)
+    return (
+        score.problem,
+        str(score.evaluations),
+        str(score.population),
+        score.algorithm,
+        number(score.hypervolume.mean, 3),
+        number(score.hypervolume.std, 3),
+        number(band.hypervolume, 3) if band else "",
+        score.hypervolume_verdict or "",
+        number(score.igd.mean, 4),
+        number(score.igd.std, 4),
+        number(band.igd, 4) if band else "",
+        score.igd_verdict or "",
+        number(score.archive_hypervolume.mean, 3),
+        number(score.archive_igd.mean, 4),
+        number(score.overhead_us, 1),
+    )
+
+
+def algorithms(options: argparse.Namespace) -> int:
+    """Run the comparison that the options ask for, and print it; returns the exit code."""
+    result = compare(
+        options.problems,
+        options.evaluations,
+        options.algorithms,
+        options.seeds,
+        options.population,
+        progress=True,
+    )
+    if options.json:
+        document = asdict(result)
+        print(json.dumps({"band_source": BAND_SOURCE, **document}, indent=2))
+    else:
+        print(table(result))
+    return 0

@@ -1,0 +1,175 @@
+"""The best front of a workcell that is known: polished from many starts, then filled."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.polish_stage import PolisherSource
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
+from hybrid_opt.indicators import metrics
+from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.polishing.settings import FillSettings, PolishSettings
+from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
+from hybrid_opt.work.processes import local_executor
+from hybrid_opt.work.service import Emit, Service, answer_all
+from studies.program import load_workcell
+from symbolic import outside
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.read.cell_files import collect_cell
+from symbolic.records.task import initial_decision
+
+CANDIDATES = 4000
+"""Random candidates among which starts are looked for."""
+
+ROUNDS = 14
+"""Rounds of one attempt, more than in a study."""
+
+ATTEMPTS = 7
+"""Attempts from each start: the point itself, then both ends and the middle, twice."""
+
+
+@dataclass(frozen=True)
+class ReferenceFront:
+    """A reference front; arrays are read-only.
+
+    Attributes:
+        digest: of the workcell that it belongs to.
+        objectives: (k, 2) by increasing first objective.
+        x: (k, n_var) decision vectors.
+    """
+
+    digest: str
+    objectives: Array
+    x: Array
+
+
+def compute_reference_front(
+    evaluator: CandidateEvaluator,
+    starts: int,
+    attempts: int,
+    rng: np.random.Generator,
+    jobs: int = 1,
+    tell: Callable[[str], None] = lambda text: None,
+) -> ReferenceFront:
+    """Polish from many starts, then the union of the results.
+
+    Args:
+        evaluator: with the paper's objectives.
+        starts: random feasible candidates to start from, the hand-made trajectory besides.
+        attempts: of the final polish of the union.
+        rng: draws the candidates.
+        jobs: worker processes, 0 for one per core; has no influence on the result.
+        tell: takes a line of progress.
+
+    Raises:
+        SettingsError: too few random candidates are feasible.
+    """
+    candidates = rng.uniform(evaluator.lower, evaluator.upper, (CANDIDATES, evaluator.n_var))
+    found = evaluator.evaluate(candidates)
+    feasible = np.flatnonzero(found.feasible)
+    if len(feasible) < starts:
+        raise SettingsError(
+            f"only {len(feasible)} of {CANDIDATES} random candidates are feasible; ask for at "
+            "most as many starts"
+        )
+    begins = [initial_decision(evaluator.workcell.task), *candidates[feasible[:starts]]]
+    cell = PackedCell.of(collect_cell(evaluator.workcell))
+    count = itertools.count(1)
+    executor = local_executor(jobs)
+    parts = answer_all(
+        executor,
+        _polish_service(cell, ATTEMPTS, FillSettings(attempts=0)),
+        list(zip([start[None] for start in begins], rng.spawn(len(begins)), strict=True)),
+        lambda: tell(f"start {next(count)} of {len(begins)}"),
+    )
+    union = np.concatenate([part.x for part in parts])
+    (front,) = answer_all(executor, _polish_service(cell, attempts, FillSettings()), [(union, rng)])
+    tell(f"reference front: {len(front.x)} points")
+    return ReferenceFront(evaluator.workcell.digest, front.objectives, front.x)
+
+
+def _polish_service(
+    cell: PackedCell, attempts: int, fill: FillSettings
+) -> Service[Polisher, tuple[Array, np.random.Generator], PolishedFront]:
+    settings = PolishSettings(attempts=attempts, rounds=ROUNDS, fill=fill)
+    source = PolisherSource(cell, PAPER_OBJECTIVES, settings)
+    return Service(source, _polished)
+
+
+def _polished(
+    polisher: Polisher, request: tuple[Array, np.random.Generator], emit: Emit
+) -> PolishedFront:
+    return polisher.polish(*request)
+
+
+def encode(front: ReferenceFront, command: str) -> bytes:
+    """The file: two comment lines, a header, one line per point."""
+    n_var = front.x.shape[1]
+    lines = [
+        f"# made with: {command}",
+        f"# workcell: {front.digest}",
+        ",".join(["peak_force_1", "peak_force_2", *(f"x_{k + 1}" for k in range(n_var))]),
+    ]
+    for objectives, x in zip(front.objectives.tolist(), front.x.tolist(), strict=True):
+        lines.append(",".join(map(repr, [*objectives, *x])))
+    return ("\n".join(lines) + "\n").encode()
+
+
+def read_reference_front(path: Path) -> ReferenceFront:
+    """Read a file of `encode`.
+
+    Raises:
+        ResultsError: it cannot be read or is damaged.
+    """
+    try:
+        content = read_bytes(path)
+        if content.count(b",") + content.count(b"\n") > outside.MOST_VALUES:
+            raise ValueError(f"it holds more than {outside.MOST_VALUES} values")
+        lines = content.decode("ascii").splitlines()
+        digest = lines[1].removeprefix("# workcell: ")
+        values = np.array([[float(word) for word in line.split(",")] for line in lines[3:]])
+        if values.ndim != 2 or values.shape[1] < 3:
+            raise ValueError("its lines do not hold two objectives and a decision")
+        if not np.isfinite(values).all():
+            raise ValueError("it holds a number that is not finite")
+        objectives, x = values[:, :2].copy(), values[:, 2:].copy()
+    except (ValueError, IndexError) as error:
+        told = str(error).splitlines()[0][:200]
+        raise ResultsError(f"{path}: no reference front ({told}); make it again") from error
+    for array in (objectives, x):
+        array.setflags(write=False)
+    return ReferenceFront(digest, objectives, x)
+
+
+def reference_front(options: argparse.Namespace) -> int:
+    """Compute and write the front that the options ask for; returns the exit code."""
+    command = (
+        f"python -m studies.research.reference_front {options.workcell} --output FILE "
+        f"--starts {options.starts} --attempts {options.attempts} --seed {options.seed}"
+    )
+    front = compute_reference_front(
+        CandidateEvaluator(load_workcell(options.workcell)),
+        options.starts,
+        options.attempts,
+        np.random.default_rng(options.seed),
+        options.jobs,
+        lambda text: print(text, file=sys.stderr, flush=True),
+    )
+    write_atomically(options.output, encode(front, command), AGAIN)
+    print(
+        f"{options.output}: {len(front.x)} points, hypervolume "
+        f"{metrics.hypervolume(front.objectives):.6f}"
+    )
+    return 0

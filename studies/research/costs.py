@@ -1,0 +1,273 @@
+"""Cost of one candidate, compiled, interpreted and plain, and how it grows with the cell."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+from collections.abc import Mapping
+from dataclasses import replace
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codegen.build import compile_function
+from codegen.interpreted import InterpretedFunction
+from codegen.source import dense
+from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from studies.research.plain.candidate import PlainEvaluator
+from studies.research.plain.verdict import PlainJudge
+from studies.research.study_costs import profile_study, study_table
+from studies.research.turns import (
+    POPULATION,
+    Evaluate,
+    interleaved,
+    progress,
+    summary,
+    with_collisions,
+)
+from symbolic.array import Array
+from symbolic.cell_model import CellModel
+from symbolic.functions import candidate_function
+from symbolic.read.cell import load
+from symbolic.records import Task, Waypoint, Workcell
+
+SAMPLES = (25, 50, 100, 200, 400)
+WAYPOINTS = (1, 2, 3, 4, 5, 6, 7, 8)
+
+
+def benchmark_cell(options: argparse.Namespace) -> int:
+    """Measure the cell or the study that the options ask for; returns the exit code."""
+    if options.study:
+        print(study_table(profile_study(_workcell(options.workcell), options.seed)))
+        return 0
+    result = benchmark(
+        _workcell(options.workcell), options.candidates, options.repeats, options.seed
+    )
+    print(json.dumps(result, indent=2) if options.json else report(result))
+    return 0
+
+
+def _workcell(path: Path | None) -> Workcell:
+    if path is not None:
+        return load(path)
+    with as_file(files("studies")) as folder:
+        return load(folder / "workcells" / "rack.toml")
+
+
+def benchmark(
+    workcell: Workcell, candidates: int = 10, repeats: int = 3, seed: int = 0
+) -> dict[str, Any]:
+    """Measure one cell; every time is in milliseconds per candidate.
+
+    Args:
+        candidates: number of decision vectors, uniform within the bounds.
+        repeats: rounds with each of them.
+        seed: of the decision vectors.
+
+    Raises:
+        CodegenError: there is no compiler.
+        DualArmError: the cell has no model.
+    """
+    progress(f"{workcell.name}: reading the robots, choosing start branches")
+    compiled = CompiledCell(workcell)
+    model = compiled.model
+    one_each = _candidates(workcell.task, candidates, seed)
+    batches = np.repeat(one_each[:, None], POPULATION, axis=1)
+    batches[:, 1:] = _candidates(workcell.task, candidates * (POPULATION - 1), seed + 1).reshape(
+        candidates, POPULATION - 1, -1
+    )
+    progress("building the evaluator")
+    evaluator = CandidateEvaluator(workcell, compiled=compiled)
+    ways: dict[str, Evaluate] = {
+        "compiled": lambda x: evaluator.sampled(x, with_collisions=False),
+        "interpreted": InterpretedFunction(dense(candidate_function(model))),
+        "plain": PlainEvaluator(workcell, model.start),
+    }
+    progress(f"{candidates * repeats} rounds: {', '.join(ways)}")
+    x = {name: batches if name == "compiled" else one_each for name in ways}
+    times = interleaved(ways, x, repeats)
+    times["compiled"] /= POPULATION
+    return {
+        "workcell": workcell.name,
+        "digest": workcell.digest,
+        "samples": workcell.task.samples,
+        "free_waypoints": len(workcell.task.free_indices),
+        "candidates": candidates,
+        "repeats": repeats,
+        "seed": seed,
+        "machine": {
+            "processor": _processor(),
+            "cores": os.cpu_count(),
+            "system": platform.platform(),
+            "python": platform.python_version(),
+        },
+        **summary(times),
+        "with_collisions": with_collisions(
+            workcell, PlainJudge(workcell, model.start), candidates, repeats, seed
+        ),
+        "scaling": _scaling(model, candidates, repeats, seed),
+    }
+
+
+def _scaling(model: CellModel, candidates: int, repeats: int, seed: int) -> dict[str, Any]:
+    """Compiled cost against the numbers of samples and of free waypoints."""
+    task = model.workcell.task
+    by_samples = {n: replace(task, samples=n) for n in SAMPLES}
+    by_waypoints = {n: with_free_waypoints(task, n) for n in WAYPOINTS}
+    samples = _costs(model, by_samples, candidates, repeats, seed, "samples")
+    waypoints = _costs(model, by_waypoints, candidates, repeats, seed, "free waypoints")
+    # The line goes through costs relative to the middle one, which turns taken make comparable;
+    # relative weights let 25 samples count as much as 400.
+    middle = SAMPLES[len(SAMPLES) // 2]
+    n = np.array(SAMPLES)
+    relative = np.array([np.median(samples[k] / samples[middle]) for k in SAMPLES])
+    slope, offset = np.polyfit(n, relative, 1, w=1.0 / relative)
+    unit = 1e3 * float(np.median(samples[middle]))
+    deviation = np.abs((slope * n + offset) / relative - 1.0).max()
+    return {
+        "samples": _entries("samples", samples),
+        "samples_line": {
+            "ms_per_sample": unit * float(slope),
+            "fixed_ms": unit * float(offset),
+            "largest_relative_deviation": float(deviation),
+        },
+        "waypoints": _entries("waypoints", waypoints),
+    }
+
+
+def _entries(name: str, costs: Mapping[int, Array]) -> list[dict[str, float]]:
+    return [{name: n, "compiled_ms": 1e3 * float(np.median(cost))} for n, cost in costs.items()]
+
+
+def _costs(
+    model: CellModel,
+    tasks: Mapping[int, Task],
+    candidates: int,
+    repeats: int,
+    seed: int,
+    what: str,
+) -> dict[int, Array]:
+    """Seconds per candidate (rounds,) of the compiled evaluator for each task, taken in turns."""
+    ways: dict[str, Evaluate] = {}
+    x: dict[str, Array] = {}
+    for n, task in tasks.items():
+        progress(f"building the evaluator with {n} {what}")
+        sized = replace(model, workcell=replace(model.workcell, task=task))
+        ways[str(n)] = compile_function(candidate_function(sized))
+        x[str(n)] = _candidates(task, candidates, seed)
+    return {int(name): value for name, value in interleaved(ways, x, repeats).items()}
+
+
+def with_free_waypoints(task: Task, count: int) -> Task:
+    """The task with another number of free waypoints between its start and goal.
+
+    They lie evenly along the polygon of the hand-made trajectory; each may deviate as far as the
+    narrowest of the original ones.
+    """
+    points = np.array([waypoint.lower for waypoint in task.waypoints])
+    points[list(task.free_indices)] = task.initial
+    knots = np.arange(len(points), dtype=float)
+    at = np.linspace(0.0, knots[-1], count + 2)[1:-1]
+    centres = np.column_stack([np.interp(at, knots, column) for column in points.T])
+    spread = (task.upper - task.lower)[: task.n_box]
+    half = np.min(np.reshape(spread, (-1, 6)), axis=0) / 2.0
+    stretched = np.linspace(0.0, knots[-1], count + 2)
+    redundant = [
+        replace(
+            joint,
+            **{
+                key: np.interp(stretched, knots, getattr(joint, key))
+                for key in ("lower", "upper", "initial")
+            },
+        )
+        for joint in task.redundant
+    ]
+    return replace(
+        task,
+        redundant=tuple(redundant),
+        waypoints=(
+            task.waypoints[0],
+            *(Waypoint(centre - half, centre + half) for centre in centres),
+            task.waypoints[-1],
+        ),
+        initial=centres,
+    )
+
+
+def _candidates(task: Task, count: int, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(task.lower, task.upper, (count, task.n_var))
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor())
+
+
+def report(result: Mapping[str, Any]) -> str:
+    """All figures of `benchmark`."""
+    machine, line = result["machine"], result["scaling"]["samples_line"]
+    collisions = result["with_collisions"]
+    rows = [
+        f"{result['workcell']}: {result['samples']} samples, "
+        f"{result['free_waypoints']} free waypoints",
+        f"{machine['processor']}, Python {machine['python']}; one core, medians of "
+        f"{result['candidates']} candidates x {result['repeats']} rounds, seed {result['seed']}",
+        "",
+        *_ways(result),
+        "",
+        f"with collisions, means over candidates of a search ({collisions['evaluations']} "
+        f"evaluations, batches of {collisions['population']})",
+        *_ways(collisions),
+        *_shares(collisions),
+        *_peak(collisions),
+        "",
+        "with collisions, means over random candidates",
+        *_ways(collisions["random"]),
+        *_shares(collisions["random"]),
+        "",
+        "samples      ms per candidate, one at a time",
+        *(f"{e['samples']:7d}  {e['compiled_ms']:20.3f}" for e in result["scaling"]["samples"]),
+        f"line: {1e3 * line['ms_per_sample']:.2f} us per sample + {1e3 * line['fixed_ms']:.1f} us, "
+        f"off by at most {100 * line['largest_relative_deviation']:.0f} %",
+        "",
+        "waypoints    ms per candidate, one at a time",
+        *(f"{e['waypoints']:7d}  {e['compiled_ms']:20.3f}" for e in result["scaling"]["waypoints"]),
+    ]
+    return "\n".join(rows)
+
+
+def _ways(figures: Mapping[str, Any]) -> list[str]:
+    return [
+        "way          ms per candidate  over compiled",
+        f"compiled     {figures['compiled_ms']:16.3f}  {1.0:13.1f}",
+        f"interpreted  {figures['interpreted_ms']:16.3f}  "
+        f"{figures['interpreted_over_compiled']:13.1f}",
+        f"plain        {figures['plain_ms']:16.3f}  {figures['plain_over_compiled']:13.1f}",
+    ]
+
+
+def _peak(figures: Mapping[str, Any]) -> list[str]:
+    rate = f"{1e-9 * figures['operations_per_second']:.1f} billion operations a second"
+    if figures["share_of_peak"] is None:
+        return [f"{rate}, one evaluation at a time"]
+    return [
+        f"{rate}, {100 * figures['share_of_peak']:.0f} % of the core's peak (counted in the CasADi "
+        "functions; the peak is that of independent additions and multiplications, measured)"
+    ]
+
+
+def _shares(figures: Mapping[str, Any]) -> list[str]:
+    parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in figures["shares"].items())
+    ratio = figures.get("compiled_over_paper")
+    joint = [] if ratio is None else [f"{ratio:.2f} times a candidate of the allocation paper"]
+    return [*joint, f"feasible {100 * figures['feasible_share']:.0f} %; compiled time: {parts}"]

@@ -1,0 +1,105 @@
+"""Redundant joints as variables against the same joints locked at constant positions."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import product
+from math import ceil
+
+import numpy as np
+
+from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.evaluation import LockedEvaluator
+from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.indicators.metrics import front_rows, hypervolume
+from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
+from studies.program import load_workcell
+from studies.study.terminal import counted
+from symbolic.errors import SettingsError
+from symbolic.records import Task
+
+
+@dataclass(frozen=True)
+class Replica:
+    """One replica.
+
+    Attributes:
+        free: hypervolume with the redundant joints free.
+        locked: per lock its hypervolume, in the order of `locks`.
+        best: positions of the best lock [rad or m].
+    """
+
+    free: float
+    locked: tuple[float, ...]
+    best: tuple[float, ...]
+
+
+def locks(task: Task, count: int) -> tuple[tuple[float, ...], ...]:
+    """A grid of at least `count` positions of the redundant joints, the middles of its cells."""
+    sides = max(ceil(count ** (1.0 / len(task.redundant)) - 1e-9), 1)
+    shares = (np.arange(sides) + 0.5) / sides
+    values = [
+        float(joint.lower.min()) + shares * float(joint.upper.max() - joint.lower.min())
+        for joint in task.redundant
+    ]
+    return tuple(tuple(float(v) for v in entry) for entry in product(*values))
+
+
+def compare(cell: Cell, count: int, replicas: int, evaluations: int, seed: int) -> list[Replica]:
+    """The replicas.
+
+    Raises:
+        SettingsError: no joint is redundant, or one is fixed at a waypoint.
+    """
+    task = cell.workcell.task
+    if not task.redundant:
+        raise SettingsError("no joint of this cell is redundant; there is nothing to compare")
+    tried, found = locks(task, count), []
+    for replica in range(replicas):
+        start = SearchSettings(initial=cell.initial[None])
+        rng = np.random.default_rng([seed, replica])
+        free = search_carries(cell.evaluator, "nsga2", evaluations, rng, start)
+        volumes = []
+        for positions in tried:
+            rng = np.random.default_rng([seed, replica])
+            locked = LockedEvaluator(cell.evaluator, np.array(positions))
+            start = SearchSettings(initial=cell.initial[None, : task.n_box])
+            done = search_carries(locked, "nsga2", evaluations, rng, start)
+            volumes.append(_volume(done.evaluations))
+        best = tried[int(np.argmax(volumes))]
+        found.append(Replica(_volume(free.evaluations), tuple(volumes), best))
+    return found
+
+
+def _volume(evaluations: Evaluations) -> float:
+    rows = front_rows(evaluations.objectives, evaluations.feasible)
+    return float(hypervolume(evaluations.objectives[rows])) if len(rows) else 0.0
+
+
+def as_text(found: Sequence[Replica]) -> str:
+    """The comparison for people."""
+    lines = ["replica     free  best lock  locks with a carry  at"]
+    for k, one in enumerate(found):
+        some = sum(volume > 0.0 for volume in one.locked)
+        at = ", ".join(f"{position:.3f}" for position in one.best)
+        best = max(one.locked)
+        lines.append(f"{k:7d} {one.free:8.4f} {best:10.4f} {some:8d} of {len(one.locked)}  {at}")
+    better = sum(one.free > max(one.locked) for one in found)
+    lines.append(f"free beats the best lock in {better} of {counted(len(found), 'replica')}")
+    return "\n".join(lines)
+
+
+def redundancy(options: argparse.Namespace) -> int:
+    """Compare as the options ask for, and print it; returns the exit code.
+
+    Raises:
+        SettingsError: no joint of the cell is redundant.
+    """
+    cell = Cell(load_workcell(options.workcell))
+    counts = (options.locks, options.replicas, options.evaluations, options.seed)
+    found = compare(cell, *counts)
+    print(json.dumps([asdict(one) for one in found]) if options.json else as_text(found))
+    return 0

@@ -1,0 +1,251 @@
+"""A polished study beside searches alone that may spend as much, or far more."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_opt.campaign import (
+    CampaignSettings,
+    ExecutionSettings,
+    Progress,
+    open_folder,
+    run_stages,
+    search_stage,
+)
+from hybrid_opt.campaign.layout import CONFIGURATION
+from hybrid_opt.campaign.polish_stage import read_polished
+from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_summary
+from hybrid_opt.campaign.settings import SIZE_KEYS
+from hybrid_opt.campaign.summary import CampaignSummary
+from hybrid_opt.display.table import text_table
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.indicators import metrics
+from hybrid_opt.store.json_records import to_json
+from studies.research.best_front import ReferenceFront, read_reference_front
+from studies.research.control import LONG
+from studies.study.terminal import number, title
+
+
+@dataclass(frozen=True)
+class Control:
+    """One algorithm's replicas beside a longer search of the same algorithm or of another.
+
+    Attributes:
+        algorithm: whose polished fronts are compared.
+        rival: the algorithm that searches longer.
+        evaluations: its budget.
+        polished_wins: replicas in which the polished front has the larger hypervolume.
+        replicas: all of them.
+        search, polished, longer: median hypervolumes.
+    """
+
+    algorithm: str
+    rival: str
+    evaluations: int
+    polished_wins: int
+    replicas: int
+    search: float
+    polished: float
+    longer: float
+
+
+def controls(
+    root: Path, evaluations: Sequence[int], jobs: int, progress: Progress
+) -> list[Control]:
+    """Run the longer searches, in `ROOT/control/EVALUATIONS`, and compare.
+
+    Args:
+        root: results folder of a polished study.
+        evaluations: budgets of the longer searches; empty for that of equal time and `LONG`.
+        jobs: worker processes, 0 for one per core.
+
+    Raises:
+        ResultsError: the study is not complete, or was not polished.
+    """
+    study, summary = read_campaign(root), read_summary(root)
+    settings = _settings(study)
+    budgets = tuple(evaluations) or (settings.evaluations + _polish_cost(root, summary), LONG)
+    found = []
+    for budget in budgets:
+        longer = _search(study, replace(settings, evaluations=budget), root, jobs, progress)
+        for name in study.algorithms:
+            rivals = dict.fromkeys((name, "nsga2" if "nsga2" in study.algorithms else name))
+            found += [_compare(summary, longer, name, rival, budget) for rival in rivals]
+    return found
+
+
+def _settings(study: CampaignResults) -> CampaignSettings:
+    stored = study.configuration.settings
+    return CampaignSettings(
+        algorithms=study.algorithms,
+        evaluations=stored.evaluations,
+        replicas=stored.replicas,
+        seed=stored.seed,
+        objectives=study.objectives,
+        constraint_handling=stored.constraint_handling,
+        first_generation=stored.first_generation,
+        populations=tuple(
+            (name, own[key])
+            for name, own in stored.algorithms.items()
+            for key in SIZE_KEYS
+            if key in own
+        ),
+    )
+
+
+def _polish_cost(root: Path, summary: CampaignSummary) -> int:
+    """Candidate evaluations that take as long as the most expensive polish of the study."""
+    costs = [
+        row.polished.equivalent_evaluations
+        for entry in summary.algorithms.values()
+        for row in entry.replicas
+        if row.polished is not None
+    ]
+    if not costs:
+        raise ResultsError(f"{root}: its fronts were not polished; run the study with --polish")
+    return int(max(costs))
+
+
+def _search(
+    study: CampaignResults,
+    settings: CampaignSettings,
+    root: Path,
+    jobs: int,
+    progress: Progress,
+) -> CampaignResults:
+    output = root / "control" / str(settings.evaluations)
+    resume = (output / CONFIGURATION).exists()
+    execution = ExecutionSettings(output, jobs=jobs, resume=resume)
+    with open_folder(settings, execution, study.workcell) as folder:
+        run_stages(folder, (search_stage(),), progress)
+    return read_campaign(output)
+
+
+def _compare(
+    summary: CampaignSummary, longer: CampaignResults, name: str, rival: str, budget: int
+) -> Control:
+    rows = summary.algorithms[name].replicas
+    before = [row.hypervolume for row in rows]
+    after = [row.polished.hypervolume for row in rows if row.polished is not None]
+    alone = [
+        metrics.hypervolume(replica.front, metrics.REFERENCE_POINT) for replica in longer.of(rival)
+    ]
+    return Control(
+        algorithm=name,
+        rival=rival,
+        evaluations=budget,
+        polished_wins=sum(a > b for a, b in zip(after, alone, strict=True)),
+        replicas=len(rows),
+        search=float(np.median(before)),
+        polished=float(np.median(after)),
+        longer=float(np.median(alone)),
+    )
+
+
+@dataclass(frozen=True)
+class Approach:
+    """How near one algorithm's fronts come to a reference front, medians over the replicas.
+
+    Attributes:
+        algorithm: its name.
+        search_gap, polished_gap: the reference's hypervolume less the front's.
+        search_igd, polished_igd: mean distances of the reference's points to the front.
+        closed: share of the gap that the polish closes [%].
+    """
+
+    algorithm: str
+    search_gap: float
+    polished_gap: float
+    search_igd: float
+    polished_igd: float
+    closed: float
+
+
+def approaches(root: Path, reference: ReferenceFront) -> list[Approach]:
+    """The distances of a polished study's fronts to a reference front.
+
+    Raises:
+        ResultsError: the study is not complete, was not polished, or is of another workcell.
+    """
+    study = read_campaign(root)
+    if study.workcell.digest != reference.digest:
+        raise ResultsError(f"{root}: is a study of another workcell than the reference front's")
+    best = metrics.hypervolume(reference.objectives)
+    found = []
+    for name in study.algorithms:
+        searched, polished = [], []
+        for replica in study.of(name):
+            after = read_polished(root, replica, study.workcell)
+            if after is None:
+                raise ResultsError(f"{root}: replica {replica.replica} of {name} is not polished")
+            searched.append(replica.front)
+            polished.append(after.objectives)
+        gaps = [
+            float(np.median([best - metrics.hypervolume(front) for front in fronts]))
+            for fronts in (searched, polished)
+        ]
+        igds = [
+            float(np.median([metrics.igd(front, reference.objectives) for front in fronts]))
+            for fronts in (searched, polished)
+        ]
+        closed = 100.0 * (1.0 - gaps[1] / gaps[0]) if gaps[0] else math.nan
+        found.append(Approach(name, gaps[0], gaps[1], igds[0], igds[1], closed))
+    return found
+
+
+def approaches_text(found: Sequence[Approach]) -> str:
+    """The distances as a table."""
+    head = ["medians over the replicas", "HV gap", "polished", "closed %", "IGD", "polished"]
+    rows = [
+        [
+            title(a.algorithm),
+            number(a.search_gap, 6),
+            number(a.polished_gap, 6),
+            number(a.closed, 1),
+            number(a.search_igd, 6),
+            number(a.polished_igd, 6),
+        ]
+        for a in found
+    ]
+    return f"Distance to the reference front\n{text_table([head, *rows])}"
+
+
+def as_text(found: Sequence[Control]) -> str:
+    """The comparison as a table."""
+    rows = [["polished front of", "search", "polished", "longer search", "HV", "wins"]]
+    rows += [
+        [
+            title(entry.algorithm),
+            number(entry.search, 5),
+            number(entry.polished, 5),
+            f"{title(entry.rival)}, {entry.evaluations} evaluations",
+            number(entry.longer, 5),
+            f"{entry.polished_wins}/{entry.replicas}",
+        ]
+        for entry in found
+    ]
+    return (
+        "Median hypervolumes; wins: replicas in which the polished front is ahead\n"
+        + text_table(rows, left=(0, 3))
+    )
+
+
+def control(options: argparse.Namespace) -> int:
+    """Hold the study of the options against longer searches; returns the exit code."""
+    found: Sequence[Control | Approach]
+    if options.reference is not None:
+        found = near = approaches(options.results, read_reference_front(options.reference))
+        text = approaches_text(near)
+    else:
+        progress = Progress(True)
+        found = run = controls(options.results, options.evaluations, options.jobs, progress)
+        text = as_text(run)
+    print(json.dumps(to_json(found), indent=1) if options.json else text)
+    return 0

@@ -1,0 +1,119 @@
+"""A whole candidate written plainly: the oracle of `symbolic.functions`.
+
+Numeric Pinocchio, NumPy and SciPy in Python loops; only tolerances are shared with the symbolic
+model. It iterates exactly as the symbolic model does, so both may be compared to rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from studies.research.plain.arm import PlainArm
+from studies.research.plain.load import sample_load
+from studies.research.plain.motion import redundant_path, timed_motion
+from symbolic.array import Array
+from symbolic.functions import CONSTRAINTS, FRICTION_TOLERANCE
+from symbolic.records import Workcell
+from symbolic.robot.arm import REACH_TOLERANCE
+
+
+@dataclass(frozen=True)
+class PlainCandidate:
+    """Verdict of the plain reference on a candidate.
+
+    Attributes:
+        outputs: every output of the symbolic evaluator by name, samples in rows.
+        violated: names of the violated constraints in the order of `CONSTRAINTS`; empty for a
+            feasible candidate.
+        reason: the constraint that is violated first along the path, or an empty string.
+    """
+
+    outputs: dict[str, Array]
+    violated: tuple[str, ...]
+    reason: str
+
+
+class PlainEvaluator:
+    """Evaluates candidates of one workcell; reads the robots' models once.
+
+    Args:
+        workcell: the cell.
+        start: joints (n,) of each arm at the first waypoint [rad or m].
+    """
+
+    def __init__(self, workcell: Workcell, start: tuple[Array, Array]) -> None:
+        self.workcell = workcell
+        self.start = start
+        self.arms = [
+            PlainArm(
+                workcell.robots[i],
+                workcell.contacts[i],
+                tuple(joint for joint, _ in workcell.task.redundant_of(i)),
+                workcell.task.orientation,
+            )
+            for i in (0, 1)
+        ]
+
+    def __call__(self, x: Array) -> PlainCandidate:
+        """Evaluate a decision vector (n_var,)."""
+        time, pose, rate, second = timed_motion(self.workcell.task, x)
+        loads = [
+            sample_load(self.workcell, *sample) for sample in zip(pose, rate, second, strict=True)
+        ]
+        load = {name: np.array([each[name] for each in loads]) for name in loads[0]}
+        values = redundant_path(self.workcell.task, x)
+        outputs = {"time": time, "pose": pose, "rate": rate, "second_rate": second}
+        outputs |= {name: value for name, value in load.items() if not name.startswith("wrench")}
+        for i, arm in enumerate(self.arms):
+            columns = [place - 6 for _, place in self.workcell.task.redundant_of(i)]
+            followed = arm.follow(self.start[i], pose, load[f"wrench_{i + 1}"], values[:, columns])
+            outputs |= {f"{name}_{i + 1}": value for name, value in followed.items()}
+        constraint = np.array([self._constraints(outputs, k) for k in range(len(time))])
+        violated = np.maximum(constraint, 0.0)
+        outputs["constraint"] = constraint
+        outputs["violation"] = violated.max(axis=0)
+        outputs["violation_time"] = np.array(
+            [np.trapezoid((column > 0.0).astype(float), time) / time[-1] for column in violated.T]
+        )
+        return PlainCandidate(outputs, *_verdict(constraint))
+
+    def _constraints(self, outputs: dict[str, Array], k: int) -> list[float]:
+        """Values of `CONSTRAINTS` at sample k."""
+        workcell, values = self.workcell, {}
+        friction = []
+        for i, contact in enumerate(workcell.contacts):
+            arm = i + 1
+            lost = bool(outputs[f"lost_{arm}"][k])
+            residual = outputs[f"ik_residual_{arm}"][k]
+            least = workcell.robots[i].min_manipulability
+            values[f"reach_{arm}"] = (
+                max(residual - REACH_TOLERANCE, 1.0) if lost else -REACH_TOLERANCE
+            )
+            values[f"joint_limits_{arm}"] = 0.0 if lost else -outputs[f"limit_margin_{arm}"][k]
+            values[f"singularity_{arm}"] = (
+                0.0 if lost else 1.0 - outputs[f"manipulability_{arm}"][k] / least
+            )
+            values[f"pressure_{arm}"] = outputs["pressure_shift"][k, i] / contact.patch_radius - 1.0
+            excess = (
+                outputs["tangential_force"][k, i] - contact.friction * outputs["normal_force"][k, i]
+            )
+            friction.append(excess / (workcell.payload.mass * 9.81) - FRICTION_TOLERANCE)
+        values["friction"] = max(friction)
+        return [float(values[name]) for name in CONSTRAINTS]
+
+
+def _verdict(constraint: Array) -> tuple[tuple[str, ...], str]:
+    """The violated constraints, and the first of them along the path."""
+    reason, violated = "", set()
+    for values in constraint:
+        here = [name for name, value in zip(CONSTRAINTS, values, strict=True) if value > 0.0]
+        violated.update(here)
+        reason = reason or (here[0] if here else "")
+    return tuple(name for name in CONSTRAINTS if name in violated), reason
+
+
+def evaluate(workcell: Workcell, start: tuple[Array, Array], x: Array) -> PlainCandidate:
+    """Evaluate one decision vector (n_var,); see `PlainEvaluator`."""
+    return PlainEvaluator(workcell, start)(x)

@@ -1,0 +1,252 @@
+"""Ways of evaluating candidates that take turns on one core, and what they cost.
+
+Times are the thread's own processor time, so that waiting for a busy machine does not count. With
+collisions the compiled way is the evaluator that the searches call, with batches of a search's
+population, on candidates of a search and on random ones; the plain way is the tests' reference:
+every pair of every sample goes to FCL.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from codegen.build import load_or_build_program
+from codegen.interpreted import InterpretedFunction
+from codegen.source import dense, operations
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.metaheuristics.problem import CarryProblem
+from hybrid_opt.metaheuristics.registry import make
+from hybrid_opt.metaheuristics.run import search
+from hybrid_opt.metaheuristics.settings import GeneticSettings
+from symbolic.array import Array
+from symbolic.cell_model import CellModel
+from symbolic.functions import cell_functions, kernel_functions
+from symbolic.records import Workcell
+
+Evaluate = Callable[[Array], object]
+
+SLICE = 0.05
+"""Least time of one way in one round [s]; fast ways go on with the next candidates to fill it, as a
+search goes on with its next generation: what another way left in the caches costs no more than
+there."""
+
+
+def interleaved(
+    ways: Mapping[str, Evaluate], x: Mapping[str, Array], repeats: int
+) -> dict[str, Array]:
+    """Seconds per call of every way in every round (rounds,); the ways take turns.
+
+    Args:
+        ways: functions of one decision vector, or of one batch of them, by name.
+        x: per way what it is called with: decision vectors (n, n_var) or batches
+            (n, size, n_var), the same n for all.
+        repeats: rounds with each of the n.
+    """
+    counts = {}
+    for name, evaluate in ways.items():
+        evaluate(x[name][0])
+        counts[name] = max(1, int(np.ceil(SLICE / _seconds(evaluate, x[name], 0, 1))))
+    n = len(next(iter(x.values())))
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for round_ in range(n * repeats):
+        # Every other round backwards: what comes first has no advantage.
+        for name in list(ways)[:: 1 if round_ % 2 == 0 else -1]:
+            times[name].append(_seconds(ways[name], x[name], round_, counts[name]))
+    return {name: np.array(values) for name, values in times.items()}
+
+
+def _seconds(evaluate: Evaluate, x: Array, first: int, count: int) -> float:
+    """Seconds per call for `count` rows of x one after the other."""
+    start = time.thread_time()
+    for k in range(first, first + count):
+        evaluate(x[k % len(x)])
+    return (time.thread_time() - start) / count
+
+
+def summary(
+    times: Mapping[str, Array], average: Callable[[Array], np.floating] = np.median
+) -> dict[str, float]:
+    """Averages [ms] of every way and averages of the ratios within a round.
+
+    Args:
+        times: seconds per candidate (rounds,) of 'compiled', 'interpreted' and 'plain'.
+        average: over the rounds.
+    """
+    ratios = {
+        f"{name}_over_compiled": float(average(times[name] / times["compiled"]))
+        for name in ("plain", "interpreted")
+    }
+    return {f"{name}_ms": 1e3 * float(average(value)) for name, value in times.items()} | ratios
+
+
+def progress(text: str) -> None:
+    """Tell what is being done, apart from the results."""
+    print(text, file=sys.stderr, flush=True)
+
+
+ROUNDS = 2_000_000
+BEST_OF = 5
+
+RARE = frozenset({"closer", "again", "held"})
+"""Branches of `symbolic.robot.arm.track_function`."""
+
+_LOOP = """
+/* Additions and multiplications that wait for nothing but their own last one. */
+DUAL_ARM_EXPORT double dual_arm_peak(long long rounds) {
+  lanes_real a[8], m[8], step = lanes_all_equal(1e-9), factor = lanes_all_equal(1.0 + 1e-16);
+  for (int i = 0; i < 8; ++i) a[i] = m[i] = lanes_all_equal(1.0 + i);
+  for (long long k = 0; k < rounds; ++k) {
+#pragma GCC unroll 8
+    for (int i = 0; i < 8; ++i) {
+      a[i] = a[i] + step;
+      m[i] = m[i] * factor;
+    }
+  }
+  lanes_real sum = lanes_all_equal(0.0);
+  for (int i = 0; i < 8; ++i) sum += a[i] + m[i];
+  return sum[0];
+}
+"""
+
+
+def peak_operations() -> float | None:
+    """Additions and multiplications per second that one core does in lanes; None without lanes.
+
+    Measured: the best of some runs of a loop of sixteen independent chains.
+    """
+    library = load_or_build_program("peak", "peak", dict, _LOOP)
+    if library.dual_arm_lanes() < 2:
+        return None
+    loop = library.dual_arm_peak
+    loop.argtypes, loop.restype = [ctypes.c_longlong], ctypes.c_double
+    times = []
+    for _ in range(BEST_OF):
+        start = time.thread_time()
+        loop(ROUNDS)
+        times.append(time.thread_time() - start)
+    return 16.0 * ROUNDS * int(library.dual_arm_lanes()) / min(times)
+
+
+def candidate_operations(model: CellModel) -> int:
+    """Operations of one candidate with collisions, counted in its CasADi functions.
+
+    Without the branches that few samples take; a sine or cosine counts as one.
+    """
+    functions = kernel_functions(model)
+    each = sum(operations(functions[name], RARE) for name in ("sample", "clearance"))
+    return operations(functions["path"]) + model.workcell.task.samples * each
+
+
+EVALUATIONS = 1000
+"""Evaluations of the NSGA-II search whose candidates are timed."""
+
+POPULATION = GeneticSettings().population
+"""Candidates per batch."""
+
+SHARED = 5
+"""Most batches on which the shares of the time are measured."""
+
+
+def with_collisions(
+    workcell: Workcell, plain: Evaluate, candidates: int, repeats: int, seed: int
+) -> dict[str, Any]:
+    """Measure the evaluation with collisions; every time is in milliseconds per candidate.
+
+    Figures are means over the rounds, as a search pays the mean and not the median.
+
+    Args:
+        plain: the plain reference with collisions, of one decision vector.
+        candidates: batches of the compiled way, drawn from all candidates; the other ways
+            evaluate one candidate of each batch.
+        repeats: rounds with each of them.
+        seed: of the search and the draws.
+
+    Returns:
+        The figures of the search's candidates and, as 'random', those of uniform candidates; under
+        the joint allocation also what they cost over the paper's.
+    """
+    rng = np.random.default_rng(seed)
+    progress(f"a search of {EVALUATIONS} evaluations, whose candidates are to be timed")
+    evaluator = CandidateEvaluator(workcell)
+    problem = CarryProblem(evaluator)
+    search(problem, make("nsga2"), EVALUATIONS, rng)
+    searched = rng.choice(problem.evaluations.x, (candidates, POPULATION))
+    size = (candidates, POPULATION, evaluator.n_var)
+    uniform = rng.uniform(evaluator.lower, evaluator.upper, size)
+    functions = {
+        name: InterpretedFunction(dense(function))
+        for name, function in cell_functions(evaluator.compiled.model).items()
+    }
+    interpreted = CandidateEvaluator(workcell, functions=functions)
+    peak = peak_operations()
+    ways: dict[str, Evaluate] = {
+        "compiled": evaluator.evaluate,
+        "interpreted": interpreted.evaluate,
+        "plain": plain,
+    }
+    if workcell.task.allocation == "joint" and workcell.has_opposite_pads:
+        task = replace(workcell.task, allocation="paper")
+        ways["paper"] = CandidateEvaluator(replace(workcell, task=task)).evaluate
+    figures: list[dict[str, Any]] = []
+    for what, batches in (("the search's", searched), ("random", uniform)):
+        progress(f"{candidates * repeats} rounds on {what} candidates, with collisions")
+        one_each = batches[:, 0]
+        in_batches = ("compiled", "paper")
+        x = {name: batches if name in in_batches else one_each for name in ways}
+        times = interleaved(ways, x, repeats)
+        for name in times.keys() & in_batches:
+            times[name] /= POPULATION
+        verdicts = evaluator.evaluate(np.concatenate(batches))
+        figures.append(
+            {
+                **summary(times, np.mean),
+                **over_paper(times),
+                "feasible_share": float(verdicts.feasible.mean()),
+                "shares": shares(evaluator, batches[:SHARED], repeats),
+            }
+        )
+    ours, random = figures
+    per_second = candidate_operations(evaluator.compiled.model) / (1e-3 * ours["compiled_ms"])
+    ours["operations_per_second"] = per_second
+    ours["share_of_peak"] = per_second / peak if peak else None
+    return {"evaluations": EVALUATIONS, "population": POPULATION, **ours, "random": random}
+
+
+def over_paper(times: Mapping[str, Array]) -> dict[str, float]:
+    """Cost of the joint allocation's candidates over the same ones under the paper's, where that
+    was measured."""
+    if "paper" not in times:
+        return {}
+    return {"compiled_over_paper": float(np.mean(times["compiled"] / times["paper"]))}
+
+
+def shares(evaluator: CandidateEvaluator, batches: Array, repeats: int) -> dict[str, float]:
+    """Where the time of the compiled way goes, as shares of the whole.
+
+    candidate: path, arms and forces. collisions: bounds, proofs and FCL. rest: objectives and
+    bookkeeping.
+
+    Args:
+        batches: (n, size, n_var).
+        repeats: rounds with each batch.
+    """
+    ways: dict[str, Evaluate] = {
+        "whole": evaluator.evaluate,
+        "with collisions": evaluator.sampled,
+        "candidate": lambda x: evaluator.sampled(x, with_collisions=False),
+    }
+    times = interleaved(ways, dict.fromkeys(ways, batches), repeats)
+    part = {name: float(np.mean(value / times["whole"])) for name, value in times.items()}
+    collisions = part["with collisions"] - part["candidate"]
+    return {
+        "candidate": part["candidate"],
+        "collisions": collisions,
+        "rest": 1.0 - part["with collisions"],
+    }

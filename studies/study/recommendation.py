@@ -1,0 +1,402 @@
+"""REC"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import hybrid_opt as ho
+from codegen.function import available_cores
+from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Progress, Stage
+from hybrid_opt.campaign.layout import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
+from hybrid_opt.campaign.progress import Advance
+from hybrid_opt.campaign.recommended import (
+    ForceTable,
+    NoRecommendation,
+    StoredDurations,
+    StoredPrice,
+    StoredRecommendation,
+    StoredRival,
+    Told,
+    set_text,
+    stored_price,
+    stored_recommendation,
+)
+from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.campaign.summary import CampaignSummary
+from hybrid_opt.errors import NoCarryError
+from hybrid_opt.evaluate.evaluations import concatenated
+from hybrid_opt.evaluate.explanation import explain
+from hybrid_opt.recommending.choice import DrivenPaths
+from hybrid_opt.recommending.comparison import (
+    front_durations,
+    over_replicas,
+    spread_members,
+    table_forces,
+)
+from hybrid_opt.recommending.recommendation import HAND_MADE, LEADER, Recommendation
+from hybrid_opt.robust.force import robust_model, robust_price
+from hybrid_opt.store.files import write_json
+from hybrid_opt.store.json_records import read_record, to_json
+from hybrid_opt.store.trajectory_file import write_trajectory
+from hybrid_opt.timing.document import StoredJerk
+from hybrid_opt.timing.records import TimingStatus
+from hybrid_opt.work.processes import ProcessExecutor
+from hybrid_opt.work.service import Emit, Executor, SerialExecutor, Service, answer_all
+from studies.study.drivable import (
+    DrivableFronts,
+    drivable_fronts,
+    drivable_root,
+    is_drivable,
+    least_force,
+)
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+
+
+def recommendation_stage(wish: ho.Wish) -> Stage:
+    """The stage that writes `recommended.json`, a trajectory file, and `recommendation.json`, or
+    `no-recommendation.json`."""
+
+    def run(folder: CampaignFolder, progress: Progress) -> None:
+        request = _Request(folder.root, wish, folder.execution.jobs, progress)
+        (found,) = answer_all(
+            _executor(folder.execution), Service(_nothing, _recommended), [request]
+        )
+        none = isinstance(found, NoRecommendation)
+        written, other = (NO_RECOMMENDATION, RECOMMENDATION)[:: 1 if none else -1]
+        # Also after an earlier attempt that was interrupted.
+        (folder.root / other).unlink(missing_ok=True)
+        write_json(folder.root / written, to_json(found))
+
+    return Stage("recommendation", run, dict(wish.given))
+
+
+@dataclass(frozen=True)
+class _Request:
+    """A carry to recommend, in so many threads: those of the workers, which wait meanwhile. The
+    worker itself shows the progress: it alone knows how much there is to do."""
+
+    root: Path
+    wish: ho.Wish
+    threads: int
+    progress: Progress
+
+
+def _executor(execution: ExecutionSettings) -> Executor:
+    """A worker here, where the folder is: its libraries are loaded already, which takes this
+    process a second."""
+    alone = execution.jobs == 1 or execution.executor != "processes"
+    return SerialExecutor() if alone else ProcessExecutor(1)
+
+
+def _nothing() -> None:
+    """A recommendation needs nothing but its folder."""
+
+
+def _recommended(_: None, request: _Request, emit: Emit) -> StoredRecommendation | NoRecommendation:
+    path = request.root / RECOMMENDED
+    try:
+        return recommend_from(request.root, request.wish, path, request.progress, request.threads)
+    except NoCarryError as error:
+        return NoRecommendation(str(error))
+
+
+def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation | None:
+    """The recommendation in a results folder, or why it has none; None where it was not asked.
+
+    Raises:
+        ResultsError: it is damaged.
+    """
+    remedy = f"delete {STAGES}/recommendation.json in its folder and continue with --resume"
+    if (root / RECOMMENDATION).exists():
+        return read_record(StoredRecommendation, root / RECOMMENDATION, remedy)
+    if (root / NO_RECOMMENDATION).exists():
+        return read_record(NoRecommendation, root / NO_RECOMMENDATION, remedy)
+    return None
+
+
+def recommend_from(
+    root: Path, wish: ho.Wish, path: Path, progress: Progress, threads: int = 0
+) -> StoredRecommendation:
+    """Recommend a carry of a study's drivable fronts, and store it.
+
+    Args:
+        root: the results folder, its drivable experiment done.
+        wish: what is asked for.
+        path: the trajectory file to write.
+        progress: where to show it.
+        threads: in which carries are timed, 0 for one per core; has no influence on what is found.
+
+    Returns:
+        What is said of it.
+
+    Raises:
+        NoCarryError: no drivable carry was found; the text says why.
+        SettingsError: no carry can do what is wished for.
+        ResultsError: the folder is not complete or damaged, or the file cannot be written.
+    """
+    campaign = read_campaign(root)
+    drivable = drivable_fronts(drivable_root(root, campaign.workcell, campaign.objectives))
+    threads = threads or available_cores()
+    cell = ho.Cell(drivable.results.workcell, drivable.results.objectives, threads)
+    if len(drivable.x) == 0:
+        raise NoCarryError(_why_none(cell, drivable.results))
+    alone = is_drivable(campaign.workcell, campaign.objectives)
+    others = {} if alone else least_force(campaign)
+    # The choice, the table's rows and the price.
+    steps = 3 + len(others) + len(drivable.fronts)
+    with progress.stage("recommendation", steps, "steps") as advance:
+        found = ho.recommend(cell, drivable.x, wish, others)
+        advance(1)
+        durations = _force_table(cell, drivable, others, found, advance)
+        price = _price(found.carry, campaign.configuration.settings.seed, threads)
+        advance(1)
+    source = drivable.sources[found.member]
+    provenance = {
+        "recommended": str(wish),
+        "source": source,
+        "settings": to_json(campaign.configuration.settings),
+    }
+    figures = cell.carry(found.x).figures
+    write_trajectory(path, cell.compiled, found.x, figures, provenance)
+    inside = path.resolve().is_relative_to(root.resolve())
+    file = path.resolve().relative_to(root.resolve()).as_posix() if inside else str(path)
+    told = Told(
+        source=source,
+        file=file,
+        export=export_command(Path(file), found.force),
+        considered=len(drivable.x),
+        durations=durations,
+        price=price,
+    )
+    return stored_recommendation(found, told)
+
+
+def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
+    """What stopped the candidates of an experiment, and its hand-made trajectory."""
+    found = concatenated([replica.evaluations for replica in results.replicas])
+    stopped = ", ".join(
+        f"{name.replace('_', ' ')} {100.0 * count / len(found):.1f} %"
+        for name, count in found.infeasible_by_reason.items()
+    )
+    told = f"none of {len(found)} drivable candidates is feasible ({stopped})"
+    limits = cell.timing_model.drive_limits(float(cell.initial[-1]))
+    timing = ho.time_path(cell, cell.initial, limits)
+    if not timing.ok:
+        return f"{told}; the hand-made trajectory cannot be driven: {timing.reason}"
+    why = explain(cell.evaluator, cell.evaluate(cell.initial))
+    hand_made = f"; the hand-made trajectory: {why[0]}" if why else ""
+    return f"{told}{hand_made}; a longer search or wider bounds may find one"
+
+
+def _price(carry: ho.Carry, seed: int, threads: int) -> StoredPrice | None:
+    """Cost of robustness for the recommended carry; None where no set leaves friction and patches,
+    and where the pads cannot hold whatever happens."""
+    try:
+        model = robust_model(carry.workcell)
+        rng = np.random.default_rng(seed)
+        return stored_price(robust_price(model, carry, rng, LEADER, threads=threads))
+    except SettingsError:
+        return None
+
+
+def _force_table(
+    cell: ho.Cell,
+    drivable: DrivableFronts,
+    others: Mapping[str, Array],
+    found: Recommendation,
+    advance: Advance,
+) -> ForceTable:
+    """Every front's durations at the same forces, that of the recommended carry among them."""
+    task = cell.workcell.task
+    forces = np.unique(np.append(table_forces(cell.workcell, cell.force_kind), found.force))
+
+    def durations(paths: Array) -> Array:
+        least = np.full(len(forces), np.inf)
+        if len(paths):
+            least = front_durations(DrivenPaths.of(cell, paths), forces)
+        advance(1)
+        return least
+
+    paths = {HAND_MADE: cell.initial[: task.n_path]} | dict(others)
+    rows = [_row(label, [durations(path[None])]) for label, path in paths.items()]
+    rows += [
+        _row(label, [durations(spread_members(front.x[:, : task.n_path])) for front in fronts])
+        for label, fronts in drivable.labelled().items()
+    ]
+    return ForceTable(tuple(forces.tolist()), tuple(rows))
+
+
+def _row(label: str, found: list[Array]) -> StoredDurations:
+    figures = [tuple(values.tolist()) for values in over_replicas(found)]
+    return StoredDurations(label, len(found), *figures)
+
+
+EXPORT_FORM = "ros2"
+
+
+@dataclass(frozen=True)
+class RecommendationText:
+    """The opening text of a study.
+
+    Attributes:
+        headline: the carry in one line.
+        facts: heading and text, in the order in which they matter.
+        warnings: what speaks against it.
+    """
+
+    headline: str
+    facts: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+
+    def terminal(self) -> str:
+        """Text for a terminal."""
+        width = max(len(heading) for heading, _ in self.facts)
+        lines = [self.headline]
+        lines += [f"  {heading:<{width}}  {text}" for heading, text in self.facts]
+        return "\n".join(lines + [f"  WARNING: {text}" for text in self.warnings])
+
+
+def study_words(summary: CampaignSummary, folder: str) -> RecommendationText | None:
+    """What a study opens with: the carry to run, or why there is none; None where nothing is known
+    of either.
+
+    Args:
+        folder: as for `recommendation_text`.
+    """
+    if summary.recommendation is not None:
+        return recommendation_text(summary.recommendation, summary.robots, folder)
+    if not summary.no_recommendation:
+        return None
+    return RecommendationText("No carry is recommended", (("why", summary.no_recommendation),), ())
+
+
+def recommendation_text(
+    found: StoredRecommendation, robots: Sequence[str], folder: str
+) -> RecommendationText:
+    """The words for a stored recommendation.
+
+    Args:
+        robots: both robots' names.
+        folder: of the results, in front of the files' names; '' where the reader is in it.
+    """
+    headline = (
+        f"Run this carry: {found.duration:.2f} s, {found.force_kind.pressing} "
+        f"{max(found.limited_force):.2f} N ({_of_robots(found.limited_force, robots)})"
+    )
+    facts = [
+        ("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}"),
+        ("file", str(Path(folder) / found.file)),
+        ("export", export_command(Path(folder) / found.file, found.force_limit)),
+        *([] if found.jerk is None else [("within jerk limits", _jerk(found.jerk))]),
+        *_planned(found, robots),
+        ("press with", f"{_of_robots(found.squeeze, robots)}, {found.squeeze_reason}"),
+        ("payload", f"up to {found.payload_limit:.2f} kg on the same motion"),
+        *[(rival.label, _rival(rival, found)) for rival in found.rivals],
+        ("margins", "; ".join(_margins(found)) or "not known"),
+    ]
+    if found.price is not None:
+        facts.append(("robust", _robust(found.price)))
+    if found.unsure:
+        facts.append(
+            (
+                "if less sure",
+                "command "
+                + "; ".join(
+                    f"{max(doubt.peak_force):.1f} N if {doubt.doubt}"
+                    + ("" if doubt.within_reference else " (beyond the reference force)")
+                    for doubt in found.unsure
+                )
+                + "; state it as [uncertainty] in the workcell",
+            )
+        )
+    return RecommendationText(headline, tuple(facts), found.warnings)
+
+
+def _planned(found: StoredRecommendation, robots: Sequence[str]) -> list[tuple[str, str]]:
+    """The planned forces, where limits are about others."""
+    if found.robust_force is None:
+        return []
+    return [("planned", f"{_of_robots(found.peak_force, robots)}, if nothing is uncertain")]
+
+
+def export_command(path: Path, force: float) -> str:
+    """The command that makes of a trajectory file, timed within a force limit [N], what robots
+    need."""
+    output = path.with_name(f"{path.stem}-{EXPORT_FORM}")
+    return (
+        f"python -m studies.export {shlex.quote(str(path))} --form {EXPORT_FORM} "
+        f"--force-limit {force:.6g} --output {shlex.quote(str(output))}"
+    )
+
+
+def _jerk(jerk: StoredJerk) -> str:
+    """Cost of the cell's limits on jerk."""
+    if jerk.status != TimingStatus.OK:
+        return f"not found: {jerk.status}"
+    return (
+        f"{jerk.duration:.2f} s ({_percent(jerk.duration / jerk.without)}), at rest without "
+        "acceleration at both ends; this is what the export drives"
+    )
+
+
+def _of_robots(values: Array, robots: Sequence[str]) -> str:
+    return ", ".join(f"{name} {value:.1f} N" for name, value in zip(robots, values, strict=True))
+
+
+def _rival(rival: StoredRival, found: StoredRecommendation) -> str:
+    """Another path beside the recommended carry."""
+    duration, force = rival.duration_at_force, rival.force_at_duration
+    same_force, same_time = "cannot move with so little force", "is never so fast"
+    if math.isfinite(duration):
+        same_force = f"{duration:.2f} s at the same force ({_percent(duration / found.duration)})"
+    if math.isfinite(force):
+        same_time = f"{force:.2f} N in the same time ({_percent(force / found.force_limit)})"
+    return f"{same_force}, {same_time}"
+
+
+def _robust(price: StoredPrice) -> str:
+    """Cost of the set, the largest multiple of it that the arms allow, and random cases."""
+    named = "[uncertainty]" if price.stated else "a usual set"
+    plan, sure = (max(values) for values in (price.peak[0], price.commanded))
+    allowed = (
+        f"up to {price.largest_factor:.2f} times the set"
+        if math.isfinite(price.largest_factor)
+        else "any multiple of the set"
+    )
+    if not price.largest_factor:
+        allowed = "not even the nominal case"
+    return (
+        f"{sure:.1f} N hold in every case of {named} ({set_text(price)}), "
+        f"{_percent(sure / plan)} against the nominal case; the reference forces allow {allowed}; "
+        f"{price.failing or 'none'} of {price.cases} random cases "
+        f"{'slip' if price.failing != 1 else 'slips'}"
+    )
+
+
+def _percent(ratio: float) -> str:
+    return f"{100.0 * (ratio - 1.0):+.1f} %"
+
+
+def _margins(found: StoredRecommendation) -> list[str]:
+    """Friction of both contacts, and the nearest limit of the centre of mass along each axis."""
+    texts = []
+    for margin in found.margins:
+        if margin.quantity == "friction of both contacts":
+            end = f" ({margin.fails} beyond)" if margin.fails else ""
+            texts.append(f"friction down to {margin.limit:.2f}{end}")
+    offs = {
+        margin.quantity[-1]: abs(margin.limit - margin.nominal)
+        for margin in sorted(found.margins, key=lambda m: -abs(m.limit - m.nominal))
+        if margin.quantity.startswith("centre of mass")
+    }
+    if offs:
+        along = ", ".join(f"{1e3 * offs[axis]:.0f} mm along {axis}" for axis in sorted(offs))
+        texts.append(f"centre of mass off by {along}")
+    return texts

@@ -1,0 +1,119 @@
+"""`python -m studies.compare`: figures of two campaigns, tests between them, misuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress, open_folder
+from hybrid_opt.campaign.polish_stage import polish_stage, read_polished
+from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.campaign.search_stage import search_stage
+from hybrid_opt.campaign.stages import run_stages
+from hybrid_opt.indicators import metrics
+from hybrid_opt.polishing.settings import FillSettings, PolishSettings
+from studies.compare import main
+from studies.programs.comparison import compare
+from studies.study.summary import summary_stage
+from symbolic.read.cell import load
+from tests.studies.conftest import TRANSFER
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign with another seed and another set of algorithms."""
+    root = tmp_path_factory.mktemp("other") / "results"
+    settings = CampaignSettings(("nsga2", "random"), evaluations=80, replicas=5, seed=9)
+    execution = ExecutionSettings(root, jobs=1)
+    with open_folder(settings, execution, load(TRANSFER)) as folder:
+        run_stages(folder, (search_stage(), summary_stage()), Progress(shown=False))
+    return root
+
+
+def test_a_campaign_equals_itself(study: Path) -> None:
+    found = compare(study, study)
+    assert found.same_workcell
+    assert found.differences == ()
+    for figure in found.figures:
+        assert figure.first == figure.second or not np.isfinite(figure.first.mean)
+
+
+def test_five_replicas_are_tested(other: Path) -> None:
+    tests = {f.figure: f.test for f in compare(other, other).figures if f.algorithm == "nsga2"}
+    hypervolume = tests["hypervolume"]
+    assert hypervolume is not None
+    assert (hypervolume.count_first, hypervolume.count_second) == (5, 5)
+    assert (hypervolume.a12, hypervolume.p) == (0.5, 1.0)
+
+
+def test_figures_are_those_of_the_stored_candidates(study: Path, other: Path) -> None:
+    found = compare(study, other)
+    figures = {figure.figure: figure for figure in found.figures}
+    runs = (read_campaign(study).of("nsga2"), read_campaign(other).of("nsga2"))
+    for side, replicas in zip(("first", "second"), runs, strict=True):
+        volumes = [metrics.hypervolume(replica.front) for replica in replicas]
+        assert getattr(figures["hypervolume"], side).median == pytest.approx(np.median(volumes))
+        shares = [replica.evaluations.feasible.mean() for replica in replicas]
+        assert getattr(figures["feasible_share"], side).mean == pytest.approx(np.mean(shares))
+    # One of the two has two replicas only, whose effects say nothing.
+    assert all(figure.test is None for figure in found.figures)
+    assert {figure.algorithm for figure in found.figures} == {"nsga2"}
+    assert found.only == (("mopso",), ("random",))
+
+
+def test_drivable_experiments_are_compared_too(study: Path, other: Path) -> None:
+    found = compare(study, study).drivable
+    assert found is not None
+    assert found.runs == (str(study / "drivable"),) * 2
+    figures = {figure.figure: figure for figure in found.figures if figure.algorithm == "nsga2"}
+    fronts = [replica.front for replica in read_campaign(study / "drivable").of("nsga2")]
+    volumes = [metrics.hypervolume(front) for front in fronts]
+    assert figures["hypervolume"].first.median == pytest.approx(np.median(volumes))
+    assert compare(study, other).drivable is None
+
+
+def test_polished_fronts_are_compared_too(own_study: Path, study: Path) -> None:
+    """A folder whose fronts were polished a little, beside itself and beside one without."""
+    workcell = load(TRANSFER)
+    settings = CampaignSettings(evaluations=120, replicas=2, seed=3)
+    with open_folder(settings, ExecutionSettings(own_study, 1, resume=True), workcell) as folder:
+        polished = polish_stage(PolishSettings(attempts=1, fill=FillSettings(solved=3, members=3)))
+        run_stages(folder, (search_stage(), polished, summary_stage()), Progress(shown=False))
+    figures = {f.figure: f for f in compare(own_study, own_study).figures if f.algorithm == "nsga2"}
+    run = read_campaign(own_study)
+    fronts = [read_polished(own_study, replica, workcell) for replica in run.of("nsga2")]
+    volumes = [metrics.hypervolume(front.objectives) for front in fronts if front is not None]
+    assert len(volumes) == 2
+    assert figures["polished_hypervolume"].first.median == pytest.approx(np.median(volumes))
+    assert figures["polished_hypervolume"].first.mean >= figures["hypervolume"].first.mean
+    assert np.isfinite(figures["polished_payload_limit"].second.median)
+    names = {figure.figure for figure in compare(study, own_study).figures}
+    assert not any(name.startswith("polished_") for name in names)
+
+
+def test_tells_what_was_set_differently(study: Path, other: Path) -> None:
+    differences = {name: (a, b) for name, a, b in compare(study, other).differences}
+    assert differences["settings.seed"] == ("3", "9")
+    assert differences["settings.evaluations"] == ("120", "80")
+
+
+def test_prints_text_and_json(study: Path, other: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(study), str(other)]) == 0
+    text = capsys.readouterr().out
+    assert "NSGA-II, hypervolume" in text
+    assert main([str(study), str(study)]) == 0
+    assert "The drivable experiments" in capsys.readouterr().out
+    assert "only in B: random search" in text
+    assert main([str(study), str(other), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert document["same_workcell"] is True
+
+
+def test_what_cannot_be_compared_is_told(
+    study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(study), str(tmp_path)]) == 2
+    assert "no results folder" in capsys.readouterr().err

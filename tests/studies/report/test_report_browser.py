@@ -1,0 +1,283 @@
+"""The page in a real browser without a window: no errors, no requests, clicks and motion."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from selenium import webdriver
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+
+from hybrid_opt.store.trajectory_file import read_trajectory, replay
+from studies.report import page_groups
+from studies.report.generate import write_report
+from studies.report.records import ReportData
+from tests.studies.report.browsing import (
+    NARROW,
+    WIDE,
+    browser,
+    logged,
+    opened,
+    report,
+    state,
+    until,
+)
+from tests.studies.report.test_report_page import HOSTILE, with_hostile_names
+
+__all__ = ["browser", "report"]
+
+
+def scene_hash(browser: webdriver.Chrome) -> str:
+    """The picture of the scene as it is drawn now."""
+    found: str = browser.execute_script(
+        "report.scene.render(); return report.scene.renderer.domElement.toDataURL()"
+    )
+    return found
+
+
+def test_loads_without_errors_or_requests(browser: webdriver.Chrome, report: Path) -> None:
+    logged(browser, "browser")
+    logged(browser, "performance")
+    opened(browser, report)
+    assert [entry for entry in logged(browser, "browser") if entry["level"] != "INFO"] == []
+    events = [json.loads(e["message"])["message"] for e in logged(browser, "performance")]
+    urls = [
+        event["params"]["request"]["url"]
+        for event in events
+        if event["method"] == "Network.requestWillBeSent"
+    ]
+    outside = [url for url in urls if not url.startswith(("data:", "blob:"))]
+    assert outside == [report.as_uri()]
+
+
+def test_is_usable_soon(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    # Ratio to what this machine needs for a fixed piece of work, so that a busy one does not fail.
+    work = browser.execute_script(
+        "const t = performance.now(); let s = 0;"
+        "for (let i = 0; i < 3e7; i += 1) s += Math.sqrt(i);"
+        "return [performance.now() - t, s][0]"
+    )
+    ready = browser.execute_script(
+        "return performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd"
+    )
+    assert ready < 2000.0 or ready < 60.0 * work
+
+
+def test_a_click_on_a_point_selects_its_trajectory(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    # The first view may leave out the ends of fronts.
+    browser.find_element(By.ID, "whole").click()
+    front = browser.execute_script(
+        "return report.data.views[0].groups.findIndex((g) => g.label === 'NSGA-II')"
+    )
+    group = browser.execute_script(
+        "return report.data.views[0].groups[arguments[0]].members", front
+    )
+    trace = browser.execute_script(
+        "return document.getElementById('front-plot').data.findIndex((t) => t.name === 'NSGA-II')"
+    )
+    wanted = group[-1]
+    assert state(browser)["selected"] != wanted
+    points = browser.find_elements(
+        By.CSS_SELECTOR, f"#front-plot .scatterlayer .trace:nth-of-type({trace + 1}) .point"
+    )
+    before = scene_hash(browser)
+    target = points[-1]
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", target)
+    ActionChains(browser).move_to_element(target).pause(0.2).click().perform()
+    until(browser, lambda: state(browser)["selected"] in group)
+    chosen = state(browser)["selected"]
+    carry = browser.execute_script(
+        "return report.data.trajectories[arguments[0]].motions[report.state.motion]", chosen
+    )
+    shown = browser.find_element(By.ID, "figures-of-choice").text
+    assert f"{carry['peaks'][0]:.2f} N" in shown
+    assert f"{carry['duration']:.2f} s" in shown
+    # Its forces, torques and motion are shown.
+    force = browser.execute_script("return document.getElementById('force-plot').data[0].y")
+    assert max(force.values() if isinstance(force, dict) else force) == pytest.approx(
+        carry["peaks"][0], abs=1e-3
+    )
+    browser.execute_script("report.seek(0.5)")
+    assert scene_hash(browser) != before
+
+
+def test_the_list_selects_too(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    options = browser.find_elements(By.CSS_SELECTOR, "#chooser option")
+    count = browser.execute_script("return report.data.lists.flatMap((l) => l.members).length")
+    assert len(options) == count
+    options[0].click()
+    assert state(browser)["selected"] == 0
+
+
+def test_every_point_can_be_saved_as_a_trajectory_file(
+    browser: webdriver.Chrome, report: Path, tmp_path: Path
+) -> None:
+    """What the browser saves is read, unpacked and reproduced."""
+    opened(browser, report)
+    views = browser.execute_script("return report.data.views.map((v) => v.groups[0].members[0])")
+    assert len(views) == 2
+    for number in views:
+        text = browser.execute_script(
+            "return report.fileOf(report.data.trajectories[arguments[0]])", number
+        )
+        file = tmp_path / f"{number}.json"
+        file.write_text(text, "utf-8")
+        (tmp_path / str(number)).mkdir()
+        assert replay(read_trajectory(file), tmp_path / str(number)).reproduced
+    assert browser.find_element(By.ID, "save").is_enabled()
+
+
+def test_pictures_and_timings_can_be_switched(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    first, second = browser.find_elements(By.CSS_SELECTOR, "#views button[data-view]")
+    title = "return document.getElementById('front-plot').layout.xaxis.title.text"
+    assert "force" in browser.execute_script(title)
+    second.click()
+    assert second.get_attribute("aria-pressed") == "true"
+    assert first.get_attribute("aria-pressed") == "false"
+    assert "north" in browser.execute_script(title)
+    ranges = "return document.getElementById('front-plot').layout.xaxis.range"
+    near = browser.execute_script(ranges)
+    browser.find_element(By.ID, "whole").click()
+    whole = browser.execute_script(ranges)
+    assert whole[1] - whole[0] >= near[1] - near[0]
+    # A selected trajectory: driven, with its whole job, and as the search assumed.
+    selected = "report.data.lists.find((l) => l.label.startsWith('Hand-made and')).members[1]"
+    browser.execute_script(f"report.select({selected})")
+    moments = []
+    for option in browser.find_elements(By.CSS_SELECTOR, "#motion option"):
+        option.click()
+        moments.append(browser.find_element(By.ID, "figures-of-choice").text)
+    assert len(moments) == len(set(moments)) == 3
+    # The chosen kind of timing stays chosen.
+    browser.execute_script("report.select(report.data.views[1].groups[0].members[1])")
+    assert "as the search assumed" in browser.find_element(By.ID, "figures-of-choice").text
+
+
+def test_plays_pauses_and_scrubs(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    still = scene_hash(browser)
+    browser.find_element(By.ID, "play").click()
+    until(browser, lambda: state(browser)["share"] > 0.1)
+    browser.find_element(By.ID, "play").click()
+    assert not state(browser)["playing"]
+    stopped = state(browser)["share"]
+    time.sleep(0.3)
+    assert state(browser)["share"] == stopped
+    assert scene_hash(browser) != still
+    browser.execute_script(
+        "const s = document.getElementById('scrub'); s.value = 1000;"
+        "s.dispatchEvent(new Event('input'))"
+    )
+    end = browser.find_element(By.ID, "moment").text
+    duration = browser.execute_script(
+        "const s = report.state, chosen = report.data.trajectories[s.selected];"
+        "return chosen.motions[s.motion].duration"
+    )
+    assert end == f"{duration:.2f} s, retreat"
+
+
+def test_the_whole_job_is_played_with_its_phases_named(
+    browser: webdriver.Chrome, report: Path
+) -> None:
+    opened(browser, report)
+    job = browser.execute_script(
+        "return report.data.trajectories[report.state.selected].motions[report.state.motion]"
+    )
+    names = [phase["name"] for phase in job["phases"]]
+    assert names[0] == "approach"
+    assert "carry" in names
+    strip = browser.find_elements(By.CSS_SELECTOR, "#phases button")
+    assert [button.text for button in strip] == names
+    for k, phase in enumerate(job["phases"]):
+        middle = (phase["begin"] + phase["duration"] / 2.0) / job["duration"]
+        browser.execute_script("report.seek(arguments[0])", middle)
+        assert browser.find_element(By.ID, "moment").text.endswith(f" s, {phase['name']}")
+        current = browser.find_elements(By.CSS_SELECTOR, "#phases [aria-current='true']")
+        assert [button.text for button in current] == [names[k]]
+    strip[names.index("carry")].click()
+    begin = job["phases"][names.index("carry")]["begin"]
+    assert browser.find_element(By.ID, "moment").text == f"{begin:.2f} s, carry"
+    rows = browser.find_elements(By.CSS_SELECTOR, "#phase-table tbody tr")
+    assert [row.find_element(By.TAG_NAME, "td").text for row in rows] == names
+    # The carry alone has no phases to play, but still the job's table.
+    browser.find_elements(By.CSS_SELECTOR, "#motion option")[0].click()
+    assert browser.find_elements(By.CSS_SELECTOR, "#phases button") == []
+    assert len(browser.find_elements(By.CSS_SELECTOR, "#phase-table tbody tr")) == len(names)
+
+
+def test_playing_ends_at_the_goal(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    browser.execute_script("report.seek(0.98); report.setPlaying(true)")
+    until(browser, lambda: not state(browser)["playing"])
+    assert state(browser)["share"] == 1.0
+
+
+def test_orbits(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    canvas = browser.find_element(By.CSS_SELECTOR, "#scene canvas")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
+    before = scene_hash(browser)
+    ActionChains(browser).click_and_hold(canvas).move_by_offset(120, 30).release().perform()
+    turned = scene_hash(browser)
+    assert turned != before
+    browser.find_element(By.ID, "reset-view").click()
+    assert scene_hash(browser) == before
+
+
+def test_joints_move_as_in_python(
+    browser: webdriver.Chrome, data: ReportData, report: Path
+) -> None:
+    """The pads' places in the browser's scene are those of the box."""
+    opened(browser, report)
+    browser.execute_script("report.seek(0.4)")
+    box = browser.execute_script("return report.scene.box.position.toArray()")
+    for i, arm in enumerate(data.geometry.arms):
+        joint = browser.execute_script(
+            "report.scene.scene.updateMatrixWorld(true);"
+            "return report.scene.arms[arguments[0]][5].moving.matrixWorld.toArray()",
+            i,
+        )
+        placed = np.array(joint).reshape(4, 4).T @ arm.T_joint_box
+        assert placed[:3, 3] == pytest.approx(box, abs=2e-3)
+
+
+@pytest.mark.parametrize("size", [WIDE, NARROW])
+def test_fits_the_window(
+    browser: webdriver.Chrome, report: Path, size: tuple[int, int], tmp_path: Path
+) -> None:
+    opened(browser, report, size)
+    width, inner = browser.execute_script(
+        "return [document.documentElement.scrollWidth, document.documentElement.clientWidth]"
+    )
+    assert width <= inner
+    for element in ("front-plot", "scene", "force-plot", "pressure-plot", "torque-plot"):
+        box = browser.execute_script(
+            "const r = document.getElementById(arguments[0]).getBoundingClientRect();"
+            "return [r.left, r.right, r.height]",
+            element,
+        )
+        assert 0 <= box[0] < box[1] <= inner
+        assert box[2] > 200
+    assert browser.save_screenshot(str(tmp_path / "page.png"))
+
+
+def test_hostile_names_are_shown_as_text(
+    browser: webdriver.Chrome, data: ReportData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_groups, "MAX_FRONT", 2)
+    hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False)
+    logged(browser, "browser")
+    opened(browser, hostile)
+    assert browser.execute_script("return window.broken") is None
+    assert browser.title == HOSTILE
+    assert browser.find_element(By.TAG_NAME, "h1").text == HOSTILE
+    assert browser.find_elements(By.CSS_SELECTOR, "img[onerror], img[src='x']") == []
+    assert [entry for entry in logged(browser, "browser") if entry["level"] != "INFO"] == []

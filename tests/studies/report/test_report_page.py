@@ -1,0 +1,307 @@
+"""The page's text: self-contained, safe with hostile names, small, complete."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hybrid_opt as ho
+from hybrid_opt.branches import BranchCompetition, PairResult
+from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.job.plan import JobModel
+from hybrid_opt.robust.squeeze import SqueezeSettings
+from studies.report import page_carries, page_groups
+from studies.report.generate import write_report
+from studies.report.jobs import DrawnJob, pressure_shift
+from studies.report.page_carries import PageCarries, Shown
+from studies.report.page_data import PageData
+from studies.report.records import ReportData
+from studies.study.recommendation import recommendation_text
+
+HOSTILE = "</title></script><script>window.broken = 1</script><img src=x onerror=alert(1)>\"'&"
+WINNER = PairResult((2, 0), 2, 120, 0.5, 0.4, 0.6)
+SECOND = PairResult((1, 1), 1, 80, 0.2, 0.3, 0.7)
+SHORT = '<b>&"</script>'
+MAX_BYTES = 15_000_000
+TABLES = (
+    "table1_quality",
+    "time_against_force",
+    "robust_price",
+    "bounds",
+    "timing",
+    "margins",
+)
+
+
+def with_hostile_names(data: ReportData) -> ReportData:
+    """The same report of a cell whose every name is markup."""
+    first, second = data.workcell.robots
+    robots = (replace(first, name=HOSTILE), replace(second, name=f"{HOSTILE}2"))
+    workcell = replace(data.workcell, name=HOSTILE, robots=robots)
+    algorithms = tuple(replace(entry, title=SHORT) for entry in data.algorithms)
+    initial = replace(data.initial, label=SHORT)
+    changed = replace(data, workcell=workcell, algorithms=algorithms, initial=initial)
+    return replace(changed, branches=BranchCompetition((WINNER, SECOND), 200, "constant"))
+
+
+@pytest.fixture(scope="module")
+def report(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_report(tmp_path_factory.mktemp("report"), data, with_paper=True)
+
+
+@pytest.fixture(scope="module")
+def text(report: Path) -> str:
+    return report.read_text("utf-8")
+
+
+class Elements(HTMLParser):
+    """Collects start tags and the content of scripts."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.scripts: list[str] = []
+        self._script: dict[str, str | None] | None = None
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self._script = dict(attrs) if tag == "script" else None
+
+    def handle_data(self, data: str) -> None:
+        if self._script is not None and "type" not in self._script:
+            self.scripts.append(data)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag == "script":
+            self._script = None
+
+
+def test_the_page_is_small_enough(report: Path) -> None:
+    assert report.stat().st_size < MAX_BYTES
+
+
+def test_nothing_is_loaded_from_elsewhere(text: str) -> None:
+    for tag, attributes in Elements(text).tags:
+        for name in ("src", "href", "srcset", "data", "action"):
+            value = attributes.get(name)
+            assert value is None or value.startswith("data:image/png;base64,"), (tag, name)
+
+
+def test_the_policy_allows_exactly_the_pages_scripts(text: str) -> None:
+    policy = re.search(r'Content-Security-Policy" content="([^"]+)"', text)
+    assert policy is not None
+    assert "default-src 'none'" in policy[1]
+    assert "unsafe-eval" not in policy[1]
+    scripts = Elements(text).scripts
+    hashes = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
+    allowed = re.findall(r"'sha256-([^']+)'", policy[1])
+    assert allowed == hashes
+    assert len(scripts) == 4
+
+
+def test_hostile_names_stay_text(
+    data: ReportData, tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_groups, "MAX_FRONT", 2)
+    hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False).read_text("utf-8")
+    assert HOSTILE not in hostile
+    assert html.escape(HOSTILE) in hostile
+    assert "Start branches 2 and 0, best of 2 pairs" in hostile
+    assert "hypervolume 0.4000, 0.1000 more than branches 1 and 1." in hostile
+    assert "Start branches" not in text
+    clean, found = Elements(text), Elements(hostile)
+    assert found.scripts == clean.scripts
+    count = [sum(tag == "img" for tag, _ in elements.tags) for elements in (clean, found)]
+    assert count[0] == count[1]
+
+
+@pytest.fixture(scope="module")
+def document(data: ReportData) -> dict[str, Any]:
+    return PageData(data).document()
+
+
+def test_data_of_the_page_are_the_trajectories(data: ReportData, document: dict[str, Any]) -> None:
+    front = data.algorithms[0].shown.front
+    view = document["views"][1]
+    group = view["groups"][0]
+    assert len(group["members"]) == len(front)
+    np.testing.assert_allclose(group["x"], front.objectives[:, 0])
+    first = document["trajectories"][group["members"][0]]
+    np.testing.assert_allclose(first["objectives"], front.objectives[0], rtol=1e-12)
+    assumed = first["motions"][-1]
+    samples = np.frombuffer(base64.b64decode(assumed["data"]), "<f4").reshape(-1, 23)
+    # The objectives are the peaks over the reference forces, and the page keeps the peaks.
+    peaks = samples[:, 19:21].max(axis=0) / data.workcell.task.reference_force
+    np.testing.assert_allclose(peaks, front.objectives[0], rtol=1e-6)
+    start = data.workcell.task.waypoints[0].lower
+    np.testing.assert_allclose(samples[0, 1:7], start, atol=1e-6)
+    assert np.all(np.diff(samples[:, 0]) > 0.0)
+    assert len(samples) <= 70
+
+
+def test_every_point_shows_what_robots_drive(data: ReportData, document: dict[str, Any]) -> None:
+    """Timed by `time_path`, and named by algorithm, replica and values."""
+    assert data.drivable is not None
+    view = document["views"][0]
+    entry = data.drivable.fronts[0]
+    group = next(g for g in view["groups"] if g["label"] == entry.front.label)
+    assert len(group["members"]) == len(entry.front.x)
+    cell = ho.Cell(data.drivable.workcell, DRIVABLE_OBJECTIVES)
+    for k in (0, len(entry.front.x) - 1):
+        x = entry.front.x[k]
+        timing = ho.time_path(cell, x, ho.TimingLimits(force=float(x[-1])))
+        shown = document["trajectories"][group["members"][k]]
+        motion, job = shown["motions"]
+        assert job["name"] == "the whole job"
+        assert motion["duration"] == pytest.approx(timing.duration, abs=1e-5)
+        assert max(motion["peaks"]) <= x[-1] * 1.005
+        assert (group["x"][k], group["y"][k]) == (max(motion["peaks"]), motion["duration"])
+        name = f"{entry.front.source}: {timing.duration:.2f} s, "
+        assert shown["label"].startswith(name)
+        assert timing.carry is not None
+        torque = np.abs(timing.carry.torque).max(axis=0)
+        limit = np.concatenate([robot.torque_max for robot in data.workcell.robots])
+        np.testing.assert_allclose(motion["torqueUse"], 100.0 * torque / limit, atol=1e-2)
+    searched = document["trajectories"][document["views"][1]["groups"][0]["members"][0]]
+    assert [motion["name"] for motion in searched["motions"]] == [
+        "as robots drive it",
+        "as the search assumed: ramped speed",
+    ]
+    assert "an export plans any" in searched["jobProblem"]
+
+
+def test_every_point_has_the_phases_of_its_job(
+    data: ReportData, document: dict[str, Any], text: str
+) -> None:
+    """As `plan_job` plans them around the same timing."""
+    assert data.drivable is not None
+    entry = data.drivable.fronts[0]
+    label = entry.front.label
+    group = next(g for g in document["views"][0]["groups"] if g["label"] == label)
+    x = entry.front.x[0]
+    cell = Cell(data.workcell)
+    limits = ho.TimingLimits(force=float(x[-1]))
+    timing = ho.time_path(cell, x[: data.workcell.task.n_var], limits)
+    job = JobModel(cell.compiled, cell.timing_model).plan(timing, within_jerk=False)
+    shown = document["trajectories"][group["members"][0]]["motions"][1]
+    assert [phase["name"] for phase in shown["phases"]] == [
+        phase.name.replace("_", " ") for phase in job.phases
+    ]
+    assert shown["duration"] == pytest.approx(job.duration, abs=1e-5)
+    assert shown["peaks"] == pytest.approx(job.peak_normal_force, abs=1e-3)
+    for mine, phase in zip(shown["phases"], job.phases, strict=True):
+        assert mine["duration"] == pytest.approx(phase.duration, abs=1e-5)
+        assert mine["use"] == pytest.approx(100.0 * phase.use[mine["most"]], abs=1e-2)
+    samples = np.frombuffer(base64.b64decode(shown["data"]), "<f4").reshape(-1, 23)
+    assert np.all(np.diff(samples[:, 0]) > 0.0)
+    np.testing.assert_allclose(samples[0, 7:19], job.phases[0].motion.q[0], atol=1e-5)
+    np.testing.assert_allclose(samples[-1, 7:19], job.phases[-1].motion.q[-1], atol=1e-5)
+    np.testing.assert_allclose(samples[[0, -1], 19:21], 0.0)
+    timed = document["trajectories"][document["first"]]
+    assert [motion["name"] for motion in timed["motions"]][:2] == [
+        "as robots drive it",
+        "the whole job",
+    ]
+    assert "Phases of the whole jobs." in text
+    assert [job.label for job in data.jobs][:2] == ["recommended", "hand-made"]
+    assert not any(job.problem for job in data.jobs)
+
+
+def test_points_are_named_by_what_was_minimised(data: ReportData) -> None:
+    cell = Cell(data.workcell, ("mean_force", "friction_use"))
+    carries = PageCarries([cell], JobModel(cell.compiled, cell.timing_model))
+    trajectory = carries.trajectory(Shown("NSGA-II, replica 1", data.initial.x, ""))
+    mean, friction = trajectory["objectives"]
+    assert trajectory["label"] == (
+        f"NSGA-II, replica 1: mean force {mean:.4f}, friction use {friction:.4f}"
+    )
+
+
+def test_selected_trajectories_name_their_replica(
+    data: ReportData, document: dict[str, Any]
+) -> None:
+    best = data.solved[0].best
+    assert best is not None
+    name = f"{best.label}, replica {data.solved[0].shown.replica}: least force: "
+    labels = [trajectory["label"] for trajectory in document["trajectories"]]
+    # In both pictures: once as it was selected, and at some of the forces of its curve.
+    assert sum(label.startswith(name) for label in labels) >= 2
+
+
+def test_pressure_shifts_are_those_of_the_plan(data: ReportData) -> None:
+    """Without more squeeze than planned, the wrenches put the centre of pressure where the plan
+    has it."""
+    cell = Cell(data.workcell)
+    timing = ho.time_path(cell, data.initial.x, ho.TimingLimits(reference_speed=True))
+    model = JobModel(cell.compiled, cell.timing_model)
+    settings = SqueezeSettings(factor=1.0, smoothing=0.002)
+    job = model.plan(timing, settings, within_jerk=False)
+    carry = job.timing.carry
+    assert carry is not None
+    phase = job.phase("carry")
+    shift = pressure_shift(job, phase)[: len(carry)]
+    extra = phase.force.normal[: len(carry)] / carry.normal_force
+    np.testing.assert_allclose(shift * extra, carry.pressure_shift, atol=2e-5)
+
+
+def test_the_page_begins_with_the_recommended_carry(
+    data: ReportData, document: dict[str, Any], text: str
+) -> None:
+    found = data.summary.recommendation
+    assert found is not None
+    first = document["trajectories"][document["first"]]
+    assert first["label"].startswith("Recommended")
+    assert first["motions"][0]["duration"] == pytest.approx(found.duration, abs=1e-5)
+    words = recommendation_text(found, data.summary.robots, "")
+    for _, sentence in words.facts:
+        assert html.escape(sentence) in text
+    assert html.escape(words.headline) in text
+
+
+def test_the_first_look_is_not_squashed(document: dict[str, Any], data: ReportData) -> None:
+    for view in document["views"]:
+        for first, whole in zip(view["first"], view["whole"], strict=True):
+            assert whole[0] <= first[1]
+            assert first[1] - first[0] <= whole[1] - whole[0] + 1e-9
+    # All the searches' fronts are in sight.
+    (low, high), _ = document["views"][1]["first"]
+    for algorithm in data.solved:
+        inside = algorithm.shown.front.objectives[:, 0]
+        assert low <= inside.min() <= inside.max() <= high
+
+
+def test_polished_fronts_stand_beside_the_searchs(
+    hybrid_data: ReportData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    no_job = DrawnJob("", "not what is looked at")
+    monkeypatch.setattr(page_carries, "drawn", lambda *_: no_job)
+    document = PageData(hybrid_data).document()
+    groups = document["views"][1]["groups"]
+    assert [group["label"] for group in groups] == [
+        f"{title}{stage}" for title in ("NSGA-II", "MOPSO") for stage in ("", ", polished")
+    ]
+    hybrid = hybrid_data.algorithms[0].shown.hybrid
+    assert hybrid is not None
+    assert len(groups[1]["members"]) == len(hybrid)
+
+
+def test_every_file_of_the_report_is_written(report: Path, text: str) -> None:
+    figures = {path.stem for path in (report.parent / "figures").glob("*.png")}
+    assert figures == {path.stem for path in (report.parent / "figures").glob("*.pdf")}
+    assert text.count("<figure>") == len(figures)
+    tables = sorted(path.name for path in (report.parent / "tables").iterdir())
+    for name in TABLES:
+        assert [f"{name}.{suffix}" for suffix in ("csv", "md", "tex")] == [
+            entry for entry in tables if entry.startswith(f"{name}.")
+        ]

@@ -1,0 +1,150 @@
+"""The benchmark: honest ratios, sensible derived cells, the promised speed."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from studies.research import benchmark, costs, study_costs, turns
+from studies.research.costs import report
+from studies.research.turns import SLICE, Evaluate, interleaved, summary
+from symbolic.array import Array
+from tests.symbolic.cells import RACK, hand_cell
+
+PROMISED_RATIO = 1000.0
+"""How many times faster than the plain version the compiled evaluator has to be."""
+
+PROMISED_RATIO_WITH_COLLISIONS = 1000.0
+
+
+def busy(milliseconds: float) -> Evaluate:
+    """A way that uses the processor for a given time."""
+
+    def evaluate(_: Array) -> None:
+        end = time.thread_time() + 1e-3 * milliseconds
+        while time.thread_time() < end:
+            pass
+
+    return evaluate
+
+
+def test_ratios_are_those_of_the_ways() -> None:
+    x = np.zeros((3, 2))
+    ways = {"compiled": busy(0.5), "interpreted": busy(2.0), "plain": busy(10.0)}
+    result = summary(interleaved(ways, dict.fromkeys(ways, x), 3))
+    assert result["plain_over_compiled"] == pytest.approx(20.0, rel=0.1)
+    assert result["interpreted_over_compiled"] == pytest.approx(4.0, rel=0.1)
+    assert result["compiled_ms"] == pytest.approx(0.5, rel=0.1)
+
+
+def test_every_way_sees_every_candidate_in_every_round() -> None:
+    seen: dict[str, list[float]] = {"a": [], "b": []}
+
+    def recorder(name: str) -> Evaluate:
+        def evaluate(x: Array) -> None:
+            seen[name].append(float(x[0]))
+            busy(1.1e3 * SLICE)(x)  # longer than a slice: once per round
+
+        return evaluate
+
+    x = np.arange(4.0)[:, None]
+    times = interleaved({n: recorder(n) for n in seen}, dict.fromkeys(seen, x), 2)
+    for name, values in seen.items():
+        # Two evaluations come before the rounds: a first one, and one to choose the repetitions.
+        assert values[2:] == [0.0, 1.0, 2.0, 3.0] * 2
+        assert times[name].shape == (8,)
+
+
+def test_fast_ways_go_on_with_the_next_candidates_within_a_round() -> None:
+    seen: list[float] = []
+
+    def fast(x: Array) -> None:
+        seen.append(float(x[0]))
+        busy(1e3 * SLICE / 2.5)(x)
+
+    interleaved({"fast": fast}, {"fast": np.arange(4.0)[:, None]}, 1)
+    # Three calls fill a slice; two evaluations come before the rounds.
+    assert seen[2:] == [0.0, 1.0, 2.0, 1.0, 2.0, 3.0, 2.0, 3.0, 0.0, 3.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("count", range(1, 9))
+def test_derived_tasks_keep_the_ends_and_stay_on_the_trajectory(count: int) -> None:
+    task = hand_cell().task
+    derived = costs.with_free_waypoints(task, count)
+    assert derived.n_var == 6 * count
+    assert derived.waypoints[0] is task.waypoints[0]
+    assert derived.waypoints[-1] is task.waypoints[-1]
+    middle = (derived.lower + derived.upper) / 2.0
+    np.testing.assert_allclose(middle, derived.initial.reshape(-1), atol=1e-15)
+    if count == len(task.initial):
+        np.testing.assert_allclose(derived.initial, task.initial, atol=1e-15)
+
+
+def test_measures_the_rack_and_keeps_its_promises(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(costs, "SAMPLES", (25, 50, 100))
+    monkeypatch.setattr(costs, "WAYPOINTS", (1, 3))
+    monkeypatch.setattr(turns, "EVALUATIONS", 200)
+    arguments = [str(RACK), "--json", "--candidates", "5", "--repeats", "2"]
+    assert benchmark.main(arguments) == 0
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert result["plain_over_compiled"] > PROMISED_RATIO
+    assert result["interpreted_over_compiled"] > 1.0
+    assert result["compiled_ms"] < result["interpreted_ms"] < result["plain_ms"]
+    collisions = result["with_collisions"]
+    for figures in (collisions, collisions["random"]):
+        assert figures["plain_over_compiled"] > PROMISED_RATIO_WITH_COLLISIONS
+        assert result["compiled_ms"] < figures["compiled_ms"] < figures["interpreted_ms"]
+        assert figures["plain_ms"] > result["plain_ms"]
+        assert sum(figures["shares"].values()) == pytest.approx(1.0)
+        assert all(0.0 < share < 1.0 for share in figures["shares"].values())
+    assert 0.01 < collisions["share_of_peak"] < 1.0
+    assert collisions["feasible_share"] > collisions["random"]["feasible_share"]
+    scaling = result["scaling"]
+    assert [entry["samples"] for entry in scaling["samples"]] == [25, 50, 100]
+    assert [entry["waypoints"] for entry in scaling["waypoints"]] == [1, 3]
+    assert scaling["samples_line"]["largest_relative_deviation"] < 0.25
+    assert report(result).startswith(result["workcell"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--candidates", "0"], "--candidates: found '0'; allowed is a whole number 1 to"),
+        (["--repeats", "-1"], "--repeats: found '-1'; allowed is a whole number 1 to"),
+        (["--seed", "-1"], "--seed: found '-1'; allowed is a whole number 0 to"),
+    ],
+)
+def test_wrong_numbers_give_one_message_and_a_code(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        benchmark.main(arguments)
+    assert message in capsys.readouterr().err
+
+
+def test_a_missing_cell_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert benchmark.main(["missing.toml"]) == 2
+    assert "missing.toml" in capsys.readouterr().err
+
+
+def test_parts_of_a_study_are_rooms_and_libraries() -> None:
+    root = study_costs._ROOT
+    assert study_costs._part(str(root / "hybrid_opt/collision/judge.py"), "") == (
+        "hybrid_opt/collision"
+    )
+    assert study_costs._part("/x/site-packages/pymoo/core/problem.py", "") == "pymoo"
+    assert study_costs._part("", "<built-in method _casadi.Function_call>") == "casadi"
+    assert study_costs._part("", "<built-in method builtins.len>") == "python"
+
+
+def test_a_stage_s_parts_sum_to_its_time() -> None:
+    stage = study_costs._timed("busy", lambda: busy(300.0)(np.zeros(1)))
+    assert stage.seconds == pytest.approx(0.3, rel=0.1)
+    assert sum(stage.parts.values()) == pytest.approx(0.3, rel=0.2)
+    assert study_costs.study_table((stage,)).startswith("busy: 0.3")

@@ -1,0 +1,91 @@
+"""Polished studies beside longer searches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
+from hybrid_opt.campaign.polish_stage import read_polished
+from hybrid_opt.campaign.results import read_campaign, read_summary
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.indicators import metrics
+from hybrid_opt.polishing.settings import PolishSettings
+from studies.research import longer_searches
+from studies.research.best_front import ReferenceFront
+from studies.research.control import main
+from studies.study.stages import StudySettings, run_study
+from symbolic.read.cell import load
+from tests.symbolic.read.samples import RACK
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("control") / "results"
+    settings = CampaignSettings(
+        algorithms=("nsga2",), evaluations=120, replicas=2, seed=4, populations=(("nsga2", 20),)
+    )
+    run_study(
+        load(RACK),
+        settings,
+        ExecutionSettings(root, jobs=1),
+        Progress(shown=False),
+        StudySettings(PolishSettings(attempts=3), report=False),
+    )
+    return root
+
+
+def test_longer_searches_repeat_the_studys_own_settings(study: Path) -> None:
+    (found,) = longer_searches.controls(study, [160], 1, Progress(shown=False))
+    longer = read_campaign(study / "control" / "160")
+    own = read_campaign(study)
+    stored, wanted = longer.configuration.settings, own.configuration.settings
+    assert stored == replace(wanted, evaluations=160)
+    # The same seed: the longer search begins as the shorter one, up to its cut last generation.
+    first, second = longer.replicas[0].evaluations.x, own.replicas[0].evaluations.x
+    assert (first[:120] == second).all()
+    rows = read_summary(study).algorithms["nsga2"].replicas
+    alone = [metrics.hypervolume(r.front, metrics.REFERENCE_POINT) for r in longer.replicas]
+    after = [row.polished.hypervolume for row in rows if row.polished is not None]
+    wins = sum(mine > theirs for mine, theirs in zip(after, alone, strict=True))
+    assert (found.polished_wins, found.replicas, found.evaluations) == (wins, 2, 160)
+    # A second call reads what the first one computed.
+    assert longer_searches.controls(study, [160], 1, Progress(shown=False)) == [found]
+    assert "NSGA-II, 160 evaluations" in longer_searches.as_text([found])
+
+
+def test_distance_to_a_reference_front(study: Path) -> None:
+    own = read_campaign(study)
+    polished = [read_polished(study, replica, own.workcell) for replica in own.replicas]
+    fronts = [found.objectives for found in polished if found is not None]
+    assert len(fronts) == 2
+    union = metrics.front_of(np.concatenate(fronts))
+    reference = ReferenceFront(own.workcell.digest, union, np.empty((len(union), 0)))
+    (found,) = longer_searches.approaches(study, reference)
+    gaps = [metrics.hypervolume(union) - metrics.hypervolume(r.front) for r in own.replicas]
+    assert found.search_gap == pytest.approx(np.median(gaps))
+    assert 0.0 <= found.polished_gap < found.search_gap
+    assert found.polished_igd < found.search_igd
+    assert found.closed == pytest.approx(100.0 * (1.0 - found.polished_gap / found.search_gap))
+    assert "NSGA-II" in longer_searches.approaches_text([found])
+    searched = metrics.front_of(np.concatenate([r.front for r in own.replicas[:1]]))
+    own_front = ReferenceFront(own.workcell.digest, searched, np.empty((len(searched), 0)))
+    assert longer_searches.approaches(study, own_front)  # the gap to it may be none
+    with pytest.raises(ResultsError, match="another workcell"):
+        longer_searches.approaches(
+            study, ReferenceFront("0" * 64, union, np.empty((len(union), 0)))
+        )
+
+
+def test_a_study_without_a_polish_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = CampaignSettings(algorithms=("random",), evaluations=60, replicas=1)
+    root = tmp_path / "results"
+    execution = ExecutionSettings(root, jobs=1)
+    run_study(load(RACK), settings, execution, Progress(shown=False), StudySettings(report=False))
+    assert main([str(root)]) == 2
+    assert "not polished; run the study with --polish" in capsys.readouterr().err

@@ -1,0 +1,195 @@
+"""A study whose limits are about robust forces: from search and polish to what is run and shown."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
+from hybrid_opt.campaign.documents import PolishDocument
+from hybrid_opt.campaign.layout import POLISH, polished_folder
+from hybrid_opt.campaign.recommended import StoredRecommendation
+from hybrid_opt.campaign.results import read_campaign, read_summary
+from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES
+from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
+from hybrid_opt.recommending.comparison import level_force
+from hybrid_opt.robust.force import robust_model
+from hybrid_opt.robust.squeeze import RESERVE
+from hybrid_opt.store.json_records import read_record
+from hybrid_opt.store.trajectory_file import read_trajectory, replay
+from hybrid_opt.timing.document import read_timing
+from hybrid_opt.witness.reference import driven_carry
+from studies import export
+from studies.report.data import gather
+from studies.report.page_data import PageData
+from studies.report.pictures_drive import duration_against_force
+from studies.report.records import ReportData
+from studies.report.tables import report_tables
+from studies.study.stages import StudySettings, run_study
+from symbolic.array import Array
+from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
+from symbolic.records import Workcell
+from tests.symbolic.read.samples import RACK
+
+FRICTION, MASS = 0.08, 0.05
+MORE = (1.0 + MASS) / (1.0 - FRICTION)
+"""What such a set asks for at rest, over the planned force."""
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Results folder of the rack, one replica, and what is printed."""
+    folder = tmp_path_factory.mktemp("robust")
+    driven = unpack_cell(drivable_files(collect_cell(load(RACK))), folder / "cell").source
+    text = driven.read_text() + f"\n[uncertainty]\nfriction = {FRICTION}\nmass = {MASS}\n"
+    driven.write_text(text)
+    settings = CampaignSettings(
+        algorithms=("nsga2",),
+        objectives=ROBUST_DRIVABLE_OBJECTIVES,
+        evaluations=120,
+        replicas=1,
+        seed=3,
+    )
+    short = PolishSettings(attempts=1, drivable=DrivableSettings(rounds=2, turn=1, members=2))
+    execution, silent = ExecutionSettings(folder / "results", jobs=1), Progress(shown=False)
+    wanted = StudySettings(polish=short, report=False)
+    told = run_study(load(driven), settings, execution, silent, wanted)
+    return folder / "results", told
+
+
+@pytest.fixture(scope="module")
+def data(study: tuple[Path, str]) -> ReportData:
+    """What a report of it shows."""
+    return gather(read_campaign(study[0]))
+
+
+def recommended(root: Path) -> StoredRecommendation:
+    found = read_summary(root).recommendation
+    assert found is not None
+    return found
+
+
+def robust_peak(workcell: Workcell, carry: Carry) -> Array:
+    return robust_model(workcell).robust_force(carry).peak
+
+
+def test_one_experiment_is_searched_and_polished(study: tuple[Path, str]) -> None:
+    root, _ = study
+    results = read_campaign(root)
+    assert results.objectives == ROBUST_DRIVABLE_OBJECTIVES
+    assert not (root / "drivable").exists()
+    path = polished_folder(root, "nsga2", 0) / POLISH
+    front = read_record(PolishDocument, path, "").front
+    assert any(point.polished for point in front)
+    reference = results.workcell.task.reference_force
+    for point in front[:: max(1, len(front) // 3)]:
+        carry = results.cell.carry(point.x)
+        most = (robust_peak(results.workcell, carry) / reference).max()
+        # The carry is sampled, the objective is of the whole path.
+        assert 0.99 * point.objectives[1] < most <= point.objectives[1] * (1.0 + 5e-3)
+        assert most > 1.05 * (carry.peak_normal_force / reference).max()
+
+
+def test_what_is_recommended_holds_in_every_case_and_uses_its_limit_up(
+    study: tuple[Path, str],
+) -> None:
+    root, printed = study
+    found = recommended(root)
+    stored = read_trajectory(root / found.file)
+    assert stored.objectives == ROBUST_DRIVABLE_OBJECTIVES
+    with TemporaryDirectory() as folder:
+        cell = stored.open_cell(Path(folder))
+        carry = driven_carry(cell, stored.x)
+    assert found.robust_force is not None
+    peak = robust_peak(cell.workcell, carry)
+    np.testing.assert_allclose(found.robust_force, peak, rtol=1e-6)
+    assert found.force_limit == pytest.approx(peak.max(), rel=5e-3)
+    assert carry.duration == pytest.approx(found.duration, rel=1e-6)
+    assert peak.max() > 1.1 * max(found.peak_force)
+    # Of the arm that is commanded; smoothing adds to that, nothing takes away.
+    assert found.squeeze[1] >= (1.0 + RESERVE) * peak[1] * (1.0 - 1e-6)
+    assert "robust" in found.squeeze_reason
+    assert f"held in every case by at most {max(found.robust_force):.2f} N" in printed
+    assert "if nothing is uncertain" in printed
+    assert "Time against robust force" in printed
+
+
+def test_its_file_is_reproduced(study: tuple[Path, str], tmp_path: Path) -> None:
+    root, _ = study
+    assert replay(read_trajectory(root / recommended(root).file), tmp_path).reproduced
+
+
+def test_it_is_also_timed_within_jerk_limits(study: tuple[Path, str]) -> None:
+    root, _ = study
+    found = recommended(root)
+    assert found.jerk is not None
+    assert found.jerk.status == "ok"
+    assert 0.0 < found.jerk.duration / found.duration - 1.0 < 0.3
+    selected = read_timing(root / "timing" / "nsga2-polished" / "00.json")
+    assert selected.jerk is not None
+    # The search's own timing is the one within robust forces.
+    chosen = read_summary(root).algorithms["nsga2"].replicas[0].polished
+    assert chosen is not None
+    assert chosen.selected is not None
+    assert selected.timings["search"].duration == pytest.approx(chosen.selected.duration)
+
+
+def test_what_is_exported_keeps_the_robust_limit(
+    study: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, _ = study
+    found = recommended(root)
+    options = ["--form", "json", "--force-limit", f"{found.force_limit:.6g}"]
+    file = str(root / found.file)
+    assert export.main([file, *options, "--output", str(tmp_path / "out")]) == 0
+    assert "carry" in capsys.readouterr().out
+
+
+def test_the_table_begins_above_what_holds_still_in_every_case(study: tuple[Path, str]) -> None:
+    root, _ = study
+    results, table = read_campaign(root), recommended(root).durations
+    level = level_force(results.workcell, results.cell.force_kind)
+    assert level == pytest.approx(MORE * 49.05, rel=1e-4)
+    assert min(table.forces) > level
+    labels = [row.label for row in table.rows]
+    assert labels == ["hand-made", "NSGA-II", "NSGA-II, polished"]
+    hand_made, searched, polished = (np.array(row.median) for row in table.rows)
+    assert (polished <= searched * (1.0 + 1e-9)).all()
+    assert (polished <= hand_made * (1.0 + 1e-3)).all()
+
+
+def test_the_report_shows_robust_forces(data: ReportData) -> None:
+    axes = duration_against_force(data).axes[0]
+    assert axes.get_xlabel() == "largest robust force [N]"
+    lines = {str(line.get_label()): np.asarray(line.get_xdata()) for line in axes.get_lines()}
+    assert lines["at rest"][0] == pytest.approx(MORE * 49.05, rel=1e-4)
+    # Curves, fronts and what is recommended lie above what holds still.
+    assert len(lines) >= 5
+    assert min(values.min() for values in lines.values()) >= MORE * 49.05 * (1.0 - 1e-4)
+    titles = {table.name: table.title for table in report_tables(data, False)}
+    assert titles["time_against_force"].startswith("Time against robust force")
+    page = PageData(data).document()
+    (view,) = page["views"]
+    assert view["xTitle"] == "largest robust force [N]"
+    choice = data.summary.recommendation
+    assert choice is not None
+    (group,) = (each for each in view["groups"] if each["label"] == "Recommended")
+    assert group["x"][0] == pytest.approx(choice.force_limit, rel=5e-3)
+    assert group["y"][0] == pytest.approx(choice.duration, rel=1e-3)
+    # Points of the fronts are driven as the search found them.
+    assert data.drivable is not None
+    entry = data.drivable.fronts[0].front
+    (shown,) = (each for each in view["groups"] if each["label"] == entry.label)
+    cell = Cell(data.drivable.workcell, data.objectives)
+    for k in (0, len(entry.x) - 1):
+        point = page["trajectories"][shown["members"][k]]
+        assert point["motions"][0]["duration"] == pytest.approx(
+            cell.carry(entry.x[k]).duration, rel=1e-4
+        )
+        assert point["force"] <= 1.005 * entry.x[k][-1]

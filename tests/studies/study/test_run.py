@@ -1,0 +1,311 @@
+"""The programs that people start: whole studies, their messages and exit codes."""
+
+from __future__ import annotations
+
+import csv
+import html
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+
+import hybrid_opt as ho
+from hybrid_opt.campaign import Progress
+from hybrid_opt.campaign.results import read_campaign, read_summary
+from hybrid_opt.errors import NoCarryError
+from hybrid_opt.indicators import metrics
+from hybrid_opt.recommending.choice import Wish
+from hybrid_opt.store.trajectory_file import read_trajectory, replay
+from hybrid_opt.timing.document import read_timing
+from studies import rack, recommend, run
+from studies.programs.study import PAGE, campaign_settings, polish_settings
+from studies.study.recommendation import recommend_from, recommendation_text
+from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
+from tests.hybrid_opt.campaign.fake import RACK, ROOT
+
+CELL = str(RACK.with_name("transfer.toml"))
+SMALL = ["--evaluations", "120", "--replicas", "2", "--jobs", "1", "--no-polish"]
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A small study by the program itself: its results folder and what it printed."""
+    root = tmp_path_factory.mktemp("study") / "a"
+    command = [sys.executable, "-m", "studies.run", CELL, "--output", str(root), *SMALL]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "240 of 480" in done.stderr or "480 of 480" in done.stderr
+    assert "left]" in done.stderr
+    return root, done.stdout
+
+
+def test_study_leaves_everything_behind(study: tuple[Path, str]) -> None:
+    root, printed = study
+    summary = read_summary(root)
+    results = read_campaign(root)
+    assert [found.algorithm for found in results.replicas] == ["nsga2"] * 2 + ["mopso"] * 2
+    for replica in results.replicas:
+        entry = summary.algorithms[replica.algorithm].replicas[replica.replica]
+        found = replica.evaluations
+        assert len(found) == entry.evaluations == 120
+        assert entry.feasible == int(found.feasible.sum()) > 0
+        assert entry.feasible + sum(entry.infeasible_by_reason.values()) == 120
+        # Dominance by its definition, point by point.
+        alive = found.objectives[found.feasible]
+        best = [p for p in alive if not any((q <= p).all() and (q < p).any() for q in alive)]
+        assert entry.non_dominated == len(np.unique(best, axis=0)) == len(replica.front)
+        assert entry.hypervolume == metrics.hypervolume(replica.front)
+        assert entry.selected is not None
+        assert entry.selected.file is not None
+        stored = read_trajectory(root / entry.selected.file)
+        np.testing.assert_array_equal(stored.x, found.x[entry.selected.evaluation - 1])
+        assert stored.figures["payload_limit"] == entry.payload_limit
+        assert entry.payload_limit < summary.static_hold.payload_limit
+        rows = list(csv.reader((root / f"fronts/{replica.algorithm}.csv").open()))
+        assert rows[0] == ["peak_force_1", "peak_force_2"]
+    assert "Table 1" in printed
+    assert "Table 2" in printed
+    assert str(root) in printed
+    assert "paper" not in printed.lower()
+
+
+def test_study_opens_with_a_carry_to_run(study: tuple[Path, str]) -> None:
+    """Terminal, summary.json and the stored trajectory agree; the hand-made one stands beside."""
+    root, printed = study
+    found = read_summary(root).recommendation
+    assert found is not None
+    words = recommendation_text(found, read_summary(root).robots, str(root))
+    assert printed.startswith(words.terminal())
+    assert f"Run this carry: {found.duration:.2f} s" in printed
+    assert f"--form ros2 --force-limit {found.force_limit:.6g}" in printed
+    assert str(root) not in found.export, "it holds wherever the folder is moved"
+    stored = read_trajectory(root / found.file)
+    assert stored.x[-1] == found.force_limit
+    drivable = read_campaign(root / "drivable")
+    assert drivable.objectives == ("duration", "peak_force")
+    assert drivable.workcell.task.time_law == "optimal"
+    fronts = np.concatenate([replica.front_x for replica in drivable.replicas])
+    assert (fronts[:, :-1] == stored.x[:-1]).all(axis=1).any()
+    assert [rival.label for rival in found.rivals] == ["hand-made", "least-force"]
+    labels = [row.label for row in found.durations.rows]
+    assert labels == ["hand-made", "least-force", "NSGA-II", "MOPSO"]
+    assert [row.replicas for row in found.durations.rows] == [1, 1, 2, 2]
+    for folder, law in ((root, "ramped"), (root / "drivable", "optimal")):
+        hand_made = read_trajectory(folder / "selected/hand-made.json")
+        with TemporaryDirectory() as unpacked:
+            workcell = hand_made.unpack(Path(unpacked))
+        assert workcell.task.time_law == law
+        np.testing.assert_array_equal(
+            hand_made.x[: workcell.task.n_path], load(Path(CELL)).task.initial.ravel()
+        )
+    assert (root / "timing/hand-made.json").exists()
+
+
+def test_the_recommended_file_is_reproduced(study: tuple[Path, str], tmp_path: Path) -> None:
+    root, _ = study
+    assert replay(read_trajectory(root / "recommended.json"), tmp_path).reproduced
+
+
+def test_another_wish_needs_no_other_study(
+    study: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, _ = study
+    file = tmp_path / "gentle.json"
+    assert recommend.main([str(root), "--duration", "4", "--output", str(file)]) == 0
+    printed = capsys.readouterr().out
+    assert "the least force of all carries of at most 4 s" in printed
+    assert str(file) in printed
+    assert read_trajectory(file).figures["duration"] < 4.1
+    assert recommend.main([str(root), "--duration", "4", "--payload", "9"]) == 2
+    assert "give at most one" in capsys.readouterr().err
+
+
+def test_searches_start_from_the_initial_trajectory(study: tuple[Path, str]) -> None:
+    for replica in read_campaign(study[0]).replicas:
+        initial = load(Path(CELL)).task.initial.ravel()
+        assert (replica.evaluations.x[0] == initial).all()
+        assert not (replica.evaluations.x[1:40] == initial).all(axis=1).any()
+
+
+def test_reference_front_file_is_the_union(study: tuple[Path, str]) -> None:
+    root, _ = study
+    rows = np.loadtxt(root / "fronts/reference.csv", delimiter=",", skiprows=1, ndmin=2)
+    union = np.concatenate([replica.front for replica in read_campaign(root).replicas])
+    np.testing.assert_array_equal(rows, metrics.front_of(union))
+    levels = np.loadtxt(root / "fronts/mopso-attainment.csv", delimiter=",", skiprows=1, ndmin=2)
+    assert set(levels[:, 0]) == {25.0, 50.0, 75.0, 100.0}
+
+
+def test_a_stored_study_can_be_repeated_from_its_own_workcell(
+    study: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, _ = study
+    configuration = json.loads((root / "configuration.json").read_text())
+    cell = str(root / configuration["workcell"]["file"])
+    arguments = [cell, "--output", str(tmp_path / "b"), *SMALL, "--no-drivable", "--no-report"]
+    arguments += ["--quiet"]
+    assert run.main(arguments) == 0
+    told = capsys.readouterr()
+    assert told.err == ""
+    assert "drivable carries were not searched for (--no-drivable)" in told.out
+    for name in ("mopso", "nsga2"):
+        file = f"replicas/{name}/01/evaluations.csv.gz"
+        assert (tmp_path / "b" / file).read_bytes() == (root / file).read_bytes()
+
+
+def test_resuming_a_finished_study_only_tells(
+    study: tuple[Path, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, printed = study
+    before = {path: path.stat().st_mtime_ns for path in root.rglob("*.*") if path.name != ".lock"}
+    assert run.main([CELL, "--output", str(root), *SMALL, "--resume"]) == 0
+    assert capsys.readouterr().out == printed
+    assert before == {p: p.stat().st_mtime_ns for p in root.rglob("*.*") if p.name != ".lock"}
+
+
+def test_interrupt_tells_how_to_go_on(tmp_path: Path) -> None:
+    root = tmp_path / "my results"
+    command = [sys.executable, "-m", "studies.run", CELL, "--output", str(root)]
+    command += ["--evaluations", "20000", "--replicas", "1", "--jobs", "2", "--seed", "5"]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    end = time.monotonic() + 120
+    while not any(path.stat().st_size > 40 for path in root.glob("replicas/*/*/journal.bin")):
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    message = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    last = message.strip().splitlines()[-1]
+    assert last.startswith("interrupted, nothing is lost; continue with: python -m studies.run ")
+    assert f"--output '{root}'" in last
+    assert last.endswith("--seed 5 --resume")
+    assert "Traceback" not in message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--evaluation", "5"], "unrecognized arguments: --evaluation"),
+        (["--evaluations", "many"], "argument --evaluations: invalid int value: 'many'"),
+        (["--evaluations", "0"], "evaluations is 0; allowed are whole numbers 1 to"),
+        (["--algorithm", "nsga3"], "unknown algorithm 'nsga3'; known are nsga2, mopso"),
+        (["--objective", "speed"], "unknown objective speed; known are peak_force_1"),
+        (["--constraint-handling", "hope"], "invalid choice: 'hope'"),
+        (["--first-generation", "lucky"], "invalid choice: 'lucky'"),
+        (["--population", "nsga2"], "found 'nsga2'; allowed is NAME=N"),
+        (["--population", "nsga3=4"], "unknown algorithm 'nsga3'"),
+        (["--executor", "dask"], "needs a scheduler's address"),
+        (["--jobs", "-2"], "jobs is -2"),
+        (["--resume", "--overwrite"], "--resume keeps results and --overwrite removes them"),
+    ],
+)
+def test_wrong_options_get_one_message(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = rack.main(["--output", str(tmp_path / "a"), *arguments])
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else -1
+    assert code == 2
+    told = capsys.readouterr()
+    assert message in told.err
+    assert told.err.startswith("python -m studies.rack: ")
+    assert told.err.count("\n") == 1
+    assert told.out == ""
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_missing_workcell_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run.main([str(tmp_path / "no.toml"), "--output", str(tmp_path / "a")]) == 2
+    assert "no.toml: 1 problem" in capsys.readouterr().err
+
+
+def test_a_cell_whose_own_law_is_optimal_has_one_experiment(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drivable = unpack_cell(drivable_files(collect_cell(load(Path(CELL)))), tmp_path / "cell")
+    root = tmp_path / "results"
+    options = ["--algorithm", "nsga2", "--no-report", "--quiet", "--output", str(root), *SMALL]
+    assert run.main([str(drivable.source), *options]) == 0
+    results, summary = read_campaign(root), read_summary(root)
+    assert results.objectives == ("duration", "peak_force")
+    assert not (root / "drivable").exists()
+    assert summary.recommendation is not None
+    assert (root / summary.recommendation.file).exists()
+    assert [rival.label for rival in summary.recommendation.rivals] == ["hand-made"]
+    # What limits on jerk cost: recommended, stored and told.
+    assert summary.recommendation.jerk is not None
+    selected = read_timing(root / "timing" / "nsga2" / "00.json").jerk
+    assert selected is not None
+    assert selected.duration > selected.without
+    assert max(selected.joint_use, selected.payload_use) == pytest.approx(1.0, abs=0.01)
+    printed = capsys.readouterr().out
+    assert "within jerk limits" in printed
+    assert re.search(r"limits on jerk +carries +without", printed)
+
+
+def test_a_study_without_a_recommendation_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Force limits that are below what holds the box still leave no drivable carry."""
+    cell = unpack_cell(drivable_files(collect_cell(load(Path(CELL)))), tmp_path / "cell").source
+    cell.write_text(cell.read_text().replace("[task]", "[task]\nforce_limit = [20.0, 30.0]"))
+    root = tmp_path / "results"
+    options = ["--algorithm", "random", "--evaluations", "4", "--replicas", "1", "--jobs", "1"]
+    options += ["--no-polish", "--quiet", "--output", str(root)]
+    assert run.main([str(cell), *options]) == 0
+    summary = read_summary(root)
+    assert summary.recommendation is None
+    assert "none of 4 drivable candidates is feasible" in summary.no_recommendation
+    assert re.search(r"standing still already uses 16\d\.\d % of", summary.no_recommendation)
+    assert f"why  {summary.no_recommendation}" in capsys.readouterr().out
+    assert html.escape(summary.no_recommendation) in (root / PAGE).read_text()
+    with pytest.raises(NoCarryError, match="none of 4"):
+        recommend_from(root, Wish(), tmp_path / "carry.json", Progress(shown=False))
+
+
+def test_help_explains_every_option_with_its_default() -> None:
+    parser = rack.main.parser()
+    options = re.split(r"\n(?=  --)", parser.format_help())[1:]
+    named = [action for action in parser._actions if action.dest != "help"]
+    assert len(options) == len(named)
+    for option in options:
+        assert re.search(r"\(default:", option), option
+
+
+def test_options_tell_how_fronts_are_polished() -> None:
+    parser, usual = rack.main.parser(), ho.PolishSettings()
+    assert polish_settings(parser.parse_args([]), True, usual) == usual
+    asked = parser.parse_args(["--polish-solver", "ipopt", "--polish-attempts", "3"])
+    found = polish_settings(asked, True, usual)
+    assert found is not None
+    assert (found.solver, found.attempts) == ("ipopt", 3)
+    assert polish_settings(parser.parse_args(["--no-polish"]), True, usual) is None
+
+
+def test_options_become_settings() -> None:
+    arguments = (
+        "--algorithm mopso --algorithm random --population mopso=30 --objective duration "
+        "--first-generation random --constraint-handling constraints --seed 7 --evaluations 50 "
+        "--replicas 3"
+    )
+    options = rack.main.parser().parse_args(arguments.split())
+    settings = campaign_settings(options)
+    assert settings.algorithms == ("mopso", "random")
+    assert settings.populations == (("mopso", 30),)
+    assert settings.objectives == ("duration",)
+    assert settings.constraint_handling == "constraints"
+    assert settings.first_generation == "random"
+    assert (settings.seed, settings.evaluations, settings.replicas) == (7, 50, 3)

@@ -1,0 +1,122 @@
+"""How a study begins: what is refused before work, what is told, Ctrl-C while it compiles; and a
+recommendation alone."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hybrid_opt.campaign import ExecutionSettings, Progress, Stage, open_folder, run_stages
+from hybrid_opt.campaign.recommended import StoredRecommendation
+from hybrid_opt.campaign.results import read_campaign
+from studies import recommend, run
+from studies.programs.study import campaign_settings
+from studies.study.recommendation import read_recommendation
+from symbolic.read.cell import load
+from tests.hybrid_opt.campaign.fake import RACK, ROOT
+from tests.studies.study.test_run import CELL, SMALL
+
+
+def test_interrupt_while_compiling_ends_at_once(tmp_path: Path) -> None:
+    root, cache = tmp_path / "a", tmp_path / "cache"
+    command = [sys.executable, "-m", "studies.run", CELL, "--output", str(root), "--quick"]
+    process = subprocess.Popen(
+        command,
+        cwd=ROOT,
+        env=os.environ | {"DUAL_ARM_CACHE": str(cache)},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    end = time.monotonic() + 120
+    while not any(cache.glob("build-*/*.c")):
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    begin = time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)
+    message = process.communicate(timeout=60)[1]
+    assert time.monotonic() - begin < 10.0  # 1 to 2 s on two busy cores; all compilers take 60 s
+    assert process.returncode == 130
+    (said,) = [line for line in message.splitlines() if line and "compiling:" not in line]
+    assert said.startswith("interrupted, nothing is lost; continue with: python -m studies.run ")
+
+
+def test_what_is_refused_is_refused_before_anything_is_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = tmp_path / "cells" / "cell.toml"
+    cell.parent.mkdir()
+    shutil.copytree(ROOT / "studies" / "robots", tmp_path / "robots")
+    shutil.copy(CELL, cell)
+    root = tmp_path / "results"
+    asked = [str(cell), "--output", str(root), *SMALL, "--quiet"]
+    settings = campaign_settings(run.main.parser().parse_args([str(cell), *SMALL]))
+    execution = ExecutionSettings(root)
+    with open_folder(settings, execution, load(cell)) as folder:
+        polished = Stage("polish", lambda folder, progress: None, {"attempts": 1})
+        run_stages(folder, [polished], Progress(shown=False))
+
+    def begin(*given: object, **more: object) -> None:
+        raise AssertionError("compiles")
+
+    monkeypatch.setattr("studies.study.stages.build_study", begin)
+    assert run.main(asked) == 2
+    assert "continue it with --resume, or choose another --output" in capsys.readouterr().err
+    assert run.main([*asked[:-2], "--polish", "--resume"]) == 2
+    assert "the stage 'polish' was run with {'attempts': 1}" in capsys.readouterr().err
+    cell.write_text(cell.read_text().replace("friction = 0.8", "friction = 0.75"))
+    assert run.main([*asked, "--resume"]) == 2
+    told = capsys.readouterr().err
+    assert "holds results of another workcell" in told
+    assert "--overwrite" in told
+    with pytest.raises(AssertionError, match="compiles"):
+        run.main([*asked, "--overwrite"])
+    assert not (root / "stages" / "polish.json").exists()
+
+
+def test_a_recommendation_alone_makes_nothing_else(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "a"
+    asked = [CELL, "--output", str(root), "--recommend-only", "--jobs", "1"]
+    asked += ["--evaluations", "120", "--no-polish", "--force-limit", "60"]
+    assert run.main(asked) == 0
+    said = capfd.readouterr()
+    assert said.out.startswith("Run this carry: ")
+    assert "Report:" not in said.out
+    assert re.search(r"recommendation: \d of \d steps \[", said.err)
+    found = read_recommendation(root)
+    assert isinstance(found, StoredRecommendation)
+    assert max(found.peak_force) <= 60.0 * (1.0 + 1e-6)
+    results = read_campaign(root)
+    assert results.workcell.task.time_law == "optimal"
+    assert [(one.algorithm, one.replica) for one in results.replicas] == [("nsga2", 0)]
+    left = {path.name for path in root.iterdir()}
+    assert left.isdisjoint({"report.html", "figures", "tables", "timing", "drivable"})
+    # It is a study like any other: it is continued, and asked for other carries.
+    assert run.main([*asked, "--resume"]) == 0
+    assert capfd.readouterr().out == said.out
+    assert recommend.main([str(root), "--force-limit", "70"]) == 0
+    again = capfd.readouterr()
+    assert again.out.startswith("Run this carry: ")
+    assert "recommendation: 0 of 4 steps" in again.err
+
+
+def test_why_carries_are_not_polished_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "stray").touch()  # so that it ends here
+    drum = str(RACK.with_name("drum.toml"))
+    assert run.main([drum, "--output", str(tmp_path)]) == 2
+    assert 'are not polished, only searched: its task says allocation = "joint"' in (
+        capsys.readouterr().err
+    )

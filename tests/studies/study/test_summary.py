@@ -1,0 +1,211 @@
+"""The summary's figures against hand-made replicas and independent computations."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hybrid_opt.campaign.documents import Configuration, StoredCell, StoredSettings
+from hybrid_opt.campaign.replica import front_rows
+from hybrid_opt.campaign.results import CampaignResults, Replica
+from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures, SelectedEntry
+from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.indicators.statistics import rank_test
+from hybrid_opt.static_hold import StaticHold
+from hybrid_opt.store.json_records import from_json, to_json
+from studies.study.summary import (
+    FIGURES,
+    TESTED,
+    best_steps,
+    campaign_summary,
+    reference_front,
+    replica_figures,
+)
+from studies.study.terminal import PAPER, terminal_summary
+from symbolic.read.cell import load
+from tests.hybrid_opt.campaign.fake import OBJECTIVES, RACK
+
+NAN = math.nan
+STATIC = StaticHold(np.array([49.05, 49.05]), np.array([69.4, 69.4]), 16.965)
+
+
+def replica(objectives: list[list[float]], reasons: list[str], number: int = 0) -> Replica:
+    """A replica with given objectives; an empty reason is a feasible candidate."""
+    n = len(objectives)
+    values = np.array(objectives)
+    reason = np.array([REASONS.index(r) if r else FEASIBLE for r in reasons], dtype=np.int8)
+    feasible = reason == FEASIBLE
+    violation = np.zeros((n, len(REASONS)))
+    violation[~feasible, reason[~feasible]] = 1.0
+    found = Evaluations(
+        np.zeros((n, 4)),
+        values,
+        np.where(feasible[:, None], values, 2.0),
+        feasible,
+        reason,
+        np.where(feasible, np.nan, 0.5),
+        violation,
+        violation,
+    )
+    return Replica(
+        "nsga2", number, found, np.ones(n, dtype=np.int64), front_rows(found), 1.5 + number
+    )
+
+
+FRONT = [[0.6, 0.4], [0.5, 0.5], [0.3, 0.3], [0.4, 0.7]]
+
+
+def test_figures_of_a_replica_by_hand() -> None:
+    mine = replica(FRONT, ["", "", "collision", ""])
+    figures = replica_figures(mine, np.array([[0.4, 0.4]]), None, None)
+    assert (figures.evaluations, figures.feasible, figures.feasible_share) == (4, 3, 0.75)
+    assert figures.non_dominated == 3
+    # Columns from the left, up to the corner (1.1, 1.1).
+    area = 0.1 * (1.1 - 0.7) + 0.1 * (1.1 - 0.5) + 0.5 * (1.1 - 0.4)
+    assert figures.hypervolume == pytest.approx(area)
+    assert figures.igd == pytest.approx(math.sqrt(0.02))
+    assert figures.igd_plus == pytest.approx(0.1414213562)
+    # L1 distances to the nearest neighbour: 0.3, 0.2, 0.2.
+    assert figures.spacing == pytest.approx(np.std([0.3, 0.2, 0.2], ddof=1))
+    assert figures.infeasible_by_reason == {"collision": 1}
+    assert [step.tolist() for step in figures.best_so_far] == [
+        [1, 0.6, 0.4],
+        [2, 0.5, 0.4],
+        [4, 0.4, 0.4],
+    ]
+    assert figures.seconds == 1.5
+    assert figures.selected is None
+    assert math.isnan(figures.payload_limit)
+
+
+def test_best_steps_begin_with_the_first_feasible_candidate() -> None:
+    history = np.array([[NAN, NAN], [0.5, 0.6], [0.5, 0.6], [0.5, 0.4]])
+    steps = [step.tolist() for step in best_steps(history)]
+    assert steps == [[2, 0.5, 0.6], [4, 0.5, 0.4]]
+    assert best_steps(history[:1]) == ()
+
+
+def test_reference_front_is_the_union() -> None:
+    first = replica([[0.2, 0.8], [0.5, 0.5]], ["", ""])
+    second = replica([[0.8, 0.2], [0.6, 0.6], [0.1, 0.1]], ["", "", "collision"])
+    union = reference_front([first.front, second.front])
+    assert union.tolist() == [[0.2, 0.8], [0.5, 0.5], [0.8, 0.2]]
+
+
+PAIR = np.array([50.0, 51.25])
+LEAST = np.array([40.0, 41.0])
+SELECTED = SelectedEntry(1, None, np.array([0.4, 0.6]), PAIR, LEAST, PAIR - 50.0, 16.5, 3.0)
+PLAIN = ReplicaFigures(
+    **dict.fromkeys(FIGURES, 0.5) | {"feasible": 5, "non_dominated": 2},  # type: ignore[arg-type]
+    selected=SELECTED,
+    replica=0,
+    evaluations=10,
+    infeasible_by_reason={"collision": 3, "reach_1": 1},
+    best_so_far=(),
+)
+
+
+def entry(number: int, **figures: Any) -> ReplicaFigures:
+    return replace(PLAIN, replica=number, **figures)
+
+
+def results(entries: dict[str, list[ReplicaFigures]]) -> CampaignResults:
+    settings = StoredSettings(
+        algorithms={name: {} for name in entries},
+        evaluations=10,
+        replicas=len(next(iter(entries.values()))),
+        seed=1,
+        objectives=OBJECTIVES,
+        constraint_handling="penalty",
+        first_generation="initial",
+    )
+    configuration = Configuration("", 1, StoredCell("Rack", "", ""), settings, {})
+    return CampaignResults(Path("results"), configuration, Cell(load(RACK)), ())
+
+
+VOLUMES = {"nsga2": [0.4, 0.6, 0.5, 0.45, 0.55], "mopso": [0.1, 0.2, 0.15, 0.12, 0.18]}
+
+
+def summary(entries: dict[str, list[ReplicaFigures]] | None = None) -> CampaignSummary:
+    made = entries or {
+        name: [entry(k, hypervolume=value) for k, value in enumerate(values)]
+        for name, values in VOLUMES.items()
+    }
+    return campaign_summary(results(made), np.array([[0.4, 0.6]]), STATIC, made)
+
+
+def test_statistics_and_tests_of_a_campaign() -> None:
+    made = summary()
+    statistics = made.algorithms["nsga2"].statistics["hypervolume"]
+    assert statistics.mean == pytest.approx(0.5)
+    assert statistics.std == pytest.approx(math.sqrt(0.00625))
+    assert (statistics.quartile1, statistics.median, statistics.quartile3) == (0.45, 0.5, 0.55)
+    assert made.algorithms["nsga2"].representative == 1
+    tests = {test.figure: test for test in made.tests}
+    assert set(tests) == set(TESTED)
+    expected = rank_test(VOLUMES["nsga2"], VOLUMES["mopso"])
+    # Two orders of the ranks of ten are as far apart: 2 of 252.
+    assert tests["hypervolume"].p == expected.p == pytest.approx(2.0 / 252.0)
+    assert tests["hypervolume"].a12 == 1.0
+    assert tests["hypervolume"].p_holm == pytest.approx(len(TESTED) * 2.0 / 252.0)
+    assert made.reference_front.hypervolume == pytest.approx(0.7 * 0.5)
+
+
+def test_few_replicas_are_not_tested() -> None:
+    few = {
+        name: [entry(k, hypervolume=v) for k, v in enumerate(VOLUMES[name][:4])] for name in VOLUMES
+    }
+    made = summary(few)
+    assert made.tests == ()
+    assert "Mann-Whitney" not in terminal_summary(made, with_paper=True)
+    assert "Mann-Whitney" in terminal_summary(summary(), with_paper=True)
+
+
+def test_a_summary_comes_back_from_its_file(tmp_path: Path) -> None:
+    made = summary()
+    document = to_json(made)
+    again = from_json(CampaignSummary, json.loads(json.dumps(document)), tmp_path, "do it again")
+    assert to_json(again) == document
+
+
+def test_figures_that_do_not_exist_become_null() -> None:
+    none = {name: [entry(0, igd=math.inf, spacing=NAN, selected=None)] for name in VOLUMES}
+    made = summary(none)
+    stored = to_json(made)["algorithms"]["mopso"]["replicas"][0]
+    assert stored["igd"] is None
+    assert stored["spacing"] is None
+    assert made.algorithms["mopso"].representative is None
+    text = terminal_summary(made, with_paper=True)
+    assert "MOPSO: no feasible candidate" in text
+    assert "nan" not in text
+    assert "None" not in text
+
+
+def test_terminal_summary_shows_the_tables() -> None:
+    text = terminal_summary(summary(), with_paper=True)
+    assert all(len(line) <= 100 for line in text.splitlines())
+    lines = {line.split("  ")[0]: line for line in text.splitlines()}
+    assert "0.5000 ± 0.0791" in text
+    figures = ["40.00", "41.00", "50.00", "51.25", "0.50", "16.50"]
+    assert lines["NSGA-II, replica 1"].split()[3:] == figures
+    assert "NSGA-II: collision 30.0, reach_1 10.0" in text
+    assert lines["held still"].split()[2:] == ["49.05"] * 4 + ["0.00", "16.96"]
+
+
+def test_the_papers_figures_stand_beside_ours_only_where_it_states_them() -> None:
+    with_paper, without = (terminal_summary(summary(), with_paper=on) for on in (True, False))
+    assert "50.0 / 69.4" in with_paper
+    assert "0.50 / 16.71" in with_paper
+    assert "50.0 / 29.6" in with_paper
+    assert "0.50 / 16.06" in with_paper
+    assert "69.4" not in without
+    others = {"random": [entry(0)]}
+    assert "paper" not in terminal_summary(summary(others), with_paper=True)
+    assert set(PAPER) == {"nsga2", "mopso"}
