@@ -26,10 +26,9 @@ def _add_options(parser: Parser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from hybrid_opt.recommending.choice import Wish
-
     from hybrid_opt.campaign import Progress
     from hybrid_opt.campaign.results import read_summary
+    from hybrid_opt.recommending.choice import Wish
     from studies.study.recommendation import recommend_from, recommendation_text
 
     wish, root = Wish(options.duration, options.force_limit, options.payload), options.results
