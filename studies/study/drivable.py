@@ -1,4 +1,4 @@
-"""DRIV"""
+"""Fronts of a drivable experiment, read back, and what limits on jerk cost its carries."""
 
 from __future__ import annotations
 

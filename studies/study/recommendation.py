@@ -1,4 +1,4 @@
-"""REC"""
+"""The carry to run: the stage that picks it from the drivable fronts, and its words."""
 
 from __future__ import annotations
 

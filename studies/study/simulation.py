@@ -1,4 +1,4 @@
-"""SIM"""
+"""The stage that has selected carries driven in the simulated cell, and its table."""
 
 from __future__ import annotations
 

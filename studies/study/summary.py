@@ -1,4 +1,4 @@
-"""SUM"""
+"""The stage that turns a finished search into figures, fronts and selected trajectories."""
 
 from __future__ import annotations
 

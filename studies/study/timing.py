@@ -1,4 +1,4 @@
-"""TIM"""
+"""The stage that times every selected trajectory as a robot can drive it, and its words."""
 
 from __future__ import annotations
 
