@@ -53,17 +53,20 @@ def test_with_a_duration_no_path_does_it_with_less_force(
     drivable: ho.Cell, front: ho.Front
 ) -> None:
     found = ho.recommend(drivable, front.x, ho.Wish(duration=3.2))
+    assert found.jerk is not None
+    driven, unlimited = found.jerk.timing.duration, found.timing.duration
     # The compiled timing, which finds the force, is up to some percent slower than the judge.
-    assert 0.97 * 3.2 < found.timing.duration < 3.2 * (1.0 + 2e-3)
+    assert 0.97 * 3.2 < driven < 3.2 * (1.0 + 2e-3)
     less = found.force - 0.5
-    assert min(timed(drivable, x[:-1], less).duration for x in front.x) > 3.2 * (1.0 - 1e-3)
+    assert min(timed(drivable, x[:-1], less).duration for x in front.x) > unlimited * (1.0 - 1e-3)
 
 
 def test_with_a_payload_the_same_motion_bears_it(drivable: ho.Cell, front: ho.Front) -> None:
     found = ho.recommend(drivable, front.x, ho.Wish(payload=16.0))
     assert found.carry.payload_limit >= 16.0 * (1.0 - 1e-3)
-    # Both cones are used fully somewhere, so that little is given away.
-    assert found.carry.payload_limit < 16.1
+    # Torsion leaves a part of the cones unused where the box is tilted; no more is given away.
+    assert found.carry.payload_limit < 17.0
+    assert found.carry.peak_normal_force.max() == pytest.approx(found.force, rel=2e-3)
     assert force_for_payload(drivable.workcell, 16.0) == found.force
 
 
@@ -97,17 +100,18 @@ def test_the_hand_made_carry_stands_beside_it(drivable: ho.Cell, front: ho.Front
 
 
 def test_a_better_path_is_warned_of(drivable: ho.Cell, front: ho.Front) -> None:
-    durations = [timed(drivable, x[:-1], 60.0).duration for x in front.x]
+    force = 70.0
+    durations = [timed(drivable, x[:-1], force).duration for x in front.x]
     quick, slow = front.x[int(np.argmin(durations))], front.x[int(np.argmax(durations))]
     assert min(durations) < 0.98 * max(durations)
-    both = np.array([np.append(slow[:-1], force) for force in (58.0, 62.0)])
-    found = ho.recommend(drivable, both, ho.Wish(force=60.0), {"other": quick[:-1]})
+    both = np.array([np.append(slow[:-1], force) for force in (68.0, 72.0)])
+    found = ho.recommend(drivable, both, ho.Wish(force=force), {"other": quick[:-1]})
     assert any("other trajectory is better" in text for text in found.warnings)
     other = found.rivals[1]
     assert other.duration_at_force < found.timing.duration
     assert other.force_at_duration < found.force
     assert other.faster_between is not None
-    alone = ho.recommend(drivable, quick[None], ho.Wish(force=60.0), {"other": slow[:-1]})
+    alone = ho.recommend(drivable, quick[None], ho.Wish(force=force), {"other": slow[:-1]})
     assert not any("other" in text for text in alone.warnings)
 
 
@@ -165,7 +169,7 @@ def test_wishes_that_nothing_answers_say_what_is_possible(
 ) -> None:
     with pytest.raises(SettingsError, match="the shortest takes"):
         ho.recommend(drivable, front.x, ho.Wish(duration=0.5))
-    with pytest.raises(SettingsError, match=r"holding still takes 49\.05 N"):
+    with pytest.raises(SettingsError, match=r"holding still takes 49\.\d\d N"):
         ho.recommend(drivable, front.x, ho.Wish(force=40.0))
     with pytest.raises(SettingsError, match="payload 30 kg"):
         ho.recommend(drivable, front.x, ho.Wish(payload=30.0))
