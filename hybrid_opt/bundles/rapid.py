@@ -105,7 +105,9 @@ def _module(sampled: SampledJob, arm: int) -> Iterator[str]:
             zone = ZONE if k < span.stop - 1 else "fine"
             time = float(sampled.time[k] - sampled.time[k - 1])
             if k % FORCE_EVERY == 0 or k == span.stop - 1:
-                yield f"    CarryForce {sampled.normal_force[k, arm]:.3f};"
+                # Until the next reference, no move may get less than it needs.
+                needed = sampled.normal_force[k - 1 : min(k + FORCE_EVERY, span.stop), arm].max()
+                yield f"    CarryForce {needed:.3f};"
             yield (
                 f"    MoveAbsJ {_target(degrees[k])} \\ID:={10 * k} \\NoEOffs, "
                 f"v1000 \\T:={time:.6f}, {zone}, carryPad;"
@@ -163,9 +165,14 @@ def _force_hook(sampled: SampledJob, arm: int) -> Iterator[str]:
 
 
 def _force_references(sampled: SampledJob, arm: int) -> Iterator[str]:
-    """Normal forces at even times, for force controllers that take a table."""
+    """Normal forces at even times, for force controllers that take a table: interpolated between
+    them, nowhere less than is needed."""
     time = np.linspace(0.0, float(sampled.time[-1]), REFERENCES)
-    force = np.interp(time, sampled.time, sampled.normal_force[:, arm])
+    needed = sampled.normal_force[:, arm]
+    force = np.interp(time, sampled.time, needed)
+    cell = np.clip(np.searchsorted(time, sampled.time, side="right") - 1, 0, REFERENCES - 2)
+    np.maximum.at(force, cell, needed)
+    np.maximum.at(force, cell + 1, needed)
     for name, values in (("carryForceTime", time), ("carryForceNewton", force)):
         listed = ",".join(f"{value:.3f}" for value in values)
         yield f"  PERS num {name}{{{REFERENCES}}} := [{listed}];"
