@@ -77,12 +77,17 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     drivable = gather_drivable(results, summary)
     slow: list[Callable[[JobModel], Any]] = [partial(_reach, geometry)]
     slow += [partial(_timing, carry.label, carry.x) for carry in carries]
-    requests = _job_requests(carries, drivable, results.cell)
-    slow += [partial(_job, request) for request in requests]
-    files = collect_cell(workcell)
+    files, workers = collect_cell(workcell), executor or SerialExecutor()
     service = Service(JobModelSource(PackedCell.of(files), results.objectives), _called)
-    reach, *found = answer_all(executor or SerialExecutor(), service, slow)
-    timings, jobs = found[: len(carries)], found[len(carries) :]
+    reach, *timings = answer_all(workers, service, slow)
+    # Jobs are what robots are told: by the cell that they drive, whose contact model may differ.
+    if drivable is not None:
+        kind = results.cell.force_kind.drivable
+        service = Service(JobModelSource(PackedCell.of(drivable.files), kind), _called)
+    asked: list[Callable[[JobModel], Any]] = [
+        partial(_job, request) for request in _job_requests(carries, drivable, results.cell)
+    ]
+    jobs = answer_all(workers, service, asked)
     return ReportData(
         root=results.root,
         workcell=workcell,

@@ -74,7 +74,7 @@ class PageCarriesSource:
     def __call__(self) -> PageCarries:
         """Load the compiled functions, or build them where they are missing."""
         made = [cell.make(partial(_loaded, names)) for cell, names in self.cells]
-        return PageCarries([cell for cell, _ in made], made[0][1])
+        return PageCarries([cell for cell, _ in made], [jobs for _, jobs in made])
 
 
 def _loaded(objectives: tuple[str, ...], workcell: Workcell) -> tuple[ho.Cell, JobModel]:
@@ -130,17 +130,17 @@ def _phase(phase: Mapping[str, Any]) -> dict[str, Any]:
 class PageCarries:
     """Works out the trajectories of a page. A resource: one per process."""
 
-    def __init__(self, cells: Sequence[ho.Cell], jobs: JobModel) -> None:
+    def __init__(self, cells: Sequence[ho.Cell], jobs: Sequence[JobModel]) -> None:
         """Take the cells.
 
         Args:
             cells: of the page; under 'optimal' their carries are timed within their force limits,
                 else as close to the reference speeds as limits allow.
-            jobs: plans jobs; its timing is that of all cells, which differ in time laws only.
+            jobs: of each cell what times its carries and plans their jobs.
         """
         self._cells, self._jobs = cells, jobs
-        self._n_var = jobs.workcell.task.n_var
-        self._limit = np.concatenate([robot.torque_max for robot in jobs.workcell.robots])
+        self._n_path = cells[0].workcell.task.n_path
+        self._limit = np.concatenate([robot.torque_max for robot in cells[0].workcell.robots])
 
     def trajectory(self, shown: Shown) -> dict[str, Any]:
         """A trajectory as JSON values: its motions, and all that is said of it."""
@@ -148,7 +148,7 @@ class PageCarries:
         law = cell.workcell.task.time_law
         judged = cell.carry(shown.x)
         assert judged.judgement is not None, "carries of a cell are judged"
-        request = JobRequest(shown.label, shown.x[: self._n_var], _limits(cell, shown.x))
+        request = JobRequest(shown.label, shown.x[: self._n_path], _limits(cell, shown.x))
         timing = self._timed(cell, shown, request)
         driven = timing.carry
         motions = [] if driven is None else [self._motion(DRIVEN, driven)]
@@ -179,7 +179,7 @@ class PageCarries:
         elif not shown.has_job:
             found["jobProblem"] = NO_JOB
         elif timing.ok:
-            _with_job(found, drawn(self._jobs, request, timing))
+            _with_job(found, drawn(self._jobs[shown.cell], request, timing))
         return found
 
     def _timed(self, cell: ho.Cell, shown: Shown, request: JobRequest) -> ho.Timing:
@@ -187,7 +187,7 @@ class PageCarries:
         force, for which that takes long: as the search found them."""
         if request.limits.robust and not shown.jerk:
             return drivable_timing(cell.timing_model, shown.x)
-        return time_path(self._jobs.timing, request.x, request.limits)
+        return time_path(self._jobs[shown.cell].timing, request.x, request.limits)
 
     def _within_jerk(self, cell: ho.Cell, x: Array) -> list[dict[str, Any]]:
         """The carry within the cell's limits on jerk, where it has any."""

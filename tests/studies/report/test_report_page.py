@@ -220,7 +220,7 @@ def test_every_point_has_the_phases_of_its_job(
 
 def test_points_are_named_by_what_was_minimised(data: ReportData) -> None:
     cell = Cell(data.workcell, ("mean_force", "friction_use"))
-    carries = PageCarries([cell], JobModel(cell.compiled, cell.timing_model))
+    carries = PageCarries([cell], [JobModel(cell.compiled, cell.timing_model)])
     trajectory = carries.trajectory(Shown("NSGA-II, replica 1", data.initial.x, ""))
     mean, friction = trajectory["objectives"]
     assert trajectory["label"] == (

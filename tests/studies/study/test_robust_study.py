@@ -90,8 +90,9 @@ def test_one_experiment_is_searched_and_polished(study: tuple[Path, str]) -> Non
     for point in front[:: max(1, len(front) // 3)]:
         carry = results.cell.carry(point.x)
         most = (robust_peak(results.workcell, carry) / reference).max()
-        # The carry is sampled, the objective is of the whole path.
-        assert 0.99 * point.objectives[1] < most <= point.objectives[1] * (1.0 + 5e-3)
+        # The carry is sampled at the task's samples, the objective is of the whole path, and forces
+        # of pads that press evenly have sharp peaks.
+        assert 0.97 * point.objectives[1] < most <= point.objectives[1] * (1.0 + 5e-3)
         assert most > 1.05 * (carry.peak_normal_force / reference).max()
 
 

@@ -137,6 +137,10 @@ def tasks(draw: st.DrawFn, bodies: list[str]) -> dict[str, Any]:
         "reference_angular_speed": numbers(0.01, 1.0),
         "ramp_time": numbers(0.01, 5.0),
     }
+    chosen = draw(st.fixed_dictionaries({}, optional=optional))
+    if chosen.get("time_law") == "optimal":
+        # Its default, soft fingers, asks for pads that nearly face one another.
+        chosen["allocation"] = "paper"
     return {
         "start": draw(SMALL_POSE),
         "waypoints": waypoints,
@@ -144,7 +148,7 @@ def tasks(draw: st.DrawFn, bodies: list[str]) -> dict[str, Any]:
         "reference_speed": draw(numbers(0.01, 1.0)),
         "reference_force": draw(st.one_of(numbers(20, 1e4), vectors(20, 1e4, 2))),
         "allowed_contacts": draw(st.lists(allowed, max_size=2)) if bodies else [],
-        **draw(st.fixed_dictionaries({}, optional=optional)),
+        **chosen,
     }
 
 

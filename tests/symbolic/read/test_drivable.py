@@ -62,3 +62,23 @@ def test_a_task_written_otherwise_is_refused() -> None:
     variant = replace(stored, files={**stored.files, stored.workcell: odd.encode()})
     with pytest.raises(BundleError, match="time_law"):
         drivable_files(variant)
+
+
+@pytest.mark.parametrize(
+    ("stated", "usual", "driven"),
+    [
+        ("", "paper", "soft-finger"),
+        ('allocation = "joint"\n', "joint", "joint"),
+        ('drivable_allocation = "paper"\n', "paper", "paper"),
+        ('allocation = "joint"\ndrivable_allocation = "soft-finger"\n', "joint", "soft-finger"),
+    ],
+)
+def test_what_robots_drive_has_an_allocation_of_its_own(
+    stated: str, usual: str, driven: str, tmp_path: Path
+) -> None:
+    stored = collect_cell(load(RACK))
+    text = stored.files[stored.workcell].decode().replace("[task]\n", f"[task]\n{stated}")
+    variant = replace(stored, files={**stored.files, stored.workcell: text.encode()})
+    cell = unpack_cell(variant, tmp_path / "usual", check_digest=False)
+    assert cell.task.allocation == usual
+    assert unpack_cell(drivable_files(variant), tmp_path / "driven").task.allocation == driven
