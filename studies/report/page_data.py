@@ -137,7 +137,11 @@ class PageData:
         for entry in drivable.fronts:
             if len(entry.cloud):
                 view.clouds.append(_cloud(entry.front.label, entry.cloud, series(entry.index)))
-        drawn = [np.column_stack([g["x"], g["y"]]) for g in (*view.groups, *view.lines)]
+        drawn = [np.column_stack([line["x"], line["y"]]) for line in view.lines]
+        for group in view.groups:
+            # What robots cannot drive has no place between force and time.
+            can = [not self._trajectories[member]["problem"] for member in group["members"]]
+            drawn.append(np.column_stack([group["x"], group["y"]])[can])
         chosen = [
             np.column_stack([g["x"], g["y"]]) for g in view.groups if g["label"] == RECOMMENDED
         ]
