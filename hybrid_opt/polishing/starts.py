@@ -132,19 +132,6 @@ def random_starts(
     return list(map(Start, candidates[rows], objectives))
 
 
-def halve(pool: list[Start], objective: int | None, solve: Callable[[Start], Start]) -> None:
-    """Solve from all starts, then from the better half of what was reached, until one is left."""
-    while pool:
-        reached = [start if start.spent else solve(start) for start in pool]
-        pool = better_half(reached, objective)
-
-
-def better_half(reached: list[Start], objective: int | None) -> list[Start]:
-    """Those that go on, the best first; none after the last."""
-    ranked = sorted(reached, key=lambda start: start.value(objective))
-    return ranked[: len(reached) // 2]
-
-
 @dataclass(frozen=True)
 class Mirror:
     """The reflection of one cell's decision vectors, each arm taking the other's part.

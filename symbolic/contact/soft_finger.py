@@ -14,7 +14,7 @@ c is the mean distance of the patch's points from its centre, which bounds pure 
 the root of the mean square of their coordinates along T: what is left for torsion when a patch
 begins to slide. Both ends are exact. A disc of radius r has c = 2/3 r and h = r: (1) asks for
 0.4 % less to 0.3 % more force than its exact limit curve. Rectangles: 0.7 % less to 2.9 % more up
-to sides of 2 to 1, 6 % more at 5 to 1.
+to sides of 2 to 1, 6.5 % more at 5 to 1.
 
 The capacities of both pads add up: the one that slips first hands torsion over to the other.
 
