@@ -12,10 +12,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from hybrid_opt.proposing.holding import LIMIT_MARGIN, MANIPULABILITY_MARGIN, Hold
 from hybrid_opt.proposing.judge import PoseJudge
-from hybrid_opt.proposing.kinematics import JUMP, box_to_last_joint, spun
+from hybrid_opt.proposing.kinematics import (
+    JUMP,
+    REACHED,
+    TRACKING_STEPS,
+    ArmKinematics,
+    box_to_last_joint,
+    spun,
+)
 from symbolic.array import Array
 from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import box_placement, inverse
@@ -69,6 +77,7 @@ class _Follower:
         contact = spun(workcell.contacts[arm], hold.spin)
         self.T_box_joint = box_to_last_joint(workcell, geometry, contact, arm)
         self.T_root_world = inverse(robot.T_world_base)
+        self.many = ArmKinematics(geometry, tuple(apart))
         self.lower = np.asarray(robot.position_lower) + LIMIT_MARGIN
         self.upper = np.asarray(robot.position_upper) - LIMIT_MARGIN
         self.least = robot.min_manipulability * MANIPULABILITY_MARGIN
@@ -148,6 +157,30 @@ class ClosedChain:
                 return None
             found.append(closed)
         return Place(extended, (found[0], found[1]))
+
+    def close_many(
+        self, extended: Array, q: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array], NDArray[np.bool_]]:
+        """Configurations near given joints, all side by side; collisions do not count.
+
+        Args:
+            extended: (n, 6 + m).
+            q: per arm (n, joints).
+
+        Returns:
+            Per arm the joints (n, joints), and which configurations (n,) are closed within limits.
+        """
+        T_world_box = box_placement(self._orientation, extended[:, :POSE_SIZE])
+        closed, found = np.ones(len(extended), dtype=bool), []
+        for arm, near in zip(self._arms, q, strict=True):
+            guess = near.copy()
+            for joint, place in arm.redundant:
+                guess[:, joint] = extended[:, place]
+            there = arm.many.solve(guess, T_world_box @ arm.T_box_joint, TRACKING_STEPS)
+            closed &= (there.residual <= REACHED) & (there.manipulability >= arm.least)
+            closed &= np.all((there.q >= arm.lower) & (there.q <= arm.upper), axis=1)
+            found.append(there.q)
+        return (found[0], found[1]), closed
 
     def along(self, begin: Place, path: Array) -> Iterator[Place]:
         """Follow extended poses (n, 6 + m) as far as they are free; the first is where to begin."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
+import cma
 import numpy as np
 
 from hybrid_opt.proposing.closed_chain import (
@@ -15,9 +16,11 @@ from hybrid_opt.proposing.closed_chain import (
     levers,
     straight,
 )
+from hybrid_opt.proposing.kinematics import JUMP
 from hybrid_opt.proposing.planner import same
 from symbolic.array import Array
 from symbolic.path.spline import path_basis
+from symbolic.records import POSE_SIZE
 
 SHORTCUTS = 80
 """Shortcuts of a path that are tried."""
@@ -37,11 +40,17 @@ SHIFTS = 12
 SHIFT = 0.04
 """Their standard deviation [m], and in a turn counted by its lever."""
 
-STRAIGHTENED = 120
-"""Shifts of via-points that are tried to make a free spline shorter."""
+GENERATIONS = 60
+"""Of the evolution strategy that shortens a free spline."""
+
+OFFSPRING = 16
+"""Splines of a generation."""
 
 MEASURED = 24
-"""Places of a spline by which its length is compared before it is looked at for collisions."""
+"""Places of a spline by which the strategy measures its length and looks for collisions."""
+
+BLOCKED = 100.0
+"""What a spline counts whose places are all out of reach; half as much where all collide [rad]."""
 
 
 def joint_length(places: Sequence[Place]) -> float:
@@ -122,38 +131,63 @@ def fit(
 def straightened(
     chain: ClosedChain, start: Place, waypoints: Array, rng: np.random.Generator
 ) -> Array:
-    """Waypoints (n, 6 + m) of a free spline on which the joints go less far than on the given one:
-    pulled in some coordinates towards the straight line, or shifted at random."""
-    share = np.linspace(0.0, 1.0, len(waypoints))[:, None]
-    line = waypoints[0] + share * (waypoints[-1] - waypoints[0])
-    shift, least = SHIFT, _length(chain, start, waypoints)
-    for k in range(STRAIGHTENED):
-        tried = waypoints.copy()
-        if k % 2:
-            pulled = rng.random(waypoints.shape[1]) < 0.5
-            tried[:, pulled] += rng.random() * (line - waypoints)[:, pulled]
-        else:
-            moved = rng.normal(0.0, shift, tried[1:-1].shape)
-            tried[1:-1] += moved / levers(waypoints.shape[1])
-        length = _length(chain, start, tried)
-        if length < least and free_share(chain, start, tried) == 1.0:
-            waypoints, least = tried, length
-            shift *= 1.5
-        else:
-            shift *= 0.95
-    return waypoints
+    """Waypoints (n, 6 + m) of a free spline on which the joints go less far than on the given one.
+
+    Found by an evolution strategy, CMA-ES (Hansen, arXiv 1604.00772), from the given one on.
+    """
+    lever = levers(waypoints.shape[1])
+    basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, MEASURED)).position
+    places = list(_closed_path(chain, start, basis @ waypoints))
+    if len(places) < MEASURED:
+        return waypoints
+    best, least = waypoints, joint_length(places)
+    near = np.array([place.q[0] for place in places]), np.array([place.q[1] for place in places])
+
+    def moved(y: Array) -> Array:
+        inner = y.reshape(-1, len(lever)) / lever
+        return np.vstack([waypoints[0], inner, waypoints[-1]])
+
+    options = {"popsize": OFFSPRING, "seed": int(rng.integers(1, 2**31)), "verbose": -9}
+    strategy = cma.CMAEvolutionStrategy((waypoints[1:-1] * lever).ravel(), SHIFT / 2.0, options)
+    for _ in range(GENERATIONS):
+        asked = strategy.ask()
+        tried = [moved(np.asarray(y)) for y in asked]
+        lengths, blocked = _lengths(chain, np.array([basis @ one for one in tried]), near)
+        strategy.tell(asked, (lengths + blocked).tolist())
+        k = int(np.argmin(lengths + blocked))
+        if blocked[k] == 0.0 and lengths[k] < least and free_share(chain, start, tried[k]) == 1.0:
+            best, least = tried[k], float(lengths[k])
+        if strategy.stop():
+            break
+    return best
 
 
-def _length(chain: ClosedChain, start: Place, waypoints: Array) -> float:
-    """How far the joints go along a spline [rad], whatever collides; infinite where it is lost."""
-    path = path_basis(len(waypoints), np.linspace(0.0, 1.0, MEASURED)).position @ waypoints
-    places = [start]
+def _closed_path(chain: ClosedChain, start: Place, path: Array) -> Iterator[Place]:
+    """Configurations along extended poses (n, 6 + m) as far as the chain closes, whatever
+    collides."""
+    place: Place | None = start
+    yield start
     for extended in path[1:]:
-        place = chain.close(extended, places[-1].q)
+        assert place is not None
+        place = chain.close(extended, place.q)
         if place is None:
-            return float("inf")
-        places.append(place)
-    return joint_length(places)
+            return
+        yield place
+
+
+def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
+    """How far the joints go [rad] along paths (k, n, 6 + m) that lie near a closed one, per arm
+    (n, joints); and what counts beside it, above 0 where a path is blocked (k,)."""
+    k, n, size = paths.shape
+    begin = np.tile(near[0], (k, 1)), np.tile(near[1], (k, 1))
+    flat = paths.reshape(-1, size)
+    q, closed = chain.close_many(flat, begin)
+    steps = np.diff(np.hstack(q).reshape(k, n, -1), axis=1)
+    closed &= np.abs(np.hstack(q) - np.hstack(begin)).max(axis=1) <= JUMP
+    hit = np.zeros(k * n, dtype=bool)
+    hit[closed] = chain.judge.colliding(flat[closed, :POSE_SIZE], q[0][closed], q[1][closed])
+    lost, met = ((~closed).reshape(k, n).mean(axis=1), hit.reshape(k, n).mean(axis=1))
+    return np.linalg.norm(steps, axis=2).sum(axis=1), BLOCKED * (lost + met / 2.0)
 
 
 def free_share(chain: ClosedChain, start: Place, waypoints: Array) -> float:
