@@ -1,0 +1,129 @@
+"""Sphinx's settings: `sphinx-build -W -b html docs build/site`.
+
+The reference comes from the docstrings of what `hybrid_opt` exports, the gallery from the files of
+`studies/examples`, which are run; `-D sphinx_gallery_conf.plot_gallery=0` leaves that out.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import hybrid_opt as ho  # noqa: E402
+
+project = "dual-arm-carry"
+author = copyright = "the project's contributors"
+release = version = "0.1.0"
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx_copybutton",
+    "sphinx_gallery.gen_gallery",
+]
+html_theme = "furo"
+html_title = project
+exclude_patterns = [
+    "README.md",
+    "sg_execution_times.rst",
+    *(f"gallery/*.{end}" for end in ("ipynb", "py", "md5", "zip")),
+]
+suppress_warnings = ["config.cache"]
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4
+
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_param = False  # one line may describe several parameters
+napoleon_custom_sections = [("Attributes", "params_style")]
+autodoc_type_aliases = {"Array": "Array"}
+
+
+def examples() -> Path:
+    """The examples as the gallery wants them: with titles, beside a link to the cells' folder."""
+    folder = ROOT / "build" / "examples"
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "studies").exists():
+        (folder / "studies").symlink_to(ROOT / "studies")
+    (folder / "GALLERY_HEADER.rst").write_text(
+        "Gallery\n=======\n\nEach example is a file of ``studies/examples`` and runs as it is.\n",
+        "utf-8",
+    )
+    for path in sorted((ROOT / "studies" / "examples").glob("[0-9]*.py")):
+        text = path.read_text("utf-8")
+        words = ast.get_docstring(ast.parse(text)) or path.stem
+        title, _, rest = words.partition(".\n")
+        title = " ".join(title.rstrip(".").split())
+        heading = f'"""\n{title}\n{"=" * len(title)}\n{rest}\n"""\n'
+        end = ast.parse(text).body[0].end_lineno
+        copy, new = folder / path.name, heading + "\n".join(text.splitlines()[end:]) + "\n"
+        if not copy.exists() or copy.read_text("utf-8") != new:
+            copy.write_text(new, "utf-8")
+    return folder
+
+
+def reference() -> Path:
+    """A page for every public name, with the examples that use it."""
+    folder = ROOT / "docs" / "reference"
+    folder.mkdir(exist_ok=True)
+    rows = []
+    for name in sorted(ho.__all__):
+        thing = getattr(ho, name)
+        summary = (inspect.getdoc(thing) or "").split("\n\n")[0].replace("\n", " ")
+        kind = "autoclass" if inspect.isclass(thing) else "autofunction"
+        target = f"hybrid_opt.{name}"
+        page = "\n".join(
+            [
+                name,
+                "=" * len(name),
+                "",
+                f".. {kind}:: {target}",
+                "",
+                f".. minigallery:: {target}",
+                "   :add-heading: Examples",
+                "",
+            ]
+        )
+        _write(folder / f"{name}.rst", page)
+        rows.append(f"* :doc:`{name} <{name}>`: {summary}")
+    listed = "\n".join(f"   {name}" for name in sorted(ho.__all__))
+    index = "Reference\n=========\n\nWhat ``import hybrid_opt as ho`` gives.\n\n"
+    hidden = f"\n\n.. toctree::\n   :hidden:\n\n{listed}\n"
+    _write(folder / "index.rst", index + "\n".join(rows) + hidden)
+    return folder
+
+
+def _write(path: Path, text: str) -> None:
+    """Write where something changed, so that Sphinx reads no page twice."""
+    if not path.exists() or path.read_text("utf-8") != text:
+        path.write_text(text, "utf-8")
+
+
+reference()
+sphinx_gallery_conf: dict[str, Any] = {
+    "examples_dirs": [str(examples())],
+    "gallery_dirs": ["gallery"],
+    "filename_pattern": r"/\d\d_",
+    "ignore_pattern": "studies",
+    "within_subsection_order": "FileNameSortKey",
+    "download_all_examples": False,
+    "remove_config_comments": True,
+    "backreferences_dir": "gallery/backreferences",
+    "doc_module": ("hybrid_opt", "symbolic"),
+    "image_scrapers": (),
+    "show_memory": False,
+    "write_computation_times": False,
+    "abort_on_example_error": True,
+}
