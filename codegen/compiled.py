@@ -66,14 +66,15 @@ class CompiledFunction(NumericFunction):
         self._run.argtypes = [ctypes.c_void_p] * 2 + [ctypes.c_longlong] * 2
         self._run.restype = ctypes.c_longlong
         self._work_sizes = tuple(int(size) for size in sizes)
-        self._n_ports = len(self.input_names) + len(self.output_names)
+        self._n_ports = len(signature.input_names) + len(self.output_names)
         sizes_of = [8 * _size(shape) for shape in self.output_shapes]
         self._offsets = list(accumulate(sizes_of, initial=0))[:-1]
         self._idle: deque[_Work] = deque()
         self._own = threading.local()
-        self.lanes = 1
+        self.lanes, self._shared = 1, [False] * len(signature.input_names)
         self._run_lanes, self._idle_lanes = self._run, deque[_Work]()
         if hasattr(loaded, "dual_arm_run_lanes"):
+            self._shared = [bool(loaded.dual_arm_shared(k)) for k in range(len(self._shared))]
             self._run_lanes = loaded.dual_arm_run_lanes
             self._run_lanes.argtypes = self._run.argtypes
             self._run_lanes.restype = ctypes.c_longlong
@@ -136,10 +137,22 @@ class CompiledFunction(NumericFunction):
     def _ports(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> ctypes.Array[ctypes.c_longlong]:
-        """Address and step of every argument of a batch, as the driver wants them."""
+        """Address and step of every argument of a batch, as the driver wants them.
+
+        Raises:
+            CodegenError: several values of an input that lanes share.
+        """
+        for name, several, shared in zip(
+            self.signature.input_names, batched, self._shared, strict=True
+        ):
+            if several and shared:
+                raise CodegenError(
+                    f"{self.name}: input '{name}' has one value for all evaluations of a batch; "
+                    "give one, or call the function once per value"
+                )
         steps = [
             _size(shape) if per_candidate else 0
-            for shape, per_candidate in zip(self.input_shapes, batched, strict=True)
+            for shape, per_candidate in zip(self.signature.input_shapes, batched, strict=True)
         ] + [_size(shape) for shape in self.output_shapes]
         ports = (ctypes.c_longlong * (2 * len(steps)))()
         for k, (array, step) in enumerate(zip([*inputs, *outputs], steps, strict=True)):
@@ -192,24 +205,28 @@ class CompiledFunction(NumericFunction):
             return self._idle_lanes.pop()
         except IndexError:
             arg, res, iw, w = self._work_sizes
-            w += sum(map(_size, (*self.input_shapes, *self.output_shapes)))
+            w += sum(map(_size, (*self.signature.input_shapes, *self.output_shapes)))
             return _Work((arg, res, iw, w * self.lanes), self._n_ports)
 
     def _lanes_agree(self) -> bool:
         """Whether a ragged batch in lanes gives the bits of single evaluations."""
         rng = np.random.default_rng(0)
         n = self.lanes + 1
-        inputs = [rng.normal(0.0, 0.5, (n, *shape)) for shape in self.input_shapes]
+        batched = [not shared for shared in self._shared]
+        inputs = [
+            rng.normal(0.0, 0.5, (n, *shape) if each else shape)
+            for shape, each in zip(self.input_shapes, batched, strict=True)
+        ]
         together = [np.empty((n, *shape)) for shape in self.output_shapes]
         apart = [np.empty((n, *shape)) for shape in self.output_shapes]
-        batched = [True] * len(inputs)
         if not inputs:
             return True
         self._evaluate_batch(inputs, batched, together, n, 1)
         for k in range(n):
             rows = slice(k, k + 1)
             one = [output[rows] for output in apart]
-            self._evaluate_batch([array[rows] for array in inputs], batched, one, 1, 1)
+            own = [a[rows] if each else a for a, each in zip(inputs, batched, strict=True)]
+            self._evaluate_batch(own, batched, one, 1, 1)
         return all(map(_same, together, apart))
 
     def _check(self, status: int, of: str) -> None:

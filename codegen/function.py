@@ -12,8 +12,9 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,7 +102,8 @@ class NumericFunction(ABC):
 
     Attributes:
         signature: names and shapes.
-        name, input_names, output_names, input_shapes, output_shapes: those of the signature.
+        name, input_names, output_names, input_shapes, output_shapes: those of the signature,
+            without the inputs that are bound.
     """
 
     def __init__(self, signature: Signature) -> None:
@@ -112,6 +114,27 @@ class NumericFunction(ABC):
         self.input_shapes = signature.input_shapes
         self.output_shapes = signature.output_shapes
         self._record = signature.output_record()
+        self._bound: list[Array] = []
+
+    def bound(self, values: Mapping[str, Array]) -> Self:
+        """The same function with values for its last inputs, as far as these are among them.
+
+        Args:
+            values: by the names of inputs, each of its input's shape.
+
+        Raises:
+            CodegenError: a value does not fit.
+        """
+        names, shapes = self.signature.input_names, self.signature.input_shapes
+        count = next((k for k, name in enumerate(names[::-1]) if name not in values), len(names))
+        free = len(names) - count
+        other = copy(self)
+        other.input_names, other.input_shapes = names[:free], shapes[:free]
+        other._bound = [self._as_array(values[name], name) for name in names[free:]]
+        for array, name, shape in zip(other._bound, names[free:], shapes[free:], strict=True):
+            if array.shape != shape:
+                raise self._wrong_shape(name, array.shape, str(shape))
+        return other
 
     def __call__(self, *inputs: ArrayLike) -> dict[str, Array]:
         """Evaluate once.
@@ -133,7 +156,7 @@ class NumericFunction(ABC):
                 raise self._wrong_shape(name, array.shape, str(shape))
             arrays.append(array)
         block = np.empty((), self._record)
-        self._evaluate_block(arrays, block)
+        self._evaluate_block([*arrays, *self._bound], block)
         return {name: block[name] for name in self.output_names}
 
     def batch(self, *inputs: ArrayLike, threads: int = 1) -> dict[str, Array]:
@@ -177,7 +200,8 @@ class NumericFunction(ABC):
             )
         outputs = [np.empty((n, *shape)) for shape in self.output_shapes]
         if n:
-            self._evaluate_batch(arrays, batched, outputs, n, threads or available_cores())
+            whole = [*arrays, *self._bound], [*batched, *[False] * len(self._bound)]
+            self._evaluate_batch(*whole, outputs, n, threads or available_cores())
         return dict(zip(self.output_names, outputs, strict=True))
 
     def prepared(
@@ -216,8 +240,8 @@ class NumericFunction(ABC):
         split = len(self.input_names)
         inputs = dict(zip(names[:split], own[:split], strict=True))
         outputs = dict(zip(names[split:], own[split:], strict=True))
-        batched = [name not in shared for name in self.input_names]
-        arrays = list(inputs.values()), list(outputs.values())
+        batched = [name not in shared for name in self.input_names] + [False] * len(self._bound)
+        arrays = [*inputs.values(), *self._bound], list(outputs.values())
         run, native = self._prepared(arrays[0], batched, arrays[1])
         return PreparedBatch(inputs, outputs, n, run, native)
 

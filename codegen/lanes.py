@@ -24,6 +24,7 @@ used before, then asks for one more entry here.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from math import prod
 
@@ -43,11 +44,8 @@ FORMS = [
             rf"^(\s*(?:\*rr\+\+|res\[\d+\]\[\d+\])\s*=\s*)({_NUMBER});",
             r"\1lanes_all_equal(\2);",
         ),
-        (
-            "a0=arg[0]? arg[0][1] : 0;",
-            r"\? (arg\[\d+\]\[\d+\]) : 0;",
-            r"? \1 : lanes_all_equal(0.0);",
-        ),
+        # Arguments with entries are always there, and branches would cut the code into blocks.
+        ("a0=arg[0]? arg[0][1] : 0;", r"arg\[\d+\]\s*\? (arg\[\d+\]\[\d+\]) : 0;", r"\1;"),
         ("a0=(a0<=a1);", _SIDES.format("<="), r"lanes_le(\1, \2)"),
         ("a0=(a0<a1);", _SIDES.format("<"), r"lanes_lt(\1, \2)"),
         ("a0=(a0==a1);", _SIDES.format("=="), r"lanes_eq(\1, \2)"),
@@ -124,12 +122,13 @@ class LaneText:
     entry: str
 
 
-def lane_text(generated: str, prefix: str) -> LaneText:
+def lane_text(generated: str, prefix: str, shared: Collection[int] = ()) -> LaneText:
     """What CasADi generated for one function, over `codegen/c/lanes.h`.
 
     Args:
         generated: CasADi's text, with its own comments.
         prefix: begins the names of everything defined.
+        shared: arguments of a straight function that are the same in all lanes and not in them.
 
     Raises:
         FormError: a line has a form that has none in lanes.
@@ -139,22 +138,26 @@ def lane_text(generated: str, prefix: str) -> LaneText:
         entries = [value.strip() for value in values.split(",")]
         equal = ", ".join(f"LANES_CONSTANT({value})" for value in entries)
         parts.append(f"static const casadi_real casadi_{name}[{size}] = {{{equal}}};\n")
-    names = []
+    names, entry = [], _ENTRY.search(generated)
     for found in _FUNCTION.finditer(generated):
         names.append(found["name"])
+        own = shared if entry and found["name"] == entry[1] else ()
         parts.append(
             f"static int casadi_{found['name']}(const casadi_real** arg, casadi_real** res, "
-            f"casadi_int* iw, casadi_real* w, int mem) {{\n{_choice(found) or _lines(found)}}}\n"
+            "casadi_int* iw, casadi_real* w, int mem) {\n"
+            f"{_choice(found) or _lines(found, own)}}}\n"
         )
-    entry = _ENTRY.search(generated)
     if entry is None or entry[1] not in names:
         raise _unknown("the text", "no function that is called from outside")
     text = re.sub(r"\bcasadi_(f\d+|c\d+|zeros)\b", rf"{prefix}_\1", "".join(parts))
     return LaneText(text.replace("casadi_", "lanes_"), f"{prefix}_{entry[1]}")
 
 
-def _lines(function: re.Match[str]) -> str:
+def _lines(function: re.Match[str], shared: Collection[int] = ()) -> str:
     body = function["body"]
+    for k in shared:
+        given = re.compile(rf"arg\[{k}\]\s*\? arg\[{k}\]\[(\d+)\] : 0;")
+        body = given.sub(rf"lanes_shared(arg[{k}], \1);", body)
     for _, pattern, in_lanes in FORMS:
         body = pattern.sub(in_lanes, body)
     for written, line in zip(function["body"].splitlines(), body.splitlines(), strict=True):

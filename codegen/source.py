@@ -51,12 +51,14 @@ def c_source(function: ca.Function, lanes: int = 1, generated: str = "") -> str:
     """
     include = "#include <math.h>\n"
     generated, signature = generated or generated_c([function]), Signature.of(function)
-    in_lanes = None if lanes == 1 else lane_text(generated, "lanes")
+    shared = shared_inputs(function)
+    in_lanes = None if lanes == 1 else lane_text(generated, "lanes", shared)
     before, after = [include, runtime("arithmetic.h")], [_filled(runtime("driver.c"), signature)]
     if in_lanes is not None:
         width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
         before += [runtime("one_lane.h"), width, runtime("lanes.h")]
-        lane_driver = _filled(runtime("lane_driver.c"), signature)
+        flags = ", ".join(str(int(k in shared)) for k in range(function.n_in()))
+        lane_driver = _filled(runtime("lane_driver.c"), signature).replace("@SHARED@", flags or "0")
         after += [
             "\n#if DUAL_ARM_LANES > 1\n" + in_lanes.text + "#endif\n\n",
             lane_driver.replace("@LANE_FUNCTION@", in_lanes.entry),
@@ -86,7 +88,8 @@ def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 
     """C text of functions in lanes, with C of our own that calls them.
 
     It finds, for a function `f` of the program, `f(arg, res, iw, w)` over `lanes_real`, the room
-    that it needs as f_ARG, f_RES, f_IW and f_W, and the size of its k-th result as f_OUT_k.
+    that it needs as f_ARG, f_RES, f_IW and f_W, the size of its k-th result as f_OUT_k, and as
+    f_SHARED whether it takes `SHARED` arguments as numbers, not lanes.
 
     Raises:
         CodegenError: CasADi cannot write a function as C, or it has no form in lanes.
@@ -101,9 +104,10 @@ def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 
     )
     for name, function in functions.items():
         whole = dense(function)
-        found = lane_text(generated_c([whole]), name)
+        shared = shared_inputs(whole)
+        found = lane_text(generated_c([whole]), name, shared)
         sizes = {"ARG": whole.sz_arg(), "RES": whole.sz_res(), "IW": whole.sz_iw()}
-        sizes |= {"W": whole.sz_w()}
+        sizes |= {"W": whole.sz_w(), "SHARED": int(bool(shared))}
         sizes |= {f"OUT_{i}": whole.numel_out(i) for i in range(whole.n_out())}
         parts += [f"#define {name}_{what} {size}\n" for what, size in sizes.items()]
         parts.append(found.text)
@@ -112,6 +116,18 @@ def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 
             f"lanes_real* w) {{\n  return {found.entry}(arg, res, iw, w, 0);\n}}\n"
         )
     return "".join([*parts, own, "#endif\n"])
+
+
+SHARED = "_numbers"
+"""End of the names of inputs that have one value for all evaluations of a batch."""
+
+
+def shared_inputs(function: ca.Function) -> tuple[int, ...]:
+    """The inputs that a function takes as numbers in lanes, too: those of straight ones that are
+    `SHARED`. Other functions hand arguments on, in lanes."""
+    straight = function.is_a("SXFunction")
+    names = enumerate(function.name_in())
+    return tuple(k for k, name in names if straight and name.endswith(SHARED))
 
 
 def generated_c(functions: Sequence[ca.Function]) -> str:

@@ -6,11 +6,11 @@ The only resource of the library. Everything it computes is returned as a frozen
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from hybrid_opt.evaluate.objectives import (
 from hybrid_opt.static_hold import StaticHold, require_hold, static_hold, unheld
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.read.cell import load
+from symbolic.read.cell import changed, load
 from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
@@ -100,8 +100,24 @@ class Cell:
         Raises:
             WorkcellError: the file was changed and is wrong now.
         """
-        decided = load(self.workcell.source, decided=branches)
+        known = self.workcell
+        decided = load(known.source, decided=branches, text=known.text)
         return Cell(decided, self._objectives, self.threads)
+
+    def changed(self, changes: Mapping[str, Any]) -> Cell:
+        """The cell with other numbers, in memory: what is compiled stays the same.
+
+        It can be stored, searched, polished and exported like any other.
+
+        Args:
+            changes: values by key path as in the workcell file: 'payload.mass',
+                'contacts.friction' of both, 'contacts[0].friction', 'environment.top board.xyz'.
+
+        Raises:
+            WorkcellError: a path leads nowhere, or the changed cell is wrong; the message lists
+                every problem.
+        """
+        return Cell(changed(self.workcell, changes), self._objectives, self.threads)
 
     def drivable(self) -> Cell:
         """The same cell with carries as robots drive them: under the time law 'optimal', searched

@@ -7,16 +7,22 @@ from functools import cached_property
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from codegen.build import load_or_build
 from codegen.cache import Cache, key_of
 from codegen.compiler import find_compiler
 from codegen.function import NumericFunction
+from symbolic.array import Array
 from symbolic.records import Workcell
 
 if TYPE_CHECKING:
     import casadi as ca
 
     from symbolic.cell_model import CellBodies, CellModel
+    from symbolic.geometry.pairs import CellGeometry
+    from symbolic.numbers import CellNumbers
+    from symbolic.robot.branches import ArmSearch
 
 
 class CompiledCell:
@@ -62,39 +68,112 @@ class CompiledCell:
         # Not imported at the top: a warm start needs neither CasADi nor Pinocchio.
         from symbolic.cell_model import build_cell_model
 
-        return build_cell_model(self.workcell) if self._given is None else self._given
+        if self._given is not None:
+            return self._given
+        return build_cell_model(self.workcell, self.bodies, self._searches())
+
+    def _searches(self) -> tuple[ArmSearch, ArmSearch]:
+        """What start branches are found with, compiled."""
+        from symbolic.cell_model import own_clearance
+        from symbolic.robot.branches import ArmSearch
+
+        def make(model: CellModel) -> Mapping[str, ca.Function]:
+            from symbolic.functions import branch_functions
+
+            return branch_functions(model)
+
+        found = self.functions("branches", make, lanes=0, bodies=False)
+        clearance = self.screening["clearance"]
+
+        def bounds(poses: Array, q_1: Array, q_2: Array) -> Array:
+            return clearance.batch(poses, q_1, q_2)["clearance"].reshape(len(poses), -1)
+
+        def search(arm: int) -> ArmSearch:
+            kinematics, follow = (found[f"{name}_{arm + 1}"] for name in ("kinematics", "follow"))
+
+            def flange(q: Array) -> tuple[Array, Array, Array]:
+                values = kinematics.batch(q)
+                R, J = (values[name].transpose(0, 2, 1) for name in ("rotation", "jacobian"))
+                return R, values["position"], J
+
+            def along(starts: Array, extended: Array) -> Mapping[str, Array]:
+                return follow.batch(starts, extended, np.zeros((len(extended), 6)))
+
+            return ArmSearch(flange, along, own_clearance(self.geometry, arm, bounds))
+
+        return search(0), search(1)
 
     @cached_property
     def bodies(self) -> CellBodies:
-        """Arms and bodies: the model where it is known, else without start postures.
+        """Arms and bodies, without start postures.
 
         Raises:
             DualArmError: they cannot be read.
         """
-        known: CellBodies | None = vars(self).get("model", self._given)
-        if known is not None:
-            return known
+        if self._given is not None:
+            return self._given
         from symbolic.cell_model import build_cell_bodies
 
         return build_cell_bodies(self.workcell)
+
+    @property
+    def geometry(self) -> CellGeometry:
+        """The collision bodies and the pairs of them that are checked."""
+        return self.bodies.geometry
+
+    @cached_property
+    def numbers(self) -> CellNumbers:
+        """What of the cell is a number, and what is structure."""
+        from symbolic.numbers import CellNumbers
+
+        bodies = self.bodies
+        return CellNumbers(self.workcell, bodies.screen, bodies.robots)
+
+    @cached_property
+    def symbols(self) -> CellModel:
+        """The model whose functions take the numbers as inputs."""
+        return self.numbers.symbolic(self.bodies)
+
+    @cached_property
+    def start(self) -> tuple[Array, Array]:
+        """(n,) joints of each arm at the first waypoint [rad].
+
+        Raises:
+            DualArmError: the model cannot be built.
+        """
+        if self._given is not None or "model" in vars(self) or not self.workcell.digest:
+            return self.model.start
+        # Found by a search: kept.
+        cache = self.cache or Cache()
+        key = key_of("start", workcell=self.workcell.digest, expressions=self._expressions)
+        record = cache.read_record(key)
+        if record is None:
+            record = {"joints": [q.tolist() for q in self.model.start]}
+            cache.write_record(key, record)
+        first, second = (np.array(q) for q in record["joints"])
+        return first, second
+
+    def vector(self, group: str) -> Array:
+        """The numbers (n,) of a group, see `symbolic.numbers`."""
+        from symbolic.numbers import START
+
+        return np.concatenate(self.start) if group == START else self.numbers.values[group]
 
     @cached_property
     def _expressions(self) -> str:
         return (self.cache or Cache()).code_digest("symbolic")
 
-    @property
-    def is_identified(self) -> bool:
-        """Whether the workcell's files say what is compiled; otherwise only its own text does."""
-        return bool(self.workcell.digest) and self._given is None
-
-    def key(self, name: str, *details: str) -> str | None:
+    def key(self, name: str, *details: str, bodies: bool = True) -> str:
         """A recipe's key: what a set of functions is made from (CasADi is part of every set's).
-        None where the cell is not identified."""
-        if not self.is_identified:
-            return None
+
+        Args:
+            details: whatever else that is.
+            bodies: whether bodies belong to it.
+        """
+        numbers = self.numbers
         return key_of(
             name,
-            workcell=self.workcell.digest,
+            structure=numbers.bodies_digest if bodies else numbers.digest,
             expressions=self._expressions,
             libraries=[f"{library} {version(library)}" for library in ("pin", "scipy")],
             details=details,
@@ -107,49 +186,78 @@ class CompiledCell:
         *details: str,
         lanes: int = 1,
         levels: Mapping[str, int] | None = None,
+        bodies: bool = True,
     ) -> dict[str, NumericFunction]:
-        """A set of functions, from the cache where it was built before.
+        """A set of functions with this cell's numbers, from the cache where one of the same
+        structure was built before.
 
         Args:
             name: of the set.
-            make: makes the functions from the model.
+            make: makes the functions from the model with symbols.
             details: whatever else `make` depends on.
             lanes, levels: see `codegen.build.build`.
+            bodies: whether it depends on the bodies.
 
         Raises:
             DualArmError: the model or its code cannot be built.
         """
-        return self.made(name, lambda: make(self.model), *details, lanes=lanes, levels=levels)
+        key = self.key(name, *details, bodies=bodies)
+        built = load_or_build(
+            key, lambda: make(self.symbols), self.cache, lanes=lanes, levels=levels
+        )
+        return {name: self.bound(function) for name, function in built.items()}
 
     def made(
         self,
         name: str,
         make: Callable[[], Mapping[str, ca.Function]],
-        *details: str,
+        *,
         lanes: int = 1,
         levels: Mapping[str, int] | None = None,
     ) -> dict[str, NumericFunction]:
-        """As `functions`, for what is made of less than the whole model.
+        """A set of functions in which numbers of this cell are constants.
 
         Raises:
             DualArmError: the code cannot be built.
         """
-        return load_or_build(self.key(name, *details), make, self.cache, lanes=lanes, levels=levels)
+        values = [
+            f"{group} {numbers.tobytes()!r}" for group, numbers in self.numbers.values.items()
+        ]
+        key = self.key(name, *values)
+        return load_or_build(key, make, self.cache, lanes=lanes, levels=levels)
+
+    def bound(self, function: NumericFunction) -> NumericFunction:
+        """A function with this cell's numbers for its last inputs."""
+        from symbolic.numbers import GROUPS
+
+        return function.bound(
+            {name: self.vector(name) for name in function.input_names if name in GROUPS}
+        )
 
     @cached_property
     def evaluators(self) -> dict[str, NumericFunction]:
         """Every function of `symbolic.functions.cell_functions`."""
 
         def make(model: CellModel) -> Mapping[str, ca.Function]:
-            from symbolic.functions import cell_functions
+            from symbolic.functions import arm_functions
 
-            return cell_functions(model)
+            return arm_functions(model)
 
-        return self.functions(EVALUATORS, make, lanes=EVALUATOR_LANES)
+        arms = self.functions(EVALUATORS, make, lanes=EVALUATOR_LANES, bodies=False)
+        return arms | self.screening
+
+    @cached_property
+    def screening(self) -> dict[str, NumericFunction]:
+        """Those of them that know the bodies."""
+
+        def make(model: CellModel) -> Mapping[str, ca.Function]:
+            return model.screening
+
+        return self.functions(SCREENING, make, lanes=EVALUATOR_LANES)
 
 
-EVALUATORS = "evaluators"
-"""Name of the set of a cell's evaluators."""
+EVALUATORS, SCREENING = "evaluators", "screening"
+"""Names of the sets of a cell's evaluators: those that know no bodies, and the others."""
 
 EVALUATOR_LANES = 0
 """As many as suit the machine."""

@@ -13,8 +13,16 @@ from symbolic.array import Array
 from symbolic.errors import WorkcellError
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.geometry.screen import Screen, screen_of
 from symbolic.records import Workcell
-from symbolic.robot.branches import StartBranch, start_branches
+from symbolic.records.numbered import Group
+from symbolic.robot.branches import (
+    ArmSearch,
+    Clearance,
+    StartBranch,
+    interpreted_search,
+    start_branches,
+)
 from symbolic.robot.model import RobotModel, build_robot_model
 
 
@@ -33,10 +41,15 @@ class CellBodies:
     geometry: CellGeometry
 
     @cached_property
+    def screen(self) -> Screen:
+        """What bounds of distances are made of."""
+        return screen_of(self.geometry)
+
+    @cached_property
     def screening(self) -> dict[str, ca.Function]:
         """The functions of `symbolic.geometry.clearance.screening_functions`."""
         placements = (self.robots[0].joint_placements, self.robots[1].joint_placements)
-        return screening_functions(self.geometry, placements)
+        return screening_functions(self.geometry, placements, screen=self.screen)
 
 
 @dataclass(frozen=True)
@@ -46,10 +59,12 @@ class CellModel(CellBodies):
     Attributes:
         branches: per arm every branch at the start, best first.
         start: (n,) joint positions of each arm at the first waypoint [rad].
+        given: the group of these where they are symbols.
     """
 
     branches: tuple[tuple[StartBranch, ...], tuple[StartBranch, ...]]
     start: tuple[Array, Array]
+    given: Group | None = None
 
 
 def build_cell_bodies(workcell: Workcell) -> CellBodies:
@@ -67,13 +82,19 @@ def build_cell_bodies(workcell: Workcell) -> CellBodies:
     return CellBodies(workcell, (first, second), build_geometry(workcell))
 
 
-def build_cell_model(workcell: Workcell, bodies: CellBodies | None = None) -> CellModel:
+Searches = tuple[ArmSearch, ArmSearch]
+
+
+def build_cell_model(
+    workcell: Workcell, bodies: CellBodies | None = None, searches: Searches | None = None
+) -> CellModel:
     """Read the robots, list all start branches and choose one per arm.
 
     The workcell's `start_branch` picks from the ranked branches; -1 stands for the best.
 
     Args:
         bodies: of the same cell, if they are known; its path may be another one.
+        searches: what both arms' branches are found with; None for the interpreted functions.
 
     Raises:
         RobotModelError: a URDF does not give an arm.
@@ -82,10 +103,10 @@ def build_cell_model(workcell: Workcell, bodies: CellBodies | None = None) -> Ce
     """
     bodies = bodies or build_cell_bodies(workcell)
     robots, geometry = bodies.robots, bodies.geometry
-    clearance = bodies.screening["clearance"]
+    searches = searches or _interpreted(workcell, bodies)
     branches = (
-        start_branches(workcell, 0, robots[0], _own_clearance(geometry, clearance, 0)),
-        start_branches(workcell, 1, robots[1], _own_clearance(geometry, clearance, 1)),
+        start_branches(workcell, 0, robots[0], searches[0]),
+        start_branches(workcell, 1, robots[1], searches[1]),
     )
     problems = []
     for i, found in enumerate(branches):
@@ -106,7 +127,8 @@ def build_cell_model(workcell: Workcell, bodies: CellBodies | None = None) -> Ce
         np.array(found[max(workcell.start_branch[i], 0)].q) for i, found in enumerate(branches)
     ]
     model = CellModel(workcell, robots, geometry, branches, (start[0], start[1]))
-    vars(model)["screening"] = bodies.screening  # of the same bodies: not made again
+    # Of the same bodies: not made again.
+    vars(model).update({k: v for k, v in vars(bodies).items() if k in ("screen", "screening")})
     return model
 
 
@@ -121,12 +143,11 @@ def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
     ]
 
 
-def _own_clearance(
-    geometry: CellGeometry, clearance: ca.Function, arm: int
-) -> Callable[[Array, Array], float]:
+def own_clearance(geometry: CellGeometry, arm: int, bounds: Bounds) -> Clearance:
     """Least clearance bound [m] of one arm over samples, the other arm left out.
 
-    The returned function takes box poses (n, 6) and the arm's joint positions (n, joints).
+    Args:
+        bounds: of all pairs, from poses (n, 6) and both arms' joints.
     """
     rows = own_pairs(geometry, arm)
 
@@ -135,7 +156,23 @@ def _own_clearance(
             return float("inf")
         absent = np.zeros((len(path), geometry.arms[1 - arm].joints))
         joints = (path, absent) if arm == 0 else (absent, path)
-        bounds = np.array(clearance.map(len(poses))(poses.T, joints[0].T, joints[1].T))
-        return float(bounds[rows].min())
+        return float(bounds(poses, *joints)[:, rows].min())
 
     return least
+
+
+Bounds = Callable[[Array, Array, Array], Array]
+"""Poses (n, 6) and both arms' joints (n, joints) to lower bounds (n, n_pairs) of distances [m]."""
+
+
+def _interpreted(workcell: Workcell, bodies: CellBodies) -> Searches:
+    clearance = bodies.screening["clearance"]
+
+    def bounds(poses: Array, q_1: Array, q_2: Array) -> Array:
+        return np.array(clearance.map(len(poses))(poses.T, q_1.T, q_2.T)).T
+
+    first, second = (
+        interpreted_search(workcell, arm, model, own_clearance(bodies.geometry, arm, bounds))
+        for arm, model in enumerate(bodies.robots)
+    )
+    return first, second

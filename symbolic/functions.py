@@ -11,11 +11,13 @@ import casadi as ca
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.load import LOAD_OUTPUTS, load_function, uncertain_load_function
+from symbolic.expression import mx_given, of, repeated, sx_given
+from symbolic.geometry.screen import Screen
 from symbolic.limits import path_force_function
 from symbolic.path.spline import extended_matrix, sample_basis, waypoint_matrix
 from symbolic.path.time_law import driven_path, timed_path
-from symbolic.path_motion import arm_derivative_function, path_motion_function
-from symbolic.records import Workcell
+from symbolic.path_motion import arm_derivative_function, path_motion_function, start_posture
+from symbolic.records import Task, Workcell
 from symbolic.records.quantities import GRAVITY
 from symbolic.robot.arm import (
     REACH_TOLERANCE,
@@ -71,20 +73,18 @@ def candidate_function(model: CellModel) -> ca.Function:
     """
     workcell = model.workcell
     n = workcell.task.samples
-    inputs = {"x": ca.MX.sym("x", workcell.task.n_var)}
-    basis, waypoints = sample_basis(workcell.task), waypoint_matrix(workcell.task, inputs["x"])
+    x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
+    inputs = {"x": x}
+    waypoints, own = _waypoints(workcell.task, x, handed), of(handed, workcell.task)
     if workcell.task.time_law == "optimal":
         inputs |= {name: ca.MX.sym(name, n) for name in DRIVE_INPUTS}
         path = driven_path(basis, waypoints, *[inputs[name].T for name in DRIVE_INPUTS])
     else:
-        path = timed_path(workcell.task, basis, waypoints)
-    load = dict(
-        zip(
-            LOAD_OUTPUTS,
-            load_function(workcell).map(n)(path.pose, path.rate, path.second_rate),
-            strict=True,
-        )
-    )
+        path = timed_path(workcell.task, basis, waypoints, handed=own)
+    inputs |= handed
+    held = repeated(of(handed, workcell.payload), n)
+    found = load_function(workcell).map(n)(path.pose, path.rate, path.second_rate, *held)
+    load = dict(zip(LOAD_OUTPUTS, found, strict=True))
     outputs: dict[str, ca.MX] = {
         "time": path.time,
         "pose": path.pose,
@@ -92,14 +92,12 @@ def candidate_function(model: CellModel) -> ca.Function:
         "second_rate": path.second_rate,
         **{name: load[name] for name in LOAD_OUTPUTS if not name.startswith("wrench")},
     }
-    whole = extended_matrix(workcell.task, inputs["x"], waypoints)
+    whole = extended_matrix(workcell.task, x, waypoints, own)
     pose = ca.mtimes(whole, ca.DM(basis.position.T))
     for i in (0, 1):
-        tracked = _track(model, i, pose, load[f"wrench_{i + 1}"])
+        tracked = _track(model, i, pose, load[f"wrench_{i + 1}"], handed)
         outputs |= {f"{name}_{i + 1}": tracked[name] for name in TRACK_OUTPUTS}
-    constraint = _constraint_function(workcell).map(n)(
-        *[outputs[name] for name in _CONSTRAINT_INPUTS]
-    )
+    constraint = _constraints(workcell, outputs, n, handed)
     violated = ca.fmax(constraint, 0.0)
     outputs["constraint"] = constraint
     outputs["violation"] = _row_max(violated)
@@ -114,6 +112,25 @@ def candidate_function(model: CellModel) -> ca.Function:
     )
 
 
+def _all(model: CellModel) -> dict[str, ca.MX]:
+    """The numbers of whole candidates."""
+    workcell = model.workcell
+    return mx_given(workcell.task, *workcell.robots, model, workcell.payload)
+
+
+def _waypoints(task: Task, x: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
+    return waypoint_matrix(task, x, of(handed, task))
+
+
+def _constraints(
+    workcell: Workcell, values: dict[str, ca.MX], n: int, handed: dict[str, ca.MX]
+) -> ca.MX:
+    """`_constraint_function` of n samples."""
+    numbers = repeated(of(handed, *workcell.robots, workcell.payload), n)
+    inputs = [values[name] for name in _CONSTRAINT_INPUTS]
+    return _constraint_function(workcell).map(n)(*inputs, *numbers)
+
+
 def motion_function(model: CellModel) -> ca.Function:
     """What of a candidate needs no forces, much cheaper where those are found by a solver; not for
     'optimal'.
@@ -123,17 +140,16 @@ def motion_function(model: CellModel) -> ca.Function:
     """
     workcell = model.workcell
     n = workcell.task.samples
-    x = ca.MX.sym("x", workcell.task.n_var)
-    basis, waypoints = sample_basis(workcell.task), waypoint_matrix(workcell.task, x)
-    path = timed_path(workcell.task, basis, waypoints)
-    whole = extended_matrix(workcell.task, x, waypoints)
+    x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
+    waypoints, own = _waypoints(workcell.task, x, handed), of(handed, workcell.task)
+    path = timed_path(workcell.task, basis, waypoints, handed=own)
+    whole = extended_matrix(workcell.task, x, waypoints, own)
     pose = ca.mtimes(whole, ca.DM(basis.position.T))
     values = {name: ca.DM.zeros(2, n) for name in _CONSTRAINT_INPUTS[-3:]}
     for i in (0, 1):
-        tracked = _track(model, i, pose, ca.DM.zeros(6, n))
+        tracked = _track(model, i, pose, ca.DM.zeros(6, n), handed)
         values |= {f"{name}_{i + 1}": tracked[name] for name in TRACK_OUTPUTS}
-    inputs = [values[name] for name in _CONSTRAINT_INPUTS]
-    constraint = _constraint_function(workcell).map(n)(*inputs)
+    constraint = _constraints(workcell, values, n, handed)
     outputs = {
         "time": path.time,
         "pose": path.pose,
@@ -141,8 +157,10 @@ def motion_function(model: CellModel) -> ca.Function:
         "q_2": values["q_2"],
         "violation": _row_max(ca.fmax(constraint, 0.0)),
     }
-    names = list(outputs)
-    return ca.Function("motion_alone", [x], list(outputs.values()), ["x"], names, {"cse": True})
+    inputs, names = {"x": x} | handed, list(outputs)
+    results = list(outputs.values())
+    given = list(inputs.values()), results, list(inputs), names
+    return ca.Function("motion_alone", *given, {"cse": True})
 
 
 _LOAD_SIZES = {
@@ -172,7 +190,7 @@ def sample_sizes(workcell: Workcell) -> dict[str, int]:
     function has the same ones."""
     sizes = dict(_LOAD_SIZES)
     for i, robot in enumerate(workcell.robots, start=1):
-        joints = len(robot.position_lower)
+        joints = robot.position_lower.shape[0]
         own = dict.fromkeys(TRACK_OUTPUTS, 1) | {"q": joints, "joint_torque": joints}
         sizes |= {f"{name}_{i}": size for name, size in own.items()}
     return sizes | {"constraint": len(CONSTRAINTS)}
@@ -195,57 +213,76 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
     """A candidate's function in parts, to be put together sample by sample; not for 'optimal'.
 
     path: x (n_var,) -> time (1, n), pose (6 + m, n), extended by the redundant joints, rate,
-    second_rate (6, n). begin: -> joints of both arms at the first box pose. start: first pose, such
-    joints -> state_1, state_2 before the first sample. predict: state_1, state_2, second pose ->
-    both states before it. sample: pose, rate, second_rate, state_1, state_2 -> next_state_1,
-    next_state_2, then `sample_sizes`. Where `forces_come_last` these are without forces, all zero,
-    and forces: pose, rate, second_rate, joints of both arms -> `force_sizes`, the last of them
-    those entries of the constraints.
+    second_rate (6, n). start: first pose, joints of both arms there -> state_1, state_2 before the
+    first sample. predict: state_1, state_2, second pose -> both states before it. sample: pose,
+    rate, second_rate, state_1, state_2 -> next_state_1, next_state_2, then `sample_sizes`. Where
+    `forces_come_last` these are without forces, all zero, and forces: pose, rate, second_rate,
+    joints of both arms -> `force_sizes`, the last of them those entries of the constraints.
+    Numbers follow, see `kernel_numbers`.
     """
     workcell = model.workcell
-    x = ca.MX.sym("x", workcell.task.n_var)
-    basis = sample_basis(workcell.task)
-    waypoints = waypoint_matrix(workcell.task, x)
-    path = timed_path(workcell.task, basis, waypoints)
-    whole = ca.mtimes(extended_matrix(workcell.task, x, waypoints), ca.DM(basis.position.T))
+    x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
+    own, held = of(handed, workcell.task), of(handed, workcell.payload)
+    arms = of(handed, *workcell.robots)
+    waypoints = _waypoints(workcell.task, x, handed)
+    path = timed_path(workcell.task, basis, waypoints, handed=own)
+    extended = extended_matrix(workcell.task, x, waypoints, own)
+    whole = ca.mtimes(extended, ca.DM(basis.position.T))
     motion = [path.time, whole, path.rate, path.second_rate]
     pose = ca.MX.sym("pose", workcell.task.extended_size)
     box = [pose[:6], *[ca.MX.sym(name, 6) for name in ("rate", "second_rate")]]
-    load = dict(zip(LOAD_OUTPUTS, load_function(workcell).call(box), strict=True))
+    found = load_function(workcell).call([*box, *held.values()])
+    load = dict(zip(LOAD_OUTPUTS, found, strict=True))
     apart = forces_come_last(workcell)
     outputs = {k: ca.MX(ca.DM.zeros(v.shape)) for k, v in load.items()} if apart else load
     states, starts, following, predicted = [], [], [], []
-    begins = [ca.MX.sym(f"begin_{i + 1}", len(q)) for i, q in enumerate(model.start)]
+    begins = [ca.MX.sym(f"begin_{i + 1}", arm.n_joints) for i, arm in enumerate(model.robots)]
     for i in (0, 1):
         arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
-        starts.append(start_function(*arm, f"arm_{i + 1}_start")(begins[i], pose))
+        given = of(handed, workcell.robots[i]).values()
+        starts.append(start_function(*arm, f"arm_{i + 1}_start")(begins[i], pose, *given))
         state = ca.MX.sym(f"state_{i + 1}", starts[i].shape[0])
         states.append(state)
         track = track_function(*arm, f"arm_{i + 1}_sample")
-        after, *tracked = track(state, pose, outputs[f"wrench_{i + 1}"])
+        after, *tracked = track(state, pose, outputs[f"wrench_{i + 1}"], *given)
         following.append(after)
         outputs |= {
             f"{name}_{i + 1}": value for name, value in zip(TRACK_OUTPUTS, tracked, strict=True)
         }
-        predicted.append(prediction_function(*arm, f"arm_{i + 1}_prediction")(state, pose))
-    inputs = [outputs[name] for name in _CONSTRAINT_INPUTS]
-    outputs["constraint"] = _constraint_function(workcell)(*inputs)
+        predict = prediction_function(*arm, f"arm_{i + 1}_prediction")
+        predicted.append(predict(state, pose, *given))
+    outputs["constraint"] = _constraints(workcell, outputs, 1, handed)
     sizes = sample_sizes(workcell)
     results = [*following, *(outputs[name] for name in sizes)]
     names = ["next_state_1", "next_state_2", *sizes]
-    given = [pose, *box[1:], *states]
+    asked = [pose, *box[1:], *states, *arms.values(), *held.values()]
     return {
-        "path": ca.Function("path", [x], motion, {"cse": True}),
-        "begin": ca.Function("begin", [], [ca.SX(ca.DM(q)) for q in model.start]),
-        "start": ca.Function("start", [pose, *begins], starts),
-        "predict": ca.Function("predict", [*states, pose], predicted),
-        "sample": ca.Function("sample", given, results, [v.name() for v in given], names),
-        **({"forces": _forces_function(model, pose, box, load)} if apart else {}),
+        "path": ca.Function("path", [x, *own.values()], motion, {"cse": True}),
+        "start": ca.Function("start", [pose, *begins, *arms.values()], starts),
+        "predict": ca.Function("predict", [*states, pose, *arms.values()], predicted),
+        "sample": ca.Function("sample", asked, results, [v.name() for v in asked], names),
+        **({"forces": _forces_function(model, (pose, *box[1:]), load, handed)} if apart else {}),
     }
 
 
+def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, ...]]:
+    """Which numbers each of `kernel_functions` takes behind its other inputs, in order.
+
+    Args:
+        workcell, screen: with numbers.
+    """
+    arms, held = tuple(sx_given(*workcell.robots)), tuple(sx_given(workcell.payload))
+    bodies = tuple(sx_given(screen))
+    found = {"path": tuple(sx_given(workcell.task)), "start": arms, "predict": arms}
+    found |= {"sample": (*arms, *held), "clearance": bodies, "piece_poses": bodies}
+    return found | ({"forces": (*arms, *held)} if forces_come_last(workcell) else {})
+
+
 def _forces_function(
-    model: CellModel, pose: ca.MX, box: list[ca.MX], load: dict[str, ca.MX]
+    model: CellModel,
+    motion: tuple[ca.MX, ...],
+    load: dict[str, ca.MX],
+    handed: dict[str, ca.MX],
 ) -> ca.Function:
     """See `sample_functions`."""
     workcell = model.workcell
@@ -253,23 +290,25 @@ def _forces_function(
     outputs = dict(load)
     for i, q in enumerate(joints):
         arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
-        torque = torque_function(*arm, f"arm_{i + 1}_torque")
-        outputs[f"joint_torque_{i + 1}"] = torque(q, pose, load[f"wrench_{i + 1}"])
-    known = [ca.DM.zeros(1)] * (len(_CONSTRAINT_INPUTS) - 3)
-    of_forces = [outputs[name] for name in _CONSTRAINT_INPUTS[-3:]]
-    constraint = _constraint_function(workcell)(*known, *of_forces)
+        torque, own = torque_function(*arm, f"arm_{i + 1}_torque"), of(handed, arm[0]).values()
+        outputs[f"joint_torque_{i + 1}"] = torque(q, motion[0], load[f"wrench_{i + 1}"], *own)
+    known = dict.fromkeys(_CONSTRAINT_INPUTS[:-3], ca.DM.zeros(1))
+    constraint = _constraints(workcell, outputs | known, 1, handed)
     outputs["force_constraint"] = constraint[-len(FORCE_CONSTRAINTS) :]
     names = list(force_sizes(workcell))
-    given = [pose, *box[1:], *joints]
+    given = [*motion, *joints, *of(handed, *workcell.robots, workcell.payload).values()]
     results = [outputs[name] for name in names]
     return ca.Function("forces", given, results, [v.name() for v in given], names)
 
 
-def _track(model: CellModel, i: int, pose: ca.MX, wrench: ca.MX) -> dict[str, ca.MX]:
+def _track(
+    model: CellModel, i: int, pose: ca.MX, wrench: ca.MX, handed: dict[str, ca.MX]
+) -> dict[str, ca.MX]:
     robot, contact = model.workcell.robots[i], model.workcell.contacts[i]
     n = model.workcell.task.samples
     follow = follow_function(robot, model.robots[i], contact, n, f"arm_{i + 1}")
-    results = follow(ca.DM(model.start[i]), pose, wrench)
+    start = start_posture(model, i, handed)
+    results = follow(start, pose, wrench, *of(handed, robot).values())
     return dict(zip(TRACK_OUTPUTS, results, strict=True))
 
 
@@ -292,6 +331,7 @@ def _constraint_function(workcell: Workcell) -> ca.Function:
     """Constraint values (9,) of one sample from the named outputs."""
     sizes = {"normal_force": 2, "tangential_force": 2, "pressure_shift": 2}
     inputs = {name: ca.SX.sym(name, sizes.get(name, 1)) for name in _CONSTRAINT_INPUTS}
+    given = sx_given(*workcell.robots, workcell.payload)
     weight = -workcell.payload.mass * GRAVITY[2]
     values: dict[str, ca.SX] = {}
     cones = []
@@ -311,7 +351,7 @@ def _constraint_function(workcell: Workcell) -> ca.Function:
     values["friction"] = ca.fmax(cones[0], cones[1])
     return ca.Function(
         "constraints",
-        list(inputs.values()),
+        [*inputs.values(), *given.values()],
         [ca.vertcat(*[values[name] for name in CONSTRAINTS])],
     )
 
@@ -329,27 +369,43 @@ def _time_share(time: ca.MX) -> ca.MX:
 # --- sets of functions ---
 
 
-def cell_functions(model: CellModel) -> dict[str, ca.Function]:
-    """The functions by name.
+def arm_functions(model: CellModel) -> dict[str, ca.Function]:
+    """The functions by name that know no bodies.
 
     candidate: the evaluator of a whole candidate, see `candidate_function`.
     inverse_dynamics_i: of each arm i = 1, 2 (`symbolic.robot.model`).
     posture: both arms at one box pose (`symbolic.robot.arm.posture_function`).
-    clearance, piece_poses, motion: collision bounds, placements and bounds of the motion
-    (`symbolic.geometry.clearance.screening_functions`).
     """
     return {
         "candidate": candidate_function(model),
         **{f"inverse_dynamics_{i + 1}": model.robots[i].inverse_dynamics for i in (0, 1)},
         "posture": posture_function(model.workcell.robots, model.robots, model.workcell.contacts),
-        **model.screening,
     }
+
+
+def cell_functions(model: CellModel) -> dict[str, ca.Function]:
+    """The functions by name: those of `arm_functions`, and clearance, piece_poses, motion, see
+    `symbolic.geometry.clearance.screening_functions`."""
+    return arm_functions(model) | model.screening
+
+
+def branch_functions(model: CellModel) -> dict[str, ca.Function]:
+    """What start branches are found with, of each arm i = 1, 2: kinematics_i
+    (`symbolic.robot.model`) and follow_i (`symbolic.robot.arm.follow_function`)."""
+    found: dict[str, ca.Function] = {}
+    for i, (robot, contact) in enumerate(
+        zip(model.workcell.robots, model.workcell.contacts, strict=True)
+    ):
+        own, name = model.robots[i], f"follow_{i + 1}"
+        found[f"kinematics_{i + 1}"] = own.kinematics
+        found[name] = follow_function(robot, own, contact, model.workcell.task.samples, name)
+    return found
 
 
 def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
     """What a whole evaluation is put together from, sample by sample.
 
-    path, begin, start, predict, sample and, of some cells, forces: see `sample_functions`.
+    path, start, predict, sample and, of some cells, forces: see `sample_functions`.
     clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
     """
     screening = {name: model.screening[name] for name in ("clearance", "piece_poses")}

@@ -13,7 +13,9 @@ import numpy as np
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.closed_form import Asked, HeldLoad, held_by
+from symbolic.contact.load import frictions
 from symbolic.contact.soft_finger import Detached
+from symbolic.expression import mx_given, number, of, sx_given
 from symbolic.path.spline import path_basis, waypoint_matrix
 from symbolic.path_motion import (
     ARM_OUTPUTS,
@@ -21,6 +23,7 @@ from symbolic.path_motion import (
     arm_derivative_function,
     box_function,
     extended_motion,
+    start_posture,
 )
 from symbolic.records import Workcell
 from symbolic.records.quantities import GRAVITY
@@ -82,7 +85,7 @@ class LimitLayout:
 
 def limit_layout(workcell: Workcell) -> LimitLayout:
     """The layout for a workcell's arms."""
-    return LimitLayout(sum(len(robot.velocity_max) for robot in workcell.robots))
+    return LimitLayout(sum(robot.velocity_max.shape[0] for robot in workcell.robots))
 
 
 PATH_OUTPUTS = ("pose", "pose_first", "pose_second", "q_1", "q_2")
@@ -103,21 +106,25 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
         samples: number of samples, at least 3.
     """
     workcell = model.workcell
-    x = ca.MX.sym("x", workcell.task.n_path)
-    waypoints = waypoint_matrix(workcell.task, x)
-    basis = path_basis(len(workcell.task.waypoints), np.linspace(0.0, 1.0, samples))
-    moved = extended_motion(workcell.task, x, basis, waypoints)
+    x, task = ca.MX.sym("x", workcell.task.n_path), workcell.task
+    handed = mx_given(task, *workcell.robots, model)
+    waypoints = waypoint_matrix(task, x, of(handed, task))
+    basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, samples))
+    moved = extended_motion(task, x, basis, waypoints, of(handed, task))
     outputs = dict(zip(PATH_OUTPUTS, moved, strict=False))
     no_wrench = ca.DM.zeros(6, samples)
     verdicts: dict[str, ca.MX] = {}
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         follow = follow_function(robot, model.robots[i], contact, samples, f"limits_arm_{i + 1}")
-        results = follow(ca.DM(model.start[i]), outputs["pose"], no_wrench)
+        start = start_posture(model, i, handed)
+        results = follow(start, outputs["pose"], no_wrench, *of(handed, robot).values())
         tracked = dict(zip(TRACK_OUTPUTS, results, strict=True))
         outputs[f"q_{i + 1}"] = tracked["q"]
         verdicts |= {f"{name}_{i + 1}": tracked[name] for name in VERDICTS}
     outputs |= verdicts
-    return ca.Function("path", [x], list(outputs.values()), ["x"], list(outputs), {"cse": True})
+    inputs = {"x": x} | handed
+    sides = list(inputs.values()), list(outputs.values()), list(inputs), list(outputs)
+    return ca.Function("path", *sides, {"cse": True})
 
 
 def sample_limits_function(model: CellModel) -> ca.Function:
@@ -126,22 +133,25 @@ def sample_limits_function(model: CellModel) -> ca.Function:
     payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
     given = [ca.SX.sym(name, task.extended_size) for name in ("pose", "first", "second")]
     pose, first, second = (values[:6] for values in given)
-    box = dict(zip(BOX_OUTPUTS, box_function(workcell)(pose, first, second), strict=True))
+    held = sx_given(payload).values()
+    box = dict(zip(BOX_OUTPUTS, box_function(workcell)(pose, first, second, *held), strict=True))
     rotation = ca.reshape(box["rotation"], 3, 3).T
-    axes = ca.mtimes(rotation, ca.DM(workcell.contacts[0].T_box_pad[:3, :3]))
+    axes = ca.mtimes(rotation, number(workcell.contacts[0].T_box_pad[:3, :3]))
     q, speed, by_a, by_w, torque, wrench = [], [], [], [], [], []
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
-        q.append(ca.SX.sym(f"q_{i + 1}", len(robot.velocity_max)))
+        q.append(ca.SX.sym(f"q_{i + 1}", robot.velocity_max.shape[0]))
         derivatives = arm_derivative_function(robot, model.robots[i], contact, f"limits_of_{i + 1}")
-        arm = dict(zip(ARM_OUTPUTS, derivatives(q[i], *given), strict=True))
-        speed.append(arm["q_first"] / ca.DM(robot.velocity_max))
-        by_a.append(arm["q_first"] / ca.DM(robot.acceleration_max))
-        by_w.append(arm["q_second"] / ca.DM(robot.acceleration_max))
+        own_numbers = sx_given(robot).values()
+        arm = dict(zip(ARM_OUTPUTS, derivatives(q[i], *given, *own_numbers), strict=True))
+        torque_max = number(robot.torque_max)
+        speed.append(arm["q_first"] / number(robot.velocity_max))
+        by_a.append(arm["q_first"] / number(robot.acceleration_max))
+        by_w.append(arm["q_second"] / number(robot.acceleration_max))
         own = ("torque_by_acceleration", "torque_by_speed", "torque_at_rest")
-        torque.append(ca.horzcat(*[arm[name] / ca.DM(robot.torque_max) for name in own]))
-        world = ca.reshape(arm["wrench_torque"], 6, len(robot.velocity_max)).T
+        torque.append(ca.horzcat(*[arm[name] / torque_max for name in own]))
+        world = ca.reshape(arm["wrench_torque"], 6, robot.velocity_max.shape[0]).T
         turned = ca.mtimes(world, ca.diagcat(axes, axes))
-        wrench.append(ca.mtimes(ca.diag(1.0 / ca.DM(robot.torque_max)), turned))
+        wrench.append(ca.mtimes(ca.diag(1.0 / torque_max), turned))
     linear, angular = ca.norm_2(first[:3]), ca.norm_2(box["angular_first"])
     weight = ca.DM(GRAVITY) * payload.mass
     forces = (box["force_by_acceleration"], box["force_by_speed"], -weight)
@@ -167,13 +177,19 @@ def sample_limits_function(model: CellModel) -> ca.Function:
     }
     assert {name: block.shape[0] for name, block in blocks.items()} == layout.sizes
     limits = ca.vertcat(*[ca.densify(blocks[name]) for name in layout.sizes])
+    numbers = limit_numbers(workcell)
     return ca.Function(
         "sample_limits",
-        [*given, *q],
+        [*given, *q, *numbers.values()],
         ca.cse([limits]),
-        list(PATH_OUTPUTS),
+        [*PATH_OUTPUTS, *numbers],
         ["limits"],
     )
+
+
+def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
+    """The numbers that `sample_limits_function` takes behind its other inputs."""
+    return sx_given(workcell.task, *workcell.robots, workcell.payload)
 
 
 def _held(
@@ -182,13 +198,13 @@ def _held(
     """Contact wrenches along the axes of contact 1 from the blocks force and moment."""
     by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
     axes, centre = workcell.contacts[0].T_box_pad[:3, :3], workcell.payload.centre_of_mass
-    arms = [ca.SX(ca.DM(axes.T @ (c.T_box_pad[:3, 3] - centre))) for c in workcell.contacts]
+    arms = [ca.SX(number(axes.T @ (c.T_box_pad[:3, 3] - centre))) for c in workcell.contacts]
     asked = Asked(
         by[0] * a + by[1] * w + by[2],
         blocks["moment"][:3] * a + blocks["moment"][3:] * w,
         (arms[0], arms[1]),
         ca.SX(ca.DM.eye(3)),
-        ca.SX([contact.friction for contact in workcell.contacts]),
+        frictions(workcell),
     )
     return held_by(workcell, workcell.task.allocation, asked, detached)
 
@@ -206,7 +222,8 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     detached: Detached = []
     value = _held(workcell, blocks, a, w, detached).normal
     names = ("limit_forces", "limit_force_slopes")
-    return _with_slopes(names, value, [ca.vertcat(*blocks.values()), a, w], detached)
+    inputs = [ca.vertcat(*blocks.values()), a, w, *sx_given(workcell.payload).values()]
+    return _with_slopes(names, value, inputs, detached)
 
 
 def path_force_function(workcell: Workcell) -> ca.Function:
@@ -214,19 +231,20 @@ def path_force_function(workcell: Workcell) -> ca.Function:
     (2, 2), of each force by u'' and by u'^2."""
     path = [ca.SX.sym(name, 6) for name in ("pose", "first", "second")]
     a, w = ca.SX.sym("a"), ca.SX.sym("w")
-    box = dict(zip(BOX_OUTPUTS, box_function(workcell)(*path), strict=True))
+    given = sx_given(workcell.payload)
+    box = dict(zip(BOX_OUTPUTS, box_function(workcell)(*path, *given.values()), strict=True))
     rotation = ca.reshape(box["rotation"], 3, 3).T
-    axes = ca.mtimes(rotation, ca.DM(workcell.contacts[0].T_box_pad[:3, :3]))
+    axes = ca.mtimes(rotation, number(workcell.contacts[0].T_box_pad[:3, :3]))
     weight = ca.DM(GRAVITY) * workcell.payload.mass
     asked = (
         *(box["force_by_acceleration"], box["force_by_speed"], -weight),
         *(box["moment_by_acceleration"], box["moment_by_speed"]),
     )
     blocks = ca.vertcat(*[ca.mtimes(axes.T, part) for part in asked])
-    force, by_a, by_w = force_functions(workcell)[1](blocks, a, w)
+    force, by_a, by_w = force_functions(workcell)[1](blocks, a, w, *given.values())
     outputs = ca.cse([force, ca.vertcat(by_a.T, by_w.T)])
-    names = ["pose", "first", "second", "a", "w"]
-    return ca.Function("path_force", [*path, a, w], outputs, names, ["normal_force", "slope"])
+    inputs, names = [*path, a, w, *given.values()], ["pose", "first", "second", "a", "w", *given]
+    return ca.Function("path_force", inputs, outputs, names, ["normal_force", "slope"])
 
 
 def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
@@ -242,7 +260,7 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     a, w = ca.SX.sym("a"), ca.SX.sym("w")
     detached: Detached = []
     _, ratios = contact_limits(workcell, blocks, (a, w), detached)
-    inputs = [ca.vertcat(*blocks.values()), a, w]
+    inputs = [ca.vertcat(*blocks.values()), a, w, *sx_given(workcell.payload).values()]
     return _with_slopes(("limit_ratios", "limit_slopes"), ratios, inputs, detached)
 
 
@@ -275,7 +293,7 @@ def contact_limits(
     torque, start = own[:, 0] * a + own[:, 1] * w + own[:, 2], 0
     ratios = []
     for robot, wrench in zip(workcell.robots, wrenches, strict=True):
-        stop = start + len(robot.velocity_max)
+        stop = start + robot.velocity_max.shape[0]
         ratios.append(torque[start:stop] + ca.mtimes(wrench_by_joint[start:stop, :], wrench))
         start = stop
     ratios += [
@@ -288,9 +306,10 @@ def contact_limits(
 def _with_slopes(
     names: tuple[str, str], value: ca.SX, inputs: list[ca.SX], detached: Detached
 ) -> tuple[ca.Function, ca.Function]:
-    """A function of blocks, u'' and u'^2, and the same with its derivatives by the latter two."""
+    """A function of blocks, u'', u'^2 and numbers, and the same with its derivatives by u'' and
+    u'^2."""
     value = ca.densify(value)
-    outputs = [value, *[ca.densify(ca.jacobian(value, z)) for z in inputs[1:]]]
+    outputs = [value, *[ca.densify(ca.jacobian(value, z)) for z in inputs[1:3]]]
     for symbol, solved in detached:
         outputs = ca.substitute(outputs, [symbol], [solved])
     return (

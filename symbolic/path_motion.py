@@ -13,8 +13,16 @@ import numpy as np
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.paper import required_moment
+from symbolic.expression import as_mx, mx_given, number, of, repeated, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
-from symbolic.path.spline import PathBasis, extended_matrix, path_basis, waypoint_matrix
+from symbolic.path.spline import (
+    NONE,
+    Handed,
+    PathBasis,
+    extended_matrix,
+    path_basis,
+    waypoint_matrix,
+)
 from symbolic.records import Contact, Robot, Task, Workcell
 from symbolic.records.cell import box_flange
 from symbolic.robot.arm import TRACK_OUTPUTS, follow_function, following_columns, joint_torque
@@ -68,43 +76,55 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
         samples: number of samples, at least 3.
     """
     workcell = model.workcell
-    x = ca.MX.sym("x", workcell.task.n_var)
-    waypoints = waypoint_matrix(workcell.task, x)
-    basis = path_basis(len(workcell.task.waypoints), np.linspace(0.0, 1.0, samples))
+    x, task = ca.MX.sym("x", workcell.task.n_var), workcell.task
+    handed = mx_given(task, *workcell.robots, model, workcell.payload)
+    waypoints = waypoint_matrix(task, x, of(handed, task))
+    basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, samples))
     pose, first, second = (
         ca.mtimes(waypoints, ca.DM(matrix.T))
         for matrix in (basis.position, basis.first, basis.second)
     )
     outputs = {"pose": pose, "pose_first": first, "pose_second": second}
-    box = box_function(workcell).map(samples)(pose, first, second)
+    held = repeated(of(handed, workcell.payload), samples)
+    box = box_function(workcell).map(samples)(pose, first, second, *held)
     outputs |= dict(zip(BOX_OUTPUTS, box, strict=True))
     no_wrench = ca.DM.zeros(6, samples)
-    moved = extended_motion(workcell.task, x, basis, waypoints)
+    moved = extended_motion(task, x, basis, waypoints, of(handed, task))
     for i in (0, 1):
         robot, contact = workcell.robots[i], workcell.contacts[i]
         follow = follow_function(robot, model.robots[i], contact, samples, f"path_arm_{i + 1}")
-        tracked = dict(
-            zip(TRACK_OUTPUTS, follow(ca.DM(model.start[i]), moved[0], no_wrench), strict=True)
-        )
+        given = of(handed, robot)
+        start = start_posture(model, i, handed)
+        found = follow(start, moved[0], no_wrench, *given.values())
+        tracked = dict(zip(TRACK_OUTPUTS, found, strict=True))
         del tracked["joint_torque"]
         arm = arm_derivative_function(robot, model.robots[i], contact, f"path_derivatives_{i + 1}")
-        derivatives = arm.map(samples)(tracked["q"], *moved)
+        derivatives = arm.map(samples)(tracked["q"], *moved, *repeated(given, samples))
         derived = dict(zip(ARM_OUTPUTS, derivatives, strict=True))
         outputs |= {f"{name}_{i + 1}": value for name, value in (tracked | derived).items()}
-    return ca.Function(
-        "path_motion", [x], list(outputs.values()), ["x"], list(outputs), {"cse": True}
-    )
+    inputs = {"x": x} | handed
+    sides = list(inputs.values()), list(outputs.values()), list(inputs), list(outputs)
+    return ca.Function("path_motion", *sides, {"cse": True})
 
 
-def extended_motion(task: Task, x: ca.MX, basis: PathBasis, waypoints: ca.MX) -> list[ca.MX]:
+def start_posture(model: CellModel, arm: int, handed: Handed) -> ca.MX:
+    """(n,) joints of an arm where the path begins."""
+    start = model.start[arm]
+    return as_mx(start, sx_given(model), of(handed, model)) if handed else ca.MX(ca.DM(start))
+
+
+def extended_motion(
+    task: Task, x: ca.MX, basis: PathBasis, waypoints: ca.MX, handed: Handed = NONE
+) -> list[ca.MX]:
     """Extended poses and their first and second derivative by u (6 + m, n), at the samples of a
     basis.
 
     Args:
         x: (n_var,) decision vector.
         waypoints: (6, n_waypoints) of the box.
+        handed: the task's numbers.
     """
-    whole = extended_matrix(task, x, waypoints)
+    whole = extended_matrix(task, x, waypoints, handed)
     matrices = (basis.position, basis.first, basis.second)
     return [ca.mtimes(whole, ca.DM(matrix.T)) for matrix in matrices]
 
@@ -117,22 +137,21 @@ def box_function(workcell: Workcell) -> ca.Function:
     rotation = rotation_matrix(turned, pose[3:])
     omega = angular_velocity(turned, pose[3:], first[3:])
     alpha = angular_acceleration(turned, pose[3:], first[3:], second[3:])
-    offset = ca.mtimes(rotation, ca.DM(payload.centre_of_mass))
-    inertia = ca.SX(ca.DM(payload.inertia))
+    offset = ca.mtimes(rotation, number(payload.centre_of_mass))
+    inertia = ca.SX(number(payload.inertia))
     outputs = {
         "rotation": ca.vec(rotation.T),
         "angular_first": omega,
         "angular_second": alpha,
-        "normal": ca.mtimes(rotation, ca.DM(workcell.contacts[0].T_box_pad[:3, 2])),
+        "normal": ca.mtimes(rotation, number(workcell.contacts[0].T_box_pad[:3, 2])),
         "force_by_acceleration": payload.mass * (first[:3] + ca.cross(omega, offset)),
         "force_by_speed": payload.mass
         * (second[:3] + ca.cross(alpha, offset) + ca.cross(omega, ca.cross(omega, offset))),
         "moment_by_acceleration": required_moment(inertia, rotation, ca.SX.zeros(3), omega),
         "moment_by_speed": required_moment(inertia, rotation, omega, alpha),
     }
-    return ca.Function(
-        "path_box", [pose, first, second], [ca.densify(outputs[name]) for name in BOX_OUTPUTS]
-    )
+    inputs = [pose, first, second, *sx_given(payload).values()]
+    return ca.Function("path_box", inputs, [ca.densify(outputs[name]) for name in BOX_OUTPUTS])
 
 
 def arm_derivative_function(
@@ -151,8 +170,8 @@ def arm_derivative_function(
     rotation = rotation_matrix(turned, pose[3:])
     omega = angular_velocity(turned, pose[3:], first[3:])
     alpha = angular_acceleration(turned, pose[3:], first[3:], second[3:])
-    lever = ca.mtimes(rotation, ca.DM(box_flange(robot, contact)[:3, 3]))
-    to_root = ca.DM(robot.T_world_base[:3, :3].T)
+    lever = ca.mtimes(rotation, number(box_flange(robot, contact)[:3, 3]))
+    to_root = number(robot.T_world_base[:3, :3].T)
     twist = ca.vertcat(
         ca.mtimes(to_root, first[:3] + ca.cross(omega, lever)), ca.mtimes(to_root, omega)
     )
@@ -185,10 +204,11 @@ def arm_derivative_function(
         "torque_at_rest": at_rest,
         "wrench_torque": ca.vec(ca.jacobian(torque, wrench).T),
     }
+    numbers = sx_given(robot)
     return ca.Function(
         name,
-        [q, *given],
+        [q, *given, *numbers.values()],
         ca.cse([ca.densify(outputs[name]) for name in ARM_OUTPUTS]),
-        ["q", *names],
+        ["q", *names, *numbers],
         list(ARM_OUTPUTS),
     )

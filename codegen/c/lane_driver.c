@@ -1,6 +1,10 @@
 /* Batches in lanes. Each lane takes one evaluation; lanes beyond the batch repeat its last. */
 DUAL_ARM_EXPORT long long dual_arm_lanes(void) { return DUAL_ARM_LANES; }
 
+/* Which arguments are the same in all lanes. */
+static const char dual_arm_shared_inputs[] = {@SHARED@};
+DUAL_ARM_EXPORT long long dual_arm_shared(long long i) { return dual_arm_shared_inputs[i]; }
+
 #if DUAL_ARM_LANES > 1
 /* The entries of one argument of evaluations k to k + m, each entry's lanes side by side. */
 static void dual_arm_gather(const dual_arm_port* port, long long size, long long k, long long m,
@@ -34,7 +38,8 @@ DUAL_ARM_EXPORT long long dual_arm_run_lanes(const dual_arm_port* ports,
     lanes_real* own = (lanes_real*)work->w;
     for (int i = 0; i < @N_IN@; ++i) {
       arg[i] = ports[i].base ? own : 0;
-      if (!ports[i].base) continue;
+      if (dual_arm_shared_inputs[i]) arg[i] = (const lanes_real*)ports[i].base;
+      if (!ports[i].base || dual_arm_shared_inputs[i]) continue;
       if (ports[i].step || k == begin) dual_arm_gather(ports + i, sizes[i], k, m, own);
       own += sizes[i];
     }

@@ -28,6 +28,12 @@ typedef long long lanes_int;
 
 LANES_INLINE lanes_real lanes_all_equal(double x) { return (lanes_real){0} + x; }
 
+/* Entry k of an argument that is the same in all lanes: not lanes but numbers, which take a fraction
+   of the memory. */
+LANES_INLINE lanes_real lanes_shared(const lanes_real* numbers, int k) {
+  return lanes_all_equal(((const double*)numbers)[k]);
+}
+
 #if DUAL_ARM_LANES == 8
 #define LANES_CONSTANT(x) {x, x, x, x, x, x, x, x}
 #elif DUAL_ARM_LANES == 4

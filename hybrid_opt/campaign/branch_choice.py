@@ -43,7 +43,7 @@ def decided_cell(
         cell = Cell(workcell, settings.objectives)
         rng = np.random.default_rng(settings.seed)
         competition = search_branches(cell, evaluations=SHARE * settings.evaluations, rng=rng)
-    return load(workcell.source, decided=competition.winner), competition
+    return load(workcell.source, decided=competition.winner, text=workcell.text), competition
 
 
 def read_branches(root: Path) -> BranchCompetition | None:

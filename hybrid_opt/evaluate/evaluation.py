@@ -52,7 +52,6 @@ from hybrid_opt.indicators.metrics import non_dominated
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.functions import CONSTRAINTS, SAMPLE_NAMES
-from symbolic.geometry.pairs import build_geometry
 from symbolic.records import Workcell
 from symbolic.records.task import extended_waypoints
 
@@ -104,7 +103,7 @@ class CandidateEvaluator:
         self._threads = threads
         self.functions = self.compiled.evaluators if functions is None else functions
         self._candidate = self.functions["candidate"]
-        self.checker = CollisionChecker(build_geometry(workcell), self.functions)
+        self.checker = CollisionChecker(self.compiled.geometry, self.functions)
         self.driver = self._driver(threads) if driver is None else driver
         self.n_var = workcell.task.n_var
         self.lower = workcell.task.lower

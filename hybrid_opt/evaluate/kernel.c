@@ -1,8 +1,9 @@
 /* Candidates in lanes, from the decision vector to the verdict on every sample.
 
-   Behind the cell's functions `path`, `begin`, `start`, `predict`, `sample`, `clearance` and
-   `piece_poses` in lanes (symbolic.functions) and the shapes' proofs (hybrid_opt/collision/prejudge.c). The
-   numbers in capitals are defined by hybrid_opt/evaluate/kernel.py. */
+   Behind the cell's functions `path`, `start`, `predict`, `sample`, `clearance` and `piece_poses` in
+   lanes (symbolic.functions) and the shapes' proofs (hybrid_opt/collision/prejudge.c). The numbers in
+   capitals are defined by hybrid_opt/evaluate/kernel.py, and per function f of the above the macro
+   f_GIVEN, which puts the cell's numbers behind its other arguments: as they are where f_SHARED. */
 
 /* A pair of one sample that neither bounds nor proofs decide. */
 typedef struct {
@@ -27,7 +28,8 @@ typedef struct {
 /* Results of n candidates, an axis over them first. wanted: per output of `sample`, (n, samples,
    size) or null. */
 typedef struct {
-  const double *x, *begin; /* begin: both arms' joints at the first box pose, or the cell's own */
+  const double *x, *begin, *numbers; /* begin: both arms' joints at the first box pose; numbers: all
+                                        groups of the cell's */
   long long n, with_collisions, all_forces, room;
   double *time, *violation, *violation_time;
   long long *first_sample, *first_reason, *reached;
@@ -41,7 +43,7 @@ typedef struct {
 #define MOST(a, b) ((a) > (b) ? (a) : (b))
 #define MOST_OF(what)                                                                        \
   MOST(MOST(MOST(path_##what, start_##what), MOST(predict_##what, sample_##what)),           \
-       MOST(MOST(clearance_##what, piece_poses_##what), begin_##what))
+       MOST(clearance_##what, piece_poses_##what))
 #ifdef FORCES_COME_LAST
 #define MOST_OF_ALL(what) MOST(MOST_OF(what), forces_##what)
 #else
@@ -52,7 +54,7 @@ typedef struct {
 typedef struct {
   lanes_real x[N_VAR], time[N_SAMPLES], pose[N_SAMPLES][POSE_SIZE], rate[N_SAMPLES][6],
       second_rate[N_SAMPLES][6], q[N_SAMPLES][2][MOST_JOINTS], state[2][2][STATE],
-      outputs[SAMPLE_SIZE], begin[2][MOST_JOINTS],
+      outputs[SAMPLE_SIZE], begin[2][MOST_JOINTS], numbers[N_NUMBERS + 1],
       clearance[N_PAIRS + 1], quaternions[4 * N_PIECES], positions[3 * N_PIECES],
       w[MOST_OF_ALL(W) + 1];
   const lanes_real* arg[MOST_OF_ALL(ARG) + 8];
@@ -72,16 +74,12 @@ static int follow(const batch_data* batch, long long first, int m) {
   lanes_mask first_sample = (lanes_mask){0} + N_SAMPLES, first_reason = (lanes_mask){0} - 1;
   lanes_mask reached = (lanes_mask){0} + N_SAMPLES;
   for (int c = 0; c < N_CONSTRAINTS; ++c) violation[c] = share[c] = zero;
-  if (batch->begin) {
-    const double* from = batch->begin;
-    for (int i = 0; i < 2; ++i)
-      for (int j = 0; j < N_JOINTS[i]; ++j) s->begin[i][j] = lanes_all_equal(*from++);
-  } else {
-    for (int i = 0; i < 2; ++i) s->res[i] = s->begin[i];
-    if (begin(s->arg, s->res, s->iw, s->w)) return 1;
-  }
+  const double* from = batch->begin;
+  for (int i = 0; i < 2; ++i)
+    for (int j = 0; j < N_JOINTS[i]; ++j) s->begin[i][j] = lanes_all_equal(*from++);
   s->arg[0] = s->pose[0];
   for (int i = 0; i < 2; ++i) s->arg[1 + i] = s->begin[i];
+  start_GIVEN(3);
   s->res[0] = s->state[0][0];
   s->res[1] = s->state[0][1];
   if (start(s->arg, s->res, s->iw, s->w)) return 1;
@@ -91,6 +89,7 @@ static int follow(const batch_data* batch, long long first, int m) {
     if (k == 1) {
       for (int i = 0; i < 2; ++i) s->arg[i] = before[i];
       s->arg[2] = s->pose[1];
+      predict_GIVEN(3);
       for (int i = 0; i < 2; ++i) s->res[i] = after[i];
       if (predict(s->arg, s->res, s->iw, s->w)) return 1;
       memcpy(before, after, sizeof s->state[0]);
@@ -99,6 +98,7 @@ static int follow(const batch_data* batch, long long first, int m) {
     s->arg[1] = s->rate[k];
     s->arg[2] = s->second_rate[k];
     for (int i = 0; i < 2; ++i) s->arg[3 + i] = before[i];
+    sample_GIVEN(5);
     for (int i = 0; i < 2; ++i) s->res[i] = after[i];
     for (int o = 0; o < N_OUTPUTS; ++o) s->res[AFTER_STATES + o] = s->outputs + OUTPUT_AT[o];
     if (sample(s->arg, s->res, s->iw, s->w)) return 1;
@@ -163,6 +163,7 @@ static int press(const batch_data* batch, long long row, int l) {
     s->arg[1] = rate;
     s->arg[2] = second_rate;
     for (int a = 0; a < 2; ++a) s->arg[3 + a] = q[a];
+    forces_GIVEN(5);
     for (int o = 0; o <= N_FORCES; ++o) s->res[o] = found + FORCES_AT[o];
     if (forces(s->arg, s->res, s->iw, s->w)) return 1;
     for (int o = 0; o < N_FORCES; ++o) {
@@ -272,6 +273,7 @@ static int collide(batch_data* batch, const judge_data* judge, long long first, 
     s->arg[0] = s->pose[k];
     for (int i = 0; i < 2; ++i) s->arg[1 + i] = s->q[k][i];
     s->res[0] = s->clearance;
+    clearance_GIVEN(3);
     if (clearance(s->arg, s->res, s->iw, s->w)) return 1;
     unsigned colliding = 0;
     long long kept = batch->n_open;
@@ -283,6 +285,7 @@ static int collide(batch_data* batch, const judge_data* judge, long long first, 
       if (!placed_already) {
         s->arg[0] = s->pose[k];
         for (int i = 0; i < 2; ++i) s->arg[1 + i] = s->q[k][i];
+        piece_poses_GIVEN(3);
         s->res[0] = s->quaternions;
         s->res[1] = s->positions;
         if (piece_poses(s->arg, s->res, s->iw, s->w)) return 1;
@@ -325,6 +328,7 @@ DUAL_ARM_EXPORT long long dual_arm_evaluate(batch_data* batch, const judge_data*
   }
   scratch* s = own;
   batch->n_open = 0;
+  for (int j = 0; j < N_NUMBERS; ++j) s->numbers[j] = lanes_all_equal(batch->numbers[j]);
   for (long long first = from; first < batch->n; first += DUAL_ARM_LANES) {
     if (batch->room - batch->n_open < DUAL_ARM_LANES * (long long)N_SAMPLES * N_PAIRS)
       return first;
@@ -333,6 +337,7 @@ DUAL_ARM_EXPORT long long dual_arm_evaluate(batch_data* batch, const judge_data*
       for (int l = 0; l < DUAL_ARM_LANES; ++l)
         ((double*)(s->x + j))[l] = batch->x[(first + (l < m ? l : m - 1)) * N_VAR + j];
     s->arg[0] = s->x;
+    path_GIVEN(1);
     s->res[0] = s->time;
     s->res[1] = s->pose[0];
     s->res[2] = s->rate[0];

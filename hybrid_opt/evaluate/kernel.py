@@ -4,8 +4,8 @@ Whole evaluations run in lanes: `kernel.c` calls the cell's functions sample by 
 candidates side by side, sums up the violations, bounds every pair's distance, and proves of most
 pairs that the bounds leave open that they are apart or intersect; the rest is left to FCL.
 Quantities per sample leave it only where they are asked for. `one_by_one` says the same in NumPy,
-from the outputs of the candidate function: the kernel's oracle, and what judges cells that were
-not read from a file and candidates of the time law 'optimal'.
+from the outputs of the candidate function: the kernel's oracle, and what judges candidates of the
+time law 'optimal'.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ from symbolic.functions import (
     FORCE_CONSTRAINTS,
     force_sizes,
     forces_come_last,
+    kernel_functions,
+    kernel_numbers,
     sample_sizes,
 )
 from symbolic.geometry.pairs import CellGeometry
@@ -114,13 +116,20 @@ class Kernel:
         lanes: candidates side by side.
     """
 
-    def __init__(self, library: ctypes.CDLL, checker: CollisionChecker) -> None:
-        """Prepare the shapes; `load_kernel` gives the library."""
+    def __init__(
+        self, library: ctypes.CDLL, checker: CollisionChecker, numbers: Array, start: Array
+    ) -> None:
+        """Prepare the shapes; `load_kernel` gives the library.
+
+        Args:
+            numbers: (n,) of the cell, its groups one after the other.
+            start: joints of both arms, side by side, that hold the box at the start.
+        """
         self._evaluate = library.dual_arm_evaluate
         self._evaluate.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong]
         self._evaluate.restype = ctypes.c_longlong
         self.lanes = int(library.dual_arm_lanes())
-        self._checker = checker
+        self._checker, self._numbers, self._start = checker, numbers, start
         workcell = checker.geometry.workcell
         self._samples = workcell.task.samples
         self._sizes = sample_sizes(workcell)
@@ -215,7 +224,8 @@ class Kernel:
         pointers = (ctypes.c_void_p * len(wanted))(*wanted)
         batch = BatchData(
             n=n,
-            begin=None if begin is None else begin.ctypes.data,
+            begin=(self._start if begin is None else begin).ctypes.data,
+            numbers=self._numbers.ctypes.data,
             room=self._room,
             wanted=ctypes.addressof(pointers),
             open=room.ctypes.data,
@@ -249,7 +259,7 @@ def load_kernel(
     outputs: Callable[[Array], Mapping[str, Array]],
     lanes: int = 0,
 ) -> Kernel | None:
-    """The kernel of a cell that was read from a file.
+    """The kernel of a cell.
 
     It is only used where it gives the bits of the functions that it is made of.
 
@@ -258,21 +268,20 @@ def load_kernel(
         lanes: candidates side by side; 0 for what suits the machine.
 
     Returns:
-        None for a cell that was not read from a file or a machine without lanes; with one warning
-        where the kernel fails.
+        None on a machine without lanes; with one warning where the kernel fails.
     """
-    key = compiled.key("kernel")
-    if key is None:
-        return None
 
     def make() -> Mapping[str, Any]:
-        from symbolic.functions import kernel_functions
+        return kernel_functions(compiled.symbols)
 
-        return kernel_functions(compiled.model)
-
-    own = _definitions(checker.geometry) + "".join(
-        files("hybrid_opt").joinpath(*path).read_text()
-        for path in (("collision", "prejudge.c"), ("evaluate", "kernel.c"))
+    values, key = compiled.numbers.values, compiled.key("kernel")
+    own = (
+        _definitions(checker.geometry)
+        + _given(compiled)
+        + "".join(
+            files("hybrid_opt").joinpath(*path).read_text()
+            for path in (("collision", "prejudge.c"), ("evaluate", "kernel.c"))
+        )
     )
     try:
         library = load_or_build_program("kernel", key, make, own, compiled.cache, lanes)
@@ -281,7 +290,8 @@ def load_kernel(
         return None
     if library.dual_arm_lanes() < 2:
         return None
-    kernel = Kernel(library, checker)
+    groups = [np.zeros(0), *values.values()]
+    kernel = Kernel(library, checker, np.concatenate(groups), np.concatenate(compiled.start))
     task = compiled.workcell.task
     x = np.random.default_rng(0).uniform(task.lower, task.upper, (kernel.lanes + 1, task.n_var))
     every = tuple(sample_sizes(compiled.workcell))
@@ -349,6 +359,22 @@ def _definitions(geometry: CellGeometry) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _given(compiled: CompiledCell) -> str:
+    """Macros of kernel.c: where each function's numbers are among all groups."""
+    numbers = compiled.numbers
+    sizes = [len(values) for values in numbers.values.values()]
+    at = dict(zip(numbers.values, np.cumsum([0, *sizes]).tolist(), strict=False))
+    lines = [f"#define N_NUMBERS {sum(sizes)}"]
+    for name, groups in kernel_numbers(numbers.workcell, numbers.screen).items():
+        parts = [
+            f"s->arg[(k) + {i}] = {name}_SHARED ? (const lanes_real*)(batch->numbers + {at[group]})"
+            f" : s->numbers + {at[group]};"
+            for i, group in enumerate(groups)
+        ]
+        lines.append(f"#define {name}_GIVEN(k) {' '.join(parts)}")
+    return "\n".join(lines) + "\n"
+
+
 def configuration_size(workcell: Workcell) -> int:
     """Entries of a configuration: box pose, joints of the first and of the second arm."""
     return POSE_SIZE + sum(len(robot.position_lower) for robot in workcell.robots)
@@ -381,7 +407,7 @@ class BatchData(ctypes.Structure):
     """`batch_data` of kernel.c."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("x", "begin")),
+        *((name, ctypes.c_void_p) for name in ("x", "begin", "numbers")),
         *((name, ctypes.c_longlong) for name in ("n", "with_collisions", "all_forces", "room")),
         *((name, ctypes.c_void_p) for name in ("time", "violation", "violation_time")),
         *((name, ctypes.c_void_p) for name in ("first_sample", "first_reason", "reached")),

@@ -34,6 +34,7 @@ from symbolic.geometry.pairs import (
     ignored_pairs,
 )
 from symbolic.geometry.pieces import support
+from symbolic.geometry.screen import screen_of
 from symbolic.records import PAYLOAD, AllowedContact, Waypoint, Workcell
 
 if TYPE_CHECKING:
@@ -81,15 +82,19 @@ class JobCollisions:
         """
         self._workcell = compiled.workcell
         self.geometry = job_geometry(compiled.workcell)
+        job = screen_of(self.geometry)
+        pairs = {name: getattr(job, name) for name in ("active", "own", "slanted")}
 
         def make(model: CellModel) -> Mapping[str, ca.Function]:
             # Not imported at the top: a warm start needs no CasADi.
             from symbolic.geometry.clearance import with_more_pairs
 
             placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
-            return with_more_pairs(model.screening, model.geometry, self.geometry, placements)
+            screen = replace(model.screen, **pairs)
+            known = model.screening, model.geometry
+            return with_more_pairs(*known, self.geometry, placements, screen)
 
-        self._functions = compiled.functions("job", make, lanes=0)
+        self._functions = compiled.functions("job", make, str(pairs), lanes=0)
 
     def standing(self, pose: Array, height: float | None) -> Standing:
         """Where the box stands below a pose (6,).

@@ -81,6 +81,7 @@ class RowFunctions:
         """known: by name; compiled: what compiles others and keeps them, None interprets them."""
         self.model, self._known = model, dict(known)
         self._place, self._cell = Place(model), compiled
+        self._symbols = cache(Place)
         self.numbers = lru_cache(maxsize=None)(self._numbers)
         self.obstacle = lru_cache(maxsize=None)(self._place.obstacle)
         self.separable = frozenset(self._place.separable())
@@ -90,14 +91,14 @@ class RowFunctions:
         name = row_name(constraint.family, order)
         if name not in self._known:
 
-            def make() -> dict[str, ca.Function]:
-                return {name: row_function(self._place, constraint, order)}
+            def make(model: CellBodies) -> dict[str, ca.Function]:
+                return {name: row_function(self._symbols(model), constraint, order)}
 
-            level = LATER_LEVELS[order]
+            level = {name: LATER_LEVELS[order]}
             self._known[name] = (
-                InterpretedFunction(make()[name])
+                InterpretedFunction(row_function(self._place, constraint, order))
                 if self._cell is None
-                else self._cell.made(f"polish {name}", make, str(level), levels={name: level})[name]
+                else self._cell.functions(f"polish {name}", make, str(level), levels=level)[name]
             )
         return self._known[name]
 
@@ -150,37 +151,42 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
         DualArmError: the cell's model cannot be built, or its functions not be compiled.
     """
     quantities = quantities_of(compiled.workcell)
-
-    @cache
-    def make() -> dict[str, ca.Function]:
-        model = compiled.model
-        place, functions = Place(model), dict[str, ca.Function]()
-        for quantity in quantities:
-            functions |= sample_functions(model.workcell, quantity)
-        if "load" in quantities:
-            functions |= held_functions(model.workcell)
-        for arm in ARMS:
-            functions |= closure_functions(model, arm)
-        for constraint in COMPILED:
-            for order in ORDERS:
-                name = row_name(constraint.family, order)
-                functions[name] = row_function(place, constraint, order)
-        return functions | {GAPS: gap_function(place)}
-
     ends = {f"{q}_{block}_first" for q in quantities for block in ("first", "last", "path")}
     levels = dict.fromkeys(sorted(_names(quantities) - ends), 1)
 
-    def in_lanes(_: CellModel) -> dict[str, ca.Function]:
-        return {name: f for name, f in make().items() if name in levels}
+    @cache
+    def samples(model: CellModel) -> dict[str, ca.Function]:
+        found = [sample_functions(model.workcell, quantity) for quantity in quantities]
+        found += [closure_functions(model, arm) for arm in ARMS]
+        return {name: function for functions in found for name, function in functions.items()}
 
-    def one_by_one(_: CellModel) -> dict[str, ca.Function]:
-        return {name: f for name, f in make().items() if name not in levels}
+    def in_lanes(model: CellModel) -> dict[str, ca.Function]:
+        return {name: f for name, f in samples(model).items() if name in levels}
+
+    def one_by_one(model: CellModel) -> dict[str, ca.Function]:
+        return {name: f for name, f in samples(model).items() if name not in levels}
+
+    def rows(model: CellModel) -> dict[str, ca.Function]:
+        place = Place(model)
+        found = {
+            row_name(constraint.family, order): row_function(place, constraint, order)
+            for constraint in COMPILED
+            for order in ORDERS
+        }
+        return found | {GAPS: gap_function(place)}
 
     details = str(levels)
-    built = compiled.functions("polish in lanes", in_lanes, details, levels=levels, lanes=0)
-    built |= compiled.functions("polish", one_by_one, details)
+    built = compiled.functions(
+        "polish in lanes", in_lanes, details, levels=levels, lanes=0, bodies=False
+    )
+    built |= compiled.functions("polish", one_by_one, details, bodies=False)
+    built |= compiled.functions("polish rows", rows, details, levels=levels, lanes=0)
+    if "load" in quantities:
+        built |= compiled.made(
+            "held", lambda: held_functions(compiled.workcell), levels=levels, lanes=0
+        )
     if compiled.workcell.task.time_law == "optimal":
-        built |= compiled.functions("driven", driven_functions, lanes=0)
+        built |= compiled.functions("driven", driven_functions, lanes=0, bodies=False)
     return PolishFunctions(built, RowFunctions(compiled.bodies, built, compiled))
 
 

@@ -201,6 +201,7 @@ class _InterpretedCell(CompiledCell):
         *details: str,
         lanes: int = 1,
         levels: Mapping[str, int] | None = None,
+        bodies: bool = True,
     ) -> dict[str, NumericFunction]:
         return {
             name: InterpretedFunction(dense(function))

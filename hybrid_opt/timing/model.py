@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from codegen.function import NumericFunction
 from hybrid_opt.carry import ArmMotion, Carry, carry_under_time_law, joints_of
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.path_motion import SAMPLED, PathMotion
@@ -16,7 +15,7 @@ from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
-from symbolic.functions import candidate_function, timing_functions
+from symbolic.functions import timing_functions
 from symbolic.read.arms import arm_model
 from symbolic.records import Robot, Workcell
 
@@ -84,7 +83,7 @@ class TimingModel:
         def make(model: CellModel) -> dict[str, ca.Function]:
             return timing_functions(model, samples)
 
-        self._functions = self._compiled.functions("timing", make, str(samples))
+        self._functions = self._compiled.functions("timing", make, str(samples), bodies=False)
 
     def path_motion(self, x: Array) -> PathMotion:
         """The geometry at `REFINEMENT` samples per interval, uniform in u.
@@ -224,7 +223,7 @@ class TimingModel:
     def search_carry(self, x: Array) -> Carry:
         """The carry under the task's own time law, see `hybrid_opt.carry`."""
         x = self._checked(x)
-        functions = self._search_functions
+        functions = self._compiled.evaluators
         if self.workcell.task.time_law != "optimal":
             return carry_under_time_law(self.workcell, functions, x, functions["candidate"](x))
         outputs = self._driver.outputs(functions["candidate"], x[None])
@@ -238,19 +237,6 @@ class TimingModel:
         from hybrid_opt.timing.path_timer import PathTimer
 
         return Driver(PathTimer(self._compiled), robust=self._robust)
-
-    @cached_property
-    def _search_functions(self) -> Mapping[str, NumericFunction]:
-        if self._compiled.is_identified:
-            return self._compiled.evaluators
-
-        def make(model: CellModel) -> dict[str, ca.Function]:
-            return {"candidate": candidate_function(model)} | {
-                f"inverse_dynamics_{i + 1}": robot.inverse_dynamics
-                for i, robot in enumerate(model.robots)
-            }
-
-        return self._compiled.functions("search carry", make)
 
     def _checked(self, x: Array) -> Array:
         x = np.ascontiguousarray(x, dtype=float)

@@ -60,8 +60,9 @@ def passes_function(
     if workcell.task.allocation == "joint":
         return None  # the passes know normal forces in closed form, and no others
     details = (str(intervals), str(cuts), source_digest(__name__), _passes_c())
-    key = compiled.key("path timing", *details)
-    return load_or_compile(key, lambda: _source(workcell, intervals, cuts), cache)
+    key = compiled.key("path timing", *details, bodies=False)
+    made = load_or_compile(key, lambda: _source(compiled.symbols.workcell, intervals, cuts), cache)
+    return compiled.bound(made)
 
 
 def _passes_c() -> str:
@@ -71,6 +72,7 @@ def _passes_c() -> str:
 def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, str]:
     # Not imported at the top: a warm start needs no CasADi.
     from codegen.source import handwritten_source
+    from symbolic.expression import sx_given
     from symbolic.limits import force_functions, limit_layout, ratio_functions
 
     layout = limit_layout(workcell)
@@ -80,8 +82,10 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
         "SIZE": layout.size,
         "RATIOS": layout.joints + 2,
         "CUTS": cuts,
+        "HELD": 3 if cuts else 2,
         **{f"AT_{name.upper()}": place for name, place in layout.offsets.items()},
     }
+    held = sx_given(workcell.payload)
     text = "".join(
         [
             *[f"#define {name} {value}\n" for name, value in constants.items()],
@@ -90,11 +94,12 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
     )
     signature = Signature(
         "path_timing",
-        ("samples", "options", *(("cuts",) if cuts else ())),
+        ("samples", "options", *(("cuts",) if cuts else ()), *held),
         ("status", "interval", "duration", "peak", "use", "squared", "sweeps", "slowed"),
         (
             *((2 * intervals + 1, layout.size), (4,)),
             *(((2 * intervals + 1, cuts, 3),) if cuts else ()),
+            *((int(symbols.numel()),) for symbols in held.values()),
         ),
         ((), (), (), (2,), (len(KINDS), 3), (intervals + 1,), (), ()),
     )

@@ -123,7 +123,9 @@ class PathTimer:
                 "sample_limits": sample_limits_function(model),
             }
 
-        functions = compiled.functions("path limits", make, str(intervals), lanes=lanes)
+        functions = compiled.functions(
+            "path limits", make, str(intervals), lanes=lanes, bodies=False
+        )
         self._path, self._limits = functions["path"], functions["sample_limits"]
         self._passes = passes_function(compiled, intervals)
         # Made here: the cell's files may be gone when the first path is timed.

@@ -34,17 +34,29 @@ def regenerate(options: argparse.Namespace) -> int:
         build_study(Cell.load(options.workcell), Progress())
         seconds = time.perf_counter() - begin
     elif options.workcell is not None:
-        from hybrid_opt.compiled_cell import EVALUATOR_LANES, EVALUATORS, CompiledCell
-        from symbolic.functions import cell_functions
+        from hybrid_opt.compiled_cell import EVALUATOR_LANES, EVALUATORS, SCREENING, CompiledCell
+        from symbolic.functions import arm_functions
+        from symbolic.numbers import GROUPS
         from symbolic.read.cell import load
 
         workcell = load(options.workcell)
         cell = CompiledCell(workcell, cache)
-        made = cell_functions(cell.model)
-        key = cell.key(EVALUATORS)
-        built = build(made, cache, key=key, rebuild=options.check, lanes=EVALUATOR_LANES)
+        how = {"rebuild": options.check, "lanes": EVALUATOR_LANES}
+        sets = [
+            (arm_functions(cell.symbols), cell.key(EVALUATORS, bodies=False)),
+            (cell.symbols.screening, cell.key(SCREENING)),
+        ]
+        builds = [build(functions, cache, key=key, **how) for functions, key in sets]
+        made = {name: function for functions, _ in sets for name, function in functions.items()}
+        built = Build(
+            {name: function for each in builds for name, function in each.functions.items()},
+            tuple(report for each in builds for report in each.reports),
+            {name: key for each in builds for name, key in each.keys.items()},
+        )
         if options.check:
             bounds = {"x": (workcell.task.lower, workcell.task.upper)}
+            # The cell's own numbers, whatever is drawn.
+            bounds |= {name: (cell.vector(name),) * 2 for name in GROUPS}
             rng = np.random.default_rng(options.seed)
             comparisons = [
                 compare(function, built.functions[name], bounds, rng, options.samples, cache)

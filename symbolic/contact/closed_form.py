@@ -5,16 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
-import numpy as np
 
 from symbolic.contact.paper import allocate, pressure_shift
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
 from symbolic.expression import Expression
 from symbolic.records import Allocation, Workcell
-
-OFFSET = 1e-9
-"""Distance between contacts, seen along their normals, from which on they count as beside one
-another [m]."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +102,7 @@ def _by_soft_fingers(workcell: Workcell, asked: Asked, detached: Detached | None
         (arms[0], arms[1]),
         asked.friction,
         (patches[0], patches[1]),
-        are_beside(workcell),
+        workcell.has_pads_beside,
         detached,
     )
     force_1 = ca.mtimes(axes, ca.vertcat(held.tangent_1, held.normal[0]))
@@ -129,11 +124,3 @@ def _by_soft_fingers(workcell: Workcell, asked: Asked, detached: Detached | None
         point,
         point - moment_1 - moment_2,
     )
-
-
-def are_beside(workcell: Workcell) -> bool:
-    """Whether the contacts lie beside one another, seen along their normals."""
-    first, second = (contact.T_box_pad[:3, 3] for contact in workcell.contacts)
-    normal = workcell.contacts[0].T_box_pad[:3, 2]
-    apart = first - second
-    return bool(np.linalg.norm(apart - (apart @ normal) * normal) > OFFSET)

@@ -10,13 +10,12 @@ two, the paper has no result: `symbolic.contact.grasp` alone answers.
 from __future__ import annotations
 
 import casadi as ca
-import numpy as np
 
 from symbolic.contact.closed_form import Asked, held_by
 from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp, balance_of, facing_wrenches, grasp_wrenches
 from symbolic.contact.paper import required_force, required_moment
-from symbolic.expression import Expression
+from symbolic.expression import Expression, as_mx, mx_given, number, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.records import Allocation, Workcell
 
@@ -68,17 +67,24 @@ def load_function(workcell: Workcell) -> ca.Function:
     Inputs: pose, rate, second_rate (6,) as in `symbolic.path.time_law.TimedPath`.
     Outputs: see `LOAD_OUTPUTS`.
     """
-    kind = ca.MX if workcell.task.allocation == "joint" else ca.SX
-    motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    friction = kind([contact.friction for contact in workcell.contacts])
-    centre_of_mass = kind(ca.DM(workcell.payload.centre_of_mass))
-    return ca.Function(
-        "load",
-        motion,
-        uncertain_load_function(workcell).call([*motion, friction, centre_of_mass]),
-        ["pose", "rate", "second_rate"],
-        list(LOAD_OUTPUTS),
-    )
+    is_joint = workcell.task.allocation == "joint"
+    kind, payload = ca.MX if is_joint else ca.SX, workcell.payload
+    names = ["pose", "rate", "second_rate"]
+    motion = [kind.sym(name, 6) for name in names]
+    own = [frictions(workcell), ca.SX(number(payload.centre_of_mass))]
+    given: dict[str, ca.SX | ca.MX] = sx_given(payload)
+    if is_joint:
+        handed = mx_given(payload)
+        own = [as_mx(value, given, handed) for value in own]
+        given = handed
+    outputs = uncertain_load_function(workcell).call([*motion, *own, *given.values()])
+    inputs = [*motion, *given.values()]
+    return ca.Function("load", inputs, outputs, [*names, *given], list(LOAD_OUTPUTS))
+
+
+def frictions(workcell: Workcell) -> ca.SX:
+    """(2,) Coulomb coefficients of the contacts."""
+    return ca.vertcat(*[ca.SX(number(contact.friction)) for contact in workcell.contacts])
 
 
 def resultant_force(
@@ -115,8 +121,9 @@ def closed_load_function(workcell: Workcell, allocation: Allocation) -> ca.Funct
     pose, rate, second, friction, centre_of_mass = inputs.values()
     contacts = workcell.contacts
     rotation, omega, alpha, force, moment = _required(workcell, pose, rate, second, centre_of_mass)
-    arms = tuple(ca.mtimes(rotation, ca.DM(c.T_box_pad[:3, 3]) - centre_of_mass) for c in contacts)
-    axes = ca.mtimes(rotation, ca.DM(contacts[0].T_box_pad[:3, :3]))
+    points = [number(contact.T_box_pad[:3, 3]) for contact in contacts]
+    arms = [ca.mtimes(rotation, point - centre_of_mass) for point in points]
+    axes = ca.mtimes(rotation, number(contacts[0].T_box_pad[:3, :3]))
     held = held_by(workcell, allocation, Asked(force, moment, (arms[0], arms[1]), axes, friction))
     outputs = {
         "angular_velocity": omega,
@@ -132,25 +139,27 @@ def closed_load_function(workcell: Workcell, allocation: Allocation) -> ca.Funct
         "wrench_1": ca.vertcat(held.force_1, held.moment_1),
         "wrench_2": ca.vertcat(held.force_2, held.moment_2),
     }
-    return _named(inputs, {name: ca.densify(value) for name, value in outputs.items()})
+    outputs = {name: ca.densify(value) for name, value in outputs.items()}
+    return _named(inputs | sx_given(workcell.payload), outputs)
 
 
 def _joint_load_function(workcell: Workcell) -> ca.Function:
     """The paper's result where the patches suffice for it, and the joint allocation elsewhere."""
-    inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
+    given = mx_given(workcell.payload)
+    inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()} | given
     found = closed_load_function(workcell, "paper")(*inputs.values())
     paper = dict(zip(LOAD_OUTPUTS, found, strict=True))
     force = paper["contact_force"][:3] + paper["contact_force"][3:]
     shift = "pressure_shift" if workcell.has_facing_pads else "shift_vector"
     suffices = _suffices_function(workcell)(
-        inputs["pose"], paper[shift], paper["moment_residual"], force
+        inputs["pose"], paper[shift], paper["moment_residual"], force, *given.values()
     )
     kept = [paper[name] for name in GRASP_OUTPUTS]
     passed = [
         ca.MX.sym(name, value.shape[0]) for name, value in zip(GRASP_OUTPUTS, kept, strict=True)
     ]
     asked = [inputs["pose"], force, paper["required_moment"], inputs["friction"]]
-    asked.append(inputs["centre_of_mass"])
+    asked += [inputs["centre_of_mass"], *given.values()]
     unused = [ca.MX.sym("unused", value.shape[0]) for value in asked]
     anew = _sample_function(workcell)
     choice = ca.Function.if_else(
@@ -168,13 +177,15 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
     inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
     names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
     given = [ca.SX.sym(name, size) for name, size in SIZES.items() if name != "friction"]
-    required = ca.Function("required", given, _required(workcell, *given)[1:])
-    found = required(*[inputs[name] for name in SIZES if name != "friction"])
+    numbers, handed = sx_given(workcell.payload), mx_given(workcell.payload)
+    required = ca.Function("required", [*given, *numbers.values()], _required(workcell, *given)[1:])
+    asked_of = [inputs[name] for name in SIZES if name != "friction"]
+    found = required(*asked_of, *handed.values())
     outputs = dict(zip(names, found, strict=True))
     asked = (inputs["pose"], outputs["force"], outputs["required_moment"])
-    held = _sample_function(workcell)(*asked, inputs["friction"], inputs["centre_of_mass"])
-    outputs |= dict(zip(GRASP_OUTPUTS, held, strict=True))
-    return _named(inputs, outputs)
+    further = (inputs["friction"], inputs["centre_of_mass"], *handed.values())
+    outputs |= dict(zip(GRASP_OUTPUTS, _sample_function(workcell)(*asked, *further), strict=True))
+    return _named(inputs | handed, outputs)
 
 
 def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
@@ -199,7 +210,7 @@ def _required(
     alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
     offset = ca.mtimes(rotation, centre_of_mass)
     force = resultant_force(workcell.payload.mass, offset, omega, alpha, second[:3])
-    moment = required_moment(ca.SX(ca.DM(workcell.payload.inertia)), rotation, omega, alpha)
+    moment = required_moment(ca.SX(number(workcell.payload.inertia)), rotation, omega, alpha)
     return [rotation, omega, alpha, force, moment]
 
 
@@ -210,8 +221,8 @@ def _suffices_function(workcell: Workcell) -> ca.Function:
     """
     sizes = (("pose", 6), ("shift", 2 if workcell.has_facing_pads else 6), ("rest", 3), ("f", 3))
     pose, shift, residual, force = inputs = [ca.SX.sym(*entry) for entry in sizes]
-    points = [contact.T_box_pad[:3, 3] for contact in workcell.contacts]
-    distance = float(np.linalg.norm(points[0] - points[1]))
+    points = [number(contact.T_box_pad[:3, 3]) for contact in workcell.contacts]
+    distance = ca.norm_2(points[0] - points[1])
     carried = ca.sumsqr(residual) <= (RESIDUAL_TOLERANCE * distance) ** 2 * ca.sumsqr(force)
     rotation = rotation_matrix(workcell.task.orientation, pose[3:])
     within = []
@@ -219,7 +230,7 @@ def _suffices_function(workcell: Workcell) -> ca.Function:
         if workcell.has_facing_pads:
             within.append(shift[i] <= contact.patch_radius)
             continue
-        axes = ca.mtimes(rotation, ca.DM(contact.T_box_pad[:3, :2]))
+        axes = ca.mtimes(rotation, number(contact.T_box_pad[:3, :2]))
         moved = ca.mtimes(axes.T, shift[3 * i : 3 * i + 3])
         if contact.half_sides is None:
             within.append(_length(moved) <= contact.patch_radius)
@@ -227,41 +238,50 @@ def _suffices_function(workcell: Workcell) -> ca.Function:
             x, y = contact.half_sides
             within.append(ca.logic_and(ca.fabs(moved[0]) <= x, ca.fabs(moved[1]) <= y))
     holds = ca.logic_and(ca.logic_and(within[0], within[1]), carried)
-    return ca.Function("suffices", inputs, [holds])
+    return ca.Function("suffices", [*inputs, *sx_given(workcell.payload).values()], [holds])
 
 
 def _sample_function(workcell: Workcell) -> ca.Function:
     """pose, force, moment (world), friction and centre of mass to the outputs `GRASP_OUTPUTS`."""
-    inputs = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES]
+    inputs, given = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES], mx_given(workcell.payload)
     pose, force, moment, friction, centre_of_mass = inputs
     asked = (pose, force, moment, centre_of_mass)
     if workcell.has_facing_pads:
-        wrenches = _facing_wrenches(workcell, asked, friction)
+        wrenches = _facing_wrenches(workcell, asked, friction, list(given.values()))
     else:
         load = box_load_function(workcell)(*asked)
         wrenches = grasp_wrenches(Grasp(workcell), load, friction)
-    return ca.Function("grasp_sample", inputs, grasp_world_function(workcell)(*asked, wrenches))
+    outputs = grasp_world_function(workcell)(*asked, wrenches, *given.values())
+    return ca.Function("grasp_sample", [*inputs, *given.values()], outputs)
 
 
 def _facing_wrenches(
-    workcell: Workcell, asked: tuple[ca.MX, ca.MX, ca.MX, ca.MX], friction: ca.MX
+    workcell: Workcell,
+    asked: tuple[ca.MX, ca.MX, ca.MX, ca.MX],
+    friction: ca.MX,
+    given: list[ca.MX],
 ) -> ca.MX:
     """As `symbolic.contact.grasp.grasp_wrenches`, of two round pads that face one another, from the
     inputs of `box_load_function`."""
     pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
-    first, second = (contact.T_box_pad for contact in workcell.contacts)
-    in_box = ca.DM(first[:3, :3])
+    first, second = (number(contact.T_box_pad) for contact in workcell.contacts)
+    numbers = sx_given(workcell.payload).values()
+    in_box = first[:3, :3]
     to_pad = ca.mtimes(rotation_matrix(workcell.task.orientation, pose[3:]), in_box).T
-    arms = [ca.mtimes(in_box.T, ca.DM(T[:3, 3]) - centre_of_mass) for T in (first, second)]
+    arms = [ca.mtimes(in_box.T, T[:3, 3] - centre_of_mass) for T in (first, second)]
     needed = (ca.mtimes(to_pad, force), ca.mtimes(to_pad, moment))
-    balance = ca.Function("balance", inputs, [balance_of(*needed, (arms[0], arms[1]))])
-    radius = ca.DM([contact.patch_radius for contact in workcell.contacts])
-    found = facing_wrenches(balance(*asked), friction, radius)
+    outputs = [
+        balance_of(*needed, (arms[0], arms[1])),
+        ca.vertcat(*[ca.SX(number(contact.patch_radius)) for contact in workcell.contacts]),
+    ]
+    balance, radius = ca.Function("balance", [*inputs, *numbers], outputs)(*asked, *given)
+    found = facing_wrenches(balance, friction, radius)
     # Pad 2 has its own tangents, and its normal is the opposite.
-    turn = ca.DM((second[:3, :3].T @ first[:3, :3])[:2, :2])
-    own = ca.diagcat(ca.DM.eye(WRENCH_SIZE), 1.0, turn, turn, -1.0)
+    turn = ca.SX(ca.mtimes(second[:3, :2].T, first[:3, :2]))
+    own = ca.diagcat(ca.SX.eye(WRENCH_SIZE), 1.0, turn, turn, -1.0)
     wrenches = ca.SX.sym("w", 2 * WRENCH_SIZE)
-    return ca.Function("in_pads", [wrenches], [ca.mtimes(own, wrenches)])(found)
+    in_pads = ca.Function("in_pads", [wrenches, *numbers], [ca.mtimes(own, wrenches)])
+    return in_pads(found, *given)
 
 
 def _length(vector: Expression) -> Expression:
@@ -313,14 +333,14 @@ def grasp_world_function(workcell: Workcell) -> ca.Function:
     forces, moments, shifts = [zero] * 2, [zero] * 2, [zero] * 2
     point, left = moment, moment
     for pad, robot, own in zip(pads, robots, ca.vertsplit(wrenches, WRENCH_SIZE), strict=True):
-        axes = ca.mtimes(rotation, ca.DM(pad.T_box_pad[:3, :3]))
+        axes = ca.mtimes(rotation, number(pad.T_box_pad[:3, :3]))
         pushed = ca.mtimes(axes, ca.vertcat(own[1:3], own[0]))
         # A normal force N n at d turns about d x n = (d_y, -d_x).
         turned = ca.mtimes(axes, ca.vertcat(own[4], -own[3], own[5]))
         shift = own[3:5] / ca.fmax(own[0], LEAST_FORCE)
         first = workcell.contacts[robot]
-        beside = ca.mtimes(rotation, ca.DM(pad.T_box_pad[:3, 3] - first.T_box_pad[:3, 3]))
-        arm = ca.mtimes(rotation, ca.DM(pad.T_box_pad[:3, 3]) - centre_of_mass)
+        beside = ca.mtimes(rotation, number(pad.T_box_pad[:3, 3] - first.T_box_pad[:3, 3]))
+        arm = ca.mtimes(rotation, number(pad.T_box_pad[:3, 3]) - centre_of_mass)
         normal[robot] += own[0]
         tangential[robot] += _length(own[1:3])
         longest[robot] = ca.fmax(longest[robot], _length(shift))
@@ -343,6 +363,6 @@ def grasp_world_function(workcell: Workcell) -> ca.Function:
     }
     return ca.Function(
         "grasp_world",
-        [*inputs, wrenches],
+        [*inputs, wrenches, *sx_given(workcell.payload).values()],
         ca.cse([ca.densify(outputs[name]) for name in GRASP_OUTPUTS]),
     )

@@ -30,8 +30,9 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.expression import Expression
+from symbolic.expression import Expression, number
 from symbolic.records import Contact
+from symbolic.records.numbered import NumberedContact
 
 NEWTON_STEPS = 5
 """For given tangential forces; the equation is nearly linear."""
@@ -83,6 +84,8 @@ class SoftPatch:
             contact: of a round or rectangular patch.
             axes: (3, 3) those of contact 1 in the box frame.
         """
+        if isinstance(contact, NumberedContact):
+            return cls(contact.twist, contact.spread)
         in_pad = contact.T_box_pad[:3, :2].T @ axes[:, :2]
         if contact.half_sides is None:
             return cls(2.0 / 3.0 * contact.patch_radius, contact.patch_radius * in_pad)
@@ -124,7 +127,7 @@ def torsion_capacity(
     squared = ca.sumsqr(tangent) + FORCE_FLOOR**2
     bound = grip**2 + squared
     s = grip**2 / bound
-    spread = ca.mtimes(ca.DM(patch.spread), tangent)
+    spread = ca.mtimes(number(patch.spread), tangent)
     half = ca.sqrt(ca.sumsqr(spread) / squared + 1e-24) / 2.0
     bend = BEND * patch.twist
     # h / 2 + s (c - h / 2) - bend s (1 - s)

@@ -24,7 +24,6 @@ from typing import Any
 import casadi as ca
 
 from symbolic.contact.central_path import least_effort
-from symbolic.contact.closed_form import are_beside
 from symbolic.contact.force_closure import WRENCH_SIZE, has_force_closure
 from symbolic.contact.grasp import (
     BEYOND,
@@ -166,7 +165,7 @@ def _least_squeeze(
     axes = workcell.contacts[0].T_box_pad[:3, :3]
     first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
     needed = case_in_pad_axes(workcell, motion, case)
-    beside = displaced or are_beside(workcell)
+    beside = displaced or workcell.has_pads_beside
     held = least_soft_squeeze(*needed, friction, (first, second), beside, detached)
     return ca.densify(held.normal)
 

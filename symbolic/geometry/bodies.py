@@ -56,6 +56,7 @@ class CollisionBody:
         is_tool: whether it is part of a robot's tool.
         carries: robots (0, 1) that are mounted on this link of a machine; None for a body that
             is neither a standing part of one nor moved by both.
+        root: of a robot's link that stands, the robot and the pieces in its root; else None.
     """
 
     name: str
@@ -64,6 +65,7 @@ class CollisionBody:
     pieces: tuple[Piece, ...]
     is_tool: bool = False
     carries: tuple[int, ...] | None = None
+    root: tuple[int, tuple[Piece, ...]] | None = None
 
 
 @dataclass(frozen=True)
@@ -185,8 +187,11 @@ def _robot_bodies(robot: Robot, i: int, links: ArmLinks, meshes: MeshReader) -> 
     bodies = []
     for link, pieces in _link_pieces(robot, own, meshes).items():
         frame, T = _attachment(model, link, robot, i)
-        moved = tuple(piece.moved(T) for piece in pieces)
-        bodies.append(CollisionBody(f"{robot.name}/{link}", group, frame, moved))
+        moved, root = tuple(piece.moved(T) for piece in pieces), None
+        if frame == WORLD:
+            placed = model.frames[link_frame(model, link)].placement.homogeneous
+            root = i, tuple(piece.moved(placed) for piece in pieces)
+        bodies.append(CollisionBody(f"{robot.name}/{link}", group, frame, moved, root=root))
     if robot.chain_root:  # a machine's file may list its links in any order
         bodies.sort(key=lambda body: body.frame.joint)
     frame, T = _attachment(model, robot.flange, robot, i)

@@ -12,24 +12,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.expression import number, sx_given
 from symbolic.geometry.bodies import BOX, WORLD, CollisionBody, Frame
-from symbolic.geometry.covers import chain_cover, close_pairs, slab_cover
-from symbolic.geometry.expressions import EXACT, Softness, clean, world_placements
+from symbolic.geometry.expressions import EXACT, Softness, clean, quaternion, world_placements
 from symbolic.geometry.motion_bounds import motion_function
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.geometry.pieces import Piece, SphereChain, axes_with_z, bounding_box, edges, support
+from symbolic.geometry.screen import Obstacle, Screen, Solid, columns, screen_of, turned
 from symbolic.path.rotation import rotation_matrix
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 
 
 def clearance_expressions(
-    geometry: CellGeometry,
+    screen: Screen,
     R_box: ca.SX,
     p_box: ca.SX,
     placements_1: tuple[ca.SX, ca.SX],
@@ -45,15 +45,15 @@ def clearance_expressions(
         softness: `EXACT` for screening; `Softness(width)` for bounds that are smooth, and lower
             by some multiples of the width [m].
     """
-    placements = (placements_1, placements_2)
-    scene = Scene(geometry, R_box, p_box, placements, softness)
-    return ca.vertcat(*[scene.bound(pair.first, pair.second) for pair in geometry.active])
+    scene = Scene(screen, R_box, p_box, (placements_1, placements_2), softness)
+    return ca.vertcat(*[scene.bound(pair) for pair in range(len(screen.active))])
 
 
 def screening_functions(
     geometry: CellGeometry,
     joint_placements: tuple[ca.Function, ca.Function],
     softness: Softness = EXACT,
+    screen: Screen | None = None,
 ) -> dict[str, ca.Function]:
     """The functions that collision checking calls, by name.
 
@@ -65,29 +65,34 @@ def screening_functions(
 
     Args:
         joint_placements: of each robot, `RobotModel.joint_placements`.
+        screen: of the geometry, or the same with symbols; None to find it.
     """
+    screen = screen_of(geometry) if screen is None else screen
     pose = ca.SX.sym("pose", 6)
     q = [ca.SX.sym(f"q_{i}", arm.joints) for i, arm in enumerate(geometry.arms, start=1)]
     R, p = rotation_matrix(geometry.workcell.task.orientation, pose[3:]), pose[:3]
     first, second = (joint_placements[i](q[i]) for i in (0, 1))
-    clearance = clearance_expressions(geometry, R, p, first, second, softness)
-    placed = {WORLD: (ca.SX.eye(3), ca.SX.zeros(3)), BOX: (R, p)}
-    for i, arm in enumerate(geometry.arms):
-        for j, joint in enumerate(world_placements(arm.T_world_root, (first, second)[i])):
+    clearance = clearance_expressions(screen, R, p, first, second, softness)
+    placed = {BOX: (R, p)}
+    for i, base in enumerate(screen.bases):
+        for j, joint in enumerate(world_placements(base, (first, second)[i])):
             placed[Frame("link", i, j)] = joint
     poses = [
-        _piece_pose(*placed[body.frame], piece) for body in geometry.bodies for piece in body.pieces
+        _piece_pose(placed.get(body.frame), *piece)
+        for body in screen.bodies
+        for piece in body.pieces
     ]
-    names = ["pose", "q_1", "q_2"]
+    given = sx_given(screen)
+    inputs, names = [pose, *q, *given.values()], ["pose", "q_1", "q_2", *given]
     outputs = [ca.horzcat(*column) for column in zip(*poses, strict=True)]
     return {
         "clearance": ca.Function(
-            "clearance", [pose, *q], [clearance], names, ["clearance"], {"cse": True}
+            "clearance", inputs, [clearance], names, ["clearance"], {"cse": True}
         ),
         "piece_poses": ca.Function(
-            "piece_poses", [pose, *q], outputs, names, ["quaternions", "positions"], {"cse": True}
+            "piece_poses", inputs, outputs, names, ["quaternions", "positions"], {"cse": True}
         ),
-        "motion": motion_function(geometry, joint_placements),
+        "motion": motion_function(geometry, joint_placements, screen),
     }
 
 
@@ -96,6 +101,7 @@ def with_more_pairs(
     geometry: CellGeometry,
     more: CellGeometry,
     joint_placements: tuple[ca.Function, ca.Function],
+    screen: Screen | None = None,
 ) -> dict[str, ca.Function]:
     """`screening_functions` of a cell in which further pairs are active, put together from those
     that are known, so that these are compiled once.
@@ -103,10 +109,13 @@ def with_more_pairs(
     Args:
         known: the functions of `geometry`.
         more: the same bodies; its active pairs are those of `geometry`, then others.
+        screen: of `more`, or the same with symbols; None to find it.
     """
     count = len(geometry.active)
     assert more.active[:count] == geometry.active, "further pairs come last"
-    others = screening_functions(replace(more, active=more.active[count:]), joint_placements)
+    whole = screen_of(more) if screen is None else screen
+    rest = {name: getattr(whole, name)[count:] for name in ("active", "own", "slanted")}
+    others = screening_functions(more, joint_placements, EXACT, replace(whole, **rest))
     found = dict(known)
     for name in ("clearance", "motion"):
         function = known[name]
@@ -119,40 +128,32 @@ def with_more_pairs(
     return found
 
 
-def _piece_pose(R: ca.SX, p: ca.SX, piece: Piece) -> tuple[ca.SX, ca.SX]:
-    """Unit quaternion (4,) and position (3,) in the world of a piece of a placed body."""
-    rotation = ca.mtimes(R, ca.SX(clean(piece.rotation)))
-    return quaternion(rotation), ca.mtimes(R, ca.SX(clean(piece.centre))) + p
+def _piece_pose(placed: tuple[ca.SX, ca.SX] | None, turn: Any, centre: Any) -> tuple[ca.SX, ca.SX]:
+    """Unit quaternion (4,) and position (3,) in the world of a piece, see `Bounded.pieces`.
 
-
-def quaternion(R: ca.SX) -> ca.SX:
-    """The unit quaternion (4,), w x y z, of a rotation (3, 3), stable for every angle.
-
-    Each column below is the quaternion times one of its own components (times 4); the column of
-    the largest component is the accurate one (Shepperd 1978).
+    Args:
+        placed: rotation and position of its frame; None of what stands.
     """
-    trace = ca.trace(R)
-    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
-    squares = [1.0 + trace] + [1.0 + 2.0 * R[k, k] - trace for k in range(3)]
-    columns = [
-        ca.vertcat(squares[0], x, y, z),
-        ca.vertcat(x, squares[1], xy, xz),
-        ca.vertcat(y, xy, squares[2], yz),
-        ca.vertcat(z, xz, yz, squares[3]),
-    ]
-    best, largest = columns[0], squares[0]
-    for column, square in zip(columns[1:], squares[1:], strict=True):
-        best = ca.if_else(square > largest, column, best)
-        largest = ca.fmax(largest, square)
-    return best / ca.norm_2(best)
+    position = ca.SX(number(centre))
+    if placed is None:
+        return ca.SX(number(turn)), position
+    R, p = placed
+    return quaternion(R if turn is None else ca.mtimes(R, turned(turn))), ca.mtimes(R, position) + p
 
 
 # --- the bodies of one sample ---
 
 
 BOX_NUMBERS = 15
-"""Length of `Scene.box_numbers`."""
+"""Length of `box_numbers`."""
+
+
+def box_numbers(body: CollisionBody) -> Array:
+    """(BOX_NUMBERS,) of a fixed box: its rotation (3, 3), centre (3,) and half edges (3,)."""
+    (piece,) = body.pieces
+    assert isinstance(piece.shape, Box)
+    half = np.asarray(piece.shape.size) / 2.0
+    return np.concatenate([clean(piece.rotation).ravel(), clean(piece.centre), half])
 
 
 class Scene:
@@ -160,65 +161,58 @@ class Scene:
 
     def __init__(
         self,
-        geometry: CellGeometry,
+        screen: Screen,
         R_box: ca.SX,
         p_box: ca.SX,
         placements: tuple[tuple[ca.SX, ca.SX], tuple[ca.SX, ca.SX]],
         softness: Softness,
     ) -> None:
         """See `clearance_expressions`."""
-        self.geometry, self.soft = geometry, softness
-        self._between = between_bases(geometry)
+        self.screen, self.soft = screen, softness
         self._placed: dict[Frame, tuple[ca.SX, ca.SX]] = {
-            Frame("world"): (ca.SX.eye(3), ca.SX.zeros(3)),
-            Frame("box"): (R_box, p_box),
+            WORLD: (ca.SX.eye(3), ca.SX.zeros(3)),
+            BOX: (R_box, p_box),
         }
-        for i, (arm, given) in enumerate(zip(geometry.arms, placements, strict=True)):
-            for j, placed in enumerate(world_placements(arm.T_world_root, given)):
+        for i, (base, given) in enumerate(zip(screen.bases, placements, strict=True)):
+            rotation, position = ca.SX(number(base.rotation)), ca.SX(number(base.position))
+            self._placed[Frame("world", i)] = rotation, position
+            for j, placed in enumerate(world_placements(base, given)):
                 self._placed[Frame("link", i, j)] = placed
         self._world = Axes("world", ca.SX.eye(3))
+        self._between = None if screen.between is None else Axes("between", turned(screen.between))
         self._relative: dict[tuple[Frame, str], tuple[ca.SX, ca.SX]] = {}
         self._intervals: dict[tuple[int, str], list[Interval]] = {}
-        self._covers: dict[int, tuple[Piece, ...]] = {}
-        self._chains: dict[int, tuple[SphereChain, list[ca.SX]]] = {}
+        self._chains: dict[int, list[ca.SX]] = {}
 
-    @cached_property
-    def _close(self) -> frozenset[tuple[int, int]]:
-        # Random postures are looked at: only where pairs within an arm are asked for.
-        return close_pairs(self.geometry)
-
-    def bound(self, i: int, j: int) -> ca.SX:
-        """Lower bound of the distance between bodies i and j (i < j)."""
-        first, second = self.geometry.bodies[i], self.geometry.bodies[j]
-        if second.group == "environment":
-            obstacles = [self._obstacle(i, first, piece) for piece in second.pieces]
+    def bound(self, pair: int) -> ca.SX:
+        """Lower bound of the distance between the bodies of a pair."""
+        i, j = self.screen.active[pair]
+        first, second = self.screen.bodies[i], self.screen.bodies[j]
+        if second.obstacles:
+            slanted = self.screen.slanted[pair]
+            obstacles = [self._obstacle(i, j, k, own) for k, own in enumerate(slanted)]
             return self.soft.minimum_below(obstacles)
         if first.group == second.group:
-            own = self._near_bound if (i, j) in self._close else self._chain_bound
+            own = self._near_bound if self.screen.own[pair] else self._chain_bound
             gaps = [own(i, j)]
             if first.frame.kind == "world":
                 gaps.append(self._gap(self._along(i, j, self._world)))
             return self.soft.maximum_below(gaps)
         gaps = [self._gap(self._along(i, j, self._world))]
         if "payload" in (first.group, second.group):
-            payload, link = (i, j) if first.group == "payload" else (j, i)
-            gaps.append(self._box_bound(link, payload))
+            gaps.append(self._box_bound(j if first.group == "payload" else i))
         elif self._between is not None:
             gaps.append(self._gap(self._along(i, j, self._between)[:1]))
         return self.soft.maximum_below(gaps)
 
-    def separable(self, i: int, j: int) -> bool:
-        """Whether bodies i and j (i < j) are the payload and an obstacle of one box."""
-        first, second = self.geometry.bodies[i], self.geometry.bodies[j]
-        return (
-            first.group == "payload"
-            and second.group == "environment"
-            and len(second.pieces) == 1
-            and isinstance(second.pieces[0].shape, Box)
-        )
+    def separable(self, pair: int) -> bool:
+        """Whether a pair is the payload and an obstacle of one box."""
+        first, second = (self.screen.bodies[body] for body in self.screen.active[pair])
+        kinds = [obstacle.kind for obstacle in second.obstacles]
+        return first.group == "payload" and kinds == [Box]
 
-    def separation(self, i: int, obstacle: ca.SX, direction: ca.SX) -> ca.SX:
-        """The gap between the payload, body i, and a fixed box along a direction.
+    def separation(self, obstacle: ca.SX, direction: ca.SX) -> ca.SX:
+        """The gap between the payload and a fixed box along a direction.
 
         Args:
             obstacle: (BOX_NUMBERS,) of the box, see `box_numbers`; may be symbols.
@@ -226,24 +220,17 @@ class Scene:
         """
         rotation, centre = ca.reshape(obstacle[:9], 3, 3).T, obstacle[9:12]
         half = obstacle[12:]
-        R, p = self._placed[self.geometry.bodies[i].frame]
+        R, p = self._placed[BOX]
         along = ca.mtimes(direction.T, R)
+        payload = next(body for body in self.screen.bodies if body.group == "payload")
         ends = [
-            ca.mtimes(along, ca.SX(clean(piece.centre)))
-            - self._reach(ca.mtimes(along, ca.SX(clean(piece.rotation))), piece)
-            for piece in self._cover(i)
+            ca.mtimes(along, ca.SX(number(piece.centre)))
+            - self._reach(ca.mtimes(along, turned(piece.rotation)), piece)
+            for piece in payload.cover
         ]
-        turned = ca.mtimes(direction.T, rotation)
-        reach = sum(half[k] * self.soft.entry_above(turned[k]) for k in range(3))
+        across = ca.mtimes(direction.T, rotation)
+        reach = sum(half[k] * self.soft.entry_above(across[k]) for k in range(3))
         return self.soft.minimum_below(ends) + ca.dot(direction, p - centre) - reach
-
-    def box_numbers(self, j: int) -> Array:
-        """(BOX_NUMBERS,) of the fixed box j of a `separable` pair: its rotation (3, 3), centre (3,)
-        and half edges (3,)."""
-        (piece,) = self.geometry.bodies[j].pieces
-        assert isinstance(piece.shape, Box)
-        half = np.asarray(piece.shape.size) / 2.0
-        return np.concatenate([clean(piece.rotation).ravel(), clean(piece.centre), half])
 
     def _along(self, i: int, j: int, axes: Axes) -> list[tuple[Interval, Interval]]:
         return list(zip(self._interval(i, axes), self._interval(j, axes), strict=True))
@@ -255,9 +242,12 @@ class Scene:
     def _interval(self, index: int, axes: Axes) -> list[Interval]:
         """Per direction the extent of a body."""
         key = (index, axes.key)
+        body = self.screen.bodies[index]
+        if body.extent is not None and axes is self._world:
+            return _ends(body.extent, 0)
         if key not in self._intervals:
-            A, offset = self._seen(self.geometry.bodies[index].frame, axes)
-            ends = [self._piece_interval(A, offset, piece) for piece in self._cover(index)]
+            A, offset = self._seen(body.frame, axes)
+            ends = [self._piece_interval(A, offset, piece) for piece in body.cover]
             self._intervals[key] = [
                 (
                     self.soft.minimum_below([end[k][0] for end in ends]),
@@ -267,57 +257,46 @@ class Scene:
             ]
         return self._intervals[key]
 
-    def _piece_interval(self, A: ca.SX, offset: ca.SX, piece: Piece) -> list[Interval]:
+    def _piece_interval(self, A: ca.SX, offset: ca.SX, piece: Solid) -> list[Interval]:
         """Extent of a cover piece along the rows of A, its frame's origin at offset."""
-        rotation, centre = ca.SX(clean(piece.rotation)), ca.SX(clean(piece.centre))
-        middle = ca.mtimes(A, centre) + offset
-        reach = [self._reach(ca.mtimes(A[k, :], rotation), piece) for k in range(3)]
+        middle = ca.mtimes(A, ca.SX(number(piece.centre))) + offset
+        seen = A if piece.rotation is None else ca.mtimes(A, turned(piece.rotation))
+        reach = [self._reach(seen[k, :], piece) for k in range(3)]
         return [(middle[k] - reach[k], middle[k] + reach[k]) for k in range(3)]
 
-    def _reach(self, u: ca.SX, piece: Piece) -> ca.SX:
+    def _reach(self, u: ca.SX, piece: Solid) -> ca.SX:
         """Support of a piece about its centre along u (1, 3) in its own axes."""
-        shape = piece.shape
-        match shape:
-            case Box():
-                half = np.asarray(shape.size) / 2.0
-                return sum((half[k] * self.soft.entry_above(u[k]) for k in range(3)), ca.SX(0))
-            case Cylinder():
-                axial = self.soft.entry_above(u[2]) * (shape.length / 2.0)
-                return axial + shape.radius * self.soft.cosine_above(u[2])
-            case Sphere():
-                return ca.SX(shape.radius)
-            case Capsule():
-                return self.soft.entry_above(u[2]) * (shape.length / 2.0) + shape.radius
-            case _:
-                raise AssertionError("a cover has no hulls")
+        size = ca.SX(number(piece.size))
+        if piece.kind is Box:
+            return sum((size[k] * self.soft.entry_above(u[k]) for k in range(3)), ca.SX(0))
+        if piece.kind is Sphere:
+            return size[0]
+        axial = self.soft.entry_above(u[2]) * size[1]
+        if piece.kind is Cylinder:
+            return axial + size[0] * self.soft.cosine_above(u[2])
+        return axial + size[0]
 
     def _seen(self, frame: Frame, axes: Axes) -> tuple[ca.SX, ca.SX]:
         """Rotation and position of a frame in coordinates along the axes."""
         key = (frame, axes.key)
         if key not in self._relative:
             R, p = self._placed[frame]
-            turned = ca.SX.eye(3) if axes.key == str(frame) else ca.mtimes(axes.A, R)
-            self._relative[key] = (turned, ca.mtimes(axes.A, p))
+            rotation = ca.SX.eye(3) if axes.key == str(frame) else ca.mtimes(axes.A, R)
+            self._relative[key] = (rotation, ca.mtimes(axes.A, p))
         return self._relative[key]
 
     def _own_axes(self, frame: Frame) -> Axes:
         return Axes(str(frame), self._placed[frame][0].T)
 
-    def _cover(self, index: int) -> tuple[Piece, ...]:
-        if index not in self._covers:
-            self._covers[index] = slab_cover(self.geometry.bodies[index])
-        return self._covers[index]
-
-    def _chain(self, index: int) -> tuple[list[ca.SX], float]:
+    def _chain(self, index: int) -> tuple[list[ca.SX], ca.SX]:
         """Centres in the world and the radius of a body's chain of spheres."""
+        body = self.screen.bodies[index]
+        assert body.chain is not None, "obstacles have no chains"
         if index not in self._chains:
-            body = self.geometry.bodies[index]
-            chain = chain_cover(body)
-            R, p = self._placed[body.frame]
-            centres = [ca.mtimes(R, ca.SX(clean(centre))) + p for centre in chain.centres]
-            self._chains[index] = (chain, centres)
-        chain, centres = self._chains[index]
-        return centres, chain.radius
+            R, p = self._placed[body.frame if body.extent is None else WORLD]
+            centres = columns(body.chain.centres)
+            self._chains[index] = [ca.mtimes(R, centre) + p for centre in centres]
+        return self._chains[index], ca.SX(number(body.chain.radius))
 
     def _nearest(self, squared: Sequence[ca.SX]) -> ca.SX:
         """Root of the least of some squared distances."""
@@ -331,28 +310,29 @@ class Scene:
         return self._nearest([ca.sumsqr(a - b) for a in first for b in second]) - (r_1 + r_2)
 
     def _near_bound(self, i: int, j: int) -> ca.SX:
-        """Piece by piece, along the axes of the first body's frame."""
-        frame = self.geometry.bodies[i].frame
-        axes = self._own_axes(frame)
-        origin = self._seen(frame, axes)[1]
-        A, offset = self._seen(self.geometry.bodies[j].frame, axes)
-        moving = [self._piece_interval(A, offset - origin, piece) for piece in self._cover(j)]
-        still = [fixed_intervals(piece, np.eye(3)) for piece in self._cover(i)]
+        """Piece by piece, along the axes of the first body's frame, the world's where it stands."""
+        first, second = self.screen.bodies[i], self.screen.bodies[j]
+        stands = first.extent is not None
+        axes = self._world if stands else self._own_axes(first.frame)
+        A, offset = self._seen(second.frame, axes)
+        if not stands:
+            offset = offset - self._seen(first.frame, axes)[1]
+        moving = [self._piece_interval(A, offset, piece) for piece in second.cover]
+        own, zero = ca.SX.eye(3), ca.SX.zeros(3)
+        still = [
+            _ends(first.extent, k) if stands else self._piece_interval(own, zero, piece)
+            for k, piece in enumerate(first.cover, start=1)
+        ]
         return self.soft.minimum_below(
-            [self._gap(list(zip(own, other, strict=True))) for own in still for other in moving]
+            [self._gap(list(zip(one, other, strict=True))) for one in still for other in moving]
         )
 
-    def _box_bound(self, link: int, payload: int) -> ca.SX:
+    def _box_bound(self, link: int) -> ca.SX:
         """A chain of spheres against the payload's box, or the one that holds its pieces."""
-        pieces = self.geometry.bodies[payload].pieces
-        box = pieces[0] if len(pieces) == 1 else bounding_box(pieces, np.eye(3))
-        if not isinstance(box.shape, Box):
-            box = bounding_box(pieces, np.eye(3))
-        assert isinstance(box.shape, Box)
-        half = np.asarray(box.shape.size) / 2.0
-        R, p = self._placed[Frame("box")]
-        if box.centre.any():
-            p = p + ca.mtimes(R, ca.DM(box.centre))
+        box = self.screen.payload
+        half, (R, p) = ca.SX(number(box.size)), self._placed[BOX]
+        if isinstance(box.centre, ca.SX) or box.centre.any():
+            p = p + ca.mtimes(R, number(box.centre))
         centres, radius = self._chain(link)
         squared = []
         for centre in centres:
@@ -364,51 +344,47 @@ class Scene:
         # Each of the three ramps may stand half a width above the true one.
         return self._nearest(squared) - radius - 3**0.5 / 2.0 * self.soft.width
 
-    def _obstacle(self, index: int, body: CollisionBody, piece: Piece) -> ca.SX:
-        """A moving body against one fixed piece."""
-        gaps = [self._gap(self._obstacle_intervals(index, body, piece))]
-        if isinstance(piece.shape, Cylinder | Sphere | Capsule):
-            gaps.append(self._round_bound(index, piece))
+    def _obstacle(self, index: int, other: int, k: int, slanted: bool) -> ca.SX:
+        """A moving body against piece k of an obstacle.
+
+        Args:
+            slanted: whether its own axes matter.
+        """
+        body, obstacle = self.screen.bodies[index], self.screen.bodies[other].obstacles[k]
+        axes = self._world
+        if obstacle.axes is not None:
+            axes = Axes(f"obstacle {other} {k}", turned(obstacle.axes))
+        pairs = list(zip(self._interval(index, axes), _ends(obstacle.extent, 0), strict=True))
+        if slanted:
+            own = self._own_axes(body.frame)
+            still = self._piece_interval(own.A, ca.SX.zeros(3), obstacle.cover)
+            pairs += list(zip(self._interval(index, own), still, strict=True))
+        gaps = [self._gap(pairs)]
+        if obstacle.kind in (Cylinder, Sphere, Capsule):
+            gaps.append(self._round_bound(index, obstacle))
         return self.soft.maximum_below(gaps)
 
-    def _obstacle_intervals(
-        self, index: int, body: CollisionBody, piece: Piece
-    ) -> list[tuple[Interval, Interval]]:
-        """Extents of a moving body and of a fixed piece along the directions that matter."""
-        axes = self._axes_of(piece)
-        fixed = fixed_intervals(piece, np.array(ca.DM(axes.A)))
-        pairs = list(zip(self._interval(index, axes), fixed, strict=True))
-        if body.frame.kind == "box" or slanted_matters(body, piece):
-            own = self._own_axes(body.frame)
-            cover = slab_cover(CollisionBody("", "environment", Frame("world"), (piece,)))[0]
-            still = self._piece_interval(own.A, ca.SX.zeros(3), cover)
-            pairs += list(zip(self._interval(index, own), still, strict=True))
-        return pairs
-
-    def _axes_of(self, piece: Piece) -> Axes:
-        """A fixed box's own axes; the world's where they agree or the piece is no box."""
-        R = clean(piece.rotation)
-        if not isinstance(piece.shape, Box) or np.allclose(np.abs(R).max(axis=0), 1.0):
-            return self._world
-        return Axes(f"fixed {R.tolist()}", ca.SX(R.T))
-
-    def _round_bound(self, index: int, piece: Piece) -> ca.SX:
+    def _round_bound(self, index: int, obstacle: Obstacle) -> ca.SX:
         """A chain of spheres against a fixed cylinder, capsule or sphere."""
         centres, radius = self._chain(index)
-        T = clean(np.asarray(np.linalg.inv(piece.pose), dtype=float))
-        shape = piece.shape
+        offset, size = number(obstacle.offset), ca.SX(number(obstacle.cover.size))
         bounds = []
         for centre in centres:
-            local = ca.mtimes(ca.SX(T[:3, :3]), centre) + T[:3, 3]
-            if isinstance(shape, Sphere):
-                bounds.append(self.soft.norm_below(ca.sumsqr(local)) - shape.radius)
+            local = ca.mtimes(turned(obstacle.to_own), centre) + offset
+            if obstacle.kind is Sphere:
+                bounds.append(self.soft.norm_below(ca.sumsqr(local)) - size[0])
                 continue
-            assert isinstance(shape, Cylinder | Capsule)
-            cap = shape.radius if isinstance(shape, Capsule) else 0.0
-            radial = self.soft.norm_below(ca.sumsqr(local[:2])) - shape.radius
-            axial = self.soft.absolute_below(local[2]) - shape.length / 2.0 - cap
+            cap = size[0] if obstacle.kind is Capsule else 0.0
+            radial = self.soft.norm_below(ca.sumsqr(local[:2])) - size[0]
+            axial = self.soft.absolute_below(local[2]) - size[1] - cap
             bounds.append(self.soft.maximum_below([radial, axial]))
         return self.soft.minimum_below(bounds) - radius
+
+
+def _ends(extent: Any, k: int) -> list[Interval]:
+    """Per direction both ends of the extent in rows 2 k and 2 k + 1."""
+    rows = ca.SX(number(extent))
+    return [(rows[2 * k, d], rows[2 * k + 1, d]) for d in range(3)]
 
 
 def _gaps(pairs: Sequence[tuple[Interval, Interval]]) -> list[ca.SX]:
@@ -416,20 +392,8 @@ def _gaps(pairs: Sequence[tuple[Interval, Interval]]) -> list[ca.SX]:
     return [gap for a, b in pairs for gap in (a[0] - b[1], b[0] - a[1])]
 
 
-# --- directions of comparison ---
-
-
 Interval = tuple[ca.SX, ca.SX]
 """Least and largest coordinate along a direction."""
-
-
-LONG = 0.25
-"""Bodies longer than wide by more than this [m] are also compared along their own axes: across
-the world's axes, a slanted body seems wider by up to that much."""
-
-
-VAST = 2.0
-"""Obstacles this many times as wide as a body is long (a floor) need no such comparison."""
 
 
 @dataclass(frozen=True)
@@ -438,25 +402,3 @@ class Axes:
 
     key: str
     A: ca.SX
-
-
-def slanted_matters(body: CollisionBody, obstacle: Piece) -> bool:
-    """Whether a body is long, and the obstacle no plane for it."""
-    _, width, length = edges(body.pieces)
-    return bool(length - width > LONG and edges((obstacle,))[1] < VAST * length)
-
-
-def between_bases(geometry: CellGeometry) -> Axes | None:
-    """Axes whose first points from one robot's base to the other's; None if the world's do."""
-    first, second = (arm.T_world_root[:3, 3] for arm in geometry.arms)
-    along = second - first
-    distance = float(np.linalg.norm(along))
-    if distance < 1e-6 or np.max(np.abs(along)) > 0.99 * distance:
-        return None
-    return Axes("between", ca.SX(clean(axes_with_z(along / distance)[:, [2, 0, 1]].T)))
-
-
-def fixed_intervals(piece: Piece, A: Array) -> list[Interval]:
-    """Along the rows of A (3, 3), of a piece that does not move."""
-    high, low = support(piece, A), -support(piece, -A)
-    return [(ca.SX(low[k]), ca.SX(high[k])) for k in range(3)]

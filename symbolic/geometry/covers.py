@@ -7,14 +7,16 @@ exact functions of `symbolic.geometry.pieces`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations, product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
-from symbolic.geometry.bodies import CollisionBody
-from symbolic.geometry.pairs import CellGeometry, relative_placement
+from symbolic.geometry.bodies import ArmGeometry, CollisionBody
+from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import (
     Hull,
     Piece,
@@ -25,6 +27,7 @@ from symbolic.geometry.pieces import (
     support,
 )
 from symbolic.records import Box
+from symbolic.records.poses import rotation_from_vector
 
 MERGE_SLACK = 0.004
 """Pieces are merged into one box that stands out from their hull by at most this [m]."""
@@ -75,35 +78,57 @@ def chain_cover(body: CollisionBody) -> SphereChain:
 def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
     """Pairs within an arm whose chains of spheres cannot be told apart in many postures."""
     rng = np.random.default_rng(0)
-    chains = [chain_cover(body) for body in geometry.bodies]
-    postures = [rng.uniform(arm.lower, arm.upper, (POSTURES, arm.joints)) for arm in geometry.arms]
+    # Seen from the arms' roots: where they stand does not matter.
+    steps = [
+        _steps(arm, rng.uniform(arm.lower, arm.upper, (POSTURES, arm.joints)))
+        for arm in geometry.arms
+    ]
+    chains: dict[int, SphereChain] = {}
     found = []
     for pair in geometry.active:
-        a, b = geometry.bodies[pair.first], geometry.bodies[pair.second]
-        if a.group != b.group:
+        bodies = geometry.bodies[pair.first], geometry.bodies[pair.second]
+        if bodies[0].group != bodies[1].group:
             continue
-        robot = b.frame.robot
-        near = 0
-        for q in postures[robot]:
-            T = relative_placement(geometry.arms[robot], a.frame.joint, b.frame.joint, q)
-            moved = chains[pair.second].centres @ T[:3, :3].T + T[:3, 3]
-            gaps = np.linalg.norm(chains[pair.first].centres[:, None] - moved, axis=2)
-            touching = gaps.min() <= chains[pair.first].radius + chains[pair.second].radius
-            if touching and a.frame.kind == "world":
-                moved_pieces = tuple(piece.moved(T) for piece in b.pieces)
-                touching = not _apart(a.pieces, moved_pieces)
-            near += bool(touching)
-        if near > OFTEN * POSTURES:
+        a, b = (replace(x, pieces=x.root[1]) if x.root else x for x in bodies)
+        for index, body in ((pair.first, a), (pair.second, b)):
+            chains[index] = chains.get(index) or chain_cover(body)
+        T = np.broadcast_to(np.eye(4), (POSTURES, 4, 4))
+        for k in range(a.frame.joint + 1, b.frame.joint + 1):
+            T = T @ steps[b.frame.robot][k]
+        moved = chains[pair.second].centres @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
+        gaps = np.linalg.norm(chains[pair.first].centres[:, None] - moved[:, None], axis=3)
+        reach = chains[pair.first].radius + chains[pair.second].radius
+        touching = gaps.min(axis=(1, 2)) <= reach
+        if a.frame.kind == "world":
+            touching &= ~_apart(a.pieces, b.pieces, T)
+        if np.count_nonzero(touching) > OFTEN * POSTURES:
             found.append((pair.first, pair.second))
     return frozenset(found)
 
 
-def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...]) -> bool:
-    """Whether two sets of pieces are separated along a coordinate axis."""
+def _steps(arm: ArmGeometry, q: Array) -> list[Array]:
+    """Per joint its frame in the one before it (n, 4, 4) at postures q (n, joints)."""
+    found = []
+    for k, axis in enumerate(arm.axes):
+        moved = np.tile(np.eye(4), (len(q), 1, 1))
+        along = q[:, k, None] * axis
+        if arm.turning[k]:
+            moved[:, :3, :3] = rotation_from_vector(along)
+        else:
+            moved[:, :3, 3] = along
+        found.append(arm.origins[k] @ moved)
+    return found
+
+
+def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...], T: Array) -> NDArray[np.bool_]:
+    """(n,) whether two sets of pieces are separated along a coordinate axis, the second seen from
+    the first by T (n, 4, 4)."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     high = np.max([support(piece, axes) for piece in first], axis=0)
-    low = -np.max([support(piece, -axes) for piece in second], axis=0)
-    return bool(np.any(low > high))
+    turned = (-axes @ T[:, :3, :3]).reshape(-1, 3)
+    ahead = np.max([support(piece, turned) for piece in second], axis=0).reshape(-1, len(axes))
+    low = T[:, :3, 3] @ axes.T - ahead
+    return np.asarray(np.any(low > high, axis=1))
 
 
 def _covered(piece: Piece, cover: list[Piece]) -> bool:

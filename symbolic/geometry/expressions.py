@@ -15,11 +15,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.expression import number
 
 _TINY = 1e-12
 """Added under roots so that derivatives stay finite."""
@@ -69,6 +71,8 @@ class Softness:
 
     def minimum_below(self, values: Sequence[ca.SX]) -> ca.SX:
         """Least value or slightly less."""
+        if not self.width:
+            return _fold(ca.fmin, values)
         return -self.maximum_above([-value for value in values])
 
     def norm_below(self, squared: ca.SX) -> ca.SX:
@@ -99,17 +103,24 @@ EXACT = Softness()
 # --- placements ---
 
 
-def world_placements(
-    T_world_root: Array, placements: tuple[ca.SX, ca.SX]
-) -> list[tuple[ca.SX, ca.SX]]:
+class Placed(Protocol):
+    """Where an arm stands: rotation (3, 3) and position (3,) [m], arrays or symbols."""
+
+    @property
+    def rotation(self) -> Any:
+        """(3, 3)."""
+
+    @property
+    def position(self) -> Any:
+        """(3,) [m]."""
+
+
+def world_placements(base: Placed, placements: tuple[ca.SX, ca.SX]) -> list[tuple[ca.SX, ca.SX]]:
     """Rotation and position in the world of each joint frame given in the root."""
     rotations, positions = placements
-    T = ca.SX(clean(T_world_root))
+    R, p = ca.SX(number(base.rotation)), ca.SX(number(base.position))
     return [
-        (
-            ca.mtimes(T[:3, :3], rotations[:, 3 * j : 3 * j + 3]),
-            ca.mtimes(T[:3, :3], positions[:, j]) + T[:3, 3],
-        )
+        (ca.mtimes(R, rotations[:, 3 * j : 3 * j + 3]), ca.mtimes(R, positions[:, j]) + p)
         for j in range(positions.shape[1])
     ]
 
@@ -119,3 +130,26 @@ def clean(matrix: Array) -> Array:
     rounded = np.round(matrix)
     near = (np.abs(matrix - rounded) < 1e-15) & (np.abs(rounded) <= 1.0)
     return np.where(near, rounded, matrix)
+
+
+def quaternion(R: ca.SX) -> ca.SX:
+    """The unit quaternion (4,), w x y z, of a rotation (3, 3), stable for every angle.
+
+    Each column below is the quaternion times one of its own components (times 4); the column of
+    the largest component is the accurate one (Shepperd 1978).
+    """
+    trace = ca.trace(R)
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    squares = [1.0 + trace] + [1.0 + 2.0 * R[k, k] - trace for k in range(3)]
+    columns = [
+        ca.vertcat(squares[0], x, y, z),
+        ca.vertcat(x, squares[1], xy, xz),
+        ca.vertcat(y, xy, squares[2], yz),
+        ca.vertcat(z, xz, yz, squares[3]),
+    ]
+    best, largest = columns[0], squares[0]
+    for column, square in zip(columns[1:], squares[1:], strict=True):
+        best = ca.if_else(square > largest, column, best)
+        largest = ca.fmax(largest, square)
+    return best / ca.norm_2(best)

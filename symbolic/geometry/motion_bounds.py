@@ -21,38 +21,16 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from symbolic.array import Array
-from symbolic.geometry.bodies import BOX, WORLD, ArmGeometry, CollisionBody, Frame
-from symbolic.geometry.expressions import clean, world_placements
-from symbolic.geometry.pairs import CellGeometry, chain_radius
-from symbolic.geometry.pieces import bounding_box, farthest_from_axis, farthest_from_point
+from symbolic.expression import number, sx_given
+from symbolic.geometry.bodies import BOX, WORLD, Frame
+from symbolic.geometry.expressions import world_placements
+from symbolic.geometry.pairs import CellGeometry
+from symbolic.geometry.screen import Bounded, Reach, Screen
 from symbolic.path.rotation import rotation_matrix
 
 
-def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
-    """(n,) distance from each joint's axis that no point of a link's body exceeds [m]; 1 of a joint
-    that slides.
-
-    Joints behind the body do not move it: zero. Own joint: from the shape; joints further down:
-    with the chain between stretched.
-    """
-    reach = np.zeros(arm.joints)
-    last = body.frame.joint
-    for j in range(last + 1):
-        if not arm.turning[j]:
-            reach[j] = 1.0
-        elif j == last:
-            reach[j] = max(farthest_from_axis(p, np.zeros(3), arm.axes[j]) for p in body.pieces)
-        else:
-            offset = arm.origins[j + 1][:3, 3]
-            across = offset - (offset @ arm.axes[j]) * arm.axes[j]
-            reach[j] = float(np.linalg.norm(across)) + chain_radius(body, arm, j + 1)
-            reach[j] += float(arm.slides[j + 1])
-    return reach
-
-
 def motion_function(
-    geometry: CellGeometry, joint_placements: tuple[ca.Function, ca.Function]
+    geometry: CellGeometry, joint_placements: tuple[ca.Function, ca.Function], screen: Screen
 ) -> ca.Function:
     """`motion`: two configurations -> chord, bend (n_pairs,) [m] of every active pair.
 
@@ -60,6 +38,9 @@ def motion_function(
     the length of the path of one seen from the other, which needs no bend.
 
     Inputs: pose_a (6,), q_1_a, q_2_a (n,), then pose_b, q_1_b, q_2_b [m, rad].
+
+    Args:
+        screen: of the geometry.
     """
     ends = []
     for end in ("a", "b"):
@@ -69,75 +50,72 @@ def motion_function(
         )
         rotation = rotation_matrix(geometry.workcell.task.orientation, pose[3:])
         placed = {WORLD: (ca.SX.eye(3), ca.SX.zeros(3)), BOX: (rotation, pose[:3])}
-        for i, (arm, q) in enumerate(zip(geometry.arms, (q_1, q_2), strict=True)):
-            for j, joint in enumerate(world_placements(arm.T_world_root, joint_placements[i](q))):
+        for i, (base, q) in enumerate(zip(screen.bases, (q_1, q_2), strict=True)):
+            for j, joint in enumerate(world_placements(base, joint_placements[i](q))):
                 placed[Frame("link", i, j)] = joint
         ends.append(((pose, q_1, q_2), placed))
     (inputs_a, placed_a), (inputs_b, placed_b) = ends
     steps = [ca.fabs(b - a) for a, b in zip(inputs_a, inputs_b, strict=True)]
-    own = [_body_motion(geometry, body, placed_a, placed_b, steps) for body in geometry.bodies]
+    own = [_body_motion(screen, body, placed_a, placed_b, steps) for body in screen.bodies]
     chords, bends = [], []
-    for pair in geometry.active:
-        first, second = geometry.bodies[pair.first], geometry.bodies[pair.second]
+    for i, j in screen.active:
+        first, second = screen.bodies[i], screen.bodies[j]
         if first.group == second.group:
-            step = steps[1 + second.frame.robot]
-            chords.append(_between_links(first, second, geometry.arms[second.frame.robot], step))
+            chords.append(_between_links(first, second, steps[1 + second.frame.robot]))
             bends.append(ca.SX(0))
         else:
-            chords.append(own[pair.first][0] + own[pair.second][0])
-            bends.append(own[pair.first][1] + own[pair.second][1])
+            chords.append(own[i][0] + own[j][0])
+            bends.append(own[i][1] + own[j][1])
+    given = sx_given(screen)
     names = [f"{name}_{end}" for end in ("a", "b") for name in ("pose", "q_1", "q_2")]
     return ca.Function(
         "motion",
-        [*inputs_a, *inputs_b],
+        [*inputs_a, *inputs_b, *given.values()],
         [ca.vertcat(*chords), ca.vertcat(*bends)],
-        names,
+        [*names, *given],
         ["chord", "bend"],
         {"cse": True},
     )
 
 
 def _body_motion(
-    geometry: CellGeometry,
-    body: CollisionBody,
+    screen: Screen,
+    body: Bounded,
     placed_a: dict[Frame, tuple[ca.SX, ca.SX]],
     placed_b: dict[Frame, tuple[ca.SX, ca.SX]],
     steps: list[ca.SX],
 ) -> tuple[ca.SX, ca.SX]:
     """Chord and bend of one body."""
-    if body.frame.kind == "world":
+    if body.reach is None:
         return ca.SX(0), ca.SX(0)
-    centre = bounding_box(body.pieces, np.eye(3)).centre
-    radius = max(farthest_from_point(piece, centre) for piece in body.pieces)
+    centre, spans = number(body.reach.centre), number(body.reach.spans)
     (R_a, p_a), (R_b, p_b) = placed_a[body.frame], placed_b[body.frame]
-    shift = ca.mtimes(R_b - R_a, ca.SX(clean(centre))) + p_b - p_a
+    shift = ca.mtimes(R_b - R_a, ca.SX(centre)) + p_b - p_a
     # |R_b - R_a| as an operator is 2 sin(angle / 2), its Frobenius norm over sqrt(2).
-    chord = _norm(shift) + radius * _norm(ca.vec(R_b - R_a)) / np.sqrt(2.0)
+    chord = _norm(shift) + spans[0] * _norm(ca.vec(R_b - R_a)) / np.sqrt(2.0)
     if body.frame.kind == "box":
         turn = ca.sum1(steps[0][3:])
-        farthest = max(farthest_from_point(piece, np.zeros(3)) for piece in body.pieces)
-        return chord, farthest * turn * turn
-    reach = reach_about_joints(body, geometry.arms[body.frame.robot])
-    return chord, _bend(reach, geometry.arms[body.frame.robot], steps[1 + body.frame.robot])
+        return chord, spans[1] * turn * turn
+    robot = body.frame.robot
+    return chord, _bend(body.reach, screen.turning[robot], steps[1 + robot])
 
 
-def _between_links(
-    first: CollisionBody, second: CollisionBody, arm: ArmGeometry, step: ca.SX
-) -> ca.SX:
+def _between_links(first: Bounded, second: Bounded, step: ca.SX) -> ca.SX:
     """Length of the path of the later link seen from the earlier one."""
-    reach = reach_about_joints(second, arm)
+    assert second.reach is not None, "the later of two links moves"
+    reach = number(second.reach.joints)
     moving = range(first.frame.joint + 1, second.frame.joint + 1)
     return sum((reach[j] * step[j] for j in moving), ca.SX(0))
 
 
-def _bend(reach: Array, arm: ArmGeometry, step: ca.SX) -> ca.SX:
-    total, before = ca.SX(0), ca.SX(0)
-    for j, turning in enumerate(arm.turning):
-        if turning:
-            total += reach[j] * step[j] * (step[j] + 2.0 * before)
+def _bend(reach: Reach, turning: tuple[bool, ...], step: ca.SX) -> ca.SX:
+    total, before, joints = ca.SX(0), ca.SX(0), number(reach.joints)
+    for j in range(joints.shape[0]):
+        if turning[j]:
+            total += joints[j] * step[j] * (step[j] + 2.0 * before)
             before += step[j]
         else:
-            total += 2.0 * reach[j] * step[j] * before
+            total += 2.0 * joints[j] * step[j] * before
     return total
 
 

@@ -8,16 +8,18 @@ the path parameter u in [0, 1].
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from types import MappingProxyType
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.expression import Expression
+from symbolic.expression import Expression, as_mx, number, sx_given
 from symbolic.records import Task
 
 
@@ -76,17 +78,30 @@ def sample_basis(task: Task) -> PathBasis:
     return path_basis(len(task.waypoints), np.linspace(0.0, 1.0, task.samples))
 
 
-def waypoint_matrix(task: Task, x: Expression) -> Expression:
+Handed = Mapping[str, ca.MX]
+NONE: Handed = MappingProxyType({})
+"""A cell's numbers as inputs of a function of MX (`symbolic.expression.mx_given`)."""
+
+
+def _fixed(task: Task, value: Any, x: Expression, handed: Handed) -> Expression:
+    """A number of the task as the kind of expression that x is."""
+    if isinstance(x, ca.MX) and isinstance(value, ca.SX):
+        return as_mx(value, sx_given(task), handed)
+    return type(x)(number(value))
+
+
+def waypoint_matrix(task: Task, x: Expression, handed: Handed = NONE) -> Expression:
     """All waypoints (6, n_waypoints) from the decision vector (paper Eq. 17), angles unwrapped.
 
     Args:
         x: (n_var,) free waypoints in path order, each a pose.
+        handed: the task's numbers.
     """
     columns = []
     taken = 0
     for waypoint in task.waypoints:
         if waypoint.is_fixed:
-            columns.append(type(x)(ca.DM(waypoint.lower)))
+            columns.append(_fixed(task, waypoint.lower, x, handed))
         else:
             columns.append(x[6 * taken : 6 * taken + 6])
             taken += 1
@@ -98,21 +113,24 @@ def waypoint_matrix(task: Task, x: Expression) -> Expression:
     return ca.horzcat(*columns)
 
 
-def extended_matrix(task: Task, x: Expression, waypoints: Expression) -> Expression:
+def extended_matrix(
+    task: Task, x: Expression, waypoints: Expression, handed: Handed = NONE
+) -> Expression:
     """The extended waypoints (6 + m, n_waypoints): the redundant joints' values below the poses.
 
     Args:
         x: (n_var,) decision vector.
         waypoints: (6, n_waypoints) from `waypoint_matrix`.
+        handed: the task's numbers.
     """
     if not task.redundant:
         return waypoints
     at, rows = task.n_box, []
     for joint in task.redundant:
         row = []
-        for low, high in zip(joint.lower, joint.upper, strict=True):
-            row.append(x[at] if low < high else type(x)(low))
-            at += int(low < high)
+        for k, moves in enumerate(joint.moving.tolist()):
+            row.append(x[at] if moves else _fixed(task, joint.lower[k], x, handed))
+            at += int(moves)
         rows.append(row)
     # Column by column, a form that code for lanes knows.
     return ca.horzcat(

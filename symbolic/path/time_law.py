@@ -19,8 +19,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from symbolic.expression import repeated, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity
-from symbolic.path.spline import PathBasis
+from symbolic.path.spline import NONE, Handed, PathBasis
 from symbolic.records import Task
 
 LENGTH_FLOOR = 1e-10
@@ -51,7 +52,11 @@ class TimedPath:
 
 
 def timed_path(
-    task: Task, basis: PathBasis, waypoints: ca.MX, rounding: ca.MX | None = None
+    task: Task,
+    basis: PathBasis,
+    waypoints: ca.MX,
+    rounding: ca.MX | None = None,
+    handed: Handed = NONE,
 ) -> TimedPath:
     """Poses at the samples of `basis` with the task's time law.
 
@@ -59,13 +64,14 @@ def timed_path(
         waypoints: (6, n_waypoints) from `symbolic.path.spline.waypoint_matrix`.
         rounding: share of a step's duration by which the constant-speed law's kink is rounded,
             where rotation takes over from translation; None for none.
+        handed: the task's numbers.
     """
     pose = ca.mtimes(waypoints, ca.DM(basis.position.T))
     if task.time_law == "constant":
-        return _constant(task, pose, rounding)
+        return _constant(task, pose, rounding, handed)
     first = ca.mtimes(waypoints, ca.DM(basis.first.T))
     second = ca.mtimes(waypoints, ca.DM(basis.second.T))
-    return _ramped(task, basis, pose, first, second)
+    return _ramped(task, basis, (pose, first, second), handed)
 
 
 def driven_path(
@@ -90,11 +96,11 @@ def driven_path(
     )
 
 
-def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None) -> TimedPath:
+def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, handed: Handed) -> TimedPath:
     count = pose.shape[1] - 1
     step = _step_time_function(task, rounding is not None).map(count)
     rounded = [] if rounding is None else [ca.repmat(rounding, 1, count)]
-    durations = step(pose[:, :-1], pose[:, 1:], *rounded)
+    durations = step(pose[:, :-1], pose[:, 1:], *rounded, *repeated(handed, count))
     time = ca.horzcat(0.0, ca.cumsum(durations, 1))
     rate = _gradient(pose, durations)
     return TimedPath(time, pose, rate, _gradient(rate, durations))
@@ -103,19 +109,19 @@ def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None) -> TimedPath:
 def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
     """Duration of the step between two neighbouring poses (paper Eqs. 23-24), and by which share
     its kink is rounded, if it is."""
-    start, end = ca.SX.sym("start", 6), ca.SX.sym("end", 6)
+    start, end, given = ca.SX.sym("start", 6), ca.SX.sym("end", 6), sx_given(task).values()
     step = end - start
     length = _smooth_norm(step[:3])
     angle = _smooth_norm(angular_velocity(task.orientation, (start[3:] + end[3:]) / 2.0, step[3:]))
     moving, turning = length / task.reference_speed, angle / task.reference_angular_speed
     if not is_rounded:
         duration = ca.fmax(ca.fmax(moving, turning), STEP_TIME_FLOOR)
-        return ca.Function("step_time", [start, end], [duration])
+        return ca.Function("step_time", [start, end, *given], [duration])
     rounding, both = ca.SX.sym("rounding"), moving + turning
     # A hyperbola; the floor keeps its slope finite where there is no rounding.
     width = ca.sqrt((moving - turning) ** 2 + (rounding * both) ** 2 + LENGTH_FLOOR**2)
     duration = ca.fmax((both + width) / 2.0, STEP_TIME_FLOOR)
-    return ca.Function("step_time", [start, end, rounding], [duration])
+    return ca.Function("step_time", [start, end, rounding, *given], [duration])
 
 
 def _gradient(values: ca.MX, durations: ca.MX) -> ca.MX:
@@ -143,16 +149,20 @@ def _one_sided(here: ca.MX, near: ca.MX, far: ca.MX, near_step: ca.MX, far_step:
     )
 
 
-def _ramped(task: Task, basis: PathBasis, pose: ca.MX, first: ca.MX, second: ca.MX) -> TimedPath:
+def _ramped(
+    task: Task, basis: PathBasis, along: tuple[ca.MX, ca.MX, ca.MX], handed: Handed
+) -> TimedPath:
+    pose, first, second = along
     n = pose.shape[1]
-    slope, curvature = _length_rate_function(task).map(n)(pose, first, second)
+    given = repeated(handed, n)
+    slope, curvature = _length_rate_function(task).map(n)(pose, first, second, *given)
     width = float(basis.parameter[1] - basis.parameter[0])
     # Trapezoid with end correction: fourth order in the sample width.
     pieces = width / 2.0 * (slope[:, :-1] + slope[:, 1:]) + width**2 / 12.0 * (
         curvature[:, :-1] - curvature[:, 1:]
     )
     arc = ca.horzcat(0.0, ca.cumsum(pieces, 1))
-    time, speed, acceleration = _ramp_function(task).map(n)(arc, ca.repmat(arc[-1], 1, n))
+    time, speed, acceleration = _ramp_function(task).map(n)(arc, ca.repmat(arc[-1], 1, n), *given)
     u_rate = speed / slope
     u_second = (acceleration - curvature * u_rate**2) / slope
     rows = ca.repmat(1.0, 6, 1)
@@ -175,7 +185,8 @@ def _length_rate_function(task: Task) -> ca.Function:
     angular_rate = lever**2 * ca.dot(turn, turn_rate) / angular
     slope = ca.fmax(linear, angular)
     curvature = ca.if_else(linear >= angular, linear_rate, angular_rate)
-    return ca.Function("length_rate", [pose, first, second], [slope, curvature])
+    inputs = [pose, first, second, *sx_given(task).values()]
+    return ca.Function("length_rate", inputs, [slope, curvature])
 
 
 def _ramp_function(task: Task) -> ca.Function:
@@ -198,7 +209,8 @@ def _ramp_function(task: Task) -> ca.Function:
     speed = ca.if_else(ramping, cruise * (3.0 * tau**2 - 2.0 * tau**3), cruise)
     push = ca.if_else(ramping, cruise / ramp * 6.0 * tau * (1.0 - tau), 0.0)
     acceleration = ca.if_else(from_end, -push, push)
-    return ca.Function("ramp", [arc, total], [time, speed, acceleration])
+    inputs = [arc, total, *sx_given(task).values()]
+    return ca.Function("ramp", inputs, [time, speed, acceleration])
 
 
 def _smooth_norm(vector: ca.SX) -> ca.SX:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from symbolic import outside
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.arms import robot_urdf
+from symbolic.read.changes import changed_text
 from symbolic.read.checks import check_all
 from symbolic.read.descriptions import description_content, resolve_mesh
 from symbolic.read.payload import check_count, read_contact, read_payload
@@ -47,6 +48,7 @@ def load(
     checks: Sequence[Check] = (),
     stored: bool = False,
     decided: tuple[int, int] = (SEARCHED, SEARCHED),
+    text: bytes | None = None,
 ) -> Workcell:
     """The workcell that a TOML file describes.
 
@@ -57,6 +59,7 @@ def load(
         stored: whether it was unpacked from an archive: packages that `package_dirs` lacks are
             not looked for on this machine, and xacro files were expanded before.
         decided: per robot the start branch that takes the place of "search" in the file.
+        text: what to read in the place of the file's content, as if it stood there.
 
     Raises:
         WorkcellError: with all problems of the file, each with its key path.
@@ -64,7 +67,7 @@ def load(
     path = Path(path)
     try:
         source = outside.resolved(path)
-        content = outside.read_bytes(source, outside.WORKCELL_BYTES)
+        content = outside.read_bytes(source, outside.WORKCELL_BYTES) if text is None else text
         content = with_branches(content, outside.toml_tables(content), decided)
         data = outside.toml_tables(content)
     except OutsideError as error:
@@ -76,7 +79,28 @@ def load(
     further = tuple(problem for check in checks for problem in check(workcell))
     if further:
         raise WorkcellError(str(path), further)
-    return workcell
+    return workcell if text is None else replace(workcell, text=content)
+
+
+def changed(workcell: Workcell, changes: Mapping[str, Any]) -> Workcell:
+    """The workcell with other values of some keys of its file, checked like a file.
+
+    Args:
+        workcell: read from a file.
+        changes: values by key path, see `symbolic.read.changes.changed_text`.
+
+    Raises:
+        WorkcellError: a path leads nowhere, or the changed cell is wrong; the message lists every
+            problem.
+    """
+    source, text = workcell.source, workcell.text
+    try:
+        known = outside.read_bytes(source, outside.WORKCELL_BYTES) if text is None else text
+        known = with_branches(known, outside.toml_tables(known), workcell.start_branch)
+        content = changed_text(known, changes, str(source))
+    except OutsideError as error:
+        raise WorkcellError(str(source), (f"file: {error}",)) from error
+    return load(source, text=content)
 
 
 def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell | None:

@@ -64,13 +64,16 @@ def collect_cell(workcell: Workcell) -> CellFiles:
         BundleError: the file on disk no longer describes this workcell, or a reference cannot
             be made relative.
     """
-    return _collected(workcell.source, workcell.digest, workcell.start_branch)
+    known = workcell.source, workcell.digest, workcell.start_branch, workcell.text
+    return _collected(*known)
 
 
 @lru_cache(maxsize=4)
-def _collected(source: Path, digest: str, branches: tuple[int, int]) -> CellFiles:
+def _collected(
+    source: Path, digest: str, branches: tuple[int, int], text: bytes | None
+) -> CellFiles:
     try:
-        current = load(source, decided=branches)
+        current = load(source, decided=branches, text=text)
     except DualArmError as error:
         raise BundleError(f"the workcell cannot be stored: {error}") from error
     if current.digest != digest:
@@ -78,7 +81,7 @@ def _collected(source: Path, digest: str, branches: tuple[int, int]) -> CellFile
             f"{source.name} does not describe the workcell in memory (it was changed after "
             "reading); store trajectories of a workcell as its file has it"
         )
-    collector = CellCollector(source)
+    collector = CellCollector(source, text)
     collector.collect(current)
     draft = CellFiles(*collector.layout(), digest="")
     with TemporaryDirectory() as folder:
@@ -243,9 +246,10 @@ def _leads_out(path: str) -> bool:
 class CellCollector:
     """Gathers a workcell's files and gives each a place relative to the workcell file."""
 
-    def __init__(self, source: Path) -> None:
+    def __init__(self, source: Path, text: bytes | None = None) -> None:
         self._source = source
-        self._text = outside.text(_content(source, outside.WORKCELL_BYTES))
+        content = _content(source, outside.WORKCELL_BYTES) if text is None else text
+        self._text = outside.text(content)
         self._files: dict[str, bytes] = {}
         self._folders: list[str] = []
         self._moved = 0

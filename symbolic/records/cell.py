@@ -312,7 +312,7 @@ def digest_of(workcell: Any, reading: Reading | None) -> str:
 def values_digest(workcell: Any) -> str:
     """SHA-256 over every value of the records, files by their place beside the workcell file."""
     total = hashlib.sha256()
-    for part in _parts(workcell, workcell.source.parent):
+    for part in parts(workcell, workcell.source.parent):
         # The length before each part keeps them apart.
         total.update(len(part).to_bytes(8, "big") + part)
     return total.hexdigest()
@@ -325,16 +325,19 @@ def named(workcell: Any) -> frozenset[str]:
     return frozenset([*_paths(workcell), *map(repr, arms)])
 
 
-def _parts(value: Any, folder: Path) -> Iterator[bytes]:
-    if is_dataclass(value):
+def parts(value: Any, folder: Path) -> Iterator[bytes]:
+    """What a record and its values are, piece by piece; paths as seen from a folder."""
+    if isinstance(value, type):
+        yield value.__name__.encode()
+    elif is_dataclass(value):
         yield type(value).__name__.encode()
         for field in fields(value):
-            if field.name not in ("source", "reading"):
-                yield from _parts(getattr(value, field.name), folder)
+            if field.name not in ("source", "reading", "text"):
+                yield from parts(getattr(value, field.name), folder)
     elif isinstance(value, tuple):
         yield f"tuple {len(value)}".encode()
         for entry in value:
-            yield from _parts(entry, folder)
+            yield from parts(entry, folder)
     elif isinstance(value, np.ndarray):
         yield f"array {value.dtype} {value.shape}".encode()
         yield value.tobytes()
@@ -358,6 +361,10 @@ def _paths(value: Any) -> Iterator[str]:
 
 # --- the whole cell ---
 
+
+BESIDE = 1e-9
+"""Distance between contacts, seen along their normals, from which on they count as beside one
+another [m]."""
 
 SEARCHED = -2
 """`Workcell.start_branch` of a robot whose branches compete."""
@@ -405,6 +412,7 @@ class Workcell:
             `hybrid_opt.branches`, and until then it is the criterion's choice.
         source: the file it came from.
         reading: what it was like when it was read from `source`.
+        text: what was read in the place of that file's content; None for that.
     """
 
     name: str
@@ -419,6 +427,7 @@ class Workcell:
     reading: Reading | None = None
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     handling: Handling = field(default_factory=Handling)
+    text: bytes | None = field(default=None, repr=False)
 
     @property
     def has_facing_pads(self) -> bool:
@@ -432,6 +441,13 @@ class Workcell:
         first, second = (contact.T_box_pad[:3, 2] for contact in self.contacts)
         opposite = np.allclose(first, -second, atol=1e-9)
         return opposite and not any(contact.further for contact in self.contacts)
+
+    @property
+    def has_pads_beside(self) -> bool:
+        """Whether the contacts lie beside one another, seen along the first one's normal."""
+        first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
+        normal, apart = self.contacts[0].T_box_pad[:3, 2], first - second
+        return bool(np.linalg.norm(apart - (apart @ normal) * normal) > BESIDE)
 
     @property
     def pads(self) -> tuple[Contact, ...]:
@@ -452,7 +468,14 @@ class Workcell:
 
 def box_flange(robot: Robot, contact: Contact) -> Array:
     """T_box_flange (4, 4) of the arm that holds this contact."""
-    return contact.T_box_pad @ inverse(robot.T_flange_pad)
+    known: Array | None = getattr(robot, "T_box_flange", None)  # of numbers that are symbols
+    return contact.T_box_pad @ inverse(robot.T_flange_pad) if known is None else known
+
+
+def flange_lever(robot: Robot, contact: Contact) -> Array:
+    """(3,) from the flange to the nominal contact point, box axes [m]."""
+    known: Array | None = getattr(robot, "lever", None)
+    return contact.T_box_pad[:3, 3] - box_flange(robot, contact)[:3, 3] if known is None else known
 
 
 PAYLOAD = "payload"

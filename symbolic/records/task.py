@@ -63,6 +63,11 @@ class RedundantJoint:
     upper: Array
     initial: Array
 
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """(n_waypoints,) where its value is a decision variable."""
+        return np.asarray(self.lower < self.upper)
+
 
 @dataclass(frozen=True)
 class AllowedContact:
@@ -152,7 +157,7 @@ class Task:
         free = np.array(self.free_indices, dtype=np.intp)
         rows, columns = [np.repeat(free, POSE_SIZE)], [np.tile(np.arange(POSE_SIZE), len(free))]
         for k, joint in enumerate(self.redundant):
-            moving = np.flatnonzero(joint.lower < joint.upper)
+            moving = np.flatnonzero(joint.moving)
             rows.append(moving)
             columns.append(np.full(len(moving), POSE_SIZE + k))
         found = np.concatenate(rows), np.concatenate(columns)
@@ -177,7 +182,7 @@ class Task:
 
     def _bounds(self, name: str, force: float) -> Array:
         parts = [getattr(self.waypoints[i], name) for i in self.free_indices]
-        parts += [getattr(joint, name)[joint.lower < joint.upper] for joint in self.redundant]
+        parts += [getattr(joint, name)[joint.moving] for joint in self.redundant]
         return np.concatenate(parts + ([np.array([force])] if self.time_law == "optimal" else []))
 
 

@@ -19,10 +19,10 @@ from operator import add
 import casadi as ca
 import numpy as np
 
-from symbolic.expression import Expression
+from symbolic.expression import Expression, mx_given, number, repeated, sx_given
 from symbolic.path.rotation import rotation_matrix
 from symbolic.records import Contact, Robot
-from symbolic.records.cell import box_flange
+from symbolic.records.cell import box_flange, flange_lever
 from symbolic.robot.model import RobotModel
 
 Arms = tuple[Robot, Robot]
@@ -69,18 +69,19 @@ def flange_target(
         position, rotation: (3,) and (3, 3), the box in the world (paper Eqs. 30-33).
     """
     T_box_flange = box_flange(robot, contact)
-    R_root_world = ca.DM(robot.T_world_base[:3, :3].T)
+    R_root_world = number(robot.T_world_base[:3, :3].T)
     R_root_box = ca.mtimes(R_root_world, rotation)
-    offset = position - ca.DM(robot.T_world_base[:3, 3])
+    offset = position - number(robot.T_world_base[:3, 3])
     return (
-        ca.mtimes(R_root_box, ca.DM(T_box_flange[:3, :3])),
-        ca.mtimes(R_root_world, offset) + ca.mtimes(R_root_box, ca.DM(T_box_flange[:3, 3])),
+        ca.mtimes(R_root_box, number(T_box_flange[:3, :3])),
+        ca.mtimes(R_root_world, offset) + ca.mtimes(R_root_box, number(T_box_flange[:3, 3])),
     )
 
 
 def limit_margin(robot: Robot, q: ca.SX) -> ca.SX:
     """Least distance (scalar) of the joints to their limits, negative beyond one [rad]."""
-    return ca.mmin(ca.vertcat(q - ca.DM(robot.position_lower), ca.DM(robot.position_upper) - q))
+    lower, upper = number(robot.position_lower), number(robot.position_upper)
+    return ca.mmin(ca.vertcat(q - lower, upper - q))
 
 
 def joint_torque(
@@ -93,10 +94,9 @@ def joint_torque(
         rotation: R_world_box (3, 3).
         wrench: (6,) on the box about the nominal contact point, world axes.
     """
-    lever_box = contact.T_box_pad[:3, 3] - box_flange(robot, contact)[:3, 3]
-    lever = ca.mtimes(rotation, ca.DM(lever_box))
+    lever = ca.mtimes(rotation, number(flange_lever(robot, contact)))
     moment = wrench[3:] + ca.cross(lever, wrench[:3])
-    R_root_world = ca.DM(robot.T_world_base[:3, :3].T)
+    R_root_world = number(robot.T_world_base[:3, :3].T)
     local = ca.vertcat(ca.mtimes(R_root_world, wrench[:3]), ca.mtimes(R_root_world, moment))
     return ca.mtimes(jacobian.T, local)
 
@@ -110,10 +110,10 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     """
     n = model.n_joints
     state, pose = ca.MX.sym("state", 3 * n + 1), ca.MX.sym("pose", model.pose_size)
-    wrench = ca.MX.sym("wrench", 6)
+    wrench, given = ca.MX.sym("wrench", 6), mx_given(robot)
     parts = _track_parts(robot, model, contact)
     previous, lost = state[:n], state[3 * n]
-    rotation, R_target, p_target = parts["target"](pose)
+    rotation, R_target, p_target = parts["target"](pose, *given.values())
     target = (R_target, p_target)
     q, before = parts["approach"](state, pose, *target)
     following = lost < 0.5
@@ -129,15 +129,15 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     change = q - previous
     return ca.Function(
         name,
-        [state, pose, wrench],
+        [state, pose, wrench, *given.values()],
         [
             ca.vertcat(q, change, change - state[n : 2 * n], lost),
             q,
             residual,
             lost,
-            *parts["measures"](q, jacobian, rotation, wrench),
+            *parts["measures"](q, jacobian, rotation, wrench, *given.values()),
         ],
-        ["state", "pose", "wrench"],
+        ["state", "pose", "wrench", *given],
         ["next_state", *TRACK_OUTPUTS],
     )
 
@@ -149,7 +149,7 @@ def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str
     rotation = rotation_matrix(model.orientation, pose[3:6])
     _, _, jacobian = model.kinematics(q)
     torque = joint_torque(robot, contact, jacobian, rotation, wrench)
-    return _function(name, [q, pose, wrench], [torque])
+    return _function(name, [q, pose, wrench, *sx_given(robot).values()], [torque])
 
 
 def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str, ca.Function]:
@@ -167,8 +167,9 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
     wrench = ca.SX.sym("wrench", 6)
     q, R, p = ca.SX.sym("q", n), ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
     residual, jacobian = ca.SX.sym("residual"), ca.SX.sym("jacobian", 6, n)
-    start = ca.SX.sym("start", n)
+    start, given = ca.SX.sym("start", n), sx_given(robot).values()
     rotation = rotation_matrix(model.orientation, pose[3:6])
+    target = [rotation, *flange_target(robot, contact, pose[:3], rotation)]
     previous, change = state[:n], state[n : 2 * n]
 
     near = model.with_redundant(previous + (change + state[2 * n : 3 * n]), pose)
@@ -190,15 +191,13 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
         joint_torque(robot, contact, jacobian, R, wrench),
     ]
     return {
-        "target": _function(
-            "target", [pose], [rotation, *flange_target(robot, contact, pose[:3], rotation)]
-        ),
+        "target": _function("target", [pose, *given], target),
         "approach": _function("approach", [state, pose, R, p], [near, before]),
         "closer": _where("closer", [q, R, p], [block_step(model, q, R, p)[0]], [q]),
         "place": place,
         "again": _where("again", [state, pose, R, p, *found], better, found),
         "held": _where("held", [start, R, p, *found], _placed(model, start, R, p), found),
-        "measures": _function("measures", [q, jacobian, R, wrench], measures),
+        "measures": _function("measures", [q, jacobian, R, wrench, *given], measures),
     }
 
 
@@ -233,18 +232,22 @@ def follow_function(
     predict it, and what they find takes the extrapolation's place.
     """
     start, pose = ca.MX.sym("start", model.n_joints), ca.MX.sym("pose", model.pose_size, samples)
-    wrench = ca.MX.sym("wrench", 6, samples)
+    wrench, given = ca.MX.sym("wrench", 6, samples), mx_given(robot)
     track = track_function(robot, model, contact, f"{name}_sample")
     begin = start_function(robot, model, contact, f"{name}_start")
-    first = track(begin(start, pose[:, 0]), pose[:, 0], wrench[:, 0])
+    first = track(
+        begin(start, pose[:, 0], *given.values()), pose[:, 0], wrench[:, 0], *given.values()
+    )
     predict = prediction_function(robot, model, contact, f"{name}_prediction")
-    state = predict(first[0], pose[:, 1])
-    rest = track.mapaccum(f"{name}_samples", samples - 1)(state, pose[:, 1:], wrench[:, 1:])
+    state = predict(first[0], pose[:, 1], *given.values())
+    rest = track.mapaccum(f"{name}_samples", samples - 1)(
+        state, pose[:, 1:], wrench[:, 1:], *repeated(given, samples - 1)
+    )
     return ca.Function(
         name,
-        [start, pose, wrench],
+        [start, pose, wrench, *given.values()],
         [ca.horzcat(one, more) for one, more in zip(first[1:], rest[1:], strict=True)],
-        ["start", "pose", "wrench"],
+        ["start", "pose", "wrench", *given],
         list(TRACK_OUTPUTS),
     )
 
@@ -258,6 +261,7 @@ def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     """
     n = model.n_joints
     start, pose = ca.MX.sym("start", n), ca.MX.sym("pose", model.pose_size)
+    numbers = mx_given(robot)
     q: Expression = start
     if model.redundant:
         q_start, at = ca.SX.sym("start", n), ca.SX.sym("q", n)
@@ -266,11 +270,13 @@ def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
         target = flange_target(robot, contact, given[:3], rotation)
         away = (model.with_redundant(q_start, given) - q_start) / BEGIN_STEPS
         moved = newton_step(model, at + away, *target)
-        move = _function(f"{name}_step", [q_start, at, given], [moved])
+        inputs = [q_start, at, given, *sx_given(robot).values()]
+        move = _function(f"{name}_step", inputs, [moved])
         for _ in range(BEGIN_STEPS):
-            q = move(start, q, pose)
+            q = move(start, q, pose, *numbers.values())
     state = ca.vertcat(q, ca.MX.zeros(2 * n + 1))
-    return ca.Function(name, [start, pose], [state], ["start", "pose"], ["state"])
+    inputs, names = [start, pose, *numbers.values()], ["start", "pose", *numbers]
+    return ca.Function(name, inputs, [state], names, ["state"])
 
 
 def prediction_function(
@@ -289,7 +295,9 @@ def prediction_function(
     for _ in range(NEWTON_STEPS):
         q = newton_step(model, q, R_target, p_target)
     predicting = ca.vertcat(start, q - start, ca.SX.zeros(n), state[3 * n])
-    return ca.Function(name, [state, pose], ca.cse([predicting]), ["state", "pose"], ["predicting"])
+    given = sx_given(robot)
+    inputs, names = [state, pose, *given.values()], ["state", "pose", *given]
+    return ca.Function(name, inputs, ca.cse([predicting]), names, ["predicting"])
 
 
 def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Function:
@@ -309,11 +317,12 @@ def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Fun
         R, p = model.placement(q)
         postures.append(q)
         residuals.append(pose_error(R_target, p_target, R, p)[1])
+    given = sx_given(*robots)
     return ca.Function(
         "posture",
-        [pose, *guesses],
+        [pose, *guesses, *given.values()],
         ca.cse([*postures, *residuals]),
-        ["pose", "guess_1", "guess_2"],
+        ["pose", "guess_1", "guess_2", *given],
         ["q_1", "q_2", "residual_1", "residual_2"],
     )
 

@@ -12,12 +12,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.path.spline import sample_basis, waypoint_matrix
-from symbolic.path.time_law import timed_path
+from symbolic.path.spline import sample_basis
 from symbolic.records import POSE_SIZE, Contact, Robot, Workcell
 from symbolic.records.cell import box_flange
 from symbolic.records.poses import box_placement, inverse
@@ -75,12 +73,66 @@ class StartBranch:
         return (-float(self.kept), -round(robust, 4), -self.limit_margin * self.manipulability)
 
 
+Kinematics = Callable[[Array], tuple[Array, Array, Array]]
+"""Joints (n, joints) to the flange's rotations (n, 3, 3), positions (n, 3) and Jacobians
+(n, 6, joints), see `RobotModel`."""
+
+Follow = Callable[[Array, Array], Mapping[str, Array]]
+"""Joints (m, joints) at the first of some extended poses (n, 6 + k) to `TRACK_OUTPUTS` (m, n, ...)
+of an arm without load."""
+
+Clearance = Callable[[Array, Array], float]
+"""Box poses (n, 6) and joints (n, joints) to an arm's least clearance bound [m]."""
+
+
+@dataclass(frozen=True)
+class ArmSearch:
+    """What start branches of an arm are found with."""
+
+    kinematics: Kinematics
+    follow: Follow
+    clearance: Clearance | None = None
+
+
+def interpreted_search(
+    workcell: Workcell, arm: int, model: RobotModel, clearance: Clearance | None = None
+) -> ArmSearch:
+    """The same by CasADi's interpreter."""
+    track = follow_function(
+        workcell.robots[arm], model, workcell.contacts[arm], workcell.task.samples, "follow"
+    )
+
+    def follow(starts: Array, extended: Array) -> Mapping[str, Array]:
+        still = np.zeros((POSE_SIZE, len(extended)))
+        found = [[np.array(x).T for x in track(q, extended.T, still)] for q in starts]
+        outputs = [np.array(values) for values in zip(*found, strict=True)]
+        return {
+            name: values[:, :, 0] if values.shape[2] == 1 else values
+            for name, values in zip(TRACK_OUTPUTS, outputs, strict=True)
+        }
+
+    return ArmSearch(interpreted_kinematics(model), follow, clearance)
+
+
+def interpreted_kinematics(model: RobotModel) -> Kinematics:
+    """An arm's kinematics by CasADi's interpreter."""
+
+    def kinematics(q: Array) -> tuple[Array, Array, Array]:
+        n = len(q)
+        R, p, J = model.kinematics.map(n)(q.T)
+        rotation = np.array(R).reshape(3, n, 3).transpose(1, 0, 2)
+        return rotation, np.array(p).T, np.array(J).reshape(6, n, -1).transpose(1, 0, 2)
+
+    return kinematics
+
+
 def inverse_kinematics(
     robot: Robot,
     model: RobotModel,
     T_root_flange: Array,
     n_starts: int = N_STARTS,
     redundant: Mapping[int, float] = MappingProxyType({}),
+    kinematics: Kinematics | None = None,
 ) -> Array:
     """All joint positions found for a flange pose, full turns of a joint counted once.
 
@@ -88,6 +140,7 @@ def inverse_kinematics(
         T_root_flange: (4, 4) wanted flange placement in the robot's root frame.
         n_starts: number of starts of the search, a power of two.
         redundant: positions of the arm's redundant joints by their indices [rad or m].
+        kinematics: of the arm; None for the interpreted one.
 
     Returns:
         (m, n) [rad], sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`
@@ -97,6 +150,7 @@ def inverse_kinematics(
     # Not imported at the top: it takes long to start, and a model from the cache needs no search.
     from scipy.stats import qmc
 
+    kinematics = kinematics or interpreted_kinematics(model)
     following = list(model.following)
     centre = (robot.position_lower + robot.position_upper) / 2.0
     half = np.minimum((robot.position_upper - robot.position_lower) / 2.0, np.pi)[following]
@@ -106,7 +160,7 @@ def inverse_kinematics(
         q[:, joint] = value
     solved = [np.empty((0, model.n_joints))]
     for _ in range(MAX_ITERATIONS):
-        error, jacobian, residual = _batch_error(model, q, T_root_flange)
+        error, jacobian, residual = _batch_error(kinematics(q), following, T_root_flange)
         arrived = residual < SOLUTION_TOLERANCE
         solved.append(q[arrived])
         q, error, jacobian, residual = (
@@ -128,33 +182,29 @@ def inverse_kinematics(
     return possible[np.lexsort(np.round(possible, 6).T[::-1])]
 
 
-def _batch_error(model: RobotModel, q: Array, target: Array) -> tuple[Array, Array, Array]:
+def _batch_error(
+    found: tuple[Array, Array, Array], following: list[int], target: Array
+) -> tuple[Array, Array, Array]:
     """Newton's right-hand side (n, 6), Jacobian (n, 6, 6) by the joints that follow, and pose
     residual (n,)."""
-    n = len(q)
-    R, p = model.placement.map(n)(q.T)
-    whole = np.array(model.jacobian.map(n)(q.T)).reshape(6, n, model.n_joints)
-    if model.redundant:
-        whole = np.delete(whole, [joint for joint, _ in model.redundant], axis=2)
-    jacobian = whole.transpose(1, 0, 2)
-    rotation = np.array(R).reshape(3, n, 3).transpose(1, 0, 2)
+    rotation, position, jacobian = found
     dR = np.einsum("ij,nkj->nik", target[:3, :3], rotation)
     axis = np.stack(
         [dR[:, 2, 1] - dR[:, 1, 2], dR[:, 0, 2] - dR[:, 2, 0], dR[:, 1, 0] - dR[:, 0, 1]], axis=1
     )
-    dp = target[:3, 3] - np.array(p).T
+    dp = target[:3, 3] - position
     turn_squared = np.sum((target[:3, :3] - rotation) ** 2, axis=(1, 2)) / 2.0
     residual = np.sqrt(np.sum(dp**2, axis=1) + turn_squared)
-    return np.concatenate([dp, axis / 2.0], axis=1), jacobian, residual
+    return np.concatenate([dp, axis / 2.0], axis=1), jacobian[:, :, following], residual
 
 
 def _distinct(q: Array) -> Array:
     """Rows that differ from all earlier ones by more than rounding, full turns apart ignored."""
-    kept: list[Array] = []
-    for row in q:
-        turns = [np.abs(np.remainder(row - other + np.pi, 2 * np.pi) - np.pi) for other in kept]
-        if not any(np.all(turn < SAME_BRANCH) for turn in turns):
-            kept.append(row)
+    kept = []
+    while len(q):
+        kept.append(q[0])
+        turns = np.abs(np.remainder(q - q[0] + np.pi, 2 * np.pi) - np.pi)
+        q = q[~np.all(turns < SAME_BRANCH, axis=1)]
     return np.array(kept).reshape(-1, q.shape[1])
 
 
@@ -168,10 +218,7 @@ def _central_turns(robot: Robot, model: RobotModel, least: Array, greatest: Arra
 
 
 def start_branches(
-    workcell: Workcell,
-    arm: int,
-    model: RobotModel,
-    clearance: Callable[[Array, Array], float] | None = None,
+    workcell: Workcell, arm: int, model: RobotModel, search: ArmSearch | None = None
 ) -> tuple[StartBranch, ...]:
     """All branches of one arm at the first waypoint, best first (see `StartBranch.rank`).
 
@@ -180,35 +227,36 @@ def start_branches(
 
     Args:
         arm: 0 or 1.
-        clearance: from box poses (n, 6) and joint positions (n, joints) to the arm's least
-            clearance bound [m].
+        search: what they are found with; None for the interpreted functions, without clearance.
     """
     robot, contact = workcell.robots[arm], workcell.contacts[arm]
-    poses = initial_poses(workcell)
-    extended = np.column_stack([poses, initial_redundant(workcell)])
+    search = search or interpreted_search(workcell, arm, model)
+    extended = initial_poses(workcell)
+    poses = np.ascontiguousarray(extended[:, :POSE_SIZE])
     target = start_flange(workcell, robot, contact)
-    follow = follow_function(robot, model, contact, len(poses), f"follow_{arm + 1}")
-    branches = []
     start = {joint: float(extended[0, place]) for joint, place in model.redundant}
-    for q in inverse_kinematics(robot, model, target, redundant=start):
-        tracked = follow(q, extended.T, np.zeros((6, len(poses))))
-        result = {name: np.array(value) for name, value in zip(TRACK_OUTPUTS, tracked, strict=True)}
-        tracked_path = result["q"].T
+    starts = inverse_kinematics(robot, model, target, redundant=start, kinematics=search.kinematics)
+    tracked = search.follow(starts, extended) if len(starts) else {}
+    branches = []
+    for k, q in enumerate(starts):
+        result = {name: values[k] for name, values in tracked.items()}
+        tracked_path = result["q"]
         turns = _central_turns(robot, model, tracked_path.min(axis=0), tracked_path.max(axis=0))
         # A path that leaves the limits may pull the start out of them, where the search found it.
         inside = (q + turns >= robot.position_lower) & (q + turns <= robot.position_upper)
         turns = np.where(inside, turns, 0.0)
         path = np.ascontiguousarray(tracked_path + turns)
         to_limits = np.minimum(path - robot.position_lower, robot.position_upper - path)
-        margin, measure = to_limits.min(axis=1), result["manipulability"][0]
-        good = (result["lost"][0] == 0.0) & (margin >= 0.0) & (measure >= robot.min_manipulability)
+        margin, measure = to_limits.min(axis=1), result["manipulability"]
+        good = (result["lost"] == 0.0) & (margin >= 0.0) & (measure >= robot.min_manipulability)
         kept = int(np.argmin(good)) if not good.all() else len(poses)
         span = slice(0, max(kept, 1))
+        clear = search.clearance(poses[span], path[span]) if search.clearance else float("inf")
         branches.append(
             StartBranch(
                 q=q + turns,
                 kept=kept,
-                clearance=clearance(poses[span], path[span]) if clearance else float("inf"),
+                clearance=clear,
                 limit_margin=float(margin[span].min()),
                 manipulability=float(measure[span].min()),
                 path=path,
@@ -224,17 +272,7 @@ def start_flange(workcell: Workcell, robot: Robot, contact: Contact) -> Array:
     return inverse(robot.T_world_base) @ T_world_box @ box_flange(robot, contact)
 
 
-def initial_redundant(workcell: Workcell) -> Array:
-    """Sampled values (n, m) of the redundant joints in the hand-made initial trajectory."""
-    task = workcell.task
-    values = extended_waypoints(task, initial_decision(task))[:, POSE_SIZE:]
-    return np.asarray(sample_basis(task).position @ values)
-
-
 def initial_poses(workcell: Workcell) -> Array:
-    """Sampled box poses (n, 6) of the hand-made initial trajectory."""
+    """Sampled extended poses (n, 6 + m) of the hand-made initial trajectory."""
     task = workcell.task
-    x = ca.MX.sym("x", task.n_var)
-    path = timed_path(task, sample_basis(task), waypoint_matrix(task, x))
-    poses = ca.Function("poses", [x], [path.pose])
-    return np.array(poses(initial_decision(task))).T
+    return sample_basis(task).position @ extended_waypoints(task, initial_decision(task))

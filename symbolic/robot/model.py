@@ -151,4 +151,4 @@ def build_robot_model(
 def gravity_in_root(T_world_base: Array) -> Array:
     """(3,) acceleration of gravity [m/s^2] along the axes of a base at T_world_base (4, 4)."""
     gravity: Array = T_world_base[:3, :3].T @ pinocchio.Model.gravity981
-    return gravity
+    return gravity + 0.0  # no negative zeros: upright arms are alike

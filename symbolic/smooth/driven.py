@@ -15,7 +15,13 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.contact.soft_finger import Detached
-from symbolic.limits import PATH_OUTPUTS, contact_limits, limit_layout, sample_limits_function
+from symbolic.limits import (
+    PATH_OUTPUTS,
+    contact_limits,
+    limit_layout,
+    limit_numbers,
+    sample_limits_function,
+)
 from symbolic.records import POSE_SIZE, Workcell
 from symbolic.smooth.samples import branch_coefficients
 
@@ -99,7 +105,7 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     """
     layout = driven_layout(model.workcell)
     names = [*PATH_OUTPUTS, "a", "w"]
-    sizes = [layout.pose] * 3 + [*[len(start) for start in model.start], 1, 1]
+    sizes = [layout.pose] * 3 + [*[arm.n_joints for arm in model.robots], 1, 1]
     inputs = [ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)]
     detached: Detached = []
     value, y = _value(model, inputs, detached), ca.vertcat(*inputs)
@@ -110,13 +116,20 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     second = [ca.densify(ca.jtimes(gradient, y, direction))]
     for symbol, solved in detached:
         first, second = (ca.substitute(found, [symbol], [solved]) for found in (first, second))
+    given = limit_numbers(model.workcell)
     return {
-        DRIVEN_FIRST: ca.Function(DRIVEN_FIRST, inputs, ca.cse(first), names, ["value", "slope"]),
+        DRIVEN_FIRST: ca.Function(
+            DRIVEN_FIRST,
+            [*inputs, *given.values()],
+            ca.cse(first),
+            [*names, *given],
+            ["value", "slope"],
+        ),
         DRIVEN_SECOND: ca.Function(
             DRIVEN_SECOND,
-            [*inputs, weight, direction],
+            [*inputs, weight, direction, *given.values()],
             ca.cse(second),
-            [*names, "weight", "direction"],
+            [*names, "weight", "direction", *given],
             ["change"],
         ),
     }
@@ -127,7 +140,7 @@ def _value(model: CellModel, inputs: list[ca.SX], detached: Detached) -> ca.SX:
     workcell = model.workcell
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints
     *path, a, w = inputs
-    row = sample_limits_function(model)(*path)
+    row = sample_limits_function(model)(*path, *limit_numbers(workcell).values())
     at = limits.offsets
     block = {name: row[at[name] : at[name] + size] for name, size in limits.sizes.items()}
     cones = [block["cone"][6 * k : 6 * k + 6] for k in (0, 1)]

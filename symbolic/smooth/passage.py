@@ -22,6 +22,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.expression import sx_given
 from symbolic.geometry.clearance import BOX_NUMBERS
 from symbolic.smooth.places import Place, PlaceConstraint
 
@@ -85,7 +86,7 @@ def direction(place: Place, numbers: ca.SX) -> ca.SX:
 def gap(place: Place, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
     """The gap along a direction, its kinks rounded [m]."""
     n = direction(place, numbers)
-    return place.scene.separation(place.payload, obstacle, n / ca.norm_2(n))
+    return place.scene.separation(obstacle, n / ca.norm_2(n))
 
 
 @dataclass(frozen=True, order=True)
@@ -166,7 +167,9 @@ def gap_function(place: Place) -> ca.Function:
         n = direction(place, turned)
         squared = ca.sumsqr(n)
         unit = n / ca.sqrt(ca.fmax(squared, PARALLEL**2))
-        along = place.sharp_scene.separation(place.payload, obstacle, unit)
+        along = place.sharp_scene.separation(obstacle, unit)
         found.append(ca.if_else(squared < PARALLEL**2, APART, along))
     gaps = ca.cse([ca.densify(ca.vertcat(*found))])
-    return ca.Function(GAPS, [place.pose, obstacle], gaps, ["pose", "obstacle"], ["gaps"])
+    given = sx_given(place.model.screen)
+    inputs, names = [place.pose, obstacle, *given.values()], ["pose", "obstacle", *given]
+    return ca.Function(GAPS, inputs, gaps, names, ["gaps"])

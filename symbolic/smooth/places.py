@@ -25,10 +25,10 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
-from symbolic.geometry.clearance import Scene
+from symbolic.expression import sx_given
+from symbolic.geometry.clearance import Scene, box_numbers
 from symbolic.geometry.expressions import EXACT, Softness
 from symbolic.path.rotation import rotation_matrix
-from symbolic.records.cell import PAYLOAD
 from symbolic.robot.arm import (
     flange_target,
     following_columns,
@@ -89,22 +89,18 @@ class Place:
 
     def _scene(self, softness: Softness) -> Scene:
         placed = [self.model.robots[arm].joint_placements(self.q[arm]) for arm in (0, 1)]
-        geometry = self.model.geometry
-        return Scene(geometry, self.rotation, self.pose[:3], (placed[0], placed[1]), softness)
-
-    @property
-    def payload(self) -> int:
-        """The payload among the bodies."""
-        return [body.name for body in self.model.geometry.bodies].index(PAYLOAD)
+        at = self.rotation, self.pose[:3], (placed[0], placed[1])
+        return Scene(self.model.screen, *at, softness)
 
     def obstacle(self, pair: int) -> Array:
         """The numbers of the box of a separable pair."""
-        return self.scene.box_numbers(self.model.geometry.active[pair].second)
+        geometry = self.model.geometry
+        return box_numbers(geometry.bodies[geometry.active[pair].second])
 
     def separable(self) -> tuple[int, ...]:
         """The active pairs of the payload and an obstacle of one box."""
-        active = self.model.geometry.active
-        return tuple(k for k, p in enumerate(active) if self.scene.separable(p.first, p.second))
+        pairs = range(len(self.model.geometry.active))
+        return tuple(pair for pair in pairs if self.scene.separable(pair))
 
 
 @dataclass(frozen=True)
@@ -143,6 +139,10 @@ class PlaceConstraint(ABC):
         """The arms whose joints the value depends on."""
         return ()
 
+    def given(self, model: CellBodies) -> dict[str, ca.SX]:
+        """The cell's numbers that the value depends on: by default those of its bodies."""
+        return sx_given(model.screen)
+
 
 @dataclass(frozen=True, order=True)
 class Clearance(PlaceConstraint):
@@ -159,8 +159,7 @@ class Clearance(PlaceConstraint):
 
     def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
         """The bound of `symbolic.geometry.clearance`, its kinks rounded."""
-        bodies = place.model.geometry.active[self.pair]
-        return place.scene.bound(bodies.first, bodies.second)
+        return place.scene.bound(self.pair)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
         """Those whose links are in the pair."""
@@ -196,7 +195,7 @@ class JointLimit(PlaceConstraint):
     def numbers(self, place: Place) -> Array:
         """The margin at zero joints, and its gradient."""
         robot = place.model.workcell.robots[self.arm]
-        slope = np.zeros(len(robot.position_lower))
+        slope = np.zeros(robot.position_lower.shape[0])
         slope[self.joint] = 1.0 if self.side == "lower" else -1.0
         limit = robot.position_lower if self.side == "lower" else robot.position_upper
         return np.concatenate([[-slope[self.joint] * limit[self.joint]], slope])
@@ -204,6 +203,10 @@ class JointLimit(PlaceConstraint):
     def arms(self, model: CellBodies) -> tuple[int, ...]:
         """The joint's own."""
         return (self.arm,)
+
+    def given(self, model: CellBodies) -> dict[str, ca.SX]:
+        """None: a limit is a number of its own."""
+        return {}
 
 
 @dataclass(frozen=True, order=True)
@@ -234,6 +237,10 @@ class Reach(PlaceConstraint):
         """The one."""
         return (self.arm,)
 
+    def given(self, model: CellBodies) -> dict[str, ca.SX]:
+        """Those of the arm."""
+        return sx_given(model.workcell.robots[self.arm])
+
 
 def row_name(family: str, order: Order) -> str:
     """Of `row_function`."""
@@ -253,7 +260,7 @@ def row_function(place: Place, constraint: PlaceConstraint, order: Order) -> ca.
     first: pose, rate, q_1, q_2, numbers -> value, gradient (n_y,).
     second: pose, rate, q_1, q_2, numbers, weight -> weight times the Hessian (n_y, n_y).
 
-    Where the family has one member, there are no numbers.
+    Where the family has one member, there are no numbers. The cell's own follow.
     """
     numbers = ca.SX.sym("numbers", constraint.count(place))
     value = constraint.expression(place, numbers)
@@ -263,13 +270,15 @@ def row_function(place: Place, constraint: PlaceConstraint, order: Order) -> ca.
     inputs, names = [place.pose, place.rate, *place.q], ["pose", "rate", "q_1", "q_2"]
     if numbers.numel():
         inputs, names = [*inputs, numbers], [*names, "numbers"]
-    name = row_name(constraint.family, order)
+    name, given = row_name(constraint.family, order), constraint.given(place.model)
     if order == "first":
         results = ca.cse([value, ca.densify(ca.gradient(value, y))])
-        return ca.Function(name, inputs, results, names, ["value", "gradient"])
+        sides = [*inputs, *given.values()], results, [*names, *given]
+        return ca.Function(name, *sides, ["value", "gradient"])
     weight = ca.SX.sym("weight")
     curvature = ca.cse([ca.densify(weight * ca.hessian(value, y)[0])])
-    return ca.Function(name, [*inputs, weight], curvature, [*names, "weight"], ["hessian"])
+    sides = [*inputs, weight, *given.values()], curvature, [*names, "weight", *given]
+    return ca.Function(name, *sides, ["hessian"])
 
 
 def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
@@ -292,27 +301,28 @@ def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
     closure = ca.vertcat(held, *tied)
     pull = -ca.solve(ca.jacobian(closure, joints), ca.SX.eye(n))
     follow = ca.mtimes(pull, ca.jacobian(closure, pose))
-    slopes = ca.Function("slopes", [pose, joints], [follow, pull])
+    given = sx_given(cell.robots[arm])
+    slopes = ca.Function("slopes", [pose, joints, *given.values()], [follow, pull])
 
     q = own.with_redundant(reference, pose)
     for _ in range(SOLVE_STEPS):
         q = newton_step(own, q, *target)
     first, second = closure_name(arm, "first"), closure_name(arm, "second")
-    results = ca.cse([ca.densify(result) for result in (q, *slopes(pose, q))])
+    results = ca.cse([ca.densify(result) for result in (q, *slopes(pose, q, *given.values()))])
     curvature, _ = ca.hessian(ca.dot(nu, closure), ca.vertcat(pose, joints))
     return {
         first: ca.Function(
             first,
-            [pose, reference],
+            [pose, reference, *given.values()],
             results,
-            ["pose", "q_reference"],
+            ["pose", "q_reference", *given],
             ["q", "follow", "pull"],
         ),
         second: ca.Function(
             second,
-            [pose, joints, nu],
+            [pose, joints, nu, *given.values()],
             ca.cse([ca.densify(curvature)]),
-            ["pose", "q", "nu"],
+            ["pose", "q", "nu", *given],
             ["hessian"],
         ),
     }

@@ -27,13 +27,14 @@ from numpy.typing import NDArray
 from symbolic.array import Array
 from symbolic.contact.closed_form import Asked, held_by
 from symbolic.contact.grasp import Grasp
-from symbolic.contact.load import resultant_force
+from symbolic.contact.load import frictions, resultant_force
 from symbolic.contact.paper import (
     normal_force_branches,
     required_moment,
     split_force,
 )
 from symbolic.contact.soft_grasp import SoftGrasp
+from symbolic.expression import mx_given, number, of, repeated, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.path.spline import PathBasis, sample_basis, waypoint_matrix
 from symbolic.path.time_law import timed_path
@@ -182,17 +183,19 @@ def _window_functions(
     task = workcell.task
     n_waypoints = len(task.waypoints)
     x, basis = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", n_waypoints, WINDOW)
-    rounding = ca.MX.sym("rounding")
+    rounding, handed = ca.MX.sym("rounding"), mx_given(task, workcell.payload)
     # The window's poses are handed to the time law as waypoints of an identity basis.
     identity = np.eye(WINDOW)
-    window = ca.mtimes(waypoint_matrix(task, x), basis)
+    window = ca.mtimes(waypoint_matrix(task, x, of(handed, task)), basis)
     own = PathBasis(np.linspace(0.0, 1.0, WINDOW), identity, identity, identity)
-    wrenches = _at_samples(workcell, _wrench_function(workcell), own, window, columns, rounding)
-    flat = ca.Function("wrenches", [x, basis, rounding], [wrenches]).expand()
+    wrench = _wrench_function(workcell)
+    wrenches = _at_samples(workcell, wrench, (own, window, rounding), columns, handed)
+    flat = ca.Function("wrenches", [x, basis, rounding, *handed.values()], [wrenches]).expand()
     inputs = [ca.SX.sym(name, *flat.size_in(k)) for k, name in enumerate(INPUTS)]
-    wrenches = flat(*inputs)
-    values = ca.vertcat(*[sample(wrenches[k : k + 6]) for k in range(0, wrenches.numel(), 6)])
-    return _functions(values, inputs, quantity, block)
+    given = sx_given(task, workcell.payload)
+    wrenches, held = flat(*inputs, *given.values()), sx_given(workcell.payload).values()
+    each = [sample(wrenches[k : k + 6], *held) for k in range(0, wrenches.numel(), 6)]
+    return _functions(ca.vertcat(*each), inputs, given, quantity, block)
 
 
 def _whole_path(
@@ -200,29 +203,34 @@ def _whole_path(
 ) -> dict[str, ca.Function]:
     task = workcell.task
     x, unused = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", len(task.waypoints), task.samples)
-    rounding = ca.MX.sym("rounding")
+    rounding, handed = ca.MX.sym("rounding"), mx_given(task, workcell.payload)
     every, wrench = tuple(range(task.samples)), _wrench_function(workcell)
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    whole = ca.Function("sample", motion, [sample(wrench(*motion))])
-    along = sample_basis(task), waypoint_matrix(task, x)
-    values = _at_samples(workcell, whole, *along, every, None)
-    return _functions(values, [x, unused, rounding], quantity, "path")
+    held = sx_given(workcell.payload).values()
+    whole = ca.Function("sample", [*motion, *held], [sample(wrench(*motion, *held), *held)])
+    waypoints = waypoint_matrix(task, x, of(handed, task))
+    values = _at_samples(workcell, whole, (sample_basis(task), waypoints, None), every, handed)
+    return _functions(values, [x, unused, rounding], handed, quantity, "path")
 
 
 def _at_samples(
     workcell: Workcell,
     of_motion: ca.Function,
-    basis: PathBasis,
-    waypoints: ca.MX,
+    along: tuple[PathBasis, ca.MX, ca.MX | None],
     columns: tuple[int, ...],
-    rounding: ca.MX | None,
+    handed: dict[str, ca.MX],
 ) -> ca.MX:
     """What a function makes of the motion at the chosen columns of the timed path, one after the
-    other."""
-    path = timed_path(workcell.task, basis, waypoints, rounding)
-    at = list(columns)
+    other.
+
+    Args:
+        along: basis, waypoints and rounding of `timed_path`.
+        handed: the numbers of task and payload.
+    """
+    path, at = timed_path(workcell.task, *along, of(handed, workcell.task)), list(columns)
+    held = repeated(of(handed, workcell.payload), len(at))
     each = of_motion.map(len(at))
-    return ca.vec(each(path.pose[:, at], path.rate[:, at], path.second_rate[:, at]))
+    return ca.vec(each(path.pose[:, at], path.rate[:, at], path.second_rate[:, at], *held))
 
 
 def _wrench_function(workcell: Workcell) -> ca.Function:
@@ -233,11 +241,12 @@ def _wrench_function(workcell: Workcell) -> ca.Function:
     rotation = rotation_matrix(turned, pose[3:])
     omega = angular_velocity(turned, pose[3:], rate[3:])
     alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
-    offset = ca.mtimes(rotation, ca.DM(payload.centre_of_mass))
+    offset = ca.mtimes(rotation, number(payload.centre_of_mass))
     force = resultant_force(payload.mass, offset, omega, alpha, second[:3])
-    moment = required_moment(ca.SX(ca.DM(payload.inertia)), rotation, omega, alpha)
+    moment = required_moment(ca.SX(number(payload.inertia)), rotation, omega, alpha)
     wrench = ca.vertcat(ca.mtimes(rotation.T, force), ca.mtimes(rotation.T, moment))
-    return ca.Function("sample_wrench", [pose, rate, second], [wrench])
+    given = sx_given(payload).values()
+    return ca.Function("sample_wrench", [pose, rate, second, *given], [wrench])
 
 
 def _margin_function(workcell: Workcell) -> ca.Function:
@@ -246,15 +255,17 @@ def _margin_function(workcell: Workcell) -> ca.Function:
     wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
     shift = held_by(workcell, "paper", _asked(workcell, wrench))
     squares = ca.vertcat(ca.sumsqr(shift.shift_1), ca.sumsqr(shift.shift_2))
-    radius = ca.DM([contact.patch_radius for contact in contacts])
-    return ca.Function("sample_margin", [wrench], [1.0 - squares / radius**2])
+    radius = ca.vertcat(*[ca.SX(number(contact.patch_radius)) for contact in contacts])
+    given = sx_given(workcell.payload).values()
+    return ca.Function("sample_margin", [wrench, *given], [1.0 - squares / radius**2])
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
     """Force and moment (6,) about the centre of mass to those about the box frame's origin."""
-    wrench, centre = ca.SX.sym("wrench", 6), ca.DM(workcell.payload.centre_of_mass)
+    wrench, centre = ca.SX.sym("wrench", 6), number(workcell.payload.centre_of_mass)
     about = wrench[3:] + ca.cross(ca.SX(centre), wrench[:3])
-    return ca.Function("sample_load", [wrench], [ca.vertcat(wrench[:3], about)])
+    given = sx_given(workcell.payload).values()
+    return ca.Function("sample_load", [wrench, *given], [ca.vertcat(wrench[:3], about)])
 
 
 def _force_function(workcell: Workcell) -> ca.Function:
@@ -265,22 +276,26 @@ def _force_function(workcell: Workcell) -> ca.Function:
     if workcell.task.allocation == "soft-finger":
         quantities = held_by(workcell, "soft-finger", _asked(workcell, wrench)).normal
     else:
-        normal = ca.SX(ca.DM(workcell.contacts[0].T_box_pad[:3, 2]))
+        normal = ca.SX(number(workcell.contacts[0].T_box_pad[:3, 2]))
         quantities = ca.vertcat(*split_force(wrench[:3], normal)[:2])
-    return ca.Function("sample_split", [wrench], [quantities])
+    given = sx_given(workcell.payload).values()
+    return ca.Function("sample_split", [wrench, *given], [quantities])
 
 
 def _asked(workcell: Workcell, wrench: ca.SX) -> Asked:
     """What force and moment (6,) in the box's frame ask of the contacts."""
     contacts, centre = workcell.contacts, workcell.payload.centre_of_mass
-    first, second = (ca.SX(ca.DM(c.T_box_pad[:3, 3] - centre)) for c in contacts)
-    friction = ca.SX(ca.DM([contact.friction for contact in contacts]))
-    axes = ca.SX(ca.DM(contacts[0].T_box_pad[:3, :3]))
-    return Asked(wrench[:3], wrench[3:], (first, second), axes, friction)
+    first, second = (ca.SX(number(c.T_box_pad[:3, 3] - centre)) for c in contacts)
+    axes = ca.SX(number(contacts[0].T_box_pad[:3, :3]))
+    return Asked(wrench[:3], wrench[3:], (first, second), axes, frictions(workcell))
 
 
 def _functions(
-    values: ca.SX | ca.MX, inputs: list[ca.SX | ca.MX], quantity: Quantity, block: Block
+    values: ca.SX | ca.MX,
+    inputs: list[ca.SX | ca.MX],
+    given: Mapping[str, ca.SX | ca.MX],
+    quantity: Quantity,
+    block: Block,
 ) -> dict[str, ca.Function]:
     """See `sample_functions`."""
     first, second = (sample_name(quantity, block, order) for order in ORDERS)
@@ -291,12 +306,18 @@ def _functions(
     results = ca.cse([ca.densify(result) for result in (values, gradient)])
     names = list(INPUTS)
     return {
-        first: ca.Function(first, inputs, results, names, ["values", "gradient"]),
+        first: ca.Function(
+            first,
+            [*inputs, *given.values()],
+            results,
+            [*names, *given],
+            ["values", "gradient"],
+        ),
         second: ca.Function(
             second,
-            [*inputs, weight, along],
+            [*inputs, weight, along, *given.values()],
             ca.cse([ca.densify(curvature)]),
-            [*names, "weight", "along"],
+            [*names, "weight", "along", *given],
             ["curvature"],
         ),
     }

@@ -23,7 +23,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate import kernel
 from symbolic.cell_model import CellModel
-from symbolic.records import Workcell
+from symbolic.numbers import HELD, START
 from tests.symbolic.cells import hand_cell, hand_model, rack_cell
 
 
@@ -32,8 +32,8 @@ def test_the_model_is_built_once_for_all_functions(monkeypatch: pytest.MonkeyPat
     models: list[CellModel] = []
     build_cell_model = symbolic.cell_model.build_cell_model
 
-    def counted(workcell: Workcell) -> CellModel:
-        models.append(build_cell_model(workcell))
+    def counted(*of: Any) -> CellModel:
+        models.append(build_cell_model(*of))
         return models[-1]
 
     def built(
@@ -52,8 +52,8 @@ def test_the_model_is_built_once_for_all_functions(monkeypatch: pytest.MonkeyPat
     assert not models
     assert cell.evaluator.functions is cell.compiled.evaluators
     assert cell.timing_model.search_carry(cell.initial).workcell is cell.workcell
-    assert cell.polish_functions.rows.model is cell.compiled.model
-    assert models == [cell.compiled.model]
+    assert cell.polish_functions.rows.model is cell.compiled.bodies
+    assert len(models) <= 1
 
 
 def test_a_compiled_cell_is_shared() -> None:
@@ -72,26 +72,33 @@ def test_a_missing_compiler_is_told_before_any_work(
         ho.propose(tmp_path / "no-problem.toml", rng=np.random.default_rng(0))
 
 
-def test_keys_tell_sets_and_cells_apart() -> None:
+def test_keys_tell_sets_and_structures_apart() -> None:
     cell = rack_cell()
     keys = [
         CompiledCell(cell).key("set"),
         CompiledCell(cell).key("other"),
         CompiledCell(cell).key("set", "200"),
+        CompiledCell(cell).key("set", bodies=False),
         CompiledCell(replace(cell, task=replace(cell.task, samples=11))).key("set"),
         CompiledCell(replace(cell, task=replace(cell.task, time_law="ramped"))).key("set"),
+        CompiledCell(replace(cell, environment=cell.environment[1:])).key("set"),
     ]
     assert len(set(keys)) == len(keys)
 
 
-def test_a_given_model_is_not_what_the_files_say() -> None:
-    assert not CompiledCell(hand_cell()).is_identified
-    assert CompiledCell(rack_cell()).is_identified
+def test_numbers_are_no_part_of_a_key() -> None:
+    cell = rack_cell()
+    heavy = replace(cell, payload=replace(cell.payload, mass=1.5 * cell.payload.mass))
+    assert CompiledCell(heavy).key("set") == CompiledCell(cell).key("set")
+    assert CompiledCell(heavy).vector(HELD).tolist() != CompiledCell(cell).vector(HELD).tolist()
+
+
+def test_a_given_model_has_its_own_start_postures() -> None:
     model = hand_model(hand_cell())
-    given = CompiledCell(rack_cell(), model=model)
-    assert not given.is_identified
+    given = CompiledCell(hand_cell(), model=model)
     assert given.model is model
     assert given.bodies is model
+    assert given.vector(START).tolist() == np.concatenate(model.start).tolist()
 
 
 def test_bodies_are_known_without_start_postures(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,9 +111,16 @@ def test_bodies_are_known_without_start_postures(monkeypatch: pytest.MonkeyPatch
         bodies = compiled.bodies
         with pytest.raises(AssertionError):
             _ = compiled.model
-    names = [body.name for body in compiled.model.geometry.bodies]
-    assert [body.name for body in bodies.geometry.bodies] == names
+    assert compiled.model.geometry is bodies.geometry
     joints = [len(start) for start in compiled.model.start]
     assert [arm.joints for arm in bodies.geometry.arms] == joints
-    known = CompiledCell(rack_cell())
-    assert known.model is known.bodies
+
+
+def test_start_postures_are_those_of_the_interpreted_search() -> None:
+    compiled = CompiledCell(rack_cell())
+    expected = symbolic.cell_model.build_cell_model(compiled.workcell, compiled.bodies)
+    for found, branches, interpreted in zip(
+        compiled.start, compiled.model.branches, expected.branches, strict=True
+    ):
+        assert [b.kept for b in branches] == [b.kept for b in interpreted]
+        np.testing.assert_allclose(found, interpreted[0].q, atol=1e-9)

@@ -2,8 +2,8 @@
 
    docs/timing.md explains the method; `symbolic.limits.LimitLayout` the numbers at a
    sample. The text before this file defines INTERVALS, JOINTS, the SIZE of a sample's row, the
-   offset of every block (AT_...), RATIOS, CUTS, the lines that a caller gives at every sample, and
-   limit_forces, limit_force_slopes, limit_ratios, limit_slopes of CasADi.
+   offset of every block (AT_...), RATIOS, CUTS, the lines that a caller gives at every sample, HELD, the
+   input with the numbers of what is held, and limit_forces, limit_force_slopes, limit_ratios, limit_slopes of CasADi.
 
    x and y are the squared speeds u'^2 at the beginning and the end of an interval. There is rest at
    both ends of the path, and standing still is allowed everywhere, so that (0, 0) satisfies every
@@ -51,6 +51,7 @@ typedef struct {
   double (*tight)[GROUPS];         /* (INTERVALS, GROUPS) divisor of what is left for motion */
   double* top;                     /* (INTERVALS + 1,) largest u'^2 that can be brought to rest */
   double* squared;                 /* (INTERVALS + 1,) u'^2 */
+  const double* held;              /* numbers of what is held */
   const double* cuts;              /* (SAMPLES, CUTS, 3) alpha u'' + beta u'^2 <= bound, infinite
                                       from the last one on */
 } problem;
@@ -60,29 +61,31 @@ static double smaller(double a, double b) { return a < b ? a : b; }
 
 /* ---- quantities at a sample ---- */
 
-static void ratios_at(const double* f, double a, double w, double* ratios) {
-  const double* arg[3] = {f + AT_FORCE, &a, &w};
+static void ratios_at(const problem* p, const double* f, double a, double w, double* ratios) {
+  const double* arg[4] = {f + AT_FORCE, &a, &w, p->held};
   double* res[1] = {ratios};
   limit_ratios(arg, res, 0, 0, 0);
 }
 
-static void slopes_at(const double* f, double a, double w, double* r, double* by_a, double* by_w) {
-  const double* arg[3] = {f + AT_FORCE, &a, &w};
+static void slopes_at(const problem* p, const double* f, double a, double w, double* r,
+                      double* by_a, double* by_w) {
+  const double* arg[4] = {f + AT_FORCE, &a, &w, p->held};
   double* res[3] = {r, by_a, by_w};
   limit_slopes(arg, res, 0, 0, 0);
 }
 
 /* Both normal forces. */
-static void normal_forces(const double* f, double a, double w, double* n) {
-  const double* arg[3] = {f + AT_FORCE, &a, &w};
+static void normal_forces(const problem* p, const double* f, double a, double w, double* n) {
+  const double* arg[4] = {f + AT_FORCE, &a, &w, p->held};
   double* res[1] = {n};
   limit_forces(arg, res, 0, 0, 0);
 }
 
 /* The larger normal force and its slopes by u'' and u'^2. */
-static double force_slopes(const double* f, double a, double w, double* by_a, double* by_w) {
+static double force_slopes(const problem* p, const double* f, double a, double w, double* by_a,
+                           double* by_w) {
   double n[2], each_by_a[2], each_by_w[2];
-  const double* arg[3] = {f + AT_FORCE, &a, &w};
+  const double* arg[4] = {f + AT_FORCE, &a, &w, p->held};
   double* res[3] = {n, each_by_a, each_by_w};
   limit_force_slopes(arg, res, 0, 0, 0);
   const int k = n[1] > n[0];
@@ -164,9 +167,9 @@ static int convex_rows(const problem* p, int interval, double x, double y, doubl
       double n[2], by_a, by_w;
       const double rest = p->rest_force[interval + end];
       const double bound = rest + (p->force - rest) / p->tight[interval][FORCE];
-      normal_forces(f, a, w, n);
+      normal_forces(p, f, a, w, n);
       if (larger(n[0], n[1]) - rest <= (bound - rest) * threshold) continue;
-      const double value = force_slopes(f, a, w, &by_a, &by_w);
+      const double value = force_slopes(p, f, a, w, &by_a, &by_w);
       const double still = value - by_a * a - by_w * w;
       const line row = interval_row(by_a / bound, by_w / bound, 1.0 - still / bound, end);
       count = append(rows, count, row);
@@ -194,7 +197,7 @@ static int linearised_rows(const problem* p, int interval, double x, double y, c
     const double w = end ? y : x;
     double r[RATIOS], by_a[RATIOS], by_w[RATIOS];
     int exceeded = 0;
-    ratios_at(f, a, w, r);
+    ratios_at(p, f, a, w, r);
     for (int k = 0; k < RATIOS; ++k) {
       if (!limited(p, k)) continue;
       const double still = fabs(p->rest[(interval + end) * RATIOS + k]);
@@ -204,7 +207,7 @@ static int linearised_rows(const problem* p, int interval, double x, double y, c
       exceeded = exceeded || excess > RATIO_TOLERANCE || (wanted && wanted[end * RATIOS + k]);
     }
     if (!exceeded) continue;
-    slopes_at(f, a, w, r, by_a, by_w);
+    slopes_at(p, f, a, w, r, by_a, by_w);
     for (int k = 0; k < RATIOS; ++k) {
       if (!limited(p, k)) continue;
       const double still = p->rest[(interval + end) * RATIOS + k];
@@ -439,13 +442,13 @@ static void judge(const problem* p, const double* f, double parameter, double a,
     }
     note(use, BOX_ACCELERATION + cone, sqrt(sum), parameter, 0);
   }
-  normal_forces(f, a, w, n);
+  normal_forces(p, f, a, w, n);
   for (int k = 0; k < 2; ++k) {
     peak[k] = larger(peak[k], n[k]);
     note(use, NORMAL_FORCE, n[k] / p->force, parameter, k);
   }
   if (!with_ratios || !(p->torque || p->pressure)) return;
-  ratios_at(f, a, w, ratios);
+  ratios_at(p, f, a, w, ratios);
   for (int k = 0; k < RATIOS; ++k) {
     if (!limited(p, k)) continue;
     if (k < JOINTS) note(use, JOINT_TORQUE, fabs(ratios[k]), parameter, k);
@@ -525,8 +528,8 @@ static double judge_rest(problem* p, largest_use* use, double* peak) {
     const double* f = p->samples + 2 * i * SIZE;
     double n[2];
     judge(p, f, i / (double)INTERVALS, 0.0, 0.0, 1, use, peak);
-    ratios_at(f, 0.0, 0.0, p->rest + i * RATIOS);
-    normal_forces(f, 0.0, 0.0, n);
+    ratios_at(p, f, 0.0, 0.0, p->rest + i * RATIOS);
+    normal_forces(p, f, 0.0, 0.0, n);
     p->rest_force[i] = larger(n[0], n[1]);
   }
   return worst_of(use);
@@ -577,7 +580,7 @@ int path_timing(const double** arg, double** res, long long* iw, double* w, int 
   problem p = {
     arg[0], options[0], options[1] > 0.5, options[2] > 0.5, options[3] > 0.5, w,
     w + (INTERVALS + 1) * RATIOS, (double(*)[GROUPS])(w + (INTERVALS + 1) * (RATIOS + 1)),
-    w + (INTERVALS + 1) * (RATIOS + 1 + GROUPS), squared, CUTS ? arg[2] : 0,
+    w + (INTERVALS + 1) * (RATIOS + 1 + GROUPS), squared, arg[HELD], CUTS ? arg[2] : 0,
   };
   (void)iw; (void)mem;
   *interval = *sweeps = *duration = 0.0;
@@ -599,7 +602,7 @@ int path_timing(const double** arg, double** res, long long* iw, double* w, int 
 }
 
 int path_timing_work(long long* arg, long long* res, long long* iw, long long* w) {
-  *arg = CUTS ? 3 : 2; *res = 8; *iw = 0; *w = (INTERVALS + 1) * (RATIOS + 2 + GROUPS);
+  *arg = HELD + 1; *res = 8; *iw = 0; *w = (INTERVALS + 1) * (RATIOS + 2 + GROUPS);
   return 0;
 }
 void path_timing_incref(void) {}

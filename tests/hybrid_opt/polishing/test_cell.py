@@ -22,7 +22,6 @@ def test_a_row_compiled_on_demand_is_the_interpreted_one_and_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiled = CompiledCell(rack_cell(), Cache(tmp_path))
-    assert compiled.is_identified
     plain = RowFunctions(compiled.bodies, {})
     row = Clearance(next(k for k in range(99) if k not in plain.separable))
     made = RowFunctions(compiled.bodies, {}, compiled)

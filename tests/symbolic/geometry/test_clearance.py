@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from symbolic.array import Array
-from symbolic.geometry.clearance import quaternion
-from symbolic.geometry.expressions import EXACT, Softness, clean
+from symbolic.geometry.expressions import EXACT, Softness, clean, quaternion
 from symbolic.path.rotation import rotation_matrix
 from symbolic.records.poses import Orientation, pose_matrix
 from tests.symbolic.geometry.collision_cells import (

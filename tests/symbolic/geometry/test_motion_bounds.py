@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from symbolic.array import Array
-from symbolic.geometry.motion_bounds import reach_about_joints
 from symbolic.geometry.pairs import coal_distance
 from symbolic.geometry.pieces import Piece, farthest_from_axis, skeleton
+from symbolic.geometry.screen import reach_about_joints
 from tests.symbolic.geometry.collision_cells import (
     functions_of,
     geometry_of,

@@ -18,7 +18,7 @@ from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import coal_distance
 from symbolic.path.rotation import rotation_matrix
 from symbolic.read.cell import load
-from symbolic.records.cell import Box
+from symbolic.records.cell import PAYLOAD, Box
 from symbolic.records.poses import Orientation
 from symbolic.robot.arm import flange_target, manipulability, pose_error
 from symbolic.smooth.passage import (
@@ -146,7 +146,7 @@ def test_one_direction_separates_boxes_that_are_apart(
     edge = half * np.where(np.arange(3) == chosen % 3, 0.0, 1.0 - 2.0 * (chosen // 3 % 2))
     pose = np.concatenate([obstacle.pose[:3, :3] @ edge + obstacle.pose[:3, 3] + away, turn])
     rotation = rotation_matrix(model().workcell.task.orientation, turn)
-    payload = model().geometry.bodies[place().payload].pieces[0]
+    payload = model().geometry.bodies[model().geometry.index(PAYLOAD)].pieces[0]
     placed = np.eye(4)
     placed[:3, :3], placed[:3, 3] = np.array(ca.DM(rotation)), pose[:3]
     edges = np.array(ca.DM(rotation)), obstacle.pose[:3, :3]

@@ -1,0 +1,379 @@
+"""What bounds of distances and motions are made of, as numbers: covers, obstacles, reach.
+
+NumPy finds it once per cell. `symbolic.geometry.clearance` and `symbolic.geometry.motion_bounds`
+write expressions of it, whether it holds arrays or symbols in their place
+(`symbolic.numbers.CellNumbers`). Which bound a pair gets depends on numbers, too: that is kept as
+flags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from symbolic.array import Array
+from symbolic.expression import number
+from symbolic.geometry.bodies import WORLD, ArmGeometry, CollisionBody, Frame
+from symbolic.geometry.covers import chain_cover, close_pairs, slab_cover
+from symbolic.geometry.expressions import clean
+from symbolic.geometry.pairs import CellGeometry, chain_radius
+from symbolic.geometry.pieces import (
+    Hull,
+    Piece,
+    axes_with_z,
+    bounding_box,
+    edges,
+    farthest_from_axis,
+    farthest_from_point,
+    support,
+)
+from symbolic.records import Box, Capsule, Cylinder, Sphere
+from symbolic.records.cell import parts
+from symbolic.records.numbered import Group
+
+LONG = 0.25
+"""Bodies longer than wide by more than this [m] are also compared along their own axes: across
+the world's axes, a slanted body seems wider by up to that much."""
+
+VAST = 2.0
+"""Obstacles this many times as wide as a body is long (a floor) need no such comparison."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A simple shape in a frame.
+
+    Attributes:
+        kind: of the shape.
+        size: half edges (3,) of a box, radius and half the length (2,) of others [m].
+        centre: (3,) [m].
+        rotation: (3, 3) axes as columns; None where they are the frame's.
+    """
+
+    kind: type
+    size: Array
+    centre: Array
+    rotation: Array | None
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Equal spheres. centres: (n, 3) in a frame [m]. radius: (1,) of each [m]."""
+
+    centres: Array
+    radius: Array
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How a body moves with its frame.
+
+    Attributes:
+        centre: (3,) of its bounding box [m].
+        spans: (2,) farthest of its points from there, and from the frame's origin [m].
+        joints: per joint before it the distance from that one's axis that no point exceeds [m]; 1
+            of a joint that slides.
+    """
+
+    centre: Array
+    spans: Array
+    joints: Array
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A fixed convex piece.
+
+    Attributes:
+        kind: of its shape.
+        axes: (3, 3) directions in which a box is compared, as rows; None for the world's.
+        extent: (2, 3) least and largest coordinate along these [m].
+        cover: a simple shape that contains it.
+        to_own: (3, 3) from the world to its own axes, None where these are the world's.
+        offset: (3,) of the world's origin there [m].
+    """
+
+    kind: type
+    axes: Array | None
+    extent: Array
+    cover: Solid
+    to_own: Array | None
+    offset: Array
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """A body.
+
+    Attributes:
+        group: see `CollisionBody`.
+        frame: what it is fixed to; 'world' with a robot for what stands at that one's base.
+        cover: simple shapes that contain it, in that frame, what stands at a base in that one's;
+            () of an obstacle.
+        chain: likewise in that frame, or in the world; None of an obstacle.
+        extent: (2 n + 2, 3) of what stands at a base: least and largest coordinates in the world of
+            all, then of each of n simple shapes [m].
+        reach: None of what stands.
+        pieces: of each the pose in its frame: rotation (3, 3), None for the frame's, and centre
+            (3,) [m]; of what stands the quaternion (4,) in the world and the centre.
+        obstacles: its pieces, of what stands in the environment.
+        is_constant: whether it is a link, or a mesh that moves: its numbers follow from files.
+    """
+
+    group: str
+    frame: Frame
+    cover: tuple[Solid, ...]
+    chain: Chain | None
+    extent: Array | None
+    reach: Reach | None
+    pieces: tuple[tuple[Array | None, Array], ...]
+    obstacles: tuple[Obstacle, ...]
+    is_constant: bool
+
+
+@dataclass(frozen=True)
+class Base:
+    """Where an arm stands. rotation: (3, 3); position: (3,) [m]."""
+
+    rotation: Any
+    position: Any
+
+
+@dataclass(frozen=True)
+class Screen:
+    """A cell's bodies and pairs.
+
+    Attributes:
+        bases: of both arms.
+        turning: which of their joints turn.
+        bodies: in the geometry's order.
+        active: the pairs, as indices of bodies.
+        own: per pair within an arm whether its bound is the finer one, else None.
+        slanted: per pair with an obstacle whether the body's own axes matter to each piece of it.
+        payload: the payload's box.
+        payload_is_mesh: whether that follows from a file.
+        between: (3, 3) directions as rows of which the first points from one base to the other;
+            None where the world's do.
+        given: the group of its numbers where these are symbols.
+    """
+
+    bases: tuple[Base, Base]
+    turning: tuple[tuple[bool, ...], tuple[bool, ...]]
+    bodies: tuple[Bounded, ...]
+    active: tuple[tuple[int, int], ...]
+    own: tuple[bool | None, ...]
+    slanted: tuple[tuple[bool, ...], ...]
+    payload: Solid
+    payload_is_mesh: bool
+    between: Array | None
+    given: Group | None = None
+
+
+def screen_of(geometry: CellGeometry) -> Screen:
+    """The screen of a cell's bodies and active pairs."""
+    bodies, arms = geometry.bodies, geometry.arms
+    pairs = tuple((pair.first, pair.second) for pair in geometry.active)
+    close = close_pairs(geometry)
+    sizes = [edges(body.pieces) for body in bodies]
+    obstacles = [
+        [edges((piece,)) for piece in body.pieces] if body.group == "environment" else []
+        for body in bodies
+    ]
+    own: list[bool | None] = []
+    slanted = []
+    for i, j in pairs:
+        first, second = bodies[i], bodies[j]
+        own.append((i, j) in close if first.group == second.group else None)
+        slanted.append(tuple(_slanted_matters(first, sizes[i], each) for each in obstacles[j]))
+    payload = next(body for body in bodies if body.frame.kind == "box")
+    box = payload.pieces[0]
+    if len(payload.pieces) > 1 or not isinstance(box.shape, Box):
+        box = bounding_box(payload.pieces, np.eye(3))
+    bases = [Base(clean(T[:3, :3]), T[:3, 3]) for T in (arm.T_world_root for arm in arms)]
+    return Screen(
+        (bases[0], bases[1]),
+        (arms[0].turning, arms[1].turning),
+        tuple(_bounded(_Seen(body, arms)) for body in bodies),
+        pairs,
+        tuple(own),
+        tuple(slanted),
+        _solid(box),
+        has_hulls(payload),
+        _between(bases[0].position, bases[1].position),
+    )
+
+
+def has_hulls(body: CollisionBody) -> bool:
+    """Whether a body is made of a mesh."""
+    return any(isinstance(piece.shape, Hull) for piece in body.pieces)
+
+
+class _Seen:
+    """A body and both arms, known by what they are: cells that are tried out share links."""
+
+    def __init__(self, body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> None:
+        self.body, self.arms = body, arms
+        of: tuple[Any, ...] = (body,)
+        if body.frame.kind == "link":
+            arm = arms[body.frame.robot]
+            of = (body, arm.origins, arm.axes, arm.turning, arm.slides)
+        elif body.root is not None:
+            of = (body, arms[body.root[0]].T_world_root)
+        self._content = b"".join(parts(of, Path()))
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Seen) and self._content == other._content
+
+
+@lru_cache(maxsize=256)
+def _bounded(seen: _Seen) -> Bounded:
+    body, arms = seen.body, seen.arms
+    still = body.frame == WORLD
+    pieces = tuple(
+        (_quaternion(piece.rotation), piece.centre)
+        if still
+        else (_rotation(piece), clean(piece.centre))
+        for piece in body.pieces
+    )
+    if body.group == "environment":
+        obstacles = tuple(_obstacle(piece) for piece in body.pieces)
+        return Bounded(body.group, body.frame, (), None, None, None, pieces, obstacles, False)
+    frame, is_link = body.frame, body.frame.kind != "box" and not body.is_tool
+    if body.root is not None:  # what stands at a base is covered as it is there
+        frame = Frame("world", body.root[0])
+        body = CollisionBody(body.name, body.group, frame, body.root[1])
+    chain = chain_cover(body)
+    solids = slab_cover(body)
+    centres, extent, reach = chain.centres, None, None
+    if still:
+        base = arms[frame.robot].T_world_root
+        centres = centres @ base[:3, :3].T + base[:3, 3]
+        each = np.array([_extent(piece.moved(base), np.eye(3)) for piece in solids])
+        whole = np.stack([each[:, 0].min(axis=0), each[:, 1].max(axis=0)])
+        extent = np.concatenate([whole[None], each]).reshape(-1, 3)
+    else:
+        reach = _reach(body, arms)
+    spheres = Chain(clean(centres), np.array([chain.radius]))
+    cover, constant = tuple(_solid(piece) for piece in solids), is_link or has_hulls(body)
+    return Bounded(body.group, frame, cover, spheres, extent, reach, pieces, (), constant)
+
+
+def _solid(piece: Piece) -> Solid:
+    shape = piece.shape
+    if isinstance(shape, Box):
+        size = np.asarray(shape.size) / 2.0
+    elif isinstance(shape, Sphere):
+        size = np.array([shape.radius, 0.0])
+    else:
+        assert isinstance(shape, Cylinder | Capsule), "a cover has no hulls"
+        size = np.array([shape.radius, shape.length / 2.0])
+    return Solid(type(shape), size, clean(piece.centre), _rotation(piece))
+
+
+def _rotation(piece: Piece) -> Array | None:
+    found = clean(piece.rotation)
+    return None if np.array_equal(found, np.eye(3)) else found
+
+
+def _quaternion(rotation: Array) -> Array:
+    x, y, z, w = pin.Quaternion(clean(rotation)).coeffs()
+    return np.array([w, x, y, z])
+
+
+def _obstacle(piece: Piece) -> Obstacle:
+    R = clean(piece.rotation)
+    along_world = np.allclose(np.abs(R).max(axis=0), 1.0)
+    box = piece.shape if isinstance(piece.shape, Box) else None
+    axes = None if box is None or along_world else R.T
+    A = np.eye(3) if axes is None else axes
+    extent = _extent(piece, A)
+    if box is not None and along_world:
+        half = np.abs(R) @ (np.asarray(box.size) / 2.0)
+        cover = Solid(Box, half, clean(piece.centre), None)
+    else:
+        (found,) = slab_cover(CollisionBody("", "environment", WORLD, (piece,)))
+        cover = _solid(found)
+    T = clean(np.asarray(np.linalg.inv(piece.pose), dtype=float))
+    to_own = None if np.array_equal(T[:3, :3], np.eye(3)) else T[:3, :3]
+    return Obstacle(type(piece.shape), axes, extent, cover, to_own, T[:3, 3])
+
+
+def _extent(piece: Piece, A: Array) -> Array:
+    """(2, 3) least and largest coordinate along the rows of A (3, 3) [m]."""
+    return np.stack([-support(piece, -A), support(piece, A)])
+
+
+def _reach(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> Reach:
+    centre = bounding_box(body.pieces, np.eye(3)).centre
+    spans = [
+        max(farthest_from_point(piece, point) for piece in body.pieces)
+        for point in (centre, np.zeros(3))
+    ]
+    joints = np.zeros(0)
+    if body.frame.kind == "link":
+        joints = reach_about_joints(body, arms[body.frame.robot])[: body.frame.joint + 1]
+    return Reach(clean(centre), np.array(spans), joints)
+
+
+def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
+    """(n,) distance from each joint's axis that no point of a link's body exceeds [m]; 1 of a joint
+    that slides.
+
+    Joints behind the body do not move it: zero. Own joint: from the shape; joints further down:
+    with the chain between stretched.
+    """
+    reach = np.zeros(arm.joints)
+    last = body.frame.joint
+    for j in range(last + 1):
+        if not arm.turning[j]:
+            reach[j] = 1.0
+        elif j == last:
+            reach[j] = max(farthest_from_axis(p, np.zeros(3), arm.axes[j]) for p in body.pieces)
+        else:
+            offset = arm.origins[j + 1][:3, 3]
+            across = offset - (offset @ arm.axes[j]) * arm.axes[j]
+            reach[j] = float(np.linalg.norm(across)) + chain_radius(body, arm, j + 1)
+            reach[j] += float(arm.slides[j + 1])
+    return reach
+
+
+def _slanted_matters(body: CollisionBody, sizes: Array, obstacle: Array) -> bool:
+    """Whether a body is the payload, or long and the obstacle no plane for it.
+
+    Args:
+        sizes, obstacle: (3,) edges of both, ascending [m].
+    """
+    _, width, length = sizes
+    return body.frame.kind == "box" or bool(length - width > LONG and obstacle[1] < VAST * length)
+
+
+def _between(first: Array, second: Array) -> Array | None:
+    along = second - first
+    distance = float(np.linalg.norm(along))
+    if distance < 1e-6 or np.max(np.abs(along)) > 0.99 * distance:
+        return None
+    return clean(axes_with_z(along / distance)[:, [2, 0, 1]].T)
+
+
+# --- as expressions ---
+
+
+def turned(rotation: Any) -> ca.SX:
+    """A rotation (3, 3) or None as an expression."""
+    return ca.SX.eye(3) if rotation is None else ca.SX(number(rotation))
+
+
+def columns(values: Any) -> Sequence[ca.SX]:
+    """The rows (n, 3) of an array as columns."""
+    whole = ca.SX(number(values))
+    return [whole[k, :].T for k in range(whole.shape[0])]

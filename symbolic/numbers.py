@@ -1,0 +1,399 @@
+"""A cell's numbers as inputs: what is compiled depends on structure alone.
+
+`CellNumbers` divides what formulas are made of into numbers, which compiled functions take as
+vectors, and structure, whose digests are the keys of what is compiled. Structure is everything that
+is not named here as a number, values that remain in formulas included: nothing has to be listed
+for a digest to be right. The dynamics of an arm come from its description and are structure; so are
+the meshes and where bodies of several pieces are fixed to a link.
+
+A vector is a group of numbers that functions share: those of the task, of either arm, of what is
+held, of both start postures, of the bodies. Its entries are named by the key paths of the workcell
+file; those that NumPy derives from several keys are named by what they are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.cell_model import CellBodies, CellModel
+from symbolic.contact.soft_finger import SoftPatch
+from symbolic.geometry.screen import Base, Bounded, Screen
+from symbolic.records import Contact, RedundantJoint, Robot, Task, Waypoint, Workcell
+from symbolic.records.cell import box_flange, flange_lever, parts
+from symbolic.records.numbered import (
+    Group,
+    NumberedContact,
+    NumberedJoint,
+    NumberedPayload,
+    NumberedRobot,
+    NumberedTask,
+    NumberedWaypoint,
+    NumberedWorkcell,
+)
+from symbolic.robot.model import RobotModel
+
+TASK, HELD, START, BODIES = "task_numbers", "held_numbers", "start_numbers", "body_numbers"
+ARMS = ("arm_1_numbers", "arm_2_numbers")
+GROUPS = frozenset((TASK, HELD, START, BODIES, *ARMS))
+"""Names of the groups, which end functions' inputs."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """The place of numbers in a structure: what they are, without their values.
+
+    Attributes:
+        group: they belong to.
+        key: path in the workcell file, or what they are.
+        shape: () of one.
+    """
+
+    group: str
+    key: str
+    shape: tuple[int, ...]
+
+
+class _Take(Protocol):
+    """What becomes of the numbers of a record."""
+
+    def __call__(self, group: str, key: str, value: Any) -> Any:
+        """A number or an array."""
+
+    def pose(self, rotation: Any, position: Any) -> Any:
+        """A transform whose parts were taken."""
+
+    def upright(self, cosine: Any, sine: Any) -> Any:
+        """A turn about z whose parts were taken."""
+
+    def group(self, name: str) -> Group:
+        """Of which all is taken."""
+
+
+class _Collected:
+    """Places in the structure, the values aside."""
+
+    def __init__(self) -> None:
+        self.entries: dict[str, list[tuple[Number, Array]]] = {}
+
+    def __call__(self, group: str, key: str, value: Any) -> Any:
+        array = np.asarray(value, dtype=float)
+        entry = Number(group, key, array.shape)
+        self.entries.setdefault(group, []).append((entry, array))
+        return entry
+
+    def pose(self, rotation: Any, position: Any) -> Any:
+        return ("pose", rotation, position)
+
+    def upright(self, cosine: Any, sine: Any) -> Any:
+        return ("turn about z", cosine, sine)
+
+    def group(self, name: str) -> Group:
+        return Group(name, ())
+
+
+class _Symbols:
+    """Slices of one vector of symbols per group, in the order in which they were collected."""
+
+    def __init__(self, sizes: Mapping[str, int]) -> None:
+        self._groups = {name: Group(name, ca.SX.sym(name, size)) for name, size in sizes.items()}
+        self._taken = dict.fromkeys(sizes, 0)
+
+    def __call__(self, group: str, key: str, value: Any) -> Any:
+        shape = np.shape(value)
+        at, size = self._taken[group], int(np.prod(shape, dtype=int))
+        self._taken[group] = at + size
+        found = self._groups[group].symbols[at : at + size]
+        return ca.reshape(found, *shape[::-1]).T if len(shape) == 2 else found
+
+    def pose(self, rotation: Any, position: Any) -> Any:
+        return ca.vertcat(ca.horzcat(rotation, position), ca.DM([[0, 0, 0, 1]]))
+
+    def upright(self, cosine: Any, sine: Any) -> Any:
+        return ca.vertcat(
+            ca.horzcat(cosine, -sine, 0), ca.horzcat(sine, cosine, 0), ca.DM([[0, 0, 1]])
+        )
+
+    def group(self, name: str) -> Group:
+        return self._groups[name]
+
+
+@dataclass(frozen=True)
+class CellNumbers:
+    """The numbers and the structure of a cell.
+
+    Attributes:
+        cell: the description.
+        bounds: what bounds of distances are made of.
+        models: of both arms.
+    """
+
+    cell: Workcell
+    bounds: Screen
+    models: tuple[RobotModel, RobotModel]
+    _found: _Collected = field(default_factory=_Collected, repr=False)
+
+    @cached_property
+    def _structures(self) -> tuple[NumberedWorkcell, Screen]:
+        return _workcell(self._found, self.cell), _screen(self._found, self.bounds)
+
+    @property
+    def workcell(self) -> NumberedWorkcell:
+        """The cell with places instead of numbers."""
+        return self._structures[0]
+
+    @property
+    def screen(self) -> Screen:
+        """The bounds with places instead of numbers."""
+        return self._structures[1]
+
+    @cached_property
+    def layout(self) -> dict[str, tuple[Number, ...]]:
+        """What the entries of every group are, but for the start postures, in order."""
+        assert self._structures, "collected"
+        return {
+            name: tuple(entry for entry, _ in found) for name, found in self._found.entries.items()
+        }
+
+    @cached_property
+    def values(self) -> dict[str, Array]:
+        """The vector (n,) of every group, but for the start postures."""
+        assert self._structures, "collected"
+        return {
+            name: np.concatenate([array.ravel() for _, array in found])
+            for name, found in self._found.entries.items()
+        }
+
+    @cached_property
+    def digest(self) -> str:
+        """Of the structure without bodies."""
+        return _digest(self.workcell, self._arms)
+
+    @cached_property
+    def bodies_digest(self) -> str:
+        """Of the whole structure."""
+        return _digest(self.workcell, self.screen, self._arms)
+
+    @property
+    def _arms(self) -> tuple[Any, ...]:
+        return tuple(
+            (model.model.saveToString(), model.flange_id, model.redundant, model.pose_size)
+            for model in self.models
+        )
+
+    def symbolic(self, bodies: CellBodies) -> CellModel:
+        """The model whose functions take the numbers as inputs.
+
+        Args:
+            bodies: of the cell, or of another one of the same structure.
+        """
+        joints = [model.n_joints for model in self.models]
+        sizes = {name: len(values) for name, values in self.values.items()}
+        take = _Symbols(sizes | {START: sum(joints)})
+        workcell, screen = _workcell(take, self.cell), _screen(take, self.bounds)
+        start = take.group(START)
+        first, second = ca.vertsplit(start.symbols, [0, joints[0], sum(joints)])
+        robots, geometry = bodies.robots, bodies.geometry
+        model = CellModel(workcell, robots, geometry, ((), ()), (first, second), start)
+        vars(model)["screen"] = screen
+        return model
+
+
+def _digest(*structure: Any) -> str:
+    total = hashlib.sha256()
+    for part in parts(structure, Path()):
+        total.update(len(part).to_bytes(8, "big") + part)
+    return total.hexdigest()
+
+
+# --- the cell without its bodies ---
+
+
+def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
+    """The cell with its numbers taken; what no formula reads is left out."""
+    pairs = zip(cell.robots, cell.contacts, strict=True)
+    first, second = (_robot(take, i, *pair) for i, pair in enumerate(pairs))
+    # A squeeze to start from is looked for with the contacts' numbers themselves.
+    searched = cell.task.allocation == "joint" and not cell.has_facing_pads
+    payload: Any = replace(cell.payload, size=np.zeros(3), shape=None, jerk_max=None)
+    contacts: Any = cell.contacts
+    task: Any = replace(
+        cell.task,
+        reference_force=np.ones(2),
+        initial=np.zeros(0),
+        allowed_contacts=(),
+        force_limit=(0.0, 0.0),
+    )
+    if not searched:
+        names = ["mass", "centre_of_mass", "inertia", "velocity_max", "acceleration_max"]
+        names += ["angular_velocity_max", "angular_acceleration_max"]
+        own = {name: take(HELD, f"payload.{name}", getattr(payload, name)) for name in names}
+        contacts = tuple(
+            _contact(take, f"contacts[{i}]", contact, cell) for i, contact in enumerate(contacts)
+        )
+        payload = _as(NumberedPayload, payload, **own, given=take.group(HELD))
+        task = _task(take, task)
+    return NumberedWorkcell(
+        name="",
+        robots=(first, second),
+        payload=payload,
+        contacts=contacts,
+        task=task,
+        environment=(),
+        facing=cell.has_facing_pads,
+        opposite=cell.has_opposite_pads,
+        beside=cell.has_pads_beside,
+    )
+
+
+def _as(kind: Any, record: Any, **changes: Any) -> Any:
+    """A record of numbers with the fields of a plain one, some changed."""
+    known = {each.name: getattr(record, each.name) for each in fields(record)}
+    return kind(**(known | changes))
+
+
+def _robot(take: _Take, i: int, robot: Robot, contact: Contact) -> NumberedRobot:
+    group, path = ARMS[i], f"robots[{i}]"
+    T_box_flange = box_flange(robot, contact)
+    names = ["position_lower", "position_upper", "velocity_max", "acceleration_max"]
+    names += ["torque_max", "min_manipulability"]
+    own = {name: take(group, f"{path}.{name}", getattr(robot, name)) for name in names}
+    base = robot.T_world_base
+    flange = (take(group, f"{path} in the box", part) for part in _split(T_box_flange))
+    return NumberedRobot(
+        name="",
+        urdf=Path(),
+        package_dirs=(),
+        flange="",
+        locked_joints=(),
+        T_world_base=take.pose(
+            _turn(take, group, path, base[:3, :3]), take(group, f"{path}.base.xyz", base[:3, 3])
+        ),
+        T_flange_pad=np.zeros((4, 4)),
+        tool=(),
+        T_box_flange=take.pose(*flange),
+        lever=take(group, f"{path} lever", flange_lever(robot, contact)),
+        given=take.group(group),
+        **own,
+    )
+
+
+def _split(T: Array) -> tuple[Array, Array]:
+    return T[:3, :3], T[:3, 3]
+
+
+def _turn(take: _Take, group: str, path: str, rotation: Array) -> Any:
+    """Of a base: those of most cells stand upright, which is structure."""
+    level = np.array([0.0, 0.0, 1.0])
+    if np.array_equal(rotation[2], level) and np.array_equal(rotation[:, 2], level):
+        cosine, sine = rotation[0, 0], rotation[1, 0]
+        key = f"{path}.base.rpy"
+        return take.upright(
+            take(group, f"{key}, cosine", cosine), take(group, f"{key}, sine", sine)
+        )
+    return take(group, f"{path}.base.rpy", rotation)
+
+
+def _contact(take: _Take, path: str, contact: Contact, cell: Workcell) -> Any:
+    pose = (take(HELD, f"{path} pose", part) for part in _split(contact.T_box_pad))
+    patch = SoftPatch.of(contact, cell.contacts[0].T_box_pad[:3, :3])
+    sides = contact.half_sides
+    return _as(
+        NumberedContact,
+        contact,
+        T_box_pad=take.pose(*pose),
+        friction=take(HELD, f"{path}.friction", contact.friction),
+        patch_radius=take(HELD, f"{path}.patch_radius", contact.patch_radius),
+        half_sides=None
+        if sides is None
+        else tuple(take(HELD, f"{path}.patch_size[{k}]", side) for k, side in enumerate(sides)),
+        further=tuple(
+            _contact(take, f"{path}.further[{k}]", pad, cell)
+            for k, pad in enumerate(contact.further)
+        ),
+        twist=take(HELD, f"{path} twist", patch.twist),
+        spread=take(HELD, f"{path} spread", patch.spread),
+    )
+
+
+def _task(take: _Take, task: Task) -> Any:
+    names = ("reference_speed", "reference_angular_speed", "ramp_time")
+    return _as(
+        NumberedTask,
+        task,
+        **{name: take(TASK, f"task.{name}", getattr(task, name)) for name in names},
+        waypoints=tuple(_waypoint(take, k, point) for k, point in enumerate(task.waypoints)),
+        redundant=tuple(_joint(take, joint) for joint in task.redundant),
+        given=take.group(TASK),
+    )
+
+
+def _waypoint(take: _Take, k: int, point: Waypoint) -> NumberedWaypoint:
+    if not point.is_fixed:
+        return NumberedWaypoint(np.zeros(0), np.zeros(0))
+    pose = take(TASK, f"task pose {k}", point.lower)
+    return NumberedWaypoint(pose, pose, fixed=True)
+
+
+def _joint(take: _Take, joint: RedundantJoint) -> NumberedJoint:
+    lower: Any = tuple(
+        0.0 if moves else take(TASK, f"{joint.name} at pose {k}", low)
+        for k, (moves, low) in enumerate(zip(joint.moving.tolist(), joint.lower, strict=True))
+    )
+    free, none = tuple(joint.moving.tolist()), np.zeros(0)
+    return NumberedJoint("", joint.drives, lower, none, none, free)
+
+
+# --- its bodies ---
+
+
+def _screen(take: _Take, screen: Screen) -> Screen:
+    """The screen with its numbers taken: all but the shapes of links and of meshes."""
+    first, second = (_base(take, f"robots[{i}]", base) for i, base in enumerate(screen.bases))
+    return replace(
+        screen,
+        bases=(first, second),
+        bodies=tuple(_body(take, f"body {k}", body) for k, body in enumerate(screen.bodies)),
+        payload=screen.payload
+        if screen.payload_is_mesh
+        else _own(take, "payload box", screen.payload),
+        between=_own(take, "between bases", screen.between),
+        given=take.group(BODIES),
+    )
+
+
+def _base(take: _Take, path: str, base: Base) -> Base:
+    rotation = _turn(take, BODIES, path, base.rotation)
+    return Base(rotation, take(BODIES, f"{path}.base.xyz", base.position))
+
+
+def _body(take: _Take, path: str, body: Bounded) -> Any:
+    if not body.is_constant:
+        return _own(take, path, body)
+    if body.frame.kind != "world" or body.chain is None:
+        return body
+    chain = replace(body.chain, centres=_own(take, f"{path} chain", body.chain.centres))
+    pieces, extent = _own(take, path, body.pieces), _own(take, f"{path} extent", body.extent)
+    return replace(body, chain=chain, pieces=pieces, extent=extent)
+
+
+def _own(take: _Take, path: str, value: Any) -> Any:
+    """Every array of a record taken, in the order of its fields."""
+    if isinstance(value, np.ndarray) and value.size:
+        return take(BODIES, path, value)
+    if isinstance(value, tuple):
+        return tuple(_own(take, f"{path}[{k}]", entry) for k, entry in enumerate(value))
+    if is_dataclass(value) and not isinstance(value, type):
+        own = {each.name: getattr(value, each.name) for each in fields(value)}
+        return replace(
+            value, **{name: _own(take, f"{path}.{name}", each) for name, each in own.items()}
+        )
+    return value

@@ -1,0 +1,119 @@
+"""Records whose numbers are symbols: what formulas take where a cell's numbers are inputs.
+
+A formula reads `payload.mass` of either kind of record, so that it is written once. A function made
+of records with symbols has their groups as its last inputs (`symbolic.expression.sx_given`); of
+plain records it has none. Beside its own numbers a record holds those that NumPy derives from them,
+so that compiled code sees the same bits as a constant would have.
+
+What is not taken for a number of a group stays as it is and is structure
+(`symbolic.numbers.CellNumbers`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symbolic.records.cell import Contact, Payload, Robot, Workcell
+from symbolic.records.task import RedundantJoint, Task, Waypoint
+
+
+@dataclass(frozen=True)
+class Group:
+    """Numbers that functions take as one vector.
+
+    Attributes:
+        name: of the input.
+        symbols: (n,) of them.
+    """
+
+    name: str
+    symbols: Any
+
+
+@dataclass(frozen=True)
+class NumberedRobot(Robot):
+    """An arm.
+
+    Attributes:
+        T_box_flange: (4, 4) of the arm as it holds the box.
+        lever: (3,) from the flange to the contact point, box axes [m].
+        given: its numbers.
+    """
+
+    T_box_flange: Any = None
+    lever: Any = None
+    given: Group | None = None
+
+
+@dataclass(frozen=True)
+class NumberedPayload(Payload):
+    """What is carried. given: its numbers, with those of the contacts."""
+
+    given: Group | None = None
+
+
+@dataclass(frozen=True)
+class NumberedContact(Contact):
+    """A contact. twist, spread: see `symbolic.contact.soft_finger.SoftPatch`."""
+
+    twist: Any = None
+    spread: Any = None
+
+
+@dataclass(frozen=True)
+class NumberedWaypoint(Waypoint):
+    """A pose of the path, of which only a fixed one has numbers."""
+
+    fixed: bool = False
+
+    @property
+    def is_fixed(self) -> bool:
+        """See `Waypoint`."""
+        return self.fixed
+
+
+@dataclass(frozen=True)
+class NumberedJoint(RedundantJoint):
+    """A redundant joint. free: at which waypoints it is; elsewhere `lower` holds its numbers."""
+
+    free: tuple[bool, ...] = ()
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """See `RedundantJoint`."""
+        return np.array(self.free, dtype=np.bool_)
+
+
+@dataclass(frozen=True)
+class NumberedTask(Task):
+    """A task. given: its numbers."""
+
+    given: Group | None = None
+
+
+@dataclass(frozen=True)
+class NumberedWorkcell(Workcell):
+    """A cell whose pads stand as these say, whatever their numbers."""
+
+    facing: bool = False
+    opposite: bool = False
+    beside: bool = False
+
+    @property
+    def has_facing_pads(self) -> bool:
+        """See `Workcell`."""
+        return self.facing
+
+    @property
+    def has_opposite_pads(self) -> bool:
+        """See `Workcell`."""
+        return self.opposite
+
+    @property
+    def has_pads_beside(self) -> bool:
+        """See `Workcell`."""
+        return self.beside

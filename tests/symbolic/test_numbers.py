@@ -1,0 +1,188 @@
+"""Functions of a cell's numbers against the same with constants, and what is structure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from symbolic.array import Array
+from symbolic.cell_model import CellBodies, CellModel, build_cell_bodies
+from symbolic.contact.load import load_function
+from symbolic.functions import arm_functions, sample_functions
+from symbolic.limits import path_force_function, sample_limits_function
+from symbolic.numbers import BODIES, GROUPS, START, CellNumbers
+from symbolic.records import Workcell
+from symbolic.records.poses import pose_matrix
+from tests.symbolic.cells import hand_cell, hand_model, rack_cell, with_task
+
+
+@cache
+def bodies() -> CellBodies:
+    return build_cell_bodies(rack_cell())
+
+
+def numbers_of(cell: Workcell) -> CellNumbers:
+    own = build_cell_bodies(cell)
+    return CellNumbers(cell, own.screen, own.robots)
+
+
+def turned_cell() -> Workcell:
+    """The hand-written cell with everything at odd places, so that no number is a zero or a one."""
+    cell = hand_cell()
+    spin = pose_matrix((0.01, 0.02, 0.03), (0.0, 0.0, 0.1))
+    first, second = (replace(r, T_world_base=spin @ r.T_world_base) for r in cell.robots)
+    payload = replace(
+        cell.payload,
+        mass=7.3,
+        centre_of_mass=np.array([0.01, -0.02, 0.015]),
+        inertia=np.array([[0.2, 0.01, 0.02], [0.01, 0.18, -0.01], [0.02, -0.01, 0.15]]),
+    )
+    turns = [pose_matrix((0.0, 0.003, 0.0), (0.0, 0.0, angle)) for angle in (0.3, -0.2)]
+    one, two = (
+        replace(contact, friction=mu, T_box_pad=contact.T_box_pad @ turn)
+        for contact, mu, turn in zip(cell.contacts, (0.7, 0.8), turns, strict=True)
+    )
+    return replace(cell, robots=(first, second), payload=payload, contacts=(one, two))
+
+
+def both(cell: Workcell) -> tuple[CellModel, CellModel, dict[str, Array]]:
+    """The model with constants, with symbols, and the values of these."""
+    plain = hand_model(cell)
+    numbers = CellNumbers(cell, plain.screen, plain.robots)
+    values = numbers.values | {START: np.concatenate(plain.start)}
+    return plain, numbers.symbolic(plain), values
+
+
+def compare(plain: ca.Function, symbolic: ca.Function, values: dict[str, Array], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    given = [name for name in symbolic.name_in() if name in GROUPS]
+    assert symbolic.name_in()[-len(given) :] == given
+    assert given, symbolic
+    assert plain.n_in() == symbolic.n_in() - len(given)
+    for _ in range(3):
+        inputs = [rng.uniform(-0.3, 0.3, plain.size_in(k)) for k in range(plain.n_in())]
+        expected = plain.call(inputs)
+        found = symbolic.call([*inputs, *[values[name] for name in given]])
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_allclose(np.array(one), np.array(other), rtol=1e-8, atol=1e-8)
+
+
+MAKERS: dict[str, Callable[[CellModel], ca.Function]] = {
+    "candidate": lambda model: arm_functions(model)["candidate"],
+    "posture": lambda model: arm_functions(model)["posture"],
+    "load": lambda model: load_function(model.workcell),
+    "limits": sample_limits_function,
+    "path force": lambda model: path_force_function(model.workcell),
+    "clearance": lambda model: model.screening["clearance"],
+    "pieces": lambda model: model.screening["piece_poses"],
+    "motion": lambda model: model.screening["motion"],
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_numbers_as_inputs_give_what_constants_give(name: str) -> None:
+    plain, symbolic, values = both(turned_cell())
+    compare(MAKERS[name](plain), MAKERS[name](symbolic), values, 0)
+
+
+@pytest.mark.parametrize("allocation", ["joint", "soft-finger"])
+def test_so_do_those_of_other_allocations(allocation: Any) -> None:
+    plain, symbolic, values = both(with_task(turned_cell(), allocation=allocation))
+    compare(load_function(plain.workcell), load_function(symbolic.workcell), values, 1)
+
+
+@pytest.mark.parametrize("law", ["constant", "ramped"])
+def test_so_does_a_path_under_each_law(law: Any) -> None:
+    plain, symbolic, values = both(with_task(turned_cell(), time_law=law))
+    constants, symbols = (sample_functions(model)["path"] for model in (plain, symbolic))
+    given = values["task_numbers"]
+    x = np.random.default_rng(2).uniform(plain.workcell.task.lower, plain.workcell.task.upper)
+    for one, other in zip(symbols.call([x, given]), constants.call([x]), strict=True):
+        np.testing.assert_allclose(np.array(one), np.array(other), rtol=1e-10, atol=1e-12)
+
+
+def moved(pose: Array, *by: float) -> Array:
+    return pose_matrix(by, (0.0, 0.0, 0.0)) @ pose
+
+
+def changes() -> dict[str, Workcell]:
+    """The rack with one number changed of each kind."""
+    cell = rack_cell()
+    robot, contact, task = cell.robots[0], cell.contacts[0], cell.task
+    board = cell.environment[2]
+    points = (replace(task.waypoints[0], **dict.fromkeys(("lower", "upper"), np.full(6, 0.1))),)
+    return {
+        "mass": replace(cell, payload=replace(cell.payload, mass=3.0)),
+        "friction": replace(cell, contacts=(replace(contact, friction=0.5), cell.contacts[1])),
+        "start": replace(cell, task=replace(task, waypoints=(*points, *task.waypoints[1:]))),
+        "speed": replace(cell, task=replace(task, reference_speed=0.2)),
+        "limits": replace(
+            cell, robots=(replace(robot, torque_max=0.9 * robot.torque_max), cell.robots[1])
+        ),
+        "board": replace(
+            cell,
+            environment=tuple(
+                replace(body, pose=moved(body.pose, 0.0, 0.0, 0.01)) if body is board else body
+                for body in cell.environment
+            ),
+        ),
+    }
+
+
+@pytest.mark.parametrize("name", list(changes()))
+def test_a_changed_number_changes_values_alone(name: str) -> None:
+    ours, other = numbers_of(rack_cell()), numbers_of(changes()[name])
+    assert other.bodies_digest == ours.bodies_digest
+    assert other.layout == ours.layout
+    differ = [k for k in ours.values if not np.array_equal(ours.values[k], other.values[k])]
+    assert differ
+    assert (differ == [BODIES]) == (name == "board")
+
+
+def test_bounds_of_the_search_are_neither_number_nor_structure() -> None:
+    cell = rack_cell()
+    points = tuple(
+        point if point.is_fixed else replace(point, upper=point.upper + 0.01)
+        for point in cell.task.waypoints
+    )
+    ours, other = (
+        numbers_of(cell),
+        numbers_of(replace(cell, task=replace(cell.task, waypoints=points))),
+    )
+    assert other.bodies_digest == ours.bodies_digest
+    assert {k: v.tolist() for k, v in other.values.items()} == {
+        k: v.tolist() for k, v in ours.values.items()
+    }
+
+
+def test_structure_is_what_formulas_are_written_of() -> None:
+    cell = rack_cell()
+    tilted = replace(cell.robots[1], T_world_base=pose_matrix((0.0, -1.1, 0.2), (0.1, 0.0, 1.5)))
+    one, two = (replace(contact, half_sides=(0.02, 0.02)) for contact in cell.contacts)
+    others = [
+        replace(cell, task=replace(cell.task, samples=50)),
+        replace(cell, task=replace(cell.task, time_law="ramped")),
+        replace(cell, task=replace(cell.task, allocation="soft-finger")),
+        replace(cell, contacts=(one, two)),
+        replace(cell, robots=(cell.robots[0], tilted)),
+        replace(cell, environment=cell.environment[:-1]),
+    ]
+    digests = [numbers_of(each).bodies_digest for each in (cell, *others)]
+    assert len(set(digests)) == len(digests)
+    without = [numbers_of(each).digest for each in (cell, others[-1])]
+    assert without[0] == without[1]
+
+
+def test_entries_are_named_by_their_keys() -> None:
+    numbers = CellNumbers(rack_cell(), bodies().screen, bodies().robots)
+    held = {entry.key for entry in numbers.layout["held_numbers"]}
+    assert {"payload.mass", "contacts[0].friction", "contacts[1].patch_radius"} <= held
+    for group, entries in numbers.layout.items():
+        sizes = [int(np.prod(entry.shape, dtype=int)) for entry in entries]
+        assert sum(sizes) == len(numbers.values[group])
