@@ -16,13 +16,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
-from codegen.cache import Cache, Entry, key_of
+from codegen.cache import Cache, Entry, key_of, library_version
 from codegen.compiled import CompiledFunction, cannot_load, warn_one_lane
 from codegen.compiler import (
     FLAGS,
@@ -351,7 +350,7 @@ def _set_key(key: str, levels: Mapping[str, int] | None, lanes: int, cache: Cach
         levels=sorted((levels or {}).items()),
         lanes=lanes,
         compiler=find_compiler().identity,
-        casadi=version("casadi"),
+        casadi=library_version("casadi"),
         generator=cache.code_digest("codegen"),
     )
 

@@ -23,7 +23,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -53,7 +54,7 @@ def key_of(what: str, **parts: object) -> str:
       library        the text, the compiler, its level and flags            (`codegen.build`)
       part           the same of an object file that several libraries share
       set            a recipe's key, lanes and levels, the compiler, CasADi, `codegen`'s code
-      recipe         a cell's files and the code of what makes its expressions
+      recipe         a cell's structure and the code of what makes its expressions
                      (`hybrid_opt.compiled_cell`)
       code           packages' sources, for what they do (`Cache.code_digest`)
     """
@@ -69,6 +70,12 @@ def digest(*parts: str | bytes) -> str:
         total.update(len(raw).to_bytes(8, "big"))
         total.update(raw)
     return total.hexdigest()
+
+
+@cache
+def library_version(name: str) -> str:
+    """Of an installed library; to ask for it takes milliseconds."""
+    return version(name)
 
 
 def source_digest(*packages: str) -> str:

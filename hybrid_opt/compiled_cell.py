@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from codegen.build import load_or_build
-from codegen.cache import Cache, key_of
+from codegen.cache import Cache, key_of, library_version
 from codegen.compiler import find_compiler
 from codegen.function import NumericFunction
 from symbolic.array import Array
@@ -175,7 +174,7 @@ class CompiledCell:
             name,
             structure=numbers.bodies_digest if bodies else numbers.digest,
             expressions=self._expressions,
-            libraries=[f"{library} {version(library)}" for library in ("pin", "scipy")],
+            libraries=[f"{name} {library_version(name)}" for name in ("pin", "scipy")],
             details=details,
         )
 

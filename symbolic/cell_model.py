@@ -26,7 +26,7 @@ from symbolic.robot.branches import (
 from symbolic.robot.model import RobotModel, build_robot_model
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CellBodies:
     """A cell's arms and bodies, which do not depend on the postures that arms start in.
 
@@ -52,7 +52,7 @@ class CellBodies:
         return screening_functions(self.geometry, placements, screen=self.screen)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CellModel(CellBodies):
     """Everything that the symbolic model of a cell is built from.
 
