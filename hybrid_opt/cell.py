@@ -76,7 +76,7 @@ class Cell:
         self.threads = threads
         select_objectives(objectives)
         self._objectives = tuple(objectives)
-        self._folder: TemporaryDirectory[str] | None = None
+        self._folder: TemporaryDirectory[str] | None = None  # of its files
 
     @classmethod
     def load(
@@ -117,7 +117,9 @@ class Cell:
             WorkcellError: a path leads nowhere, or the changed cell is wrong; the message lists
                 every problem.
         """
-        return Cell(changed(self.workcell, changes), self._objectives, self.threads)
+        cell = Cell(changed(self.workcell, changes), self._objectives, self.threads)
+        cell._folder = self._folder
+        return cell
 
     def drivable(self) -> Cell:
         """The same cell with carries as robots drive them: under the time law 'optimal', searched

@@ -255,6 +255,37 @@ class CompiledCell:
         return self.functions(SCREENING, make, lanes=EVALUATOR_LANES)
 
 
+def held_function(
+    workcell: Workcell,
+    name: str,
+    make: Callable[[Workcell], ca.Function],
+    cache: Cache | None = None,
+    lanes: int = 1,
+) -> NumericFunction:
+    """A function of what is held and how, with a cell's numbers, from the cache where one of the
+    same structure was built before. Neither arms nor bodies are read.
+
+    Args:
+        name: in the cache.
+        make: makes it from the cell with symbols.
+        lanes: see `codegen.build.build`.
+
+    Raises:
+        DualArmError: its code cannot be built.
+    """
+    from symbolic.numbers import WorkcellNumbers
+
+    numbers, cache = WorkcellNumbers(workcell), cache or Cache()
+    key = key_of(
+        name,
+        structure=numbers.digest,
+        expressions=cache.code_digest("symbolic"),
+        libraries=[f"scipy {library_version('scipy')}"],
+    )
+    built = load_or_build(key, lambda: {name: make(numbers.symbols())}, cache, lanes=lanes)
+    return built[name].bound(numbers.values)
+
+
 EVALUATORS, SCREENING = "evaluators", "screening"
 """Names of the sets of a cell's evaluators: those that know no bodies, and the others."""
 

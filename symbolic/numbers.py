@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import casadi as ca
@@ -127,54 +128,84 @@ class _Symbols:
 
 
 @dataclass(frozen=True)
-class CellNumbers:
-    """The numbers and the structure of a cell.
+class WorkcellNumbers:
+    """The numbers and the structure of a cell without its bodies.
 
     Attributes:
         cell: the description.
-        bounds: what bounds of distances are made of.
-        models: of both arms.
     """
 
     cell: Workcell
-    bounds: Screen
-    models: tuple[RobotModel, RobotModel]
-    _found: _Collected = field(default_factory=_Collected, repr=False)
 
     @cached_property
-    def _structures(self) -> tuple[NumberedWorkcell, Screen]:
-        return _workcell(self._found, self.cell), _screen(self._found, self.bounds)
+    def _collected(self) -> tuple[_Collected, NumberedWorkcell]:
+        take = _Collected()
+        return take, _workcell(take, self.cell)
 
     @property
     def workcell(self) -> NumberedWorkcell:
         """The cell with places instead of numbers."""
-        return self._structures[0]
+        return self._collected[1]
 
     @property
-    def screen(self) -> Screen:
-        """The bounds with places instead of numbers."""
-        return self._structures[1]
+    def _entries(self) -> dict[str, list[tuple[Number, Array]]]:
+        return self._collected[0].entries
 
-    @cached_property
+    @property
     def layout(self) -> dict[str, tuple[Number, ...]]:
         """What the entries of every group are, but for the start postures, in order."""
-        assert self._structures, "collected"
-        return {
-            name: tuple(entry for entry, _ in found) for name, found in self._found.entries.items()
-        }
+        return {name: tuple(each for each, _ in found) for name, found in self._entries.items()}
 
     @cached_property
     def values(self) -> dict[str, Array]:
         """The vector (n,) of every group, but for the start postures."""
-        assert self._structures, "collected"
         return {
             name: np.concatenate([array.ravel() for _, array in found])
-            for name, found in self._found.entries.items()
+            for name, found in self._entries.items()
         }
 
     @cached_property
     def digest(self) -> str:
         """Of the structure without bodies."""
+        return _digest(self.workcell)
+
+    def symbols(self) -> NumberedWorkcell:
+        """The cell with symbols instead of numbers."""
+        return _workcell(self._symbols(), self.cell)
+
+    def _symbols(self, further: Mapping[str, int] = MappingProxyType({})) -> _Symbols:
+        return _Symbols({name: len(values) for name, values in self.values.items()} | dict(further))
+
+
+@dataclass(frozen=True)
+class CellNumbers(WorkcellNumbers):
+    """The same of a whole cell.
+
+    Attributes:
+        bounds: what bounds of distances are made of.
+        models: of both arms.
+    """
+
+    bounds: Screen
+    models: tuple[RobotModel, RobotModel]
+
+    @cached_property
+    def _of_bodies(self) -> tuple[_Collected, Screen]:
+        take = _Collected()
+        return take, _screen(take, self.bounds)
+
+    @property
+    def screen(self) -> Screen:
+        """The bounds with places instead of numbers."""
+        return self._of_bodies[1]
+
+    @property
+    def _entries(self) -> dict[str, list[tuple[Number, Array]]]:
+        return super()._entries | self._of_bodies[0].entries
+
+    @cached_property
+    def digest(self) -> str:
+        """Of the structure without bodies, the arms' own included."""
         return _digest(self.workcell, self._arms)
 
     @cached_property
@@ -196,8 +227,7 @@ class CellNumbers:
             bodies: of the cell, or of another one of the same structure.
         """
         joints = [model.n_joints for model in self.models]
-        sizes = {name: len(values) for name, values in self.values.items()}
-        take = _Symbols(sizes | {START: sum(joints)})
+        take = self._symbols({START: sum(joints)})
         workcell, screen = _workcell(take, self.cell), _screen(take, self.bounds)
         start = take.group(START)
         first, second = ca.vertsplit(start.symbols, [0, joints[0], sum(joints)])

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from codegen.build import compile_function
 from codegen.interpreted import InterpretedFunction
+from hybrid_opt.compiled_cell import held_function
 from hybrid_opt.robust.cases import RulingCases, ruling_cases, worst_cases
 from hybrid_opt.robust.force import BoxMotion, check_set, robust_model
 from hybrid_opt.robust.path_force import PathPoints, robust_path
@@ -48,7 +48,7 @@ class RobustSamples:
         check_set(workcell, workcell.uncertainty)
         self._workcell, self._model = workcell, robust_model(workcell)
         self._cases = worst_cases(workcell, workcell.uncertainty)
-        self._gradient = compile_function(case_gradient_function(workcell))
+        self._gradient = held_function(workcell, "case gradient", case_gradient_function)
         self._motion = InterpretedFunction(motion_function(workcell.task))
 
     def forces(self, found: Mapping[str, Array]) -> Array:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from codegen.build import compile_function
 from codegen.cache import Cache
 from codegen.function import NumericFunction
+from hybrid_opt.compiled_cell import held_function
 from symbolic.array import Array
 from symbolic.contact.worst_cases import (
     GraspSqueeze,
@@ -116,7 +117,7 @@ class CaseForces:
         self._squeezed = is_squeezed(workcell)
         if self._squeezed:
             self._facing = [
-                compile_function(function(workcell), cache, lanes=0)
+                held_function(workcell, function.__name__, function, cache, lanes=0)
                 for function in (case_squeeze_function, case_slack_function)
             ]
 

@@ -6,14 +6,16 @@ In every case the least squeeze is convex in the required force and moment, and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.build import compile_function
 from codegen.cache import Cache
+from hybrid_opt.compiled_cell import held_function
 from hybrid_opt.robust.cases import (
     RulingCases,
     check_pads,
@@ -103,15 +105,16 @@ class RobustPath:
         self.leader = leader
         self._cases = worst_cases(workcell, workcell.uncertainty)
         self._set = workcell.uncertainty
+        makers: dict[str, Callable[[Workcell], Any]] = {
+            "undisplaced squeeze": partial(case_squeeze_function, displaced=False),
+            "case slopes": case_slopes_function,
+            "case slack": case_slack_function,
+            "case difference": case_difference_function,
+        }
         self._squeeze, self._slopes, self._slack, self._difference = (
             # Slopes add up in loops, for which there is no form in lanes.
-            compile_function(function(workcell), cache, lanes=int(function is case_slopes_function))
-            for function in (
-                partial(case_squeeze_function, displaced=False),
-                case_slopes_function,
-                case_slack_function,
-                case_difference_function,
-            )
+            held_function(workcell, name, make, cache, int(make is case_slopes_function))
+            for name, make in makers.items()
         )
 
     def at(self, points: PathPoints) -> tuple[Array, Array]:

@@ -39,7 +39,7 @@ from symbolic.contact.load import resultant_force
 from symbolic.contact.paper import required_moment
 from symbolic.contact.patches import least
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
-from symbolic.expression import Expression
+from symbolic.expression import Expression, mx_given, number, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.records import Contact, Workcell
 
@@ -60,6 +60,9 @@ SQUARED_SPEED_FLOOR = 1e-12
 
 CASE_SIZE = sum(CASE_SIZES.values())
 
+MOTION = ("pose", "rate", "second_rate")
+"""Inputs of functions of cases, before the case."""
+
 
 def case_squeeze_function(workcell: Workcell, displaced: bool = True) -> ca.Function:
     """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to normal_force (2,) [N].
@@ -73,9 +76,10 @@ def case_squeeze_function(workcell: Workcell, displaced: bool = True) -> ca.Func
     kind = _kind(workcell)
     motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = kind.sym("case", CASE_SIZE)
-    force = _least_squeeze(workcell, motion, case, displaced=displaced)
-    names = ["pose", "rate", "second_rate", "case"]
-    return ca.Function("case_squeeze", [*motion, case], [force], names, ["normal_force"])
+    given = _given(workcell)
+    force = _least_squeeze(workcell, motion, case, given, displaced=displaced)
+    inputs, names = [*motion, case, *given.values()], [*MOTION, "case", *given]
+    return ca.Function("case_squeeze", inputs, [force], names, ["normal_force"])
 
 
 def case_gradient_function(workcell: Workcell) -> ca.Function:
@@ -85,12 +89,12 @@ def case_gradient_function(workcell: Workcell) -> ca.Function:
     motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = kind.sym("case", CASE_SIZE)
     detached: Detached = []
-    force = _least_squeeze(workcell, motion, case, detached, differentiable=True)
+    given = _given(workcell)
+    force = _least_squeeze(workcell, motion, case, given, detached, differentiable=True)
     slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in motion]).T)
-    names = ["pose", "rate", "second_rate", "case"]
-    outputs = ["normal_force", "slope"]
+    inputs, names = [*motion, case, *given.values()], [*MOTION, "case", *given]
     found = _solved([force, slope], detached)
-    return ca.Function("case_gradient", [*motion, case], found, names, outputs)
+    return ca.Function("case_gradient", inputs, found, names, ["normal_force", "slope"])
 
 
 def case_slopes_function(workcell: Workcell) -> ca.Function:
@@ -104,22 +108,24 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     # A root has no slope at rest, what follows from its square has.
     motion = [pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w]
     detached: Detached = []
-    force = _least_squeeze(workcell, motion, case, detached, differentiable=True)
+    given = _given(workcell)
+    force = _least_squeeze(workcell, motion, case, given, detached, differentiable=True)
     slope = ca.densify(ca.jacobian(force, ca.vertcat(*path, a, w)).T)
-    names = ["pose", "first", "second", "a", "w", "case"]
-    outputs = ["normal_force", "slope"]
+    names = ["pose", "first", "second", "a", "w", "case", *given]
     found = _solved([force, slope], detached)
-    return ca.Function("case_slopes", [*path, a, w, case], found, names, outputs)
+    inputs, outputs = [*path, a, w, case, *given.values()], ["normal_force", "slope"]
+    return ca.Function("case_slopes", inputs, found, names, outputs)
 
 
 def case_difference_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to difference N_1 - N_2 [N],
     which no squeeze changes."""
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case = ca.SX.sym("case", CASE_SIZE)
-    difference = ca.cse([_balance_function(workcell)(*motion, case)[0]])
-    names = ["pose", "rate", "second_rate", "case"]
-    return ca.Function("case_difference", [*motion, case], difference, names, ["difference"])
+    case, given = ca.SX.sym("case", CASE_SIZE), sx_given(workcell.payload)
+    inputs = [*motion, case, *given.values()]
+    difference = ca.cse([_balance_function(workcell)(*inputs)[0]])
+    names = [*MOTION, "case", *given]
+    return ca.Function("case_difference", inputs, difference, names, ["difference"])
 
 
 def case_slack_function(workcell: Workcell) -> ca.Function:
@@ -132,14 +138,16 @@ def case_slack_function(workcell: Workcell) -> ca.Function:
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case, force, arm = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force"), ca.SX.sym("arm")
     friction, radius, *_ = case_parts(case)
-    balance = _balance_function(workcell)(*motion, case)
+    given = sx_given(workcell.payload)
+    balance = _balance_function(workcell)(*motion, case, *given.values())
     n_1 = force + arm * balance[0]
-    names = ["pose", "rate", "second_rate", "case", "force", "arm"]
     if workcell.task.allocation == "soft-finger":
-        slack = [n_1 - _least_squeeze(workcell, motion, case)[0]]
+        slack = [n_1 - _least_squeeze(workcell, motion, case, given)[0]]
     else:
         slack = ca.cse([even_slack(balance, friction, radius, n_1)])
-    return ca.Function("case_slack", [*motion, case, force, arm], slack, names, ["slack"])
+    inputs = [*motion, case, force, arm, *given.values()]
+    names = [*MOTION, "case", "force", "arm", *given]
+    return ca.Function("case_slack", inputs, slack, names, ["slack"])
 
 
 def _kind(workcell: Workcell) -> Any:
@@ -147,10 +155,17 @@ def _kind(workcell: Workcell) -> Any:
     return ca.SX if workcell.task.allocation == "soft-finger" else ca.MX
 
 
+def _given(workcell: Workcell) -> dict[str, Any]:
+    """The cell's numbers as inputs of such expressions."""
+    of = sx_given if _kind(workcell) is ca.SX else mx_given
+    return dict(of(workcell.payload))
+
+
 def _least_squeeze(
     workcell: Workcell,
     motion: list[Expression],
     case: Expression,
+    given: dict[str, Any],
     detached: Detached | None = None,
     differentiable: bool = False,
     displaced: bool = False,
@@ -159,7 +174,7 @@ def _least_squeeze(
     their pressure, see `symbolic.contact.grasp.facing_wrenches`."""
     friction, radius, *_ = case_parts(case)
     if workcell.task.allocation != "soft-finger":
-        balance = _balance_function(workcell)(*motion, case)
+        balance = _balance_function(workcell)(*motion, case, *given.values())
         wrenches = facing_wrenches(balance, friction, radius, "squeeze", differentiable)
         return wrenches[::WRENCH_SIZE]
     axes = workcell.contacts[0].T_box_pad[:3, :3]
@@ -190,7 +205,8 @@ def _balance_function(workcell: Workcell) -> ca.Function:
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = ca.SX.sym("case", CASE_SIZE)
     balance = balance_of(*case_in_pad_axes(workcell, motion, case))
-    return ca.Function("case_balance", [*motion, case], [balance])
+    inputs = [*motion, case, *sx_given(workcell.payload).values()]
+    return ca.Function("case_balance", inputs, [balance])
 
 
 def case_in_pad_axes(
@@ -204,14 +220,14 @@ def case_in_pad_axes(
         case: (15,), see `CASE_SIZES`.
     """
     *_, displacement = case_parts(case)
-    nominal = ca.DM(workcell.payload.centre_of_mass)
-    axes = ca.DM(workcell.contacts[0].T_box_pad[:3, :3])
+    nominal = number(workcell.payload.centre_of_mass)
+    axes = number(workcell.contacts[0].T_box_pad[:3, :3])
     arms = [
-        ca.mtimes(axes.T, ca.DM(contact.T_box_pad[:3, 3]) - nominal)
+        ca.mtimes(axes.T, number(contact.T_box_pad[:3, 3]) - nominal)
         + ca.vertcat(displacement[2 * i : 2 * i + 2], 0.0)
         for i, contact in enumerate(workcell.contacts)
     ]
-    in_box = case_load_function(workcell)(*motion, case)
+    in_box = case_load_function(workcell)(*motion, case, *sx_given(workcell.payload).values())
     force, moment = (ca.mtimes(axes.T, part) for part in in_box)
     return force, moment, (arms[0], arms[1])
 
@@ -228,17 +244,17 @@ def case_load_function(workcell: Workcell) -> ca.Function:
     omega = angular_velocity(turned, pose[3:], rate[3:])
     alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
     share = mass / payload.mass
-    nominal = ca.DM(payload.centre_of_mass)
+    nominal = number(payload.centre_of_mass)
     pulled = second[:3] + disturbance
 
     def resultant(offset: ca.SX | ca.DM) -> ca.SX:
         return resultant_force(payload.mass, ca.mtimes(rotation, offset), omega, alpha, pulled)
 
     # About the nominal centre of mass; the true one's distance turns the force on a mass there.
-    turning = required_moment(ca.SX(ca.DM(payload.inertia)), rotation, omega, alpha)
+    turning = required_moment(ca.SX(number(payload.inertia)), rotation, omega, alpha)
     moment = turning + ca.cross(ca.mtimes(rotation, centre - nominal), resultant(nominal))
     parts = [share * ca.mtimes(rotation.T, part) for part in (resultant(centre), moment)]
-    return ca.Function("case_load", [*motion, case], parts)
+    return ca.Function("case_load", [*motion, case, *sx_given(payload).values()], parts)
 
 
 # --- pads anywhere ---
