@@ -47,8 +47,7 @@ def _add_options(parser: Parser) -> None:
         type=float,
         metavar="FACTOR",
         help="commanded squeeze over the least that holds pads that press evenly (default: what "
-        "holds them in every case of the cell's [uncertainty], "
-        f"{stated('hybrid_opt.robust.squeeze.FACTOR'):g} where it has none)",
+        "holds them in every case of the cell's [uncertainty], or of the usual one)",
     )
     add(parser, "--leader")
     parser.add_argument(

@@ -15,8 +15,6 @@ Count = Annotated[int, Range(0, 10**12)]
 Seconds = Annotated[float, Range(0.0, 1e12)]
 Pair = Annotated[Array, Shape((2,))]
 """One number per robot."""
-Vector = Annotated[Array, Shape((3,))]
-"""One number per axis."""
 
 StageStatus = Literal["running", "done", "outdated"]
 

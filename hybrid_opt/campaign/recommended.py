@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hybrid_opt.campaign.documents import Count, Pair, Vector
+from hybrid_opt.campaign.documents import Count, Pair
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ROBUST_FORCE, ForceKind
 from hybrid_opt.recommending.recommendation import Recommendation, Unsure
 from hybrid_opt.robust.force import RobustPrice
@@ -12,7 +12,6 @@ from hybrid_opt.store.json_records import Figure
 from hybrid_opt.timing.document import StoredJerk
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array
-from symbolic.records import Uncertainty
 
 
 @dataclass(frozen=True)
@@ -74,58 +73,35 @@ class StoredPrice:
     """Cost for the recommended carry to hold in every case of a set.
 
     Attributes:
-        stated: whether the workcell states the set; else it is a usual one.
-        friction, mass, centre_of_mass, pad_position, disturbance: the set, as in a workcell.
+        stated: whether the workcell states the set; else it is the usual one.
+        uncertainty: the set in words.
         factors: multiples of it.
         peak: largest normal force of each robot under them [N].
         commanded: under the set itself [N].
         limit: reference forces [N].
-        largest_factor: the largest multiple that they allow, null where any.
+        largest_factor: the largest multiple that they allow, at most
+            `hybrid_opt.robust.force.LARGEST_FACTOR`.
         cases, failing: random cases held against the forces, and how many they did not hold.
         closest: largest share of the forces that a case needed; less is told as 0.97.
     """
 
     stated: bool
-    friction: float
-    mass: float
-    centre_of_mass: Vector
-    pad_position: float
-    disturbance: Vector
+    uncertainty: str
     factors: tuple[float, ...]
     peak: tuple[Pair, ...]
     commanded: Pair
     limit: Pair
-    largest_factor: Figure
+    largest_factor: float
     cases: Count
     failing: Count
     closest: float
 
 
-def set_text(found: StoredPrice | Uncertainty) -> str:
-    """A set of uncertain quantities in words."""
-    parts = [
-        f"friction off by {100.0 * found.friction:g} %" if found.friction else "",
-        f"mass by {100.0 * found.mass:g} %" if found.mass else "",
-        _width("centre of mass", 1e3 * found.centre_of_mass, "mm"),
-        f"pads by {1e3 * found.pad_position:g} mm" if found.pad_position else "",
-        _width("disturbance", found.disturbance, "m/s^2"),
-    ]
-    return ", ".join(part for part in parts if part)
-
-
-def _width(name: str, values: Array, unit: str) -> str:
-    if not values.any():
-        return ""
-    same = values.min() == values.max()
-    numbers = f"{values[0]:g}" if same else " / ".join(f"{value:g}" for value in values)
-    return f"{name} by {numbers} {unit}"
-
-
 def stored_price(price: RobustPrice) -> StoredPrice:
     """A price as a study stores it."""
     return StoredPrice(
-        **vars(price.uncertainty),
-        stated=price.stated,
+        stated=price.uncertainty.stated,
+        uncertainty=str(price.uncertainty),
         factors=tuple(price.factors.tolist()),
         peak=tuple(price.peak),
         commanded=price.commanded,

@@ -13,7 +13,7 @@ import numpy as np
 from hybrid_opt.job.motions import PEAK_RATE, SAMPLES, TICK, at_even_steps, rise
 from hybrid_opt.job.records import Force, PhaseMotion, contact_effort
 from hybrid_opt.robust.force import BoxMotion
-from hybrid_opt.robust.squeeze import Squeeze, extra_force
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, pressed_beyond
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array
@@ -31,8 +31,11 @@ _SAME_TIME = 1e-9
 _NO_JUMP = 1e-6
 
 
-def holding(model: TimingModel, squeeze: Squeeze, motions: Sequence[PhaseMotion]) -> list[Force]:
-    """Forces of phases that follow one another, with the box held in all of them.
+def holding(
+    model: TimingModel, settings: SqueezeSettings, motions: Sequence[PhaseMotion]
+) -> tuple[list[Force], Squeeze]:
+    """Forces of phases that follow one another, with the box held in all of them, and how they came
+    about.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch, or the contacts are not two pads
@@ -53,12 +56,12 @@ def holding(model: TimingModel, squeeze: Squeeze, motions: Sequence[PhaseMotion]
     )
     load = model.load(box.pose, box.rate, box.second_rate)
     least, wrench = load["normal_force"], np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
-    extra = extra_force(model.workcell, squeeze, time, box, least)
+    extra, squeeze = pressed_beyond(model.workcell, settings, time, box, least)
     normal = least + extra[:, None]
     wrench = wrench + extra[:, None, None] * unit_squeeze(model.workcell, box.pose)
     cuts = np.cumsum([len(motion.time) for motion in motions])[:-1]
     parts = zip(*(np.split(values, cuts) for values in (normal, least, wrench)), strict=True)
-    return [Force(*part) for part in parts]
+    return [Force(*part) for part in parts], squeeze
 
 
 def pressing(hold: Force, sample: int, rate: float) -> tuple[float, Force]:

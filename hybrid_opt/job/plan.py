@@ -33,7 +33,7 @@ from hybrid_opt.job.motions import (
 )
 from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
 from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, smoothed
-from hybrid_opt.robust.squeeze import SqueezeSettings, chosen_squeeze
+from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.static_hold import kept_per_workcell
 from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.model import TimingModel
@@ -141,7 +141,6 @@ class JobModel:
             timing = self._without_jumps(timing, smoothing, jerk)
             carry = timing.carry
         assert carry is not None, "a smoothed timing has a carry"
-        chosen = chosen_squeeze(self.workcell, squeeze or SqueezeSettings())
         handling = handling or self.workcell.handling
         around = self._around(carry, handling)
         before, after = around.before, around.after
@@ -150,7 +149,8 @@ class JobModel:
             _Part("carry", carry_motion(self.timing, carry), self._proof(around.checker, carry)),
             *after[:-1],
         ]
-        forces = holding(self.timing, chosen, [part.motion for part in loaded])
+        settings = squeeze or SqueezeSettings()
+        forces, chosen = holding(self.timing, settings, [part.motion for part in loaded])
         first, last = before[0], after[-1]
         press, release = (
             (name, *_pressed(motion, force, end, handling.pressing_rate))

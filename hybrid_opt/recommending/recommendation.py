@@ -15,7 +15,7 @@ from hybrid_opt.evaluate.objectives import ForceKind
 from hybrid_opt.recommending.choice import Choice, DrivenPaths, Wish, choices
 from hybrid_opt.recommending.comparison import BETTER, Rival, rivals
 from hybrid_opt.robust.force import RobustModel, robust_model
-from hybrid_opt.robust.squeeze import FACTOR, Squeeze, SqueezeSettings, commanded_forces
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.store.json_records import Shape
 from hybrid_opt.timing.jerk import drive_with_jerk
 from hybrid_opt.timing.records import JerkTiming, Timing
@@ -233,7 +233,7 @@ def _commanded(carry: Carry) -> tuple[Array, Squeeze, tuple[str, ...]]:
     try:
         forces, squeeze = commanded_forces(carry.workcell, carry, SqueezeSettings())
     except SettingsError as error:
-        forces, squeeze = commanded_forces(carry.workcell, carry, SqueezeSettings(FACTOR))
+        forces, squeeze = commanded_forces(carry.workcell, carry, SqueezeSettings(1.0))
         doubts.append(f"no robust forces: {error}")
     peak = np.asarray(forces.max(axis=0))
     if not squeeze.even_pads:

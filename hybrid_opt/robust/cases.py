@@ -14,7 +14,13 @@ Which are worst follows from the least squeeze that a case asks for:
 - soft fingers press about their displaced places. Displaced alike by e, both leave the centre of
   mass as much beside them. Displaced apart, they turn the squeeze into a moment, which a difference
   of their tangential forces of up to 2 e N / L each carries, L being their distance: a coefficient
-  of friction that is lower by 2 e / L stands for it. Both at once are sufficient, not exact.
+  of friction that is lower by 2 e / L stands for it. Both at once are sufficient, not exact. What
+  the arms' places are off one another adds to 2 e;
+- a pad that is tilted by t against its face presses along its own axis: the cone about that axis
+  which lies within the face's own has the coefficient tan(atan mu - t), exact in the worst
+  direction;
+- the force that is commanded grows with the share of it that may be missing, and with the opposed
+  force (`symbolic.contact.worst_cases`).
 """
 
 from __future__ import annotations
@@ -45,7 +51,7 @@ from symbolic.records import Uncertainty, Workcell
 
 
 def nominal_case(workcell: Workcell) -> Array:
-    """(15,) the case that the workcell describes, laid out by `worst_cases.CASE_SIZES`."""
+    """(18,) the case that the workcell describes, laid out by `worst_cases.CASE_SIZES`."""
     contacts, payload = workcell.contacts, workcell.payload
     return np.concatenate(
         [
@@ -53,48 +59,75 @@ def nominal_case(workcell: Workcell) -> Array:
             [contact.patch_radius for contact in contacts],
             [payload.mass],
             payload.centre_of_mass,
-            np.zeros(7),
+            np.zeros(10),
         ]
     )
 
 
-def worst_cases(workcell: Workcell, uncertainty: Uncertainty) -> Array:
-    """(k, 15) cases that ask for as much squeeze as any within the ranges, or a little more."""
+def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -> Array:
+    """(k, 18) cases that ask for as much squeeze as any within the ranges, or a little more.
+
+    Args:
+        leader: index of the robot whose force is not commanded.
+    """
     case, off = nominal_case(workcell), uncertainty.pad_position
-    case[0:2] *= 1.0 - uncertainty.friction
+    case[0:2] = least_friction(workcell, uncertainty)
     case[4] *= 1.0 + uncertainty.mass
+    case[16 - leader] = uncertainty.tracking
+    case[17] = uncertainty.opposed_force
     centre = uncertainty.centre_of_mass
     if workcell.task.allocation == "soft-finger":
-        case[0:2] -= off * friction_by_displacement(workcell)
         normal = workcell.contacts[0].T_box_pad[:3, 2]
         centre = centre + off * np.sqrt(np.maximum(1.0 - normal**2, 0.0))
     else:
-        case[2:4] *= 1.0 - off / np.array(least_reaches(workcell))
+        case[2:4] *= patches_left(workcell, uncertainty)
     ranges = np.concatenate([centre, uncertainty.disturbance])
     corners = product(*[(-width, width) if width > 0.0 else (0.0,) for width in ranges])
-    return np.array([case + np.concatenate([np.zeros(5), at, np.zeros(4)]) for at in corners])
+    return np.array([case + np.concatenate([np.zeros(5), at, np.zeros(7)]) for at in corners])
 
 
-def friction_by_displacement(workcell: Workcell) -> float:
-    """What soft fingers lose of their coefficients of friction by being displaced apart [1/m]."""
-    first, second = (contact.T_box_pad for contact in workcell.contacts)
-    return 2.0 / abs(float((first[:3, 3] - second[:3, 3]) @ first[:3, 2]))
+def least_friction(workcell: Workcell, uncertainty: Uncertainty) -> Array:
+    """(2,) coefficients of friction that stand for the worst of a set, zero or less for none."""
+    friction = np.array([contact.friction for contact in workcell.contacts])
+    left = np.tan(np.arctan(friction * (1.0 - uncertainty.friction)) - uncertainty.turned)
+    if workcell.task.allocation == "soft-finger":
+        first, second = (contact.T_box_pad for contact in workcell.contacts)
+        length = abs(float((first[:3, 3] - second[:3, 3]) @ first[:3, 2]))
+        left -= (2.0 * uncertainty.pad_position + uncertainty.apart) / length
+    return np.asarray(left)
+
+
+def patches_left(workcell: Workcell, uncertainty: Uncertainty) -> Array:
+    """(2,) sizes, as shares, of patches that lie within all displaced ones, zero or less for
+    none."""
+    off = uncertainty.pad_position + uncertainty.apart / 2.0
+    return np.asarray(1.0 - off / np.array(least_reaches(workcell)))
 
 
 def random_cases(
-    workcell: Workcell, uncertainty: Uncertainty, n: int, rng: np.random.Generator
+    workcell: Workcell, uncertainty: Uncertainty, n: int, rng: np.random.Generator, leader: int = 0
 ) -> Array:
-    """(n, 15) cases drawn evenly from the ranges, pads from discs."""
+    """(n, 18) cases drawn evenly from the ranges, pads from discs."""
     cases = np.tile(nominal_case(workcell), (n, 1))
     cases[:, 0:2] *= 1.0 + uncertainty.friction * rng.uniform(-1.0, 1.0, (n, 2))
     cases[:, 4] *= 1.0 + uncertainty.mass * rng.uniform(-1.0, 1.0, n)
     cases[:, 5:8] += uncertainty.centre_of_mass * rng.uniform(-1.0, 1.0, (n, 3))
     cases[:, 8:11] = uncertainty.disturbance * rng.uniform(-1.0, 1.0, (n, 3))
-    angle = rng.uniform(0.0, 2.0 * np.pi, (n, 2))
-    reach = uncertainty.pad_position * np.sqrt(rng.random((n, 2)))
-    displaced = np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=2)
-    cases[:, 11:15] = displaced.reshape(n, 4)
+    cases[:, 11:15] = _in_discs(rng, uncertainty.pad_position, n, 2).reshape(n, 4)
+    turned = uncertainty.turned * rng.random((n, 2))
+    cases[:, 0:2] = np.tan(np.arctan(cases[:, 0:2]) - turned)
+    apart = _in_discs(rng, uncertainty.apart / 2.0, n, 1)[:, 0]
+    cases[:, 11:15] += np.hstack([apart, -apart])
+    cases[:, 16 - leader] = uncertainty.tracking * rng.random(n)
+    cases[:, 17] = uncertainty.opposed_force * rng.random(n)
     return cases
+
+
+def _in_discs(rng: np.random.Generator, radius: float, n: int, discs: int) -> Array:
+    """(n, discs, 2) drawn evenly from discs of a radius [m]."""
+    angle = rng.uniform(0.0, 2.0 * np.pi, (n, discs))
+    reach = radius * np.sqrt(rng.random((n, discs)))
+    return np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=2)
 
 
 class CaseForces:
@@ -129,7 +162,7 @@ class CaseForces:
 
         Args:
             motion: poses and their time derivatives (m, 6) each.
-            cases: (m, 15).
+            cases: (m, 18).
             leader: index of the robot whose force is not commanded.
             threads: 0 for one per core.
         """

@@ -16,15 +16,15 @@ from codegen.cache import Cache
 from hybrid_opt.carry import Carry
 from hybrid_opt.robust.cases import (
     CaseForces,
-    friction_by_displacement,
+    least_friction,
     nominal_case,
+    patches_left,
     random_cases,
     ruling_cases,
     worst_cases,
 )
 from hybrid_opt.static_hold import kept_per_workcell
 from symbolic.array import Array
-from symbolic.contact.worst_cases import least_reaches
 from symbolic.errors import SettingsError
 from symbolic.read.checks import PATCH_OVERLAP, pads_beside
 from symbolic.records import Uncertainty, Workcell
@@ -41,15 +41,6 @@ SCREENED = 0.97
 
 HOLDS = 1e-6
 """Excess over the commanded force that counts as rounding, as a share of it."""
-
-USUAL = Uncertainty(
-    friction=0.10,
-    mass=0.05,
-    centre_of_mass=np.full(3, 0.005),
-    pad_position=0.003,
-    disturbance=np.full(3, 0.2),
-)
-"""A set to think of where the workcell states none."""
 
 FACTORS = np.linspace(0.0, 2.0, 9)
 """Multiples of the set whose forces are given."""
@@ -138,7 +129,7 @@ class RobustModel:
         self._cases = CaseForces(workcell, cache)
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
-        """(k, n, 2) least normal forces [N] that hold each of k cases (k, 15) at n samples; of pads
+        """(k, n, 2) least normal forces [N] that hold each of k cases (k, 18) at n samples; of pads
         that do not face one another the least commanded one, and what `leader` presses with."""
         n = len(motion.pose)
         found = np.empty((len(cases), n, 2))
@@ -169,7 +160,7 @@ class RobustModel:
         if leader not in (0, 1):
             raise SettingsError(f"leader {leader}: give 0 or 1, the index of an arm")
         check_set(self.workcell, uncertainty)
-        worst = self.least_squeeze(motion, worst_cases(self.workcell, uncertainty), leader)
+        worst = self.least_squeeze(motion, worst_cases(self.workcell, uncertainty, leader), leader)
         follower, share = 1 - leader, self._cases.leading_share(leader)
         force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
         return force[:, follower], force[:, leader]
@@ -211,7 +202,9 @@ class RobustModel:
         failing, closest, left = 0, SCREENED, n
         step = max(1, BATCH // len(motion.pose))
         while left:
-            cases = random_cases(self.workcell, force.uncertainty, min(step, left), rng)
+            cases = random_cases(
+                self.workcell, force.uncertainty, min(step, left), rng, force.leader
+            )
             # Only what needs more than the closest so far can say more; beyond 1 all are counted.
             share = self._shares(motion, force, cases, min(closest, 1.0), threads)
             failing += int((share > 1.0 + HOLDS).sum())
@@ -262,12 +255,9 @@ class RobustModel:
         uncertainty: Uncertainty | None = None,
     ) -> float:
         """Largest multiple of a set, by default the workcell's, whose forces stay within limits
-        (2,) [N].
-
-        Zero where the nominal forces exceed them, infinite where nothing is uncertain.
-        """
+        (2,) [N], at most `LARGEST_FACTOR`; zero where the nominal forces exceed them."""
         chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
-        end = min(LARGEST_FACTOR, (1.0 - 1e-6) * allowed_factor(self.workcell, chosen))
+        end = allowed_factor(self.workcell, chosen)
 
         def within(factor: float) -> bool:
             peak = self.robust_force(motion, chosen.scaled(factor), leader).peak
@@ -276,7 +266,7 @@ class RobustModel:
         if not within(0.0):
             return 0.0
         if within(end):
-            return end if end < LARGEST_FACTOR else float("inf")
+            return end
         low, high = 0.0, end
         for _ in range(BISECTIONS):
             middle = (low + high) / 2.0
@@ -288,31 +278,39 @@ def check_set(workcell: Workcell, uncertainty: Uncertainty) -> None:
     """Refuse sets that nothing can hold.
 
     Raises:
-        SettingsError: the set leaves no friction or no patch.
+        SettingsError: the set leaves no friction, no patch or no force.
     """
-    if not allowed_factor(workcell, uncertainty) > 1.0:
+    if not _leaves_something(workcell, uncertainty):
         raise SettingsError(
-            "the uncertainty leaves no friction or no patch; make its shares or pad_position "
-            "smaller"
+            "the uncertainty leaves no friction or no patch; make its shares, tilt or "
+            f"displacements smaller ({uncertainty})"
         )
 
 
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
-    """Largest multiple of a set that leaves some friction and patches."""
-    limits = [float("inf")]
-    limits += [1.0 / share for share in (uncertainty.friction, uncertainty.mass) if share > 0.0]
-    off = uncertainty.pad_position
-    if workcell.task.allocation == "soft-finger":
-        lost = off * friction_by_displacement(workcell)
-        friction = min(contact.friction for contact in workcell.contacts)
-        limits.append(friction / max(friction * uncertainty.friction + lost, 1e-300))
-    elif off > 0.0:
-        radii = least_reaches(workcell)
-        room = min(radii)
+    """Largest multiple of a set that leaves some friction and patches, at most
+    `LARGEST_FACTOR`."""
+    low, high = 0.0, LARGEST_FACTOR
+    if _leaves_something(workcell, uncertainty.scaled(high)):
+        return high
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2.0
+        leaves = _leaves_something(workcell, uncertainty.scaled(middle))
+        low, high = (middle, high) if leaves else (low, middle)
+    return low
+
+
+def _leaves_something(workcell: Workcell, uncertainty: Uncertainty) -> bool:
+    """Whether friction, patches, mass and force are left in the worst case."""
+    shares = [1.0 - uncertainty.mass, 1.0 - uncertainty.tracking]
+    left = [*least_friction(workcell, uncertainty), *shares]
+    if workcell.task.allocation != "soft-finger":
+        patches = patches_left(workcell, uncertainty)
+        left += [*patches]
         if workcell.has_facing_pads:
-            room = min(room, (sum(radii) - pads_beside(workcell) / PATCH_OVERLAP) / 2.0)
-        limits.append(room / off)
-    return min(limits)
+            radii = np.array([contact.patch_radius for contact in workcell.contacts])
+            left.append(PATCH_OVERLAP * float(patches @ radii) - pads_beside(workcell))
+    return bool(min(left) > 0.0)
 
 
 robust_model = kept_per_workcell(RobustModel)
@@ -329,23 +327,26 @@ soft_model = kept_per_workcell(_soft_model)
 opposite normals."""
 
 
+def pressing_model(workcell: Workcell) -> RobustModel:
+    """The model of what is commanded: of pads that press evenly where that is known of them."""
+    return (soft_model if workcell.has_opposite_pads else robust_model)(workcell)
+
+
 @dataclass(frozen=True)
 class RobustPrice:
     """The price of robustness of one carry.
 
     Attributes:
         uncertainty: the set.
-        stated: whether the workcell states it.
         factors: (k,) multiples of the set.
         peak: (k, 2) largest normal force of each robot under them [N].
         commanded: (2,) under the set itself [N].
         limit: (2,) reference forces [N].
-        largest_factor: the largest multiple that they allow.
+        largest_factor: the largest multiple that they allow, see `RobustModel.largest_factor`.
         check: random cases of the set itself under its forces.
     """
 
     uncertainty: Uncertainty
-    stated: bool
     factors: Array
     peak: Array
     commanded: Array
@@ -362,7 +363,7 @@ def robust_price(
     cases: int = CASES,
     threads: int = 1,
 ) -> RobustPrice:
-    """The cost of robustness against the workcell's set for a carry; against `USUAL` without one.
+    """The cost of robustness against the workcell's set for a carry.
 
     Args:
         model: of the carry's workcell.
@@ -375,14 +376,12 @@ def robust_price(
         SettingsError: the set leaves no friction or patch, or there is no such arm.
     """
     workcell = model.workcell
-    stated = not workcell.uncertainty.is_empty
-    uncertainty = workcell.uncertainty if stated else USUAL
+    uncertainty = workcell.uncertainty
     motion, limit = thinned(carry), workcell.task.reference_force
     force = model.robust_force(motion, uncertainty, leader)
     factors = FACTORS[allowed_factor(workcell, uncertainty) > FACTORS]
     return RobustPrice(
         uncertainty=uncertainty,
-        stated=stated,
         factors=factors,
         peak=model.price(motion, factors, leader, uncertainty),
         commanded=force.peak,

@@ -103,7 +103,7 @@ class RobustPath:
         check_pads(workcell)
         check_set(workcell, workcell.uncertainty)
         self.leader = leader
-        self._cases = worst_cases(workcell, workcell.uncertainty)
+        self._cases = worst_cases(workcell, workcell.uncertainty, leader)
         self._set = workcell.uncertainty
         makers: dict[str, Callable[[Workcell], Any]] = {
             "undisplaced squeeze": partial(case_squeeze_function, displaced=False),

@@ -5,7 +5,8 @@ place and feels what follows, the other is force-controlled (`hybrid_opt.robust`
 beyond the plan presses both pads against one another and moves nothing.
 
 The plan may assume pads that choose their pressure. What is commanded always holds pads that press
-evenly as well (`hybrid_opt.robust.force.soft_model`).
+evenly as well (`hybrid_opt.robust.force.soft_model`), in every case of the cell's set: one number
+says how hard to press, and `Squeeze.parts` what it is made of.
 """
 
 from __future__ import annotations
@@ -16,18 +17,10 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.robust.force import HeldMotion, robust_model, soft_model
+from hybrid_opt.robust.force import HeldMotion, pressing_model, soft_model
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
-
-FACTOR = 1.3
-"""Commanded over least force where nothing says how uncertain the cell is."""
-
-RESERVE = 0.10
-"""Share by which robust forces are exceeded: they hold a box whose wrenches follow the plan.
-Simulated arms hold their pads' orientation instead, and needed up to 10 % more (docs/witness.md).
-"""
 
 LARGEST_FACTOR = 10.0
 SMOOTHING = 0.1
@@ -42,8 +35,8 @@ class SqueezeSettings:
     """How hard to press.
 
     Attributes:
-        factor: commanded squeeze over the least that holds; None for the robust force of the
-            workcell's uncertainty, and `FACTOR` where it has none.
+        factor: commanded squeeze over the least that holds; None for what holds in every case of
+            the workcell's uncertainty.
         leader: index of the arm that keeps its place.
         smoothing: half the width of the time window of the smoothing [s].
     """
@@ -67,6 +60,28 @@ class SqueezeSettings:
 
 
 @dataclass(frozen=True)
+class Part:
+    """What one doubt adds to the largest force of the force-controlled arm [N]."""
+
+    name: str
+    force: float
+
+
+DOUBTS = {
+    "friction": ("friction",),
+    "mass": ("mass",),
+    "centre of mass": ("centre_of_mass",),
+    "pads' places": ("pad_position",),
+    "tilt of the pads": ("tilt",),
+    "arms' relative pose": ("relative_position", "relative_angle"),
+    "disturbance": ("disturbance",),
+    "arms against one another": ("internal_force",),
+    "tracking": ("tracking",),
+}
+"""Parts of a set in the order in which they add to the force, and whose ranges they are."""
+
+
+@dataclass(frozen=True)
 class Squeeze:
     """How the commanded forces came about.
 
@@ -77,39 +92,45 @@ class Squeeze:
         smoothing: half the width of the time window of the smoothing [s].
         even_pads: whether the forces hold pads that press evenly; known for two pads with opposite
             normals.
+        parts: of the largest force that is commanded, the least that holds first; they add up to
+            it.
     """
 
     leader: int
     factor: float | None
     uncertainty: Uncertainty | None
     smoothing: float
-    even_pads: bool = True
+    even_pads: bool
+    parts: tuple[Part, ...]
+
+    @property
+    def force(self) -> float:
+        """Largest force that is commanded of the force-controlled arm [N]."""
+        return sum(part.force for part in self.parts)
+
+    @property
+    def account(self) -> str:
+        """The parts as a sum."""
+        terms = " + ".join(f"{part.force:.1f} {part.name}" for part in self.parts)
+        return f"{terms} = {self.force:.1f} N"
 
     def __str__(self) -> str:
         pads = "pads that press evenly" if self.even_pads else "pads that choose their pressure"
-        if self.factor is None:
-            return f"holds {pads} in every case of the cell's [uncertainty]"
-        return f"{self.factor:g} times the least that holds {pads}"
+        if self.uncertainty is None:
+            return f"{self.factor:g} times the least that holds {pads}"
+        if self.uncertainty.is_empty:
+            return f"the least that holds {pads}: the cell states that nothing is uncertain"
+        named = "the cell's [uncertainty]" if self.uncertainty.stated else "the usual uncertainty"
+        return f"holds {pads} in every case of {named}"
 
 
-def chosen_squeeze(workcell: Workcell, settings: SqueezeSettings) -> Squeeze:
-    """The settings applied to a workcell."""
-    factor, uncertainty = settings.factor, None
-    if factor is None and not workcell.uncertainty.is_empty:
-        uncertainty = workcell.uncertainty
-    elif factor is None:
-        factor = FACTOR
-    even = workcell.has_opposite_pads
-    return Squeeze(settings.leader, factor, uncertainty, settings.smoothing, even)
-
-
-def extra_force(
-    workcell: Workcell, squeeze: Squeeze, time: Array, motion: HeldMotion, least: Array
-) -> Array:
-    """(n,) what both robots press with beyond the planned normal forces [N].
+def pressed_beyond(
+    workcell: Workcell, settings: SqueezeSettings, time: Array, motion: HeldMotion, least: Array
+) -> tuple[Array, Squeeze]:
+    """(n,) what both robots press with beyond the planned normal forces [N], and how it came about.
 
     Smooth where the planned forces are; with it neither robot ever presses less than the plan, or
-    than what holds pads that press evenly, or than the robust force and its reserve, ask for.
+    than what holds pads that press evenly, in every case of the set, asks for.
 
     Args:
         time: (n,) of the samples, not decreasing [s].
@@ -119,20 +140,39 @@ def extra_force(
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
     """
-    follower = 1 - squeeze.leader
-    planned = least[:, follower]
-    if squeeze.uncertainty is not None:
-        needed, known = planned, (motion, squeeze.uncertainty, squeeze.leader)
-        if squeeze.even_pads:
-            needed = np.maximum(needed, soft_model(workcell).hold(*known)[0])
-        if workcell.task.allocation != "soft-finger":
-            needed = np.maximum(needed, (1.0 + RESERVE) * robust_model(workcell).hold(*known)[0])
+    leader, even = settings.leader, workcell.has_opposite_pads
+    planned, doubt = least[:, 1 - leader], workcell.uncertainty
+    if settings.factor is None:
+        model = pressing_model(workcell)
+
+        def needed_for(names: tuple[str, ...]) -> Array:
+            return np.maximum(planned, model.hold(motion, doubt.only(names), leader)[0])
+
+        names: tuple[str, ...] = ()
+        needed = needed_for(names)
+        parts, before = [Part("least force", float(needed.max()))], float(needed.max())
+        for name, ranges in DOUBTS.items():
+            names += ranges
+            if not doubt.only(ranges).is_empty:
+                needed = needed_for(names)
+                parts.append(Part(name, float(needed.max()) - before))
+                before = float(needed.max())
     else:
-        assert squeeze.factor is not None, "a squeeze has a factor or a set"
-        if squeeze.even_pads:
+        if even:
             least = np.maximum(least, soft_model(workcell).nominal(motion))
-        needed = least[:, follower] + (squeeze.factor - 1.0) * least.mean(axis=1)
-    return smooth_above(time, needed, squeeze.smoothing) - planned
+        held = least[:, 1 - leader]
+        needed = held + (settings.factor - 1.0) * least.mean(axis=1)
+        parts = [Part("least force", float(held.max()))]
+        parts.append(Part("factor", float(needed.max() - held.max())))
+    squeeze = Squeeze(
+        leader,
+        settings.factor,
+        doubt if settings.factor is None else None,
+        settings.smoothing,
+        even,
+        tuple(parts),
+    )
+    return smooth_above(time, needed, settings.smoothing) - planned, squeeze
 
 
 def commanded_forces(
@@ -146,8 +186,7 @@ def commanded_forces(
     Raises:
         SettingsError: the cell's uncertainty leaves no friction or patch.
     """
-    squeeze = chosen_squeeze(workcell, settings)
-    extra = extra_force(workcell, squeeze, carry.time, carry, carry.normal_force)
+    extra, squeeze = pressed_beyond(workcell, settings, carry.time, carry, carry.normal_force)
     return carry.normal_force + extra[:, None], squeeze
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 
 from hybrid_opt.bundles import BundleOptions, Origin, export
 from hybrid_opt.bundles.manifest import warnings_of
-from hybrid_opt.campaign.recommended import set_text
+from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import text_table
 from hybrid_opt.job.compliance import (
@@ -27,8 +26,14 @@ from hybrid_opt.job.compliance import (
 )
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
-from hybrid_opt.robust.force import USUAL, RobustModel, allowed_factor
-from hybrid_opt.robust.squeeze import SqueezeSettings
+from hybrid_opt.robust.force import (
+    LARGEST_FACTOR,
+    RobustForce,
+    RobustModel,
+    allowed_factor,
+    pressing_model,
+)
+from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.store.files import read_bytes
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import Replay, StoredTrajectory, read_trajectory, replay
@@ -47,7 +52,6 @@ from studies.study.terminal import number
 from studies.study.timing import timing_text
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.records import Uncertainty
 
 EXIT_DIFFERENT = 1
 """Where a replayed figure differs."""
@@ -55,7 +59,7 @@ EXIT_DIFFERENT = 1
 EXIT_DOES_NOT_HOLD = 1
 """Where a random case fails."""
 
-NOT_STATED = "a usual one, because the workcell states no [uncertainty]"
+NOT_STATED = "the usual one, because the workcell states no [uncertainty]"
 
 
 def replay_file(options: argparse.Namespace) -> int:
@@ -175,47 +179,57 @@ def robust_forces(options: argparse.Namespace) -> int:
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
-        stated = not cell.workcell.uncertainty.is_empty
-        uncertainty = cell.workcell.uncertainty if stated else USUAL
+        uncertainty = cell.workcell.uncertainty
         carry = cell.carry(stored.x)
         limit = options.force_limit
-        timed = [] if limit is None else _timed(cell, stored.x, limit, uncertainty)
-    model, leader = RobustModel(cell.workcell), options.leader - 1
-    reference = cell.workcell.task.reference_force
+        timed = [] if limit is None else _timed(cell, stored.x, limit)
+    model, leader = pressing_model(cell.workcell), options.leader - 1
     held = model.robust_force(carry, uncertainty, leader)
-    factors = np.linspace(0.0, 2.0, options.points)
-    factors = factors[factors < allowed_factor(cell.workcell, uncertainty)]
-    price = model.price(carry, factors, leader, uncertainty)
-    largest = model.largest_factor(carry, reference, leader, uncertainty)
-    check = model.check(carry, held, options.cases, np.random.default_rng(options.seed), threads=0)
-    named = "the workcell's [uncertainty]" if stated else NOT_STATED
+    squeeze = commanded_forces(cell.workcell, carry, SqueezeSettings(leader=leader))[1]
+    named = "the workcell's [uncertainty]" if uncertainty.stated else NOT_STATED
     print(f"{cell.workcell.name}: arm {options.leader} leads, the other's force is commanded")
-    print(f"  the set is {named}: {set_text(uncertainty)}")
+    print(f"  the set is {named}: {uncertainty}")
     print(f"  least peak forces, nothing uncertain {_both(held.nominal.max(axis=0))} N")
     print(f"  peak forces that hold in all cases   {_both(held.peak)} N")
-    print(f"  reference forces                     {_both(reference)} N")
-    multiple = f"{largest:.3f} times" if np.isfinite(largest) else "any multiple of"
-    print(f"  they allow {multiple} the set")
+    print(f"  reference forces                     {_both(cell.workcell.task.reference_force)} N")
+    print(f"  commanded: {squeeze.account}")
+    exit_code = 0
+    if uncertainty.is_empty:
+        print("  nothing is uncertain, so there is nothing to check: state what may be off")
+    else:
+        exit_code = _priced(model, carry, held, options)
+    for text in timed:
+        print(f"  {text}")
+    return exit_code
+
+
+def _priced(
+    model: RobustModel, carry: Carry, held: RobustForce, options: argparse.Namespace
+) -> int:
+    """Print the price of a set that is not empty, and random cases of it; returns the exit code."""
+    reference, leader = model.workcell.task.reference_force, held.leader
+    largest = model.largest_factor(carry, reference, leader)
+    most = f"at least {LARGEST_FACTOR:g}" if largest == LARGEST_FACTOR else f"{largest:.3f}"
+    print(f"  they allow {most} times the set")
+    factors = np.linspace(0.0, 2.0, options.points)
+    factors = factors[factors < allowed_factor(model.workcell, held.uncertainty)]
     rows = [("times the set", "peak force 1 [N]", "peak force 2 [N]")]
     rows += [
         (number(factor, 2), number(peak[0], 2), number(peak[1], 2))
-        for factor, peak in zip(factors, price, strict=True)
+        for factor, peak in zip(factors, model.price(carry, factors, leader), strict=True)
     ]
     print(f"\n{text_table(rows, left=())}")
+    check = model.check(carry, held, options.cases, np.random.default_rng(options.seed), threads=0)
     verdict = "all hold" if check.holds else f"{check.failing} FAIL"
     print(
         f"\n  {check.cases} random cases (seed {options.seed}): {verdict}; the hardest needs "
         f"{100.0 * check.closest:.2f} % of the commanded force"
     )
-    for text in timed:
-        print(f"  {text}")
     return 0 if check.holds else EXIT_DOES_NOT_HOLD
 
 
-def _timed(cell: Cell, x: Array, limit: float, uncertainty: Uncertainty) -> list[str]:
+def _timed(cell: Cell, x: Array, limit: float) -> list[str]:
     """How fast the path is within a force limit [N] on planned forces and on robust ones."""
-    if cell.workcell.uncertainty.is_empty:
-        cell = Cell(replace(cell.workcell, uncertainty=uncertainty))
     found = []
     for text, robust in (("planned forces", False), ("forces that hold in all cases", True)):
         timing = time_path(cell.timing_model, x, TimingLimits(force=limit, robust=robust))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from hybrid_opt.campaign.recommended import set_text
 from studies.report import (
     pictures_carry,
     pictures_cell,
@@ -170,11 +169,11 @@ def _price_picture(data: ReportData) -> Iterator[ReportPicture]:
     choice = data.summary.recommendation
     if choice is not None and choice.price is not None:
         price = choice.price
-        whose = "the workcell's [uncertainty]" if price.stated else "a usual set of cases"
+        whose = "the workcell's [uncertainty]" if price.stated else "the usual uncertainty"
         yield ReportPicture(
             "robust_price",
             "The price of robustness: largest normal forces of the recommended carry that hold in "
-            f"every case of {whose} ({set_text(price)}), times a factor.",
+            f"every case of {whose} ({price.uncertainty}), times a factor.",
             lambda: pictures_robust.robust_price(data, price),
         )
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation, set_text
+from hybrid_opt.campaign.recommended import StoredPrice, StoredRecommendation
 from studies.report.records import ReportData
 from studies.report.table_text import Table, number
 from studies.study.drivable import HEAD, NOTE, JerkCosts
@@ -41,16 +41,16 @@ def robust_price(data: ReportData, price: StoredPrice) -> Table:
         for factor, peak in zip(price.factors, price.peak, strict=True)
     )
     left, right = (robot.name for robot in data.workcell.robots)
-    largest = number(price.largest_factor) if math.isfinite(price.largest_factor) else "any"
     return Table(
         "robust_price",
         "The price of robustness of the recommended carry.",
         ("times the set", f"peak, {left} [N]", f"peak, {right} [N]"),
         rows,
-        f"The set{'' if price.stated else ', a usual one'}: {set_text(price)}. The first robot "
+        f"The set{'' if price.stated else ', the usual one'}: {price.uncertainty}. The first robot "
         "leads, the force of the second is commanded. The reference forces allow "
-        f"{largest} times the set. Of {price.cases} random cases of the set {price.failing} slip "
-        f"under its forces; the hardest needs {100.0 * price.closest:.2f} % of them.",
+        f"{number(price.largest_factor)} times the set. Of {price.cases} random cases of the set "
+        f"{price.failing} slip under its forces; the hardest needs {100.0 * price.closest:.2f} % "
+        "of them.",
     )
 
 

@@ -23,7 +23,6 @@ from hybrid_opt.campaign.recommended import (
     StoredRecommendation,
     StoredRival,
     Told,
-    set_text,
     stored_price,
     stored_recommendation,
 )
@@ -363,7 +362,7 @@ def _rival(rival: StoredRival, found: StoredRecommendation) -> str:
 
 def _robust(price: StoredPrice) -> str:
     """Cost of the set, the largest multiple of it that the arms allow, and random cases."""
-    named = "[uncertainty]" if price.stated else "a usual set"
+    named = "[uncertainty]" if price.stated else "the usual uncertainty"
     plan, sure = (max(values) for values in (price.peak[0], price.commanded))
     allowed = (
         f"up to {price.largest_factor:.2f} times the set"
@@ -373,7 +372,7 @@ def _robust(price: StoredPrice) -> str:
     if not price.largest_factor:
         allowed = "not even the nominal case"
     return (
-        f"{sure:.1f} N hold in every case of {named} ({set_text(price)}), "
+        f"{sure:.1f} N hold in every case of {named} ({price.uncertainty}), "
         f"{_percent(sure / plan)} against the nominal case; the reference forces allow {allowed}; "
         f"{price.failing or 'none'} of {price.cases} random cases "
         f"{'slip' if price.failing != 1 else 'slips'}"

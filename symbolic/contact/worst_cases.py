@@ -14,6 +14,12 @@ well.
 A displaced pad that chooses its pressure counts as a smaller one that lies within it: a disc
 shrinks by the displacement, a rectangle in proportion, so that its shorter side does. A soft finger
 presses about its displaced place.
+
+What is commanded is more: a share of it may be missing, and the arms may work against one another.
+With N a pad's least normal force, e the missing share and T the opposed tangential force, it is
+(N + T / mu) / (1 - e). Friction's cones are convex and contain (T / mu, T), so that N + T / mu
+holds whichever way T acts; where the pad carries no torsion and T acts along its load, nothing less
+does.
 """
 
 from __future__ import annotations
@@ -50,10 +56,13 @@ CASE_SIZES = {
     "centre_of_mass": 3,
     "disturbance": 3,
     "displacement": 4,
+    "tracking": 2,
+    "internal": 1,
 }
 """Parts of a case, in order: coefficients; radii of the patches [m]; mass [kg]; centre of mass in
 the box frame [m]; acceleration beside the motion's, world frame [m/s^2]; displacements of both
-pads along the tangents of contact 1 [m], of pads anywhere along their own."""
+pads along the tangents of contact 1 [m], of pads anywhere along their own; share of its commanded
+normal force that either robot lacks, none of the one that leads; opposed tangential force [N]."""
 
 SQUARED_SPEED_FLOOR = 1e-12
 """Of u'^2 [1/s^2]; what it adds to a force is far below rounding."""
@@ -65,7 +74,7 @@ MOTION = ("pose", "rate", "second_rate")
 
 
 def case_squeeze_function(workcell: Workcell, displaced: bool = True) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to normal_force (2,) [N].
+    """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to normal_force (2,) [N].
 
     With the least squeeze the pads can carry the case; with more they can, with less not.
 
@@ -98,7 +107,7 @@ def case_gradient_function(workcell: Workcell) -> ca.Function:
 
 
 def case_slopes_function(workcell: Workcell) -> ca.Function:
-    """Box pose and its derivatives by u (6,), u'', u'^2 and a case (15,), see `CASE_SIZES`, to
+    """Box pose and its derivatives by u (6,), u'', u'^2 and a case (18,), see `CASE_SIZES`, to
     normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 20)), of each
     force by pose, both derivatives, u'' and u'^2; of cases without displaced pads."""
     kind = _kind(workcell)
@@ -118,7 +127,7 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
 
 
 def case_difference_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to difference N_1 - N_2 [N],
+    """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to difference N_1 - N_2 [N],
     which no squeeze changes."""
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case, given = ca.SX.sym("case", CASE_SIZE), sx_given(workcell.payload)
@@ -129,7 +138,7 @@ def case_difference_function(workcell: Workcell) -> ca.Function:
 
 
 def case_slack_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,), a case (15,), force [N] and arm to slack.
+    """pose, rate, second_rate (6,), a case (18,), force [N] and arm to slack.
 
     With the force commanded of the arm (0 or 1), a pressure that shares everything evenly holds the
     case where slack is positive; elsewhere `case_squeeze_function` knows. It takes a
@@ -144,7 +153,9 @@ def case_slack_function(workcell: Workcell) -> ca.Function:
     if workcell.task.allocation == "soft-finger":
         slack = [n_1 - _least_squeeze(workcell, motion, case, given)[0]]
     else:
-        slack = ca.cse([even_slack(balance, friction, radius, n_1)])
+        *_, tracking, _ = case_parts(case)
+        lost = tracking[0] * n_1 + tracking[1] * (n_1 - balance[0]) + _against_arms(case)
+        slack = ca.cse([even_slack(balance, friction, radius, n_1 - lost)])
     inputs = [*motion, case, force, arm, *given.values()]
     names = [*MOTION, "case", "force", "arm", *given]
     return ca.Function("case_slack", inputs, slack, names, ["slack"])
@@ -170,19 +181,35 @@ def _least_squeeze(
     differentiable: bool = False,
     displaced: bool = False,
 ) -> Expression:
-    """(2,) N_1 and N_2 [N]: of soft fingers where the cell has these, else of pads that choose
-    their pressure, see `symbolic.contact.grasp.facing_wrenches`."""
+    """(2,) N_1 and N_2 to command [N]: of soft fingers where the cell has these, else of pads that
+    choose their pressure, see `symbolic.contact.grasp.facing_wrenches`."""
     friction, radius, *_ = case_parts(case)
     if workcell.task.allocation != "soft-finger":
         balance = _balance_function(workcell)(*motion, case, *given.values())
         wrenches = facing_wrenches(balance, friction, radius, "squeeze", differentiable)
-        return wrenches[::WRENCH_SIZE]
+        return _to_command(wrenches[::WRENCH_SIZE], case)
     axes = workcell.contacts[0].T_box_pad[:3, :3]
     first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
     needed = case_in_pad_axes(workcell, motion, case)
     beside = displaced or workcell.has_pads_beside
     held = least_soft_squeeze(*needed, friction, (first, second), beside, detached)
-    return ca.densify(held.normal)
+    return ca.densify(_to_command(held.normal, case))
+
+
+def _to_command(normal: Expression, case: Expression) -> Expression:
+    """(2,) normal forces to command where least ones (2,) hold: the motion fixes their difference,
+    so that both press as much more."""
+    *_, tracking, _ = case_parts(case)
+    share, opposed = tracking / (1.0 - tracking), _against_arms(case)
+    # Entry by entry: CasADi 3.8 loses the derivative of a product of vectors here.
+    more = opposed + sum(share[i] * (normal[i] + opposed) for i in (0, 1))
+    return ca.vertcat(normal[0] + more, normal[1] + more)
+
+
+def _against_arms(case: Expression) -> Expression:
+    """Normal force that holds the opposed tangential force of a case at either pad [N]."""
+    friction, *_, internal = case_parts(case)
+    return internal / ca.fmin(friction[0], friction[1])
 
 
 def _solved(outputs: list[Expression], detached: Detached) -> list[Expression]:
@@ -193,7 +220,7 @@ def _solved(outputs: list[Expression], detached: Detached) -> list[Expression]:
 
 
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
-    """The parts of a case (15,), see `CASE_SIZES`."""
+    """The parts of a case (18,), see `CASE_SIZES`."""
     ends = [0]
     for size in CASE_SIZES.values():
         ends.append(ends[-1] + size)
@@ -217,9 +244,9 @@ def case_in_pad_axes(
 
     Args:
         motion: pose, rate, second_rate (6,).
-        case: (15,), see `CASE_SIZES`.
+        case: (18,), see `CASE_SIZES`.
     """
-    *_, displacement = case_parts(case)
+    displacement = case_parts(case)[5]
     nominal = number(workcell.payload.centre_of_mass)
     axes = number(workcell.contacts[0].T_box_pad[:3, :3])
     arms = [
@@ -237,7 +264,7 @@ def case_load_function(workcell: Workcell) -> ca.Function:
     mass that the case asks for, (3,) each, box axes."""
     pose, rate, second = motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = ca.SX.sym("case", CASE_SIZE)
-    _, _, mass, centre, disturbance, _ = case_parts(case)
+    _, _, mass, centre, disturbance, *_ = case_parts(case)
     payload = workcell.payload
     turned = workcell.task.orientation
     rotation = rotation_matrix(turned, pose[3:])
@@ -261,7 +288,7 @@ def case_load_function(workcell: Workcell) -> ca.Function:
 
 
 def case_grasp_function(workcell: Workcell, commanded: int) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (15,), see `CASE_SIZES`, to
+    """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to
     normal_force (2,) [N], see `commanded_forces`.
 
     Args:
@@ -272,23 +299,29 @@ def case_grasp_function(workcell: Workcell, commanded: int) -> ca.Function:
     """
     motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = ca.MX.sym("case", CASE_SIZE)
-    friction, *_ = case_parts(case)
-    squeeze = GraspSqueeze(workcell, commanded)
+    friction, *_, tracking, internal = case_parts(case)
+    squeeze, sizes = GraspSqueeze(workcell, commanded), _sizes(workcell, case)
     load = _origin_load_function(workcell)(*motion, case)
-    force = commanded_forces(squeeze, load, friction, _sizes(workcell, case))
+    force = commanded_forces(squeeze, load, friction, sizes)
+    needed = force[commanded] + internal * _against_internal(squeeze)(friction, sizes)
+    more = needed / (1.0 - tracking[commanded]) - force[commanded]
+    normals = squeeze.squeeze_normals()
+    force += more * ca.DM(normals / normals[commanded])
     names = ["pose", "rate", "second_rate", "case"]
     return ca.Function("case_grasp", [*motion, case], [force], names, ["normal_force"])
 
 
 def case_grasp_slack_function(workcell: Workcell, commanded: int) -> ca.Function:
-    """pose, rate, second_rate (6,), a case (15,) and the commanded force [N] to slack: where it is
+    """pose, rate, second_rate (6,), a case (18,) and the commanded force [N] to slack: where it is
     positive, one pressure that is known holds the case; elsewhere `case_grasp_function` knows."""
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case, force = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force")
-    friction, *_ = case_parts(case)
-    squeeze = GraspSqueeze(workcell, commanded)
+    friction, *_, tracking, internal = case_parts(case)
+    squeeze, sizes = GraspSqueeze(workcell, commanded), _sizes(workcell, case)
     load = _origin_load_function(workcell)(*motion, case)
-    slack = commanded_slack(squeeze, load, friction, _sizes(workcell, case), force)
+    left = (1.0 - tracking[commanded]) * force
+    left -= internal * _against_internal(squeeze)(friction, sizes)
+    slack = commanded_slack(squeeze, load, friction, sizes, left)
     names = ["pose", "rate", "second_rate", "case", "force"]
     inputs = [*motion, case, force]
     return ca.Function("case_grasp_slack", inputs, ca.cse([slack]), names, ["slack"])
@@ -305,7 +338,7 @@ def least_reaches(workcell: Workcell) -> tuple[float, float]:
 
 def _sizes(workcell: Workcell, case: ca.SX | ca.MX) -> ca.SX | ca.MX:
     """(2,) of the robots' patches over the cell's own."""
-    _, radius, *_, displacement = case_parts(case)
+    _, radius, *_, displacement, _, _ = case_parts(case)
     own = ca.DM([contact.patch_radius for contact in workcell.contacts])
     lengths = [ca.norm_2(displacement[2 * i : 2 * i + 2]) for i in (0, 1)]
     return radius / own - ca.vertcat(*lengths) / ca.DM(least_reaches(workcell))
@@ -386,6 +419,22 @@ def commanded_slack(
     held = [a + pressed * g for a, g in zip(asked, given, strict=True)]
     slack = [patch.slack(state) for patch, state in zip(squeeze.patches, held, strict=True)]
     return ca.fmin(least(slack), pressed)
+
+
+def _against_internal(squeeze: GraspSqueeze) -> ca.Function:
+    """friction and sizes of the patches, (2,) by robot, to the commanded force beyond the least [N]
+    per newton of tangential force of any pad: what the squeeze leaves of that pad's friction holds
+    it."""
+    friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
+    given = squeeze.squeezed(friction, share / squeeze.reach)
+    robots = enumerate(squeeze.robots)
+    left = [
+        friction[r] * (given[k][0] - ca.norm_2(given[k][1:3]) - ca.fabs(given[k][5]))
+        for k, r in robots
+    ]
+    pressed = float(squeeze.squeeze_normals()[squeeze.commanded])
+    held = ca.fmax(least(left), SCALE_FLOOR)
+    return ca.Function("against_internal", [friction, share], [pressed / held])
 
 
 def smaller_patches(workcell: Workcell, share: float) -> Workcell:

@@ -110,9 +110,10 @@ def pair_tolerance(workcell: Workcell, a: CollisionBody, b: CollisionBody) -> fl
     """Distance up to which two bodies count as colliding [m].
 
     That of the workcell, and for the payload how far displaced pads may have it off its place:
-    arms that keep to their paths carry a box that they took hold of elsewhere.
+    arms that keep to their paths carry a box that they took hold of elsewhere. Only a set that the
+    cell states says so.
     """
-    holds = "box" in (a.frame.kind, b.frame.kind)
+    holds = "box" in (a.frame.kind, b.frame.kind) and workcell.uncertainty.stated
     return workcell.collision.tolerance + (workcell.uncertainty.pad_position if holds else 0.0)
 
 

@@ -22,6 +22,7 @@ from symbolic.read.tables import Table, read_body
 from symbolic.read.task import read_task, with_force_limit
 from symbolic.records import (
     SEARCHED,
+    USUAL,
     Body,
     CollisionSettings,
     Handling,
@@ -117,7 +118,8 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     task_table.close()
     environment = tuple(read_body(entry, folder) for entry in table.tables("environment"))
     collision = read_collision(table.table("collision", {}))
-    uncertainty = read_uncertainty(table.table("uncertainty", {}))
+    stated = table.has("uncertainty")
+    uncertainty = read_uncertainty(table.table("uncertainty")) if stated else USUAL
     handling = read_handling(table.table("handling", {}))
     table.close()
     if len(robots) != 2 or len(contacts) != 2:
@@ -243,14 +245,24 @@ def read_collision(table: Table) -> CollisionSettings:
 
 
 def read_uncertainty(table: Table) -> Uncertainty:
-    """How far from nominal each quantity may be; nothing by default."""
+    """How far from nominal each quantity may be; what is not told is exact."""
     none = (0.0, 0.0, 0.0)
+
+    def number(key: str, kind: quantity.Quantity) -> float:
+        return table.number(key, kind, 0.0)
+
     uncertainty = Uncertainty(
-        friction=table.number("friction", quantity.SHARE, 0.0),
-        mass=table.number("mass", quantity.SHARE, 0.0),
+        friction=number("friction", quantity.SHARE),
+        mass=number("mass", quantity.SHARE),
         centre_of_mass=table.vector("centre_of_mass", (quantity.DISPLACEMENT,) * 3, none),
-        pad_position=table.number("pad_position", quantity.DISPLACEMENT, 0.0),
+        pad_position=number("pad_position", quantity.DISPLACEMENT),
         disturbance=table.vector("disturbance", (quantity.DISTURBANCE,) * 3, none),
+        tracking=number("tracking", quantity.SHARE),
+        internal_force=number("internal_force", quantity.INTERNAL_FORCE),
+        tilt=number("tilt", quantity.TILT),
+        relative_position=number("relative_position", quantity.DISPLACEMENT),
+        relative_angle=number("relative_angle", quantity.TILT),
+        stiffness=number("stiffness", quantity.ARM_STIFFNESS),
     )
     table.close()
     return uncertainty

@@ -150,7 +150,9 @@ def _check_overlap(workcell: Workcell, problems: Problems) -> None:
 def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
     """Displaced pads keep some of their patches, and these face one another."""
     displaced = workcell.uncertainty.pad_position
-    if not displaced or not problems.clean("uncertainty", "contacts", *SHAPE_KEYS):
+    if not (displaced and workcell.uncertainty.stated) or not problems.clean(
+        "uncertainty", "contacts", *SHAPE_KEYS
+    ):
         return
     if not workcell.has_facing_pads:
         problems.add(

@@ -14,6 +14,7 @@ format; `symbolic.read.cell` reads them from TOML.
 from symbolic.records.cell import (
     PAYLOAD,
     SEARCHED,
+    USUAL,
     Body,
     Box,
     Capsule,
@@ -45,6 +46,7 @@ __all__ = [
     "PAYLOAD",
     "POSE_SIZE",
     "SEARCHED",
+    "USUAL",
     "Allocation",
     "AllowedContact",
     "Body",

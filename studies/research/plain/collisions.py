@@ -100,7 +100,8 @@ class PlainCollisionChecker:
 
     def _tolerance(self, of_payload: bool) -> float:
         """Distance up to which bodies collide [m]: displaced pads have the payload elsewhere."""
-        displaced = self.workcell.uncertainty.pad_position if of_payload else 0.0
+        doubt = self.workcell.uncertainty
+        displaced = doubt.pad_position if of_payload and doubt.stated else 0.0
         return self.workcell.collision.tolerance + displaced
 
     def _move_payload(self, pose: Array) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from hybrid_opt.robust.cases import random_cases
 from hybrid_opt.robust.force import BoxMotion, soft_model
-from hybrid_opt.robust.squeeze import SqueezeSettings, chosen_squeeze, extra_force
+from hybrid_opt.robust.squeeze import SqueezeSettings, pressed_beyond
 from symbolic.read.cell import load
 from symbolic.records import Uncertainty, Workcell
 from tests.symbolic.cells import RACK, rack_cell
@@ -52,12 +52,13 @@ def test_what_is_commanded_holds_even_pads(rack: Workcell, settings: SqueezeSett
     """Although the plan, here none at all, asks for less."""
     model, motion = soft_model(rack), motions(np.random.default_rng(3))
     time, planned = np.linspace(0.0, 2.0, 30), np.zeros((30, 2))
-    squeeze = chosen_squeeze(rack, settings)
-    extra = extra_force(rack, squeeze, time, motion, planned)
+    extra, squeeze = pressed_beyond(rack, settings, time, motion, planned)
     assert (extra >= model.nominal(motion)[:, 1] * (1.0 - 1e-9)).all()
     assert "press evenly" in str(squeeze)
 
 
 def test_other_pads_are_told() -> None:
-    cell = load(RACK.with_name("corner.toml"))
-    assert "choose their pressure" in str(chosen_squeeze(cell, SqueezeSettings()))
+    cell, still = load(RACK.with_name("corner.toml")), BoxMotion(*[np.zeros((2, 6))] * 3)
+    time = np.array([0.0, 1.0])
+    _, squeeze = pressed_beyond(cell, SqueezeSettings(), time, still, np.zeros((2, 2)))
+    assert "choose their pressure" in str(squeeze)

@@ -21,6 +21,7 @@ from hybrid_opt.robust.force import (
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
+from symbolic.records.cell import RANGES
 from tests.symbolic.cells import hand_cell, with_contacts
 from tests.symbolic.contact.test_payload_load import random_motion
 
@@ -30,6 +31,11 @@ SET = Uncertainty(
     centre_of_mass=np.array([0.01, 0.01, 0.005]),
     pad_position=0.004,
     disturbance=np.array([0.5, 0.3, 0.4]),
+    tracking=0.1,
+    internal_force=4.0,
+    tilt=0.02,
+    relative_position=0.002,
+    relative_angle=0.01,
 )
 FRICTION = 0.8
 SAMPLES = 12
@@ -92,7 +98,7 @@ def test_no_random_case_needs_more_and_some_need_nearly_as_much() -> None:
     assert not model().check(motion(), weaker, 3000, rng).holds
 
 
-@pytest.mark.parametrize("factor", [0.98, 0.95])
+@pytest.mark.parametrize("factor", [0.95, 0.92])
 def test_the_closest_case_is_that_of_every_case_at_every_sample(factor: float) -> None:
     """In several turns, of which each looks only at what is closer than those before."""
     moved, rng = motion(), np.random.default_rng(5)
@@ -106,7 +112,7 @@ def test_the_closest_case_is_that_of_every_case_at_every_sample(factor: float) -
     share = (needed / force.commanded).max(axis=1)
     assert check.closest == share.max() > SCREENED
     assert check.failing == (share > 1.0 + HOLDS).sum()
-    assert check.holds == (factor > 0.965)
+    assert check.holds == (factor > 0.93)
 
 
 @pytest.mark.slow
@@ -118,7 +124,7 @@ def test_none_of_a_hundred_thousand_cases_slips() -> None:
 def test_cases_within_the_ranges_lie_below_the_vertices() -> None:
     """Each range for itself, so that no other hides what it adds."""
     rng = np.random.default_rng(3)
-    for name in ("friction", "mass", "centre_of_mass", "pad_position", "disturbance"):
+    for name in RANGES:
         one = replace(Uncertainty(), **{name: getattr(SET, name)})
         force = model().robust_force(motion(), one)
         assert model().check(motion(), force, 500, rng).holds, name
@@ -153,7 +159,7 @@ def test_the_largest_set_uses_the_forces_up() -> None:
     assert factor > 1.0
     assert (peak / limit).max() == pytest.approx(1.0, rel=1e-4)
     assert model().largest_factor(motion(), 0.1 * limit) == 0.0
-    assert allowed_factor(cell(), SET) == pytest.approx(0.0315 / 0.004)
+    assert allowed_factor(cell(), SET) == pytest.approx(0.0315 / 0.005)
 
 
 def test_is_an_objective() -> None:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_opt.robust.force import SAMPLES, USUAL, RobustModel, RobustPrice, robust_price, thinned
+from hybrid_opt.robust.force import SAMPLES, RobustModel, RobustPrice, robust_price, thinned
 from symbolic.errors import SettingsError
-from symbolic.records import Uncertainty
+from symbolic.records import USUAL, Uncertainty
 from tests.hybrid_opt.job.jobs import rack_job
 
 CASES = 2000
@@ -25,7 +25,6 @@ def priced(uncertainty: Uncertainty) -> RobustPrice:
 
 def test_a_carry_is_priced_under_its_cells_own_set() -> None:
     found = priced(SET)
-    assert found.stated
     assert found.uncertainty is SET
     at_one = found.peak[found.factors == 1.0][0]
     np.testing.assert_allclose(found.commanded, at_one)
@@ -40,9 +39,11 @@ def test_a_carry_is_priced_under_its_cells_own_set() -> None:
 
 
 def test_a_cell_that_states_nothing_is_priced_under_a_usual_set() -> None:
-    found = priced(Uncertainty())
-    assert not found.stated
-    assert found.uncertainty is USUAL
+    carry = rack_job().timing.carry
+    assert carry is not None
+    model = RobustModel(replace(carry.workcell, uncertainty=USUAL))
+    found = robust_price(model, carry, np.random.default_rng(1), cases=CASES)
+    assert not found.uncertainty.stated
     assert found.check.holds
 
 

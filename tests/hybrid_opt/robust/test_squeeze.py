@@ -9,17 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.robust.force import RobustModel, soft_model
+from hybrid_opt.robust.force import BoxMotion, soft_model
 from hybrid_opt.robust.squeeze import (
-    RESERVE,
+    DOUBTS,
+    Squeeze,
     SqueezeSettings,
-    chosen_squeeze,
-    extra_force,
+    commanded_forces,
+    pressed_beyond,
     smooth_above,
 )
+from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.records import Uncertainty
-from tests.hybrid_opt.job.jobs import rack, rack_job
+from symbolic.records import USUAL, Uncertainty, Workcell
+from tests.hybrid_opt.job.jobs import rack, rack_job, rack_jobs, rack_timing
 
 FORCES = st.lists(st.floats(0.0, 200.0), min_size=2, max_size=40)
 
@@ -47,7 +49,10 @@ def test_a_jump_becomes_a_smooth_rise_before_it() -> None:
 
 
 def test_the_factor_multiplies_the_squeeze() -> None:
-    for phase in rack_job().phases:
+    job = rack_jobs().plan(rack_timing(), SqueezeSettings(1.3))
+    assert str(job.squeeze) == "1.3 times the least that holds pads that press evenly"
+    assert job.squeeze.force == pytest.approx(job.peak_normal_force[1], rel=1e-9)
+    for phase in job.phases:
         if phase.name in ("lift", "carry", "set_down"):
             least, normal = phase.force.least, phase.force.normal
             assert (normal >= least - 1e-9).all()
@@ -58,27 +63,67 @@ def test_the_factor_multiplies_the_squeeze() -> None:
             )
 
 
-def test_an_uncertain_cell_is_pressed_robustly() -> None:
-    uncertain = replace(rack().workcell, uncertainty=Uncertainty(friction=0.2, mass=0.05))
-    squeeze = chosen_squeeze(uncertain, SqueezeSettings())
-    assert squeeze.factor is None
+def pressed(uncertainty: Uncertainty) -> tuple[Workcell, Array, Squeeze]:
+    """The rack under a set, what is commanded of arm 2 along its carry, and why."""
+    cell, carry = replace(rack().workcell, uncertainty=uncertainty), rack_job().timing.carry
+    assert carry is not None
+    forces, squeeze = commanded_forces(cell, carry, SqueezeSettings())
+    return cell, forces[:, 1], squeeze
+
+
+SET = Uncertainty(
+    0.2, 0.05, np.full(3, 0.005), 0.003, np.full(3, 0.2), 0.1, 5.0, 0.02, 0.004, 0.005
+)
+
+
+def test_an_uncertain_cell_is_pressed_for_every_case() -> None:
+    cell, commanded, squeeze = pressed(SET)
     carry = rack_job().timing.carry
     assert carry is not None
-    extra = extra_force(uncertain, squeeze, carry.time, carry, carry.normal_force)
-    commanded = carry.normal_force[:, 1] + extra
-    needed = np.maximum(
-        (1.0 + RESERVE) * RobustModel(uncertain).robust_force(carry).commanded,
-        soft_model(uncertain).hold(carry, uncertain.uncertainty)[0],
-    )
+    needed = soft_model(cell).hold(carry, SET)[0]
     assert (commanded >= needed - 1e-6).all()
-    assert commanded.max() <= needed.max() + 1e-6
+    assert commanded.max() == pytest.approx(needed.max(), abs=1e-6)
+    assert str(squeeze) == "holds pads that press evenly in every case of the cell's [uncertainty]"
 
 
-def test_a_cell_without_uncertainty_gets_the_factor() -> None:
-    assert Uncertainty().is_empty
-    assert not Uncertainty(disturbance=np.array([0.0, 0.1, 0.0])).is_empty
-    assert chosen_squeeze(rack().workcell, SqueezeSettings()).factor == 1.3
-    assert chosen_squeeze(rack().workcell, SqueezeSettings(1.1)).factor == 1.1
+def test_the_force_is_the_sum_of_its_parts() -> None:
+    """At rest and level each part is known in closed form: mass, friction, tilt and places scale
+    the force, the arms' own force adds to it, tracking scales both."""
+    cell = replace(rack().workcell, uncertainty=replace(SET, centre_of_mass=np.zeros(3)))
+    still = BoxMotion(np.zeros((2, 6)), np.zeros((2, 6)), np.zeros((2, 6)))
+    extra, squeeze = pressed_beyond(
+        cell, SqueezeSettings(), np.array([0.0, 1.0]), still, np.zeros((2, 2))
+    )
+    parts = {part.name: part.force for part in squeeze.parts}
+    assert list(parts) == ["least force", *[name for name in DOUBTS if name != "centre of mass"]]
+    assert extra.max() == pytest.approx(sum(parts.values()))
+    weight = 10.0 * 9.81 / 2.0
+    assert parts["least force"] == pytest.approx(weight, rel=1e-6)
+    assert parts["friction"] == pytest.approx(weight / 0.8 - weight, rel=1e-6)
+    assert parts["mass"] == pytest.approx(0.05 * weight / 0.8, rel=1e-6)
+    mu = np.tan(np.arctan(0.8) - 0.025) - (2.0 * 0.003 + 0.004) / 0.4
+    assert parts["arms against one another"] == pytest.approx(5.0 / mu, rel=1e-6)
+    assert parts["tracking"] == pytest.approx(squeeze.force * 0.1, rel=1e-6)
+    assert squeeze.account.endswith(f"tracking = {squeeze.force:.1f} N")
+
+
+def test_a_stated_stiffness_makes_a_force_of_the_arms_places() -> None:
+    stiff = Uncertainty(relative_position=0.001, stiffness=2e4)
+    assert stiff.opposed_force == 10.0
+    _, soft_sided, _ = pressed(Uncertainty(relative_position=0.001))
+    _, commanded, _ = pressed(stiff)
+    _, same, _ = pressed(Uncertainty(internal_force=10.0))
+    np.testing.assert_allclose(commanded, same)
+    assert commanded.max() > soft_sided.max() + 9.0
+
+
+def test_a_cell_that_states_nothing_is_pressed_for_the_usual_set() -> None:
+    _, commanded, squeeze = pressed(USUAL)
+    assert str(squeeze) == "holds pads that press evenly in every case of the usual uncertainty"
+    _, least, told = pressed(Uncertainty())
+    assert "states that nothing is uncertain" in str(told)
+    assert [part.name for part in told.parts] == ["least force"]
+    assert commanded.max() > 1.5 * least.max()
 
 
 @pytest.mark.parametrize(

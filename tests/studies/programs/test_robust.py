@@ -46,8 +46,8 @@ def test_tells_forces_price_and_check(tmp_path: Path, capsys: pytest.CaptureFixt
     lines = lines[:-2]
     nominal, robust = (np.array(line.split()[-4:-1:2], dtype=float) for line in lines[2:4])
     assert (robust > 1.1 * nominal).all()
-    assert lines[9].split()[-2:] == lines[2].split()[-4:-1:2]
-    assert lines[10].split()[-2:] == lines[3].split()[-4:-1:2]
+    assert lines[10].split()[-2:] == lines[2].split()[-4:-1:2]
+    assert lines[11].split()[-2:] == lines[3].split()[-4:-1:2]
     assert "200 random cases (seed 1): all hold" in lines[-1]
 
 
@@ -59,10 +59,19 @@ def test_without_uncertainty_a_usual_set_is_taken_and_told(
     assert main([str(stored(tmp_path, "")), *arguments]) == 0
     without = capsys.readouterr().out
     assert "arm 2 leads" in without
-    assert "the set is a usual one, because the workcell states no [uncertainty]: fri" in without
+    assert "the set is the usual one, because the workcell states no [uncertainty]: fri" in without
     assert "inf" not in without
     assert main([str(stored(tmp_path / "a", TABLE)), *arguments]) == 0
-    assert capsys.readouterr().out.splitlines()[2:] == without.splitlines()[2:]
+    assert "the set is the workcell's [uncertainty]: fri" in capsys.readouterr().out
+
+
+def test_a_set_that_is_empty_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(stored(tmp_path, "[uncertainty]\n")), "--cases", "10"]) == 0
+    told = capsys.readouterr().out
+    assert "the set is the workcell's [uncertainty]: nothing" in told
+    assert "nothing to check" in told
+    assert "all hold" not in told
+    assert "times the set" not in told
 
 
 def test_a_file_that_is_none_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -69,6 +69,8 @@ CASES: list[tuple[str, Any, str, str]] = [
     ("uncertainty", {"frction": 0.1}, "uncertainty.frction", "did you mean 'friction'"),
     ("uncertainty", {"disturbance": 0.3}, "uncertainty.disturbance", "array of 3 numbers"),
     ("uncertainty", {"pad_position": 0.04}, "uncertainty.pad_position", "less than 0.0315 m"),
+    ("uncertainty", {"tilt": 2}, "uncertainty.tilt", "this looks like deg"),
+    ("uncertainty", {"internal": 2.0}, "uncertainty.internal", "did you mean 'internal_force'"),
     ("task.allocation", "conic", "task.allocation", "allowed is one of 'paper', 'joint'"),
     ("task.force_limit", [60.0, 50.0], "task.force_limit", "found 60 above 50"),
     ("task.force_limit", 50.0, "task.force_limit", "allowed is an array of 2 numbers"),

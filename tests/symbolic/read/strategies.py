@@ -173,6 +173,12 @@ def cells(draw: st.DrawFn) -> dict[str, Any]:
             "mass": draw(numbers(0, 0.5)),
             "centre_of_mass": draw(vectors(0, 0.1, 3)),
             "disturbance": draw(vectors(0, 5.0, 3)),
+            "tracking": draw(numbers(0, 0.5)),
+            "internal_force": draw(numbers(0, 100.0)),
+            "tilt": draw(numbers(0, 0.4)),
+            "relative_position": draw(numbers(0, 0.1)),
+            "relative_angle": draw(numbers(0, 0.4)),
+            "stiffness": draw(numbers(0, 1e5)),
         }
     if draw(st.booleans()):
         data["handling"] = {
