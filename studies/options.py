@@ -95,20 +95,21 @@ def add_wishes(parser: argparse._ActionsContainer) -> None:
         "--duration",
         type=force,
         metavar="S",
-        help="recommend the least force of the carries of at most S seconds (default: the knee)",
+        help="recommend the least force of the carries of at most S seconds (default: the least "
+        "product of duration and commanded force)",
     )
     add(
         parser,
         "--force-limit",
-        help="recommend the shortest carry with both normal forces below N newtons; a study also "
-        "times every selected trajectory with that limit (default: the knee)",
+        help="recommend the shortest carry that needs at most N newtons commanded; a study also "
+        "times every selected trajectory with that limit of its planned forces",
     )
     parser.add_argument(
         "--payload",
         type=force,
         metavar="KG",
-        help="recommend the shortest carry on whose motion the robots would bear a box of KG "
-        "kilograms (default: the knee)",
+        help="recommend the shortest carry on whose motion the robots would hold a box of KG "
+        "kilograms in every case of the uncertainty",
     )
 
 

@@ -27,16 +27,14 @@ def _add_options(parser: Parser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     from hybrid_opt.campaign import Progress
-    from hybrid_opt.campaign.results import read_summary
     from hybrid_opt.recommending.choice import Wish
     from studies.study.recommendation import recommend_from, recommendation_text
 
     wish, root = Wish(options.duration, options.force_limit, options.payload), options.results
-    named = "-".join(f"{name}-{value:g}" for name, value in wish.given.items()) or "knee"
+    named = "-".join(f"{name}-{value:g}" for name, value in wish.given.items()) or "least-product"
     path = options.output or root / f"recommended-{named}.json"
-    robots = read_summary(root).robots
     found = recommend_from(root, wish, path, Progress(not options.quiet))
-    print(recommendation_text(found, robots, str(root)).terminal())
+    print(recommendation_text(found, str(root)).terminal())
     return 0
 
 

@@ -181,6 +181,8 @@ def manifest(
         "squeeze": {
             "text": str(job.squeeze),
             "factor": job.squeeze.factor,
+            "force": job.squeeze.force,
+            "parts": {part.name: part.force for part in job.squeeze.parts},
             "force_controlled": job.workcell.robots[1 - job.squeeze.leader].name,
             "peak_normal_force": job.peak_normal_force.tolist(),
         },

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 from hybrid_opt.campaign.documents import Count, Pair
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ROBUST_FORCE, ForceKind
-from hybrid_opt.recommending.recommendation import Recommendation, Unsure
+from hybrid_opt.recommending.advice import Advice
+from hybrid_opt.recommending.recommendation import Recommendation
 from hybrid_opt.robust.force import RobustPrice
+from hybrid_opt.robust.squeeze import Part
 from hybrid_opt.store.json_records import Figure
-from hybrid_opt.timing.document import StoredJerk
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array
 
@@ -29,8 +30,8 @@ class StoredRival:
 
     Attributes:
         label: what it is.
-        duration_at_force: [s] with the same force, null where it cannot.
-        force_at_duration: [N] in the same time, null where it cannot.
+        duration_at_force: [s] with the same force commanded, null where it cannot.
+        force_at_duration: to command in the same time [N], null where it cannot.
     """
 
     label: str
@@ -122,21 +123,23 @@ class StoredRecommendation:
         source: whose it is, as 'NSGA-II, polished, replica 3'.
         file: its trajectory file, relative to the folder.
         export: the command that makes of it what robots need, run in the folder.
-        duration: [s].
-        force_limit: [N].
+        duration: as robots drive it, limits on jerk kept [s].
+        force: largest force to command of the force-controlled arm [N]; the one force.
+        parts: what it is made of, its sum.
+        job_duration: of the whole job [s], null where none can be planned.
+        force_limit: of the search [N].
         peak_force: largest planned normal force of each robot [N].
         robust_force: likewise in every case of the workcell's uncertainty, where force limits are
             about these; else null.
         squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
-        payload_limit: payload that the robots bear on the same motion [kg].
+        payload_limit: payload that the robots bear on the same motion, nothing uncertain [kg].
         rivals: other paths at the same force and in the same time, the hand-made one first.
-        margins: how far the cell's description may be off.
-        unsure: forces that hold if it is off.
+        margins: how far the cell's description may be off at the commanded force.
+        advice: what changes of the cell would change.
         warnings: what speaks against it.
         considered: carries that it was chosen from.
         durations: how long all fronts take at the same forces.
         price: of robustness, null where no set leaves friction and patches.
-        jerk: what the cell's limits on jerk make of it, None without any.
     """
 
     wish: StoredWish
@@ -145,6 +148,9 @@ class StoredRecommendation:
     file: str
     export: str
     duration: float
+    force: float
+    parts: tuple[Part, ...]
+    job_duration: Figure
     force_limit: float
     peak_force: Pair
     squeeze: Pair
@@ -152,12 +158,11 @@ class StoredRecommendation:
     payload_limit: float
     rivals: tuple[StoredRival, ...]
     margins: tuple[Margin, ...]
-    unsure: tuple[Unsure, ...]
+    advice: tuple[Advice, ...]
     warnings: tuple[str, ...]
     considered: Count
     durations: ForceTable
     price: StoredPrice | None = None
-    jerk: StoredJerk | None = None
     robust_force: Pair | None = None
 
     @property
@@ -196,8 +201,11 @@ def stored_recommendation(found: Recommendation, told: Told) -> StoredRecommenda
         **vars(told),
         wish=StoredWish(**vars(found.wish)),
         why=str(found.wish),
-        duration=found.timing.duration,
-        force_limit=found.force,
+        duration=found.duration,
+        force=found.force,
+        parts=found.squeeze.parts,
+        job_duration=float("nan") if found.job is None else found.job.duration,
+        force_limit=found.limit,
         peak_force=found.carry.peak_normal_force,
         squeeze=found.commanded,
         squeeze_reason=str(found.squeeze),
@@ -207,8 +215,7 @@ def stored_recommendation(found: Recommendation, told: Told) -> StoredRecommenda
             for rival in found.rivals
         ),
         margins=found.margins,
-        unsure=found.unsure,
+        advice=found.advice,
         warnings=found.warnings,
-        jerk=None if found.jerk is None else StoredJerk.of(found.jerk),
         robust_force=found.limited_force if found.force_kind.robust else None,
     )

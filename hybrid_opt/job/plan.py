@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -291,10 +292,19 @@ def refuse_excess(job: Job) -> None:
 _model = kept_per_workcell(JobModel)
 
 
+class Timed(Protocol):
+    """What knows how its carry is timed, as a recommendation does."""
+
+    @property
+    def timing(self) -> Timing:
+        """As robots drive it."""
+
+
 def plan_job(
-    timing: Timing, squeeze: SqueezeSettings | None = None, smoothing: float = WIDTH
+    timing: Timing | Timed, squeeze: SqueezeSettings | None = None, smoothing: float = WIDTH
 ) -> Job:
-    """The whole job around a timed carry, see `JobModel.plan`."""
+    """The whole job around a timed carry, or one that is recommended, see `JobModel.plan`."""
+    timing = timing if isinstance(timing, Timing) else timing.timing
     if timing.carry is None:
         raise SettingsError(f"there is no timing to export ({timing.status}: {timing.reason})")
     return _model(timing.carry.workcell).plan(timing, squeeze, smoothing)

@@ -184,6 +184,7 @@ class Job:
                 text_table([head, *rows], left=(0, 4)),
                 f"commanded: {self.squeeze}; robot "
                 f"{self.workcell.robots[1 - self.squeeze.leader].name!r} is force-controlled",
+                f"  {self.squeeze.account}",
             ]
         )
 

@@ -1,16 +1,22 @@
-"""The carry that a wish names among the paths of a drivable front, which are timed anew at
-any force, or so that they take a given time."""
+"""The carry that a wish names among the paths of a drivable front.
+
+Every path is driven within several limits of the planned force. Each is an option: how long the
+carry takes, and how hard to press so that it holds in every case of the cell's uncertainty. Wishes
+are about these two.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+import operator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.indicators.selection import knee
+from hybrid_opt.robust.cases import least_friction
+from hybrid_opt.robust.force import BoxMotion, pressing_model
 from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
@@ -19,21 +25,31 @@ from symbolic.records import Workcell
 
 _UNITS = {"duration": "s", "force": "N", "payload": "kg"}
 
-BISECTIONS = 30
+LEADER = 0
+"""The arm that keeps its place; the other's force is commanded."""
 
-LEAST_ABOVE_STILL = 1e-4
-"""Where the search for a force begins, as a share above that of holding still."""
+FORCES = 10
+"""Limits that every path is driven within at first, and by how much they are refined."""
+
+ROUNDS = 6
+
+LEAST_ABOVE_STILL = 1e-3
+"""Least limit, as a share above holding still."""
+
+LOOKED_AT = 32
+"""Samples of largest planned force at which it is computed how hard to press."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """At most one of three wishes; without any, the knee of the front is meant.
+    """At most one of three wishes. Without any, the least product of duration and commanded force
+    is meant.
 
     Attributes:
-        duration: the carry may take so long; asked for is the least force [s].
-        force: neither robot may press harder; asked for is the shortest duration [N].
-        payload: both robots have to bear so heavy a box within their reference forces on the same
-            motion; asked for is the shortest duration [kg].
+        duration: the carry may take so long, limits on jerk kept; asked for is the least force [s].
+        force: no more may be commanded; asked for is the shortest duration [N].
+        payload: so heavy a box has to hold on the same motion within the reference forces; asked
+            for is the shortest duration [kg].
     """
 
     duration: float | None = None
@@ -65,10 +81,61 @@ class Wish:
         for name, value in self.given.items():
             return {
                 "duration": f"the least force of all carries of at most {value:g} s",
-                "force": f"the shortest of all carries that press with at most {value:g} N",
-                "payload": f"the shortest of all carries that would bear {value:g} kg",
+                "force": f"the shortest of all carries that need at most {value:g} N commanded",
+                "payload": f"the shortest of all carries that would hold {value:g} kg",
             }[name]
-        return "the knee of the front: one per cent less time costs more than a per cent of force"
+        return "least product of duration and commanded force"
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What an option has to keep to, and what is to be least.
+
+    Attributes:
+        longest: [s].
+        hardest: (2,) force of each robot that holds in every case [N].
+        cost: of duration [s] and commanded force [N].
+    """
+
+    longest: float
+    hardest: Array
+    cost: Callable[[float, float], float]
+
+    @classmethod
+    def of(cls, wish: Wish, workcell: Workcell) -> Goal:
+        """The goal of a wish; robots never press beyond their reference forces."""
+        allowed, longest = workcell.task.reference_force, math.inf
+        cost: Callable[[float, float], float] = operator.mul
+        if wish.force is not None:
+            allowed, cost = commanded_at_most(wish.force, allowed), duration_alone
+        elif wish.payload is not None:
+            doubt = workcell.uncertainty
+            friction = least_friction(pressing_model(workcell).workcell, doubt)
+            opposed, share = doubt.opposed_force / friction, 1.0 - doubt.tracking
+            heavier = wish.payload / workcell.payload.mass
+            allowed = ((share * allowed - opposed) / heavier + opposed) / share
+            cost = duration_alone
+        elif wish.duration is not None:
+            longest, cost = wish.duration, force_alone
+        return cls(longest, allowed, cost)
+
+
+def commanded_at_most(force: float, others: Array | float = np.inf) -> Array:
+    """(2,) largest forces [N] of which one is commanded, the other the leading arm's among
+    others."""
+    found = np.broadcast_to(others, 2).astype(float)
+    found[1 - LEADER] = min(found[1 - LEADER], force)
+    return found
+
+
+def duration_alone(duration: float, force: float) -> float:
+    """A cost, see `Goal`."""
+    return duration
+
+
+def force_alone(duration: float, force: float) -> float:
+    """A cost, see `Goal`."""
+    return force
 
 
 class DrivenPaths:
@@ -91,6 +158,7 @@ class DrivenPaths:
             robust: whether limits hold in every case of the cell's uncertainty.
         """
         self.x = np.atleast_2d(np.asarray(x, dtype=float))
+        self._model = pressing_model(timer.workcell)
         self.highest_force = highest_force
         self._timer, self._robust = timer, robust
         self._known = timer.path_limits(self.x)
@@ -105,109 +173,138 @@ class DrivenPaths:
     def __len__(self) -> int:
         return len(self.x)
 
-    def timings(self, force: Array | float) -> list[PathTiming]:
-        """The fastest timing of every path within force limits (k,) or one for all [N]."""
-        limits = np.broadcast_to(np.asarray(force, dtype=float), (len(self),))
+    def timings(self, force: Array | float, rows: Sequence[int] | None = None) -> list[PathTiming]:
+        """The fastest timing of every path, or of some, within force limits (k,) or one for all
+        [N]."""
+        chosen = list(range(len(self)) if rows is None else rows)
+        limits = np.broadcast_to(np.asarray(force, dtype=float), (len(chosen),))
+        known = self._known
+        if rows is not None:
+            known = {name: values[chosen] for name, values in known.items()}
         return self._timer.time_known(
-            self.x,
-            self._known,
+            self.x[chosen],
+            known,
             [TimingLimits(force=float(limit), robust=self._robust) for limit in limits],
-            self._failures,
+            [self._failures[row] for row in chosen],
         )
 
     def durations(self, force: Array | float) -> Array:
         """(k,) durations [s], infinite where nothing moves within the limit."""
         return np.array([timing.duration for timing in self.timings(force)])
 
-    def forces(self, duration: float) -> Array:
-        """(k,) least force limits with which the paths take at most a duration, inf for none [N].
+    def options(self, force: Array | float, rows: Sequence[int] | None = None) -> list[Option]:
+        """Every path, or some, driven within limits (k,) or one for all [N]; those that move."""
+        chosen = list(range(len(self)) if rows is None else rows)
+        limits = np.broadcast_to(np.asarray(force, dtype=float), (len(chosen),)).tolist()
+        timings = self.timings(force, rows)
+        return [
+            self._option(row, limit, timing)
+            for row, limit, timing in zip(chosen, limits, timings, strict=True)
+            if timing.ok
+        ]
 
-        Durations fall as the limit rises, so bisection finds it.
-        """
+    def _option(self, row: int, limit: float, timing: PathTiming) -> Option:
+        speed = timing.grid_speed
+        a = np.repeat(np.diff(speed**2) * (len(speed) - 1) / 2.0, 2)
+        v = np.stack([speed[:-1], speed[1:]], axis=1).reshape(-1)
+        # Both ends of every interval; between them paths have a sample in the middle.
+        at = np.repeat(2 * np.arange(len(speed) - 1), 2) + np.tile([0, 2], len(speed) - 1)
+        pose, first, second = (
+            np.ascontiguousarray(self._known[name][row][at, :6])
+            for name in ("pose", "pose_first", "pose_second")
+        )
+        rate, second_rate = first * v[:, None], first * a[:, None] + second * v[:, None] ** 2
+        motion = BoxMotion(pose, rate, second_rate)
+        most = np.argsort(-self._model.nominal(motion).max(axis=1))[:LOOKED_AT]
+        motion = BoxMotion(pose[most], rate[most], second_rate[most])
+        commanded, leading = self._model.hold(motion, self._model.workcell.uncertainty, LEADER)
+        peaks = float(leading.max()), float(commanded.max())
+        return Option(row, limit, timing.duration, np.array(peaks))
+
+    def all_options(self, own: Array | float) -> list[Option]:
+        """Every path within its own limit (k,) [N], and, where that takes milliseconds, within
+        several limits from holding still on."""
+        found = self.options(own)
+        if self._robust or not self._timer.compiled:
+            return found
         still = np.array([timing.limited_force for timing in self.timings(1e-6)])
-        low = np.where(np.isfinite(still), still, 1.0) * (1.0 + LEAST_ABOVE_STILL)
-        high = np.full(len(self), max(self.highest_force, float(low.max())))
-        possible = self.durations(high) <= duration
-        for _ in range(BISECTIONS):
-            middle = (low + high) / 2.0
-            enough = self.durations(middle) <= duration
-            low, high = np.where(enough, low, middle), np.where(enough, middle, high)
-        return np.where(possible, high, np.inf)
+        least = np.where(np.isfinite(still), still, self.highest_force)
+        low = np.minimum((1.0 + LEAST_ABOVE_STILL) * least, self.highest_force)
+        # Closer together where force is least and durations change most.
+        shares = np.linspace(0.0, 1.0, FORCES) ** 2
+        limits = [low + share * (self.highest_force - low) for share in shares]
+        return found + [option for limit in limits for option in self.options(limit)]
 
 
 @dataclass(frozen=True)
-class Choice:
-    """A path and the force it is driven with.
+class Option:
+    """A path driven within a limit of the planned force.
 
     Attributes:
         index: of the path.
-        force: limit on both normal forces [N].
+        limit: [N].
+        duration: without limits on jerk [s].
+        force: (2,) largest force of each robot that holds in every case [N].
     """
 
     index: int
-    force: float
+    limit: float
+    duration: float
+    force: Array
+
+    @property
+    def commanded(self) -> float:
+        """Of the force-controlled arm [N]."""
+        return float(self.force[1 - LEADER])
 
 
-def force_for_payload(workcell: Workcell, payload: float) -> float:
-    """Normal force limit [N] within which both robots would bear a payload [kg] on the same motion.
-
-    Forces grow in proportion to the mass, and the friction cone bounds the whole force of a contact
-    by sqrt(1 + mu^2) times its normal force, so the whole force of neither robot can exceed its
-    reference force.
-    """
-    friction = np.array([contact.friction for contact in workcell.contacts])
-    normal = workcell.task.reference_force / np.sqrt(1.0 + friction**2)
-    return float(normal.min()) * workcell.payload.mass / payload
+def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
+    """The options that keep to a goal, best first."""
+    kept = [
+        option
+        for option in options
+        if option.duration <= goal.longest and (option.force <= goal.hardest).all()
+    ]
+    return sorted(kept, key=lambda option: goal.cost(option.duration, option.commanded))
 
 
-def choices(workcell: Workcell, paths: DrivenPaths, points: Array, wish: Wish) -> Iterator[Choice]:
-    """Answers to a wish, best first.
+def best_of_paths(
+    paths: DrivenPaths, options: Sequence[Option], goal: Goal, most: int
+) -> Iterator[Option]:
+    """The best option of each of the best paths, their limits refined; best paths first."""
+    best: dict[int, Option] = {}
+    for option in ranked(options, goal):
+        best.setdefault(option.index, option)
+    for option in list(best.values())[:most]:
+        known = [other for other in options if other.index == option.index]
+        for _ in range(ROUNDS):
+            limits = sorted(other.limit for other in known)
+            at = limits.index(option.limit)
+            low, high = limits[max(at - 1, 0)], limits[min(at + 1, len(limits) - 1)]
+            for limit in np.linspace(low, high, 5)[1:-1]:
+                known += paths.options(float(limit), [option.index]) if low < high else []
+            option = ranked(known, goal)[0]
+        yield option
 
-    Args:
-        workcell: the cell.
-        paths: of the front's members.
-        points: (k, 2) duration [s] and largest limited force [N] of the members themselves.
-        wish: what is asked for.
+
+def refuse(options: Sequence[Option], wish: Wish, goal: Goal) -> None:
+    """Say what is possible where nothing keeps to a wish.
 
     Raises:
-        SettingsError: no member can do it; the message says what is possible.
+        SettingsError: it does.
     """
-    if wish.duration is not None:
-        yield from _by_duration(paths, wish.duration)
-    elif wish.force is not None or wish.payload is not None:
-        yield from _by_force(workcell, paths, wish)
-    else:
-        # At the knee's force another path may be faster than the one that was a member there.
-        force = float(points[knee(points), 1])
-        yield from _by_force(workcell, paths, Wish(force=force))
-
-
-def _by_duration(paths: DrivenPaths, duration: float) -> Iterator[Choice]:
-    forces = paths.forces(duration)
-    if not np.isfinite(forces).any():
-        shortest = float(paths.durations(paths.highest_force).min())
+    if ranked(options, goal):
+        return
+    held = ranked(options, replace(goal, longest=math.inf))
+    if wish.duration is not None and held:
+        shortest = min(option.duration for option in held)
         raise SettingsError(
-            f"duration {duration:g} s: no carry of the front is so short; the shortest takes "
-            f"{shortest:.3f} s"
+            f"duration {wish.duration:g} s: no carry of the front is so short; the shortest takes "
+            f"{shortest:.3f} s, before limits on jerk"
         )
-    for row in np.argsort(forces, kind="stable")[: int(np.isfinite(forces).sum())].tolist():
-        yield Choice(row, float(forces[row]))
-
-
-def _by_force(workcell: Workcell, paths: DrivenPaths, wish: Wish) -> Iterator[Choice]:
-    if wish.payload is not None:
-        force = force_for_payload(workcell, wish.payload)
-        asked = f"payload {wish.payload:g} kg, so {force:.2f} N at {workcell.payload.mass:g} kg"
-    else:
-        assert wish.force is not None, "one of both is wished for"
-        force, asked = wish.force, f"force {wish.force:g} N"
-    force = min(force, paths.highest_force)
-    durations = paths.durations(force)
-    if not np.isfinite(durations).any():
-        still = min(timing.limited_force for timing in paths.timings(1e-6))
-        raise SettingsError(
-            f"{asked}: no carry of the front moves with so little; holding still takes {still:.2f} "
-            "N already"
-        )
-    for row in np.argsort(durations, kind="stable")[: int(np.isfinite(durations).sum())].tolist():
-        yield Choice(row, force)
+    least = min(option.commanded for option in options)
+    asked = ", ".join(f"{name} {value:g} {_UNITS[name]}" for name, value in wish.given.items())
+    raise SettingsError(
+        f"{asked}: no carry of the front holds with so little in every case of the cell's "
+        f"uncertainty; the gentlest needs {least:.1f} N commanded"
+    )

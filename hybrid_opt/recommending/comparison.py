@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ForceKind
-from hybrid_opt.recommending.choice import DrivenPaths
+from hybrid_opt.recommending.choice import (
+    DrivenPaths,
+    Goal,
+    best_of_paths,
+    commanded_at_most,
+    duration_alone,
+    force_alone,
+)
 from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.static_hold import static_hold
-from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.jerk import driven_timing
+from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
 from symbolic.records import Workcell
 
 BETTER = 1e-3
 """Share by which a rival has to be shorter to count as better: timings agree to so much."""
-
-FORCES = 12
-"""Limits at which a front is held against a rival."""
 
 ABOVE_STILL = (1.02, 1.04, 1.06, 1.08, 1.12, 1.2)
 """Forces of the table over that of holding the payload level and still."""
@@ -31,72 +37,43 @@ MEMBERS = 24
 
 @dataclass(frozen=True, repr=False)
 class Rival:
-    """A path driven as fast as the same limits allow.
+    """A path driven as fast as the same limits allow, those on jerk among them.
 
     Attributes:
         label: what it is.
-        duration_at_force: [s] with the recommended carry's force, infinite where it cannot.
-        force_at_duration: [N] in the recommended carry's time, infinite where it cannot.
-        faster_between: least and largest force limit [N] at which it is faster than every member
-            of the front, None where it never is.
+        duration_at_force: [s] with the recommended carry's commanded force, infinite where it
+            cannot.
+        force_at_duration: force to command [N] in the recommended carry's time, infinite where it
+            cannot.
     """
 
     label: str
     duration_at_force: float
     force_at_duration: float
-    faster_between: tuple[float, float] | None = None
 
     def __repr__(self) -> str:
-        force, time = "cannot move with so little force", "is never so fast"
+        force, time = "cannot be held with so little force", "is never so fast"
         if np.isfinite(self.duration_at_force):
             force = f"{self.duration_at_force:.3f} s at the same force"
         if np.isfinite(self.force_at_duration):
-            time = f"{self.force_at_duration:.2f} N in the same time"
+            time = f"{self.force_at_duration:.1f} N in the same time"
         return f"{self.label}: {force}, {time}"
 
 
-def rivals(
-    cell: Cell,
-    paths: Mapping[str, Array],
-    *,
-    front: DrivenPaths,
-    points: Array,
-    member: int,
-    force: float,
-) -> tuple[Rival, ...]:
-    """Each path (n_path,) by its label beside the recommended carry and its front.
-
-    The duration at the same force is that of the independent timing, as the recommended carry's
-    own is; forces and the front's durations are compared by the compiled timing, which also gives
-    the duration that the rival has to keep to.
-
-    Args:
-        front: the paths of the front.
-        points: (k, 2) duration [s] and largest limited force [N] of its members.
-        member: that of the recommended carry.
-        force: its limit on the normal forces [N].
-    """
-    low, high = float(points[:, 1].min()), float(points[:, 1].max())
-    # Over the front's own range, closer together where force is least.
-    compared = low + (high - low) * np.linspace(0.0, 1.0, FORCES) ** 2
-    best = np.array([front.durations(float(limit)).min() for limit in compared])
-    in_time = float(front.durations(force)[member])
-    found = []
-    for label, path in paths.items():
-        driven = DrivenPaths.of(cell, path)
-        own = np.array([driven.durations(float(limit))[0] for limit in compared])
-        ahead = compared[own < best * (1.0 - BETTER)]
-        limits = cell.timing_model.drive_limits(force)
-        timing = time_path(cell.timing_model, np.append(path, force), limits)
-        found.append(
-            Rival(
-                label,
-                timing.duration if timing.ok else float("inf"),
-                float(driven.forces(in_time)[0]),
-                (float(ahead.min()), float(ahead.max())) if len(ahead) else None,
-            )
-        )
-    return tuple(found)
+def rival(cell: Cell, label: str, path: Array, timing: Timing, force: float) -> Rival:
+    """A path (n_path,) beside a recommended carry: its timing, and the force to command [N]."""
+    paths = DrivenPaths.of(cell, path)
+    options = paths.all_options(paths.highest_force)
+    goal = Goal(np.inf, commanded_at_most(force), duration_alone)
+    found = next(best_of_paths(paths, options, goal, 1), None)
+    longer, duration = 1.0, float("inf")
+    if found is not None:
+        driven = driven_timing(cell.timing_model, np.append(path, found.limit))
+        duration = driven.duration if driven.ok else duration
+        longer = max(driven.duration / found.duration, 1.0) if driven.ok else 1.0
+    in_time = Goal(timing.duration / longer, np.full(2, np.inf), force_alone)
+    same = next(best_of_paths(paths, options, in_time, 1), None)
+    return Rival(label, duration, float("inf") if same is None else same.commanded)
 
 
 def level_force(workcell: Workcell, kind: ForceKind) -> float:
@@ -124,11 +101,11 @@ def front_durations(paths: DrivenPaths, forces: Array) -> Array:
     return np.array([paths.durations(float(force)).min(initial=np.inf) for force in forces])
 
 
-def spread_members(paths: Array) -> Array:
-    """At most `MEMBERS` different ones of a front's paths (k, n), both ends among them."""
+def spread_rows(paths: Array) -> NDArray[np.intp]:
+    """Rows of at most `MEMBERS` different ones of a front's paths (k, n), both ends among them."""
     different = np.sort(np.unique(paths, axis=0, return_index=True)[1])
     rows = np.linspace(0, len(different) - 1, min(len(different), MEMBERS)).round().astype(int)
-    return np.asarray(paths[different[np.unique(rows)]])
+    return np.asarray(different[np.unique(rows)])
 
 
 def over_replicas(durations: Sequence[Array]) -> tuple[Array, Array, Array]:

@@ -153,9 +153,16 @@ class CaseForces:
                 held_function(workcell, function.__name__, function, cache, lanes=0)
                 for function in (case_squeeze_function, case_slack_function)
             ]
+            in_place = case_squeeze_function(workcell, displaced=False)
+            self._in_place = compile_function(in_place, cache, lanes=0)
 
     def least(
-        self, motion: tuple[Array, ...], cases: Array, leader: int, threads: int = 1
+        self,
+        motion: tuple[Array, ...],
+        cases: Array,
+        leader: int,
+        threads: int = 1,
+        displaced: bool = True,
     ) -> Array:
         """(m, 2) least normal forces [N]: what is to be commanded of one robot, and what the
         leading one then presses with.
@@ -165,8 +172,11 @@ class CaseForces:
             cases: (m, 18).
             leader: index of the robot whose force is not commanded.
             threads: 0 for one per core.
+            displaced: whether any of the cases displaces a pad; without, it is faster.
         """
         function = self._functions(1 - leader)[0]
+        if self._squeezed and not displaced:
+            function = self._in_place
         return function.batch(*motion, cases, threads=threads)["normal_force"]
 
     def surely_held(

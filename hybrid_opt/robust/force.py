@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from codegen.cache import Cache
 from hybrid_opt.carry import Carry
@@ -129,8 +130,9 @@ class RobustModel:
         self._cases = CaseForces(workcell, cache)
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
-        """(k, n, 2) least normal forces [N] that hold each of k cases (k, 18) at n samples; of pads
-        that do not face one another the least commanded one, and what `leader` presses with."""
+        """(k, n, 2) normal forces to command [N] that hold each of k cases (k, 18) at n samples; of
+        pads that do not face one another what `leader` presses with beside the commanded one."""
+        displaced = bool(cases[:, 11:15].any())
         n = len(motion.pose)
         found = np.empty((len(cases), n, 2))
         step = max(1, BATCH // n)
@@ -138,7 +140,8 @@ class RobustModel:
         for start in range(0, len(cases), step):
             some = cases[start : start + step]
             repeated = tuple(np.tile(values, (len(some), 1)) for values in arrays)
-            forces = self._cases.least(repeated, np.repeat(some, n, axis=0), leader)
+            every = np.repeat(some, n, axis=0)
+            forces = self._cases.least(repeated, every, leader, displaced=displaced)
             found[start : start + step] = forces.reshape(len(some), n, 2)
         return found
 
@@ -377,7 +380,7 @@ def robust_price(
     """
     workcell = model.workcell
     uncertainty = workcell.uncertainty
-    motion, limit = thinned(carry), workcell.task.reference_force
+    (_, motion), limit = thinned(carry), workcell.task.reference_force
     force = model.robust_force(motion, uncertainty, leader)
     factors = FACTORS[allowed_factor(workcell, uncertainty) > FACTORS]
     return RobustPrice(
@@ -391,8 +394,9 @@ def robust_price(
     )
 
 
-def thinned(carry: Carry) -> BoxMotion:
-    """`SAMPLES` evenly spread samples of a carry, and those of its largest normal forces."""
+def thinned(carry: Carry) -> tuple[NDArray[np.intp], BoxMotion]:
+    """`SAMPLES` evenly spread samples of a carry, and those of its largest normal forces; which
+    they are, and their motion."""
     even = np.linspace(0, len(carry) - 1, min(len(carry), SAMPLES)).round().astype(int)
     rows = np.union1d(even, carry.normal_force.argmax(axis=0))
-    return BoxMotion(carry.pose[rows], carry.rate[rows], carry.second_rate[rows])
+    return rows, BoxMotion(carry.pose[rows], carry.rate[rows], carry.second_rate[rows])

@@ -11,6 +11,7 @@ says how hard to press, and `Squeeze.parts` what it is made of.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,6 +68,13 @@ class Part:
     force: float
 
 
+def account(parts: Iterable[Part]) -> str:
+    """Parts as a sum."""
+    known = list(parts)
+    terms = " + ".join(f"{part.force:.1f} {part.name}" for part in known)
+    return f"{terms} = {sum(part.force for part in known):.1f} N"
+
+
 DOUBTS = {
     "friction": ("friction",),
     "mass": ("mass",),
@@ -111,8 +119,7 @@ class Squeeze:
     @property
     def account(self) -> str:
         """The parts as a sum."""
-        terms = " + ".join(f"{part.force:.1f} {part.name}" for part in self.parts)
-        return f"{terms} = {self.force:.1f} N"
+        return account(self.parts)
 
     def __str__(self) -> str:
         pads = "pads that press evenly" if self.even_pads else "pads that choose their pressure"

@@ -98,6 +98,13 @@ def drive_with_jerk(model: TimingModel, x: Array) -> JerkTiming | None:
     return time_with_jerk(model, x, model.drive_limits(float(x[-1])), limits)
 
 
+def driven_timing(model: TimingModel, x: Array) -> Timing:
+    """How robots drive a drivable carry x (n_var,): as fast as all limits allow within its own
+    force limit, limits on jerk among them where the cell states any."""
+    found = drive_with_jerk(model, x)
+    return time_path(model, x, model.drive_limits(float(x[-1]))) if found is None else found.timing
+
+
 class _Problem:
     """One path with one set of limits."""
 

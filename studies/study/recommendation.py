@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,20 +31,19 @@ from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.evaluate.evaluations import concatenated
 from hybrid_opt.evaluate.explanation import explain
-from hybrid_opt.recommending.choice import DrivenPaths
+from hybrid_opt.recommending.choice import LEADER, DrivenPaths
 from hybrid_opt.recommending.comparison import (
     front_durations,
     over_replicas,
-    spread_members,
+    spread_rows,
     table_forces,
 )
-from hybrid_opt.recommending.recommendation import HAND_MADE, LEADER, Recommendation
-from hybrid_opt.robust.force import robust_model, robust_price
+from hybrid_opt.recommending.recommendation import HAND_MADE, STEPS, Recommendation
+from hybrid_opt.robust.force import pressing_model, robust_price
+from hybrid_opt.robust.squeeze import account
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
-from hybrid_opt.timing.document import StoredJerk
-from hybrid_opt.timing.records import TimingStatus
 from hybrid_opt.work.processes import ProcessExecutor
 from hybrid_opt.work.service import Emit, Executor, SerialExecutor, Service, answer_all
 from studies.study.drivable import (
@@ -55,7 +54,6 @@ from studies.study.drivable import (
     least_force,
 )
 from symbolic.array import Array
-from symbolic.errors import SettingsError
 
 
 def recommendation_stage(wish: ho.Wish) -> Stage:
@@ -148,11 +146,10 @@ def recommend_from(
         raise NoCarryError(_why_none(cell, drivable.results))
     alone = is_drivable(campaign.workcell, campaign.objectives)
     others = {} if alone else least_force(campaign)
-    # The choice, the table's rows and the price.
-    steps = 3 + len(others) + len(drivable.fronts)
+    # The choice with its rivals, the table's rows and the price.
+    steps = STEPS + 3 + 2 * len(others) + len(drivable.fronts)
     with progress.stage("recommendation", steps, "steps") as advance:
-        found = ho.recommend(cell, drivable.x, wish, others)
-        advance(1)
+        found = ho.recommend(cell, drivable.x, wish, others, told=lambda: advance(1))
         durations = _force_table(cell, drivable, others, found, advance)
         price = _price(found.carry, campaign.configuration.settings.seed, threads)
         advance(1)
@@ -169,7 +166,7 @@ def recommend_from(
     told = Told(
         source=source,
         file=file,
-        export=export_command(Path(file), found.force),
+        export=export_command(Path(file), found.limit),
         considered=len(drivable.x),
         durations=durations,
         price=price,
@@ -195,14 +192,11 @@ def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
 
 
 def _price(carry: ho.Carry, seed: int, threads: int) -> StoredPrice | None:
-    """Cost of robustness for the recommended carry; None where no set leaves friction and patches,
-    and where the pads cannot hold whatever happens."""
-    try:
-        model = robust_model(carry.workcell)
-        rng = np.random.default_rng(seed)
-        return stored_price(robust_price(model, carry, rng, LEADER, threads=threads))
-    except SettingsError:
+    """Cost of robustness for the recommended carry; None where nothing is uncertain."""
+    if carry.workcell.uncertainty.is_empty:
         return None
+    model, rng = pressing_model(carry.workcell), np.random.default_rng(seed)
+    return stored_price(robust_price(model, carry, rng, LEADER, threads=threads))
 
 
 def _force_table(
@@ -214,7 +208,7 @@ def _force_table(
 ) -> ForceTable:
     """Every front's durations at the same forces, that of the recommended carry among them."""
     task = cell.workcell.task
-    forces = np.unique(np.append(table_forces(cell.workcell, cell.force_kind), found.force))
+    forces = np.unique(np.append(table_forces(cell.workcell, cell.force_kind), found.limit))
 
     def durations(paths: Array) -> Array:
         least = np.full(len(forces), np.inf)
@@ -226,10 +220,14 @@ def _force_table(
     paths = {HAND_MADE: cell.initial[: task.n_path]} | dict(others)
     rows = [_row(label, [durations(path[None])]) for label, path in paths.items()]
     rows += [
-        _row(label, [durations(spread_members(front.x[:, : task.n_path])) for front in fronts])
+        _row(label, [durations(_spread(front.x[:, : task.n_path])) for front in fronts])
         for label, fronts in drivable.labelled().items()
     ]
     return ForceTable(tuple(forces.tolist()), tuple(rows))
+
+
+def _spread(paths: Array) -> Array:
+    return np.asarray(paths[spread_rows(paths)])
 
 
 def _row(label: str, found: list[Array]) -> StoredDurations:
@@ -238,6 +236,9 @@ def _row(label: str, found: list[Array]) -> StoredDurations:
 
 
 EXPORT_FORM = "ros2"
+
+ADVICE = 3
+"""Changes that a terminal tells."""
 
 
 @dataclass(frozen=True)
@@ -270,59 +271,33 @@ def study_words(summary: CampaignSummary, folder: str) -> RecommendationText | N
         folder: as for `recommendation_text`.
     """
     if summary.recommendation is not None:
-        return recommendation_text(summary.recommendation, summary.robots, folder)
+        return recommendation_text(summary.recommendation, folder)
     if not summary.no_recommendation:
         return None
     return RecommendationText("No carry is recommended", (("why", summary.no_recommendation),), ())
 
 
-def recommendation_text(
-    found: StoredRecommendation, robots: Sequence[str], folder: str
-) -> RecommendationText:
+def recommendation_text(found: StoredRecommendation, folder: str) -> RecommendationText:
     """The words for a stored recommendation.
 
     Args:
-        robots: both robots' names.
         folder: of the results, in front of the files' names; '' where the reader is in it.
     """
-    headline = (
-        f"Run this carry: {found.duration:.2f} s, {found.force_kind.pressing} "
-        f"{max(found.limited_force):.2f} N ({_of_robots(found.limited_force, robots)})"
-    )
+    job = f", the whole job {found.job_duration:.1f} s" if math.isfinite(found.job_duration) else ""
+    headline = f"Run this carry: {found.duration:.2f} s, press with {found.force:.1f} N{job}"
     facts = [
         ("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}"),
         ("file", str(Path(folder) / found.file)),
         ("export", export_command(Path(folder) / found.file, found.force_limit)),
-        *([] if found.jerk is None else [("within jerk limits", _jerk(found.jerk))]),
-        *_planned(found, robots),
-        ("press with", f"{_of_robots(found.squeeze, robots)}, {found.squeeze_reason}"),
-        ("payload", f"up to {found.payload_limit:.2f} kg on the same motion"),
+        ("the force", f"{account(found.parts)}; {found.squeeze_reason}"),
         *[(rival.label, _rival(rival, found)) for rival in found.rivals],
         ("margins", "; ".join(_margins(found)) or "not known"),
     ]
+    if found.advice:
+        facts.append(("costs most", "; ".join(str(each) for each in found.advice[:ADVICE])))
     if found.price is not None:
         facts.append(("robust", _robust(found.price)))
-    if found.unsure:
-        facts.append(
-            (
-                "if less sure",
-                "command "
-                + "; ".join(
-                    f"{max(doubt.peak_force):.1f} N if {doubt.doubt}"
-                    + ("" if doubt.within_reference else " (beyond the reference force)")
-                    for doubt in found.unsure
-                )
-                + "; state it as [uncertainty] in the workcell",
-            )
-        )
     return RecommendationText(headline, tuple(facts), found.warnings)
-
-
-def _planned(found: StoredRecommendation, robots: Sequence[str]) -> list[tuple[str, str]]:
-    """The planned forces, where limits are about others."""
-    if found.robust_force is None:
-        return []
-    return [("planned", f"{_of_robots(found.peak_force, robots)}, if nothing is uncertain")]
 
 
 def export_command(path: Path, force: float) -> str:
@@ -335,28 +310,14 @@ def export_command(path: Path, force: float) -> str:
     )
 
 
-def _jerk(jerk: StoredJerk) -> str:
-    """Cost of the cell's limits on jerk."""
-    if jerk.status != TimingStatus.OK:
-        return f"not found: {jerk.status}"
-    return (
-        f"{jerk.duration:.2f} s ({_percent(jerk.duration / jerk.without)}), at rest without "
-        "acceleration at both ends; this is what the export drives"
-    )
-
-
-def _of_robots(values: Array, robots: Sequence[str]) -> str:
-    return ", ".join(f"{name} {value:.1f} N" for name, value in zip(robots, values, strict=True))
-
-
 def _rival(rival: StoredRival, found: StoredRecommendation) -> str:
     """Another path beside the recommended carry."""
     duration, force = rival.duration_at_force, rival.force_at_duration
-    same_force, same_time = "cannot move with so little force", "is never so fast"
+    same_force, same_time = "cannot be held with so little force", "is never so fast"
     if math.isfinite(duration):
         same_force = f"{duration:.2f} s at the same force ({_percent(duration / found.duration)})"
     if math.isfinite(force):
-        same_time = f"{force:.2f} N in the same time ({_percent(force / found.force_limit)})"
+        same_time = f"{force:.1f} N in the same time ({_percent(force / found.force)})"
     return f"{same_force}, {same_time}"
 
 
@@ -364,11 +325,7 @@ def _robust(price: StoredPrice) -> str:
     """Cost of the set, the largest multiple of it that the arms allow, and random cases."""
     named = "[uncertainty]" if price.stated else "the usual uncertainty"
     plan, sure = (max(values) for values in (price.peak[0], price.commanded))
-    allowed = (
-        f"up to {price.largest_factor:.2f} times the set"
-        if math.isfinite(price.largest_factor)
-        else "any multiple of the set"
-    )
+    allowed = f"up to {price.largest_factor:.2f} times the set"
     if not price.largest_factor:
         allowed = "not even the nominal case"
     return (
@@ -384,12 +341,16 @@ def _percent(ratio: float) -> str:
 
 
 def _margins(found: StoredRecommendation) -> list[str]:
-    """Friction of both contacts, and the nearest limit of the centre of mass along each axis."""
+    """Of friction, force and mass, and the nearest limit of the centre of mass along each axis, at
+    the commanded force."""
     texts = []
     for margin in found.margins:
         if margin.quantity == "friction of both contacts":
-            end = f" ({margin.fails} beyond)" if margin.fails else ""
-            texts.append(f"friction down to {margin.limit:.2f}{end}")
+            texts.append(f"friction down to {margin.limit:.2f}")
+        elif margin.quantity == "share of the force that is missing":
+            texts.append(f"{100.0 * margin.limit:.0f} % less force")
+        elif margin.quantity == "mass":
+            texts.append(f"mass up to {margin.limit:.1f} kg")
     offs = {
         margin.quantity[-1]: abs(margin.limit - margin.nominal)
         for margin in sorted(found.margins, key=lambda m: -abs(m.limit - m.nominal))

@@ -50,7 +50,7 @@ def test_a_cell_that_states_nothing_is_priced_under_a_usual_set() -> None:
 def test_the_largest_forces_are_among_the_thinned_samples() -> None:
     carry = rack_job().timing.carry
     assert carry is not None
-    motion = thinned(carry)
+    _, motion = thinned(carry)
     assert SAMPLES <= len(motion.pose) <= SAMPLES + 2
     for row in carry.normal_force.argmax(axis=0):
         assert (motion.pose == carry.pose[row]).all(axis=1).any()
