@@ -302,6 +302,8 @@ def refuse(options: Sequence[Option], wish: Wish, goal: Goal) -> None:
             f"duration {wish.duration:g} s: no carry of the front is so short; the shortest takes "
             f"{shortest:.3f} s, before limits on jerk"
         )
+    if not options:
+        raise SettingsError("no carry of the front can be driven: it cannot even be held still")
     least = min(option.commanded for option in options)
     asked = ", ".join(f"{name} {value:g} {_UNITS[name]}" for name, value in wish.given.items())
     raise SettingsError(

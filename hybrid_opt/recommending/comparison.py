@@ -62,8 +62,9 @@ class Rival:
 
 def rival(cell: Cell, label: str, path: Array, timing: Timing, force: float) -> Rival:
     """A path (n_path,) beside a recommended carry: its timing, and the force to command [N]."""
+    assert timing.limits.force is not None, "drivable carries have a force limit"
     paths = DrivenPaths.of(cell, path)
-    options = paths.all_options(paths.highest_force)
+    options = paths.all_options(timing.limits.force)
     goal = Goal(np.inf, commanded_at_most(force), duration_alone)
     found = next(best_of_paths(paths, options, goal, 1), None)
     longer, duration = 1.0, float("inf")

@@ -18,7 +18,7 @@ from hybrid_opt.display.scene import packed
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.timing import drivable_timing, time_path
-from hybrid_opt.timing.jerk import drive_with_jerk
+from hybrid_opt.timing.jerk import driven_timing
 from hybrid_opt.work.service import Emit
 from studies.report.jobs import DrawnJob, JobRequest, drawn
 from symbolic.array import Array
@@ -28,7 +28,6 @@ MAX_SAMPLES = 60
 """Samples of a trajectory on the page; its force peaks are kept besides."""
 
 DRIVEN = "as robots drive it"
-WITHIN_JERK = "within the limits on jerk"
 ASSUMED = "as the search assumed"
 WHOLE_JOB = "the whole job"
 
@@ -47,7 +46,7 @@ class Shown:
         x: (n_var,) decision vector.
         provenance: how it came about, stored with a saved file.
         cell: number of its cell among those of the page.
-        jerk: whether it is also shown within the cell's limits on jerk, where it has any.
+        jerk: whether it is driven within the cell's limits on jerk, where it has any.
         job: the whole job around it, where it is planned already.
         has_job: whether one is planned where it is not.
     """
@@ -152,8 +151,6 @@ class PageCarries:
         timing = self._timed(cell, shown, request)
         driven = timing.carry
         motions = [] if driven is None else [self._motion(DRIVEN, driven)]
-        if shown.jerk:
-            motions += self._within_jerk(cell, shown.x)
         if law != "optimal":
             motions.append(self._motion(f"{ASSUMED}: {LAWS[law]}", judged))
         if not motions:
@@ -163,7 +160,7 @@ class PageCarries:
             name = f"{name} (infeasible)"
         figures = judged.figures.items()
         found = {
-            "label": f"{name}: {_values(cell, judged, timing)}",
+            "label": f"{name}: {_values(cell, judged, timing, shown.job)}",
             "objectives": [float(value) for value in values.values()],
             "problem": "" if timing.ok else f"robots cannot drive it: {timing.reason}",
             "force": max(motions[0]["peaks"]) if driven is None else round(timing.peak_force, 4),
@@ -183,17 +180,14 @@ class PageCarries:
         return found
 
     def _timed(self, cell: ho.Cell, shown: Shown, request: JobRequest) -> ho.Timing:
-        """As robots drive it: as an export times it, but for the points of time against robust
-        force, for which that takes long: as the search found them."""
-        if request.limits.robust and not shown.jerk:
+        """As robots drive it: what is recommended as an export does; others without limits on jerk,
+        and points of time against robust force, for which that takes long, as the search found
+        them."""
+        if shown.jerk:
+            return driven_timing(cell.timing_model, shown.x)
+        if request.limits.robust:
             return drivable_timing(cell.timing_model, shown.x)
         return time_path(self._jobs[shown.cell].timing, request.x, request.limits)
-
-    def _within_jerk(self, cell: ho.Cell, x: Array) -> list[dict[str, Any]]:
-        """The carry within the cell's limits on jerk, where it has any."""
-        found = drive_with_jerk(cell.timing_model, x)
-        carry = None if found is None else found.timing.carry
-        return [] if carry is None else [self._motion(WITHIN_JERK, carry)]
 
     def _motion(self, name: str, carry: ho.Carry) -> dict[str, Any]:
         torque = 100.0 * np.abs(carry.torque).max(axis=0) / self._limit
@@ -220,8 +214,11 @@ def _limits(cell: ho.Cell, x: Array) -> ho.TimingLimits:
     return ho.TimingLimits(reference_speed=True)
 
 
-def _values(cell: ho.Cell, judged: ho.Carry, timing: ho.Timing) -> str:
-    """Title of a trajectory: its objectives, forces and times with their units."""
+def _values(cell: ho.Cell, judged: ho.Carry, timing: ho.Timing, job: DrawnJob | None) -> str:
+    """Title of a trajectory: its objectives, forces and times with their units; of one whose job
+    is planned what is commanded."""
+    if cell.workcell.task.time_law == "optimal" and job is not None and job.phases:
+        return f"{timing.duration:.2f} s, pressed with {max(job.peaks):.1f} N"
     if cell.workcell.task.time_law == "optimal":
         if timing.carry is not None:
             return f"{timing.duration:.2f} s, {timing.peak_force:.2f} N"

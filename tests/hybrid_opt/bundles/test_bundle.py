@@ -162,7 +162,10 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
     assert all(phase["free_of_collisions"] for phase in document["phases"])
     worst = max(value for phase in document["phases"] for value in phase["limits"].values())
     assert worst <= 1.005
-    assert document["squeeze"]["factor"] == 1.3
+    squeeze = document["squeeze"]
+    assert squeeze["factor"] is None
+    assert squeeze["force"] == pytest.approx(squeeze["peak_normal_force"][1], rel=1e-9)
+    assert sum(squeeze["parts"].values()) == pytest.approx(squeeze["force"], rel=1e-9)
     assert document["units"]["force"] == "N"
     assert document["how_to_run"]
     assert any("tool_load" in warning for warning in document["warnings"])

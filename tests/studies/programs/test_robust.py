@@ -23,7 +23,8 @@ disturbance = [0.2, 0.2, 0.2]
 
 
 def stored(folder: Path, table: str) -> Path:
-    text = RACK.read_text(encoding="utf-8").replace("../robots", str(RACK.parents[1] / "robots"))
+    text, _ = RACK.read_text(encoding="utf-8").split("[uncertainty]")
+    text = text.replace("../robots", str(RACK.parents[1] / "robots"))
     cell = folder / "cell.toml"
     cell.write_text(text + table, encoding="utf-8")
     workcell = load(cell)

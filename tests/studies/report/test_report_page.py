@@ -262,8 +262,10 @@ def test_the_page_begins_with_the_recommended_carry(
     assert found is not None
     first = document["trajectories"][document["first"]]
     assert first["label"].startswith("Recommended")
-    assert first["motions"][0]["duration"] == pytest.approx(found.duration, abs=1e-5)
-    words = recommendation_text(found, data.summary.robots, "")
+    # A job's carry takes whole ticks.
+    assert first["motions"][0]["duration"] == pytest.approx(found.duration, abs=0.01)
+    assert f"pressed with {found.squeeze.max():.1f} N" in first["label"]
+    words = recommendation_text(found, "")
     for _, sentence in words.facts:
         assert html.escape(sentence) in text
     assert html.escape(words.headline) in text

@@ -46,8 +46,8 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Results folder of the rack, one replica, and what is printed."""
     folder = tmp_path_factory.mktemp("robust")
     driven = unpack_cell(drivable_files(collect_cell(load(RACK))), folder / "cell").source
-    text = driven.read_text() + f"\n[uncertainty]\nfriction = {FRICTION}\nmass = {MASS}\n"
-    driven.write_text(text)
+    text, _ = driven.read_text().split("[uncertainty]")
+    driven.write_text(f"{text}[uncertainty]\nfriction = {FRICTION}\nmass = {MASS}\n")
     settings = CampaignSettings(
         algorithms=("nsga2",),
         objectives=ROBUST_DRIVABLE_OBJECTIVES,
@@ -110,13 +110,14 @@ def test_what_is_recommended_holds_in_every_case_and_uses_its_limit_up(
     peak = robust_peak(cell.workcell, carry)
     np.testing.assert_allclose(found.robust_force, peak, rtol=1e-6)
     assert found.force_limit == pytest.approx(peak.max(), rel=5e-3)
-    assert carry.duration == pytest.approx(found.duration, rel=1e-6)
+    # A job's carry takes whole ticks.
+    assert carry.duration == pytest.approx(found.duration, abs=0.01)
     assert peak.max() > 1.1 * max(found.peak_force)
     # Of the arm that is commanded; smoothing adds to that, nothing takes away.
     assert found.squeeze[1] >= peak[1] * (1.0 - 1e-6)
     assert "in every case of the cell's [uncertainty]" in found.squeeze_reason
-    assert f"held in every case by at most {max(found.robust_force):.2f} N" in printed
-    assert "if nothing is uncertain" in printed
+    assert f"press with {found.force:.1f} N" in printed
+    assert [part.name for part in found.parts] == ["least force", "friction", "mass"]
     assert "Time against robust force" in printed
 
 
@@ -125,12 +126,8 @@ def test_its_file_is_reproduced(study: tuple[Path, str], tmp_path: Path) -> None
     assert replay(read_trajectory(root / recommended(root).file), tmp_path).reproduced
 
 
-def test_it_is_also_timed_within_jerk_limits(study: tuple[Path, str]) -> None:
+def test_what_is_selected_is_also_timed_within_jerk_limits(study: tuple[Path, str]) -> None:
     root, _ = study
-    found = recommended(root)
-    assert found.jerk is not None
-    assert found.jerk.status == "ok"
-    assert 0.0 < found.jerk.duration / found.duration - 1.0 < 0.3
     selected = read_timing(root / "timing" / "nsga2-polished" / "00.json")
     assert selected.jerk is not None
     # The search's own timing is the one within robust forces.
@@ -181,7 +178,7 @@ def test_the_report_shows_robust_forces(data: ReportData) -> None:
     assert choice is not None
     (group,) = (each for each in view["groups"] if each["label"] == "Recommended")
     assert group["x"][0] == pytest.approx(choice.force_limit, rel=5e-3)
-    assert group["y"][0] == pytest.approx(choice.duration, rel=1e-3)
+    assert group["y"][0] == pytest.approx(choice.duration, abs=0.01)
     # Points of the fronts are driven as the search found them.
     assert data.drivable is not None
     entry = data.drivable.fronts[0].front
