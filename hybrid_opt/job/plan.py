@@ -33,10 +33,9 @@ from hybrid_opt.job.motions import (
     timed,
 )
 from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
-from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, smoothed
+from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.static_hold import kept_per_workcell
-from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array
@@ -138,9 +137,8 @@ class JobModel:
         if not 0.0 <= smoothing <= WIDEST:
             raise SettingsError(f"smoothing over {smoothing:g} s: allowed is 0 to {WIDEST:g} s")
         jerk = self._jerk if within_jerk else None
-        if smoothing > 0.0 and not rests_at_ends(timing):
-            timing = self._without_jumps(timing, smoothing, jerk)
-            carry = timing.carry
+        timing = without_jumps(self.timing, timing, jerk, smoothing)
+        carry = timing.carry
         assert carry is not None, "a smoothed timing has a carry"
         handling = handling or self.workcell.handling
         around = self._around(carry, handling)
@@ -180,16 +178,6 @@ class JobModel:
         )
         refuse_excess(job)
         return job
-
-    def _without_jumps(self, timing: Timing, width: float, jerk: JerkLimits | None) -> Timing:
-        """A timing of the same path within the same limits whose acceleration does not jump."""
-        if jerk is None:
-            return smoothed(self.timing, timing, width)
-        assert timing.carry is not None, "a timing that is to be driven has a carry"
-        found = time_with_jerk(self.timing, timing.carry.x, timing.limits, jerk).timing
-        if found.carry is None:
-            raise JobError(f"no timing within the limits on jerk: {found.reason}")
-        return found
 
     def _around(self, carry: Carry, handling: Handling) -> _Around:
         """The phases around a carry, computed once for carries with the same ends."""

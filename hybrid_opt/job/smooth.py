@@ -16,8 +16,10 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import JobError
+from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.records import Excess, Timing
+from hybrid_opt.timing.records import Excess, JerkLimits, Timing
+from hybrid_opt.timing.solve import time_path
 from hybrid_opt.timing.use import limit_ratios, use_of, worst
 from symbolic.array import Array
 
@@ -60,6 +62,45 @@ def acceleration_at_ends(timing: Timing) -> float:
     assert carry is not None, "a timing that is to be driven has a carry"
     limit = np.concatenate([robot.acceleration_max for robot in carry.workcell.robots])
     return float((np.abs(carry.side_by_side("q_second")[[0, -1]]) / limit).max())
+
+
+def without_jumps(
+    model: TimingModel, timing: Timing, jerk: JerkLimits | None, width: float = WIDTH
+) -> Timing:
+    """A timing of the same path within the same limits whose acceleration does not jump: what jobs
+    drive.
+
+    Args:
+        model: of the timing's workcell.
+        timing: one that robots can drive, with its speeds on the grid.
+        jerk: limits to keep in place of averaging; None where there are none.
+        width: half the width of the window [s]; zero leaves jumps as they are.
+
+    Raises:
+        JobError: slowing down by half does not bring it within its limits, or those on jerk cannot
+            be kept.
+    """
+    if width == 0.0 or rests_at_ends(timing):
+        return timing
+    if jerk is None:
+        return smoothed(model, timing, width)
+    assert timing.carry is not None, "a timing that is to be driven has a carry"
+    found = time_with_jerk(model, timing.carry.x, timing.limits, jerk).timing
+    if found.carry is None:
+        raise JobError(f"no timing within the limits on jerk: {found.reason}")
+    return found
+
+
+def driven_timing(model: TimingModel, x: Array) -> Timing:
+    """How jobs drive a drivable carry x (n_var,): as fast as all limits allow within its own force
+    limit, without jumps of acceleration.
+
+    Raises:
+        JobError: as of `without_jumps`.
+    """
+    timing = time_path(model, x, model.drive_limits(float(x[-1])))
+    jerk = JerkLimits.of(model.workcell) if model.workcell.has_facing_pads else None
+    return without_jumps(model, timing, jerk) if timing.ok else timing
 
 
 def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing:

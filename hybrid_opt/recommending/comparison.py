@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.cell import Cell
+from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ForceKind
+from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.recommending.choice import (
     DrivenPaths,
     Goal,
@@ -20,7 +23,6 @@ from hybrid_opt.recommending.choice import (
 )
 from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.static_hold import static_hold
-from hybrid_opt.timing.jerk import driven_timing
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
 from symbolic.records import Workcell
@@ -69,9 +71,10 @@ def rival(cell: Cell, label: str, path: Array, timing: Timing, force: float) -> 
     found = next(best_of_paths(paths, options, goal, 1), None)
     longer, duration = 1.0, float("inf")
     if found is not None:
-        driven = driven_timing(cell.timing_model, np.append(path, found.limit))
-        duration = driven.duration if driven.ok else duration
-        longer = max(driven.duration / found.duration, 1.0) if driven.ok else 1.0
+        with suppress(JobError):
+            driven = driven_timing(cell.timing_model, np.append(path, found.limit))
+            duration = driven.duration if driven.ok else duration
+            longer = max(driven.duration / found.duration, 1.0) if driven.ok else 1.0
     in_time = Goal(timing.duration / longer, np.full(2, np.inf), force_alone)
     same = next(best_of_paths(paths, options, in_time, 1), None)
     return Rival(label, duration, float("inf") if same is None else same.commanded)

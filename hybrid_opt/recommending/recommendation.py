@@ -18,6 +18,7 @@ from hybrid_opt.evaluate.objectives import ForceKind
 from hybrid_opt.front import Front
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
+from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.recommending.advice import Advice, advice, commanded_margins
 from hybrid_opt.recommending.choice import (
     LEADER,
@@ -31,7 +32,6 @@ from hybrid_opt.recommending.choice import (
 )
 from hybrid_opt.recommending.comparison import BETTER, Rival, rival, spread_rows
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
-from hybrid_opt.timing.jerk import driven_timing
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from hybrid_opt.timing.use import limited_force
@@ -213,7 +213,11 @@ def _driven(
         for _ in range(SHORTENED):
             if option is None:
                 break
-            timing = driven_timing(model, np.append(paths.x[option.index], option.limit))
+            try:
+                timing = driven_timing(model, np.append(paths.x[option.index], option.limit))
+            except JobError as error:
+                reason = str(error)
+                break
             if not timing.ok or timing.carry is None:
                 reason = timing.reason
                 break

@@ -98,18 +98,6 @@ def drive_with_jerk(model: TimingModel, x: Array) -> JerkTiming | None:
     return time_with_jerk(model, x, model.drive_limits(float(x[-1])), limits)
 
 
-def driven_timing(model: TimingModel, x: Array, force: float | None = None) -> Timing:
-    """How robots drive a carry x (n_var,): as fast as all limits allow within a force limit [N],
-    that of a drivable carry itself where none is given, limits on jerk among them where the cell
-    states any."""
-    limits, jerk = model.drive_limits(float(x[-1]) if force is None else force), None
-    if model.workcell.has_facing_pads:
-        jerk = JerkLimits.of(model.workcell)
-    if jerk is None:
-        return time_path(model, x, limits)
-    return time_with_jerk(model, x, limits, jerk).timing
-
-
 class _Problem:
     """One path with one set of limits."""
 

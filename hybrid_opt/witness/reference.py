@@ -21,8 +21,8 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.analysis import closest_to_reference_timing
-from hybrid_opt.timing.jerk import driven_timing
 from hybrid_opt.timing.model import contact_torque
+from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.scene import ArmSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -359,14 +359,14 @@ def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Refere
 
 
 def driven_carry(cell: Cell, x: Array) -> Carry:
-    """A decision vector's carry from rest to rest: within its force limit where it has one, as an
-    export drives it, else the closest to the reference speeds.
+    """A decision vector's carry from rest to rest: the fastest within its force limit where it has
+    one, else the closest to the reference speeds.
 
     Raises:
         WitnessError: there is none.
     """
     if cell.workcell.task.time_law == "optimal":
-        timing = driven_timing(cell.timing_model, x)
+        timing = time_path(cell.timing_model, x, cell.timing_model.drive_limits(float(x[-1])))
     else:
         timing = closest_to_reference_timing(cell.timing_model, x)
     if not timing.ok or timing.carry is None:

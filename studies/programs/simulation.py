@@ -19,7 +19,6 @@ from hybrid_opt.store.files import AGAIN, storing
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.analysis import closest_to_reference_timing
-from hybrid_opt.timing.jerk import driven_timing
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.arms import BISECTIONS, HIGH, LOW, ArmOutcome, CellWitness, account_of
 from hybrid_opt.witness.box import (
@@ -230,7 +229,7 @@ def simulate_file(options: argparse.Namespace) -> int:
 def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
     model = cell.timing_model
     if options.force_limit is not None:
-        timing = driven_timing(model, x, options.force_limit)
+        timing = time_path(model, x, model.drive_limits(options.force_limit))
     elif options.timing == "fastest":
         timing = time_path(model, x, TimingLimits())
     elif options.timing == "search":

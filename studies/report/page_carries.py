@@ -17,8 +17,8 @@ from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.display.scene import packed
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
+from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.timing import drivable_timing, time_path
-from hybrid_opt.timing.jerk import driven_timing
 from hybrid_opt.work.service import Emit
 from studies.report.jobs import DrawnJob, JobRequest, drawn
 from symbolic.array import Array

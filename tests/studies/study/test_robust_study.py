@@ -16,13 +16,13 @@ from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES
+from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.store.json_records import read_record
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
 from hybrid_opt.timing.document import read_timing
-from hybrid_opt.witness.reference import driven_carry
 from studies import export
 from studies.report.data import gather
 from studies.report.page_data import PageData
@@ -105,7 +105,8 @@ def test_what_is_recommended_holds_in_every_case_and_uses_its_limit_up(
     assert stored.objectives == ROBUST_DRIVABLE_OBJECTIVES
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
-        carry = driven_carry(cell, stored.x)
+        carry = driven_timing(cell.timing_model, stored.x).carry
+    assert carry is not None
     assert found.robust_force is not None
     peak = robust_peak(cell.workcell, carry)
     np.testing.assert_allclose(found.robust_force, peak, rtol=1e-6)
