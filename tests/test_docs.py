@@ -98,7 +98,10 @@ def test_what_is_broken_would_be_found(tmp_path: Path) -> None:
 
 def test_the_index_lists_every_page() -> None:
     docs = ROOT / "docs"
-    pages = {path.relative_to(docs).as_posix() for path in docs.glob("**/*.md")} - {"README.md", "index.md"}
+    pages = {path.relative_to(docs).as_posix() for path in docs.glob("**/*.md")} - {
+        "README.md",
+        "index.md",
+    }
     assert pages <= set(LINK.findall((docs / "README.md").read_text("utf-8")))
 
 

@@ -111,10 +111,12 @@ def commanded_margins(carry: Carry) -> tuple[Margin, ...]:
 def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tuple[Advice, ...]:
     """What changes of the cell would change of a recommended carry, most force first."""
     assert timing.carry is not None, "what is driven has a carry"
-    near = [paths.options(option.limit * (1.0 + s), [option.index]) for s in (-SLOPE, SLOPE)]
+    limits = [option.limit * (1.0 + share) for share in (-SLOPE, 0.0, SLOPE)]
+    # With less the path may not move: a tilted box asks for more than a level one.
+    near = [each for limit in limits for each in paths.options(limit, [option.index])]
+    low, high = near[0], near[-1]
     slope = 0.0
-    if all(near) and near[1][0].commanded > near[0][0].commanded:
-        (low,), (high,) = near
+    if high.commanded > low.commanded:
         slope = (high.duration - low.duration) / (high.commanded - low.commanded)
     found = [
         Advice(change, force, -slope * force)
