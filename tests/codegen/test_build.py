@@ -18,9 +18,8 @@ import pytest
 from codegen.build import build, compile_function, load_or_build
 from codegen.cache import Cache
 from codegen.compiled import CompiledFunction
-from codegen.compiler import LARGE_SOURCE, SMALL_SOURCE, default_level, find_compiler
+from codegen.compiler import find_compiler
 from codegen.errors import CodegenError
-from codegen.source import operations
 
 SET = """
 import casadi as ca
@@ -124,13 +123,6 @@ print(found["norm"]([3.0, 4.0, 0.0, 0.0])["y"], *found)
     assert done.stderr == ""
     assert done.stdout == "5.0 square norm\n"
     assert cold["norm"].signature == load_or_build("cell", functions, cache)["norm"].signature
-
-
-def test_another_key_is_made_anew(cache: Cache) -> None:
-    load_or_build("cell", functions, cache)
-    x = ca.MX.sym("x", 4)
-    other = load_or_build("other", lambda: {"f": ca.Function("f", [x], [x])}, cache)
-    assert list(other) == ["f"]
 
 
 def test_set_with_a_lost_member_is_made_anew(cache: Cache) -> None:
@@ -254,25 +246,6 @@ def test_function_that_cannot_be_written_as_c_is_told(
     with pytest.raises(CodegenError, match="uses_python"):
         compile_function(ca.Function("uses_python", [x], [doubled(x)]), cache)
     capfd.readouterr()
-
-
-def test_level_falls_with_size() -> None:
-    sizes = [0, SMALL_SOURCE, SMALL_SOURCE + 1, LARGE_SOURCE, LARGE_SOURCE + 1]
-    assert [default_level(size) for size in sizes] == [3, 3, 1, 1, 0]
-
-
-def test_operations_count_nested_calls() -> None:
-    a = ca.SX.sym("a", 2)
-    step = ca.Function("step", [a], [ca.sin(a) * a[0]])
-    own = step.n_instructions()
-    assert operations(step) == own
-    assert operations(step.map(10)) == 10 * own
-    assert operations(step.map(10, "thread", 2)) == 10 * own
-    x = ca.MX.sym("x", 2)
-    called_twice = ca.Function("twice", [x], [step(step(x))])
-    # Input, output and the two calls.
-    assert operations(called_twice) == 2 * own + 2
-    assert operations(step.mapaccum(100)) >= 100 * own
 
 
 def test_libraries_are_kept_apart_by_instruction_set(

@@ -66,14 +66,6 @@ def test_shapes_follow_the_convention(make: Make) -> None:
     assert [found[name].shape for name in "abc"] == list(function.output_shapes)
 
 
-def test_results_of_two_calls_are_independent(make: Make) -> None:
-    function = make(small())
-    y = np.zeros((4, 2))
-    first = function(np.ones(3), y)["b"]
-    function(np.zeros(3), y)
-    np.testing.assert_array_equal(first, np.full(3, 3.0))
-
-
 @pytest.mark.parametrize("threads", [1, 2, 3, 0])
 def test_batch_equals_loop_to_the_bit(make: Make, threads: int) -> None:
     rng = np.random.default_rng(1)
@@ -124,11 +116,6 @@ def test_c_evaluates_a_prepared_batch_as_python_does(cache: Cache) -> None:
         assert run(native.one)(native.ports, native.work, 4, 9) == -1
     for name, wanted in expected.items():
         np.testing.assert_array_equal(prepared.outputs[name], wanted)
-
-
-def test_interpreted_functions_have_no_address() -> None:
-    function = InterpretedFunction(dense(random_function(np.random.default_rng(4), ca.MX)))
-    assert function.prepared(2).native is None
 
 
 def test_a_prepared_batch_works_on_arrays_that_it_is_given(make: Make) -> None:
@@ -195,12 +182,6 @@ def test_any_layout_is_taken(make: Make, layout: str, x: Any) -> None:
     np.testing.assert_array_equal(found["a"], 2.0 * np.arange(8.0).reshape(4, 2))
 
 
-def test_read_only_inputs_are_taken_without_a_copy(make: Make) -> None:
-    x = np.arange(3.0)
-    x.flags.writeable = False
-    np.testing.assert_array_equal(make(small())(x, np.zeros((4, 2)))["b"], 5.0 * x)
-
-
 @pytest.mark.parametrize(
     ("inputs", "message"),
     [
@@ -250,16 +231,6 @@ def test_zero_size_arguments(make: Make) -> None:
     found = function(np.ones(2), np.empty(0))
     assert found["n2"].shape == (0,)
     np.testing.assert_array_equal(found["y"], [3.0, 3.0])
-
-
-def test_loaded_twice_from_one_library(cache: Cache) -> None:
-    first, second = compile_function(small(), cache), compile_function(small(), cache)
-    assert isinstance(first, CompiledFunction)
-    assert isinstance(second, CompiledFunction)
-    assert first.library == second.library
-    np.testing.assert_array_equal(
-        first(np.ones(3), np.ones((4, 2)))["b"], second(np.ones(3), np.ones((4, 2)))["b"]
-    )
 
 
 def test_maximum_and_minimum_yield_to_numbers(cache: Cache) -> None:

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hybrid_opt.carry import Carry, joints_of
+from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import REASONS
 from symbolic.read.cell import load
@@ -67,15 +67,6 @@ def test_figures_have_closed_forms() -> None:
     even = replace(carry, time=np.linspace(0.0, 1.0, len(carry)))
     inner = carry.normal_force[1:-1].sum(axis=0) + carry.normal_force[[0, -1]].sum(axis=0) / 2.0
     np.testing.assert_allclose(even.mean_normal_force, inner / (len(carry) - 1))
-
-
-def test_arms_may_stand_side_by_side() -> None:
-    carry = initial()
-    both = carry.side_by_side("q_rate")
-    assert both.shape == (len(carry), 12)
-    first, second = joints_of(carry.workcell, both)
-    np.testing.assert_array_equal(first, carry.arms[0].q_rate)
-    np.testing.assert_array_equal(second, carry.arms[1].q_rate)
 
 
 def test_a_carry_cannot_be_changed() -> None:

@@ -56,12 +56,6 @@ def test_the_model_is_built_once_for_all_functions(monkeypatch: pytest.MonkeyPat
     assert len(models) <= 1
 
 
-def test_a_compiled_cell_is_shared() -> None:
-    compiled = CompiledCell(hand_cell())
-    assert CompiledCell.of(compiled) is compiled
-    assert CompiledCell.of(compiled.workcell).workcell is compiled.workcell
-
-
 def test_a_missing_compiler_is_told_before_any_work(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

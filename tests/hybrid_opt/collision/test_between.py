@@ -12,7 +12,7 @@ from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt.collision.between import check_between
 from hybrid_opt.collision.certify import certify
-from hybrid_opt.collision.checker import CollisionChecker, Separations
+from hybrid_opt.collision.checker import CollisionChecker
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import build_geometry
@@ -172,18 +172,3 @@ def test_a_certified_path_is_free_on_a_fine_grid() -> None:
     certificate = certify(judge, arc, np.linspace(0.0, 1.0, 8))
     u = np.linspace(0.0, 1.0, 2000)
     assert certificate.is_free == (not judge.collision_mask(*arc(u)).any())
-
-
-def test_what_was_measured_is_not_measured_again() -> None:
-    judge, places = checker(thickness=0.001), passing(np.array([-0.6, 0.0, -0.3]))
-    wanted = np.ones((3, len(judge.geometry.active)), dtype=bool)
-    alone, first, second = (np.zeros(wanted.shape) for _ in range(3))
-    known: Separations = {}
-    hits = judge.measure(*places, alone, wanted)
-    assert (hits >= 0).tolist() == [False, True, False]
-    np.testing.assert_array_equal(judge.measure(*places, first, wanted, known), hits)
-    calls = judge.judge.calls
-    np.testing.assert_array_equal(judge.measure(*places, second, wanted, known), hits)
-    assert judge.judge.calls == calls
-    for found in (first, second):
-        np.testing.assert_array_equal(found, alone)

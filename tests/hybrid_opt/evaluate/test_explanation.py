@@ -65,8 +65,3 @@ def test_missing_reach_is_the_distance_beyond_the_stretched_arm(cell: Cell) -> N
     lacks = [missing_reach(robot, contact, T, carry.arms[0].q[0]) for T in (near, far)]
     assert lacks[0] > 0.5
     assert lacks[1] - lacks[0] == pytest.approx(1.0, abs=0.2)
-
-
-def test_excess_is_told_in_the_joints_unit() -> None:
-    lift = Explanation("joint_limits_1", 0.5, 50, joint="left/lift", excess=0.0123, unit="m")
-    assert str(lift) == "left/lift is 0.012 m beyond its limit at 50 % of the path (sample 50)"

@@ -14,11 +14,11 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.kernel import Kernel, SampledVerdicts, load_kernel, one_by_one
 from symbolic.array import Array
-from symbolic.functions import SAMPLE_NAMES, force_sizes, sample_functions, sample_sizes
+from symbolic.functions import SAMPLE_NAMES, force_sizes
 from symbolic.read.cell import load
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.evaluate.test_evaluation import TRANSFER, candidates
-from tests.symbolic.cells import RACK, hand_model
+from tests.symbolic.cells import RACK
 
 UNEVEN = RACK.parent / "uneven.toml"
 
@@ -167,13 +167,6 @@ def test_forces_that_come_last_are_those_of_one_by_one(lanes: int) -> None:
     verdicts, expected = ours.evaluate(x), stepwise(UNEVEN).evaluate(x)
     for name in ("penalised", "feasible", "reason", "position", "violation", "violation_time"):
         np.testing.assert_array_equal(getattr(verdicts, name), getattr(expected, name), name)
-
-
-def test_sizes_are_those_of_the_functions() -> None:
-    sample = sample_functions(hand_model(load(RACK)))["sample"]
-    sizes = {name: sample.numel_out(name) for name in sample.name_out()[2:]}
-    assert sizes == sample_sizes(load(RACK))
-    assert set(sizes) == SAMPLE_NAMES
 
 
 def test_a_kernel_that_differs_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,14 +77,6 @@ def test_non_dominated_refuses_what_is_not_finite() -> None:
     assert len(metrics.front_of([[np.nan, 1.0]])) == 0
 
 
-def test_front_is_sorted() -> None:
-    values = [[3.0, 1.0], [1.0, 3.0], [2.0, 2.0], [2.0, 2.5]]
-    np.testing.assert_array_equal(metrics.front_of(values), [[1.0, 3.0], [2.0, 2.0], [3.0, 1.0]])
-    np.testing.assert_array_equal(
-        metrics.front_of(values, [True, False, False, True]), [[2.0, 2.5], [3.0, 1.0]]
-    )
-
-
 def test_igd_is_the_mean_euclidean_distance() -> None:
     reference = [[0.0, 0.0], [3.0, 4.0], [0.0, 2.0]]
     # Distances to (0, 0): 0, 5, 2.
@@ -118,13 +110,6 @@ def test_spacing_by_hand() -> None:
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_spacing_needs_three_points(count: int) -> None:
     assert math.isnan(metrics.spacing(np.zeros((count, 2))))
-
-
-def test_normalise() -> None:
-    values = metrics.normalise([[2.0, -1.0], [6.0, 3.0]], [2.0, 1.0], [4.0, 2.0])
-    np.testing.assert_array_equal(values, [[0.0, -2.0], [2.0, 2.0]])
-    with pytest.raises(ValueError, match="must exceed"):
-        metrics.normalise([[0.0, 0.0]], [0.0, 1.0], [1.0, 1.0])
 
 
 def test_feasible_figures() -> None:

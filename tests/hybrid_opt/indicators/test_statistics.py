@@ -60,11 +60,6 @@ def test_ten_against_ten_at_five_percent(u: int, level: float, significant: int)
     assert (test.p < level) == bool(significant)
 
 
-@pytest.mark.parametrize(("u", "significant"), [(84, True), (83, False)])
-def test_ten_against_ten_at_one_percent(u: int, significant: bool) -> None:
-    assert (rank_test(*separated(u)).p < 0.01) == significant
-
-
 @given(samples.filter(lambda x: len(x) > 1), samples.filter(lambda x: len(x) > 1))
 @settings(max_examples=40, deadline=None)
 def test_exact_p_with_ties_is_that_of_all_permutations(x: list[float], y: list[float]) -> None:
@@ -113,14 +108,6 @@ def test_a_family_is_corrected_together() -> None:
     assert family[0].p_holm == pytest.approx(2.0 * tests[0].p)
     assert family[1].p_holm == pytest.approx(tests[1].p)
     assert family[0].p == tests[0].p
-
-
-def test_attainment_of_two_crossing_fronts() -> None:
-    fronts = [np.array([[0.0, 2.0], [2.0, 1.0]]), np.array([[1.0, 0.0]]), np.empty((0, 2))]
-    any_one, two, all_three = attainment_surfaces(fronts, (100 / 3, 200 / 3, 100.0))
-    np.testing.assert_array_equal(any_one.points, [[0.0, 2.0], [1.0, 0.0]])
-    np.testing.assert_array_equal(two.points, [[1.0, 2.0], [2.0, 1.0]])
-    assert len(all_three.points) == 0
 
 
 @given(

@@ -47,13 +47,6 @@ def test_turbulence_strikes_one_coordinate_within_its_reach() -> None:
     assert (reach > 0.149 * (upper - lower)).all()
 
 
-def test_turbulence_stays_inside_the_bounds() -> None:
-    position = rng(1).choice([0.0, 1.0], size=(500, 4))
-    moved = turbulence(position, np.zeros(4), np.ones(4), 1.0, rng(2))
-    assert ((moved >= 0.0) & (moved <= 1.0)).all()
-    assert (moved != position).any(axis=1).all()
-
-
 @pytest.mark.parametrize(
     ("point", "violation", "best", "best_violation", "share"),
     [
@@ -92,10 +85,6 @@ def test_hypercubes_of_a_hand_made_case() -> None:
     assert cubes[0] == cubes[1]
     assert cubes[3] == cubes[4]
     assert len(set(cubes)) == 3
-
-
-def test_hypercubes_without_extent() -> None:
-    np.testing.assert_array_equal(hypercubes(np.ones((4, 2)), 30), np.zeros(4))
 
 
 @given(
@@ -185,13 +174,6 @@ def test_swarm_flies_between_its_place_and_the_leader() -> None:
     assert ((flown >= low) & (flown <= high)).all()
     fraction = (flown - place) / np.where(leader == place, 1.0, leader - place)
     assert fraction.mean() == pytest.approx(0.5, abs=0.08)
-
-
-def test_a_swarm_without_forces_rests() -> None:
-    still = {"inertia": 0.4, "cognitive": 0.0, "social": 0.0, "mutation_share": 0.0, "swarm": 10}
-    decisions = search(ZDT1(), make("mopso", still), 30, 1).evaluated.decisions
-    np.testing.assert_array_equal(decisions[:10], decisions[10:20])
-    np.testing.assert_array_equal(decisions[:10], decisions[20:])
 
 
 def test_turbulence_fades_over_the_horizon() -> None:

@@ -67,13 +67,6 @@ def test_no_figure_that_is_not_finite_gets_out(figure: str, value: float, handli
     np.testing.assert_array_equal(found.feasible, np.isnan(found.position))
 
 
-def test_sound_verdicts_are_left_as_they_are() -> None:
-    x = RNG.random((40, 4))
-    x[:, 0] = 0.5
-    found = verdicts(x)
-    assert disarmed(found) is found
-
-
 def test_disarmed_candidates_are_worst_and_say_why() -> None:
     x = np.array([[0.31, 0.5, 0.5, 0.5], [0.5, 0.5, 0.5, 0.5]])
     before = verdicts(x)

@@ -53,9 +53,3 @@ def test_widths_do_not_depend_on_the_number_of_samples(samples: int) -> None:
     for width in (0.015, 0.04, 0.08):
         assert grid.places(width) * spacing == pytest.approx(width, abs=spacing)
     np.testing.assert_allclose(grid.parameter[:: grid.per_sample], grid.sample_parameter)
-
-
-def test_rates_are_derivatives_of_positions() -> None:
-    grid = Grid(hand_cell().task)
-    slope = np.gradient(grid.basis, grid.parameter, axis=0)
-    np.testing.assert_allclose(slope[1:-1], grid.rate_basis[1:-1], atol=1e-2)

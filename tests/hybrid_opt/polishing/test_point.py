@@ -11,16 +11,6 @@ from hybrid_opt.polishing.point import LARGEST, TrustRegion
 LEAST = 1e-3
 
 
-def test_a_step_that_taught_something_is_repeated_at_the_same_radius() -> None:
-    region = TrustRegion(0.5, LEAST)
-    region.refused(learned=True)
-    assert region.radius == 0.5
-    region.refused(learned=False)
-    assert region.radius == 0.25
-    region.refused(learned=False, length=0.1)
-    assert region.radius == 0.05
-
-
 def test_it_grows_after_two_steps_in_a_row_that_it_stopped() -> None:
     region = TrustRegion(0.5, LEAST)
     region.taken(0.5)
@@ -30,15 +20,6 @@ def test_it_grows_after_two_steps_in_a_row_that_it_stopped() -> None:
     region.refused(learned=True)
     region.taken(1.0)
     assert region.radius == 1.0
-
-
-def test_it_does_not_grow_after_steps_that_end_inside() -> None:
-    region = TrustRegion(0.5, LEAST)
-    for _ in range(3):
-        region.taken(0.1)
-    assert region.radius == 0.5
-    assert not region.holds(0.1)
-    assert region.holds(0.5)
 
 
 def test_a_promised_gain_tells_at_once_whether_the_model_holds() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.evaluate.evaluations import COLLISION, REASONS
-from hybrid_opt.polishing.force_front import FAR, better_half, halve
+from hybrid_opt.polishing.force_front import FAR, better_half
 from hybrid_opt.polishing.starts import (
     AWAY,
     LEAST_TURN,
@@ -44,18 +44,6 @@ def test_a_kick_is_feasible_far_away_and_the_same_for_the_same_seed() -> None:
         moved = np.abs(candidate - x) / (evaluator().upper - evaluator().lower)
         assert moved.max() > AWAY
         assert (moved == 0.0).sum() > evaluator().n_var / 2
-
-
-def test_more_candidates_are_no_worse() -> None:
-    x = initial_decision(evaluator().workcell.task)
-    found = kicked(evaluator(), x, 0, np.random.default_rng(4), candidates=400, away=0.0)
-    assert found is not None
-    assert found[1][0] <= evaluator().evaluate(x).objectives[0, 0]
-
-
-def test_where_nothing_else_is_feasible_there_is_none() -> None:
-    x, rng = evaluator().lower, np.random.default_rng(0)
-    assert kicked(evaluator(), x, 0, rng, candidates=3, share=0.0) is None
 
 
 def test_random_starts_are_feasible_and_the_same_for_the_same_seed() -> None:
@@ -97,20 +85,6 @@ def test_the_better_half_is_no_worse_than_the_rest(
     rest = [start for start in starts if all(start is not kept for kept in half)]
     for kept in half:
         assert all(kept.value(objective) <= other.value(objective) for other in rest)
-
-
-def test_starts_that_came_no_further_are_not_solved_again_and_stay_in_the_running() -> None:
-    solved: list[float] = []
-
-    def solve(start: Start) -> Start:
-        value = start.value(0)
-        solved.append(value)
-        gain = 0.0 if value == 1.0 else 0.5
-        return Start(start.x, start.objectives - gain, spent=gain == 0.0)
-
-    pool = [Start(np.empty(0), np.array([value, 0.0])) for value in (1.0, 4.0, 2.0, 3.0)]
-    halve(pool, 0, solve)
-    assert solved == [1.0, 4.0, 2.0, 3.0, 1.5]
 
 
 def test_what_probes_reach_is_given_up_only_where_the_front_is_nearly_as_good() -> None:

@@ -54,11 +54,3 @@ def test_a_path_that_cannot_be_left_is_a_failure() -> None:
     limits = rows(50, (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0), (0.0, -1.0, -0.5))
     found = fastest_speed(limits, np.linspace(0.0, 1.0, 51))
     assert isinstance(found, SolverFailure)
-
-
-def test_the_logger_is_left_as_it_was() -> None:
-    logger = logging.getLogger("toppra")
-    logger.setLevel(logging.INFO)
-    fastest_speed(rows(20, (1.0, 0.0, 1.0), (-1.0, 0.0, 1.0)), np.linspace(0.0, 1.0, 21))
-    assert logger.level == logging.INFO
-    logger.setLevel(logging.NOTSET)

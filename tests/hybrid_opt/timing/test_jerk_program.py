@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from hybrid_opt.timing.jerk_program import SUPPORT, Point, Rows
+from hybrid_opt.timing.jerk_program import Point, Rows
 from hybrid_opt.timing.path_motion import PathMotion
 from symbolic.array import Array
 
@@ -39,14 +39,6 @@ def spread(local: Array, first: NDArray[np.intp]) -> Array:
     for row, column in enumerate(first):
         found[row, ..., column : column + local.shape[-1]] = local[row]
     return found
-
-
-def test_all_that_is_not_zero_is_local() -> None:
-    at = spline_point()
-    for values in (at.value, at.squared_by, at.acceleration_by, at.joint_jerk_by):
-        local = at.local(values)
-        assert local.shape[-1] == SUPPORT
-        np.testing.assert_array_equal(spread(local, at.first_basis), values)
 
 
 def test_rows_are_those_of_full_matrices() -> None:

@@ -26,12 +26,6 @@ def test_rows_allow_rest_and_touch_the_value_where_they_are_made() -> None:
     assert 100 < raised.sum() < 1400
 
 
-def test_standing_still_they_leave_half_of_what_is_free() -> None:
-    one = np.ones((1, 1))
-    rows = linearised_rows(0.9 * one, np.ones((1, 1, 2)), 0.2 * one, np.zeros((1, 2)))
-    assert rows.bound[0, 0] == 0.4
-
-
 def test_a_tilted_path_whose_patches_rest_nearly_uses_up_is_timed() -> None:
     """Rows whose bounds were raised cut nothing off there: 25 iterations came to one timing."""
     x = np.zeros((3, 6))

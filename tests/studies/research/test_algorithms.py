@@ -37,22 +37,6 @@ def test_verdicts(
 ARGUMENTS = ["--seeds", "2", "--evaluations", "200", "--problems", "tnk", "shifted-zdt1"]
 
 
-def test_table(capsys: pytest.CaptureFixture[str]) -> None:
-    assert algorithms.main(ARGUMENTS) == 0
-    printed = capsys.readouterr()
-    assert "shifted-zdt1, 1000 evaluations, population 40" in printed.out
-    assert "infeasible members of final fronts: 0" in printed.out
-    assert printed.err.splitlines()[-1].startswith("4/4 shifted-zdt1 1000 nsga2")
-
-
-def test_bands_hold_for_their_population_only(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--seeds", "2", "--evaluations", "1000", "--problems", "srn"]
-    assert algorithms.main(arguments) == 0
-    assert "mopso against the bands" in capsys.readouterr().out
-    assert algorithms.main([*arguments, "--population", "40"]) == 0
-    assert "mopso against the bands" not in capsys.readouterr().out
-
-
 def test_json_repeats_to_the_digit(capsys: pytest.CaptureFixture[str]) -> None:
     documents = []
     for _ in range(2):

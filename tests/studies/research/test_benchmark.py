@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from studies.research import benchmark, costs, study_costs, turns
+from studies.research import benchmark, costs, turns
 from studies.research.costs import report
 from studies.research.turns import SLICE, Evaluate, interleaved, summary
 from symbolic.array import Array
@@ -131,20 +131,3 @@ def test_wrong_numbers_give_one_message_and_a_code(
 def test_a_missing_cell_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert benchmark.main(["missing.toml"]) == 2
     assert "missing.toml" in capsys.readouterr().err
-
-
-def test_parts_of_a_study_are_rooms_and_libraries() -> None:
-    root = study_costs._ROOT
-    assert study_costs._part(str(root / "hybrid_opt/collision/judge.py"), "") == (
-        "hybrid_opt/collision"
-    )
-    assert study_costs._part("/x/site-packages/pymoo/core/problem.py", "") == "pymoo"
-    assert study_costs._part("", "<built-in method _casadi.Function_call>") == "casadi"
-    assert study_costs._part("", "<built-in method builtins.len>") == "python"
-
-
-def test_a_stage_s_parts_sum_to_its_time() -> None:
-    stage = study_costs._timed("busy", lambda: busy(300.0)(np.zeros(1)))
-    assert stage.seconds == pytest.approx(0.3, rel=0.1)
-    assert sum(stage.parts.values()) == pytest.approx(0.3, rel=0.2)
-    assert study_costs.study_table((stage,)).startswith("busy: 0.3")

@@ -154,14 +154,6 @@ def test_a_broken_constraint_is_named(constraint: str, cell: Workcell) -> None:
     assert_agree(outputs, PlainEvaluator(cell, model.start)(x))
 
 
-def test_the_initial_trajectory_of_the_hand_cell_breaks_nothing() -> None:
-    cell = hand_cell()
-    outputs = interpreted(hand_model(cell))(cell.task.initial.reshape(-1))
-    assert verdict(outputs) == ((), "")
-    assert not outputs["violation"].any()
-    assert not outputs["violation_time"].any()
-
-
 # --- physics of a whole carry ---
 
 

@@ -54,18 +54,6 @@ def test_candidates_are_those_of_the_plain_reference(pandas: CellModel) -> None:
             )
 
 
-def test_a_redundant_joint_is_where_its_spline_has_it(pandas: CellModel) -> None:
-    task = pandas.workcell.task
-    x = initial_decision(task)
-    x[task.n_box :] = [0.0, 0.2, 0.5, 0.3, 0.1, -0.2]
-    found = outputs(pandas, x)
-    for name, values in (("q_1", x[6:9]), ("q_2", x[9:])):
-        column = found[name][:, 2]
-        assert column[[0, -1]] == pytest.approx(values[[0, -1]], abs=1e-12)
-        middle = np.interp(0.5, np.linspace(0, 1, len(column)), column)
-        assert middle == pytest.approx(values[1], abs=0.02)
-
-
 @pytest.mark.parametrize("angle", [0.1, -0.35])
 def test_a_constant_redundant_joint_is_a_locked_one(tmp_path: Path, angle: float) -> None:
     free = build_cell_model(free_pandas(tmp_path, f"initial = {angle}"))

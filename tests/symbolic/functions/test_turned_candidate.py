@@ -45,15 +45,6 @@ def test_candidates_are_those_of_the_plain_reference(time_law: TimeLaw) -> None:
             )
 
 
-def test_the_box_arrives_upside_down() -> None:
-    cell = turned_cell()
-    pose = candidate(cell, random_x(cell, 1))["pose"]
-    turned = box_rotation(cell.task.orientation, pose)
-    np.testing.assert_allclose(turned[0], np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(turned[-1], np.diag([-1.0, 1.0, -1.0]), atol=1e-12)
-    assert np.abs(turned[:, 1, 1] - 1.0).max() > 1e-4, "waypoints tilt the axis it is turned about"
-
-
 def test_about_one_axis_it_is_the_carry_of_roll_pitch_yaw() -> None:
     cell, other = turned_cell(about_one_axis=True), pitched_cell()
     x = random_x(cell, 2)

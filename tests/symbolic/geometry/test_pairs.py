@@ -31,7 +31,6 @@ from tests.symbolic.geometry.collision_cells import (
     placed_pieces,
     rack,
     random_configurations,
-    ur10_cell,
 )
 from tests.symbolic.read.samples import RACK
 
@@ -83,16 +82,6 @@ def _support(item: pin.GeometryObject, T: Array, u: Array) -> Array:
         vertices = np.asarray(shape.vertices())
         piece = Piece(Hull(vertices, np.zeros((0, 3), dtype=np.int64)), T)
     return support(piece, u)
-
-
-def test_every_pair_is_listed_once() -> None:
-    for name in ("rack", "ur10"):
-        geometry = geometry_of(name)
-        n = len(geometry.bodies)
-        listed = [(pair.first, pair.second) for pair in geometry.active]
-        listed += [(pair.first, pair.second) for pair in geometry.excluded]
-        assert len(listed) == len(set(listed)) == n * (n - 1) // 2
-        assert all(pair.reason for pair in geometry.excluded)
 
 
 @pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
@@ -223,24 +212,6 @@ def test_more_pieces_than_allowed_are_told() -> None:
     few = replace(rack(), collision=CollisionSettings(most_pieces=20))
     with pytest.raises(CollisionModelError, match=r"allowed are 20.*raise collision.most_pieces"):
         collision_bodies(few)
-
-
-def test_the_ur10_has_bodies_for_all_its_links() -> None:
-    names = [body.name for body in collision_bodies(ur10_cell()) if body.group == "robot 1"]
-    assert names == [
-        f"left/{link}"
-        for link in (
-            "base_link",
-            "shoulder_link",
-            "upper_arm_link",
-            "forearm_link",
-            "wrist_1_link",
-            "wrist_2_link",
-            "wrist_3_link",
-            "ee_link",
-            "pad",
-        )
-    ]
 
 
 def test_a_tool_that_enters_the_payload_is_told_by_name() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from studies.research.plain.motion import evaluate_spline, natural_quintic, waypoints
 from symbolic.array import Array
-from symbolic.path.spline import path_basis, sample_basis, waypoint_matrix
+from symbolic.path.spline import path_basis, waypoint_matrix
 from symbolic.records import Task, Waypoint
 from tests.symbolic.cells import fixed, free, hand_cell, with_task
 
@@ -41,12 +41,6 @@ def test_agrees_with_the_conditions_solved_one_by_one(count: int) -> None:
     for order, matrix in enumerate((basis.position, basis.first, basis.second)):
         expected = [evaluate_spline(spline, u, order) for u in PARAMETER]
         np.testing.assert_allclose(matrix @ points, expected, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("count", range(2, 11))
-def test_passes_through_every_waypoint(count: int) -> None:
-    basis = path_basis(count, np.linspace(0.0, 1.0, count))
-    np.testing.assert_allclose(basis.position, np.eye(count), atol=1e-12)
 
 
 @pytest.mark.parametrize("count", range(3, 11))
@@ -88,24 +82,6 @@ def test_is_four_times_continuously_differentiable_and_natural_at_the_ends(count
         np.testing.assert_allclose(derivative(pieces[-1], 1.0, order), 0.0, atol=1e-8 * scale)
 
 
-def test_two_waypoints_make_a_straight_line_at_constant_rate() -> None:
-    basis = path_basis(2, PARAMETER)
-    points = random_points(2)
-    np.testing.assert_allclose(
-        basis.position @ points, points[0] + np.outer(PARAMETER, points[1] - points[0]), atol=1e-15
-    )
-    np.testing.assert_allclose(basis.first @ points, np.tile(points[1] - points[0], (41, 1)))
-    assert not basis.second.any()
-
-
-def test_three_waypoints_make_the_parabola_through_them() -> None:
-    """A parabola has no jerk at all, so it is the natural quintic spline of three points."""
-    points = random_points(3)
-    parabola = np.polynomial.polynomial.polyfit([0.0, 0.5, 1.0], points, 2)
-    expected = np.polynomial.polynomial.polyval(PARAMETER, parabola).T
-    np.testing.assert_allclose(path_basis(3, PARAMETER).position @ points, expected, atol=1e-12)
-
-
 def integrated_squared_jerk(values: Array, parameter: Array) -> float:
     jerk = np.diff(values, 3) / (parameter[1] - parameter[0]) ** 3
     return float(np.sum(jerk**2) * (parameter[1] - parameter[0]))
@@ -129,25 +105,6 @@ def test_has_the_least_jerk_of_all_curves_through_the_waypoints(
     least = integrated_squared_jerk(curve, fine)
     for sign in (-1.0, 1.0):
         assert integrated_squared_jerk(curve + sign * size * perturbation, fine) > least
-
-
-@given(seed=st.integers(0, 2**31), factor=st.floats(-3.0, 3.0))
-@settings(max_examples=30, deadline=None)
-def test_is_linear_and_carries_translations_along(seed: int, factor: float) -> None:
-    rng = np.random.default_rng(seed)
-    first, second, shift = rng.normal(size=(5, 6)), rng.normal(size=(5, 6)), rng.normal(size=6)
-    position = path_basis(5, PARAMETER).position
-    np.testing.assert_allclose(
-        position @ (first + factor * second),
-        position @ first + factor * (position @ second),
-        atol=1e-11,
-    )
-    np.testing.assert_allclose(position @ (first + shift), position @ first + shift, atol=1e-11)
-
-
-def test_basis_is_read_only() -> None:
-    with pytest.raises(ValueError, match="read-only"):
-        sample_basis(hand_cell().task).position[0, 0] = 1.0
 
 
 @pytest.mark.parametrize("count", range(1, 9))

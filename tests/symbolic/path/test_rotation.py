@@ -14,7 +14,6 @@ from symbolic.array import Array
 from symbolic.path.rotation import (
     angular_acceleration,
     angular_velocity,
-    rate_matrix,
     rotation_matrix,
 )
 from symbolic.records.poses import Orientation, box_placement, box_rotation, rotation_from_rpy
@@ -101,28 +100,6 @@ def test_the_derivatives_of_a_rotation_vector_hold_at_and_near_zero(
         rotation, velocity, _ = rates(size * vector, rate, rate, OF_PLAIN_VECTORS)
         np.testing.assert_allclose(rotation, np.eye(3), atol=8 * size)
         np.testing.assert_allclose(velocity, rate, atol=50 * size + TINY)
-
-
-@given(axis=st.integers(0, 2), angle=angle, rate=angle, second=angle)
-@settings(max_examples=50, deadline=None)
-def test_about_a_single_axis_both_charts_agree(
-    axis: int, angle: float, rate: float, second: float
-) -> None:
-    along = np.eye(3)[axis]
-    of_angles, of_vectors = (
-        rates(angle * along, rate * along, second * along, chart)
-        for chart in (OF_ANGLES, OF_PLAIN_VECTORS)
-    )
-    for one, other in zip(of_angles, of_vectors, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-13)
-
-
-def test_the_rotation_vector_passes_where_pitch_is_singular() -> None:
-    up, rate, none = np.array([0.0, np.pi / 2.0, 0.0]), np.array([0.3, 0.2, 0.1]), np.zeros(3)
-    assert abs(np.linalg.det(np.array(ca.DM(rate_matrix(ca.DM(up)))))) < 1e-15
-    turned = np.array([rates(up, row, none, OF_PLAIN_VECTORS)[1] for row in np.eye(3)])
-    assert np.linalg.det(turned) == pytest.approx(4.0 * 2.0 / np.pi**2)
-    assert np.linalg.norm(rates(up, rate, none, OF_PLAIN_VECTORS)[1]) > 0.1
 
 
 @given(rpy=angles, xyz=angles)

@@ -182,22 +182,6 @@ def test_ramped_law_cruises_at_the_reference_speed_and_never_exceeds_it() -> Non
     assert speed.max() <= task.reference_speed * (1 + 1e-9)
 
 
-def test_ramped_speed_follows_the_smooth_step_in_time() -> None:
-    task = task_through(np.zeros(6), [1.0, 0, 0, 0, 0, 0], time_law="ramped", samples=400)
-    result = timed(task)
-    tau = np.clip(result["time"] / task.ramp_time, 0.0, 1.0)
-    rising = result["time"] <= task.ramp_time
-    expected = task.reference_speed * (3 * tau**2 - 2 * tau**3)
-    np.testing.assert_allclose(result["rate"][rising, 0], expected[rising], atol=1e-9)
-
-
-def test_ramped_law_is_symmetric_in_time_on_a_straight_line() -> None:
-    result = timed(task_through(np.zeros(6), [0.6, 0.3, 0, 0, 0, 0.1], time_law="ramped"))
-    np.testing.assert_allclose(result["time"], result["time"][-1] - result["time"][::-1], atol=1e-9)
-    np.testing.assert_allclose(result["rate"], result["rate"][::-1], atol=1e-9)
-    np.testing.assert_allclose(result["second_rate"], -result["second_rate"][::-1], atol=1e-7)
-
-
 def test_a_short_path_never_reaches_the_cruise_speed() -> None:
     """Two ramps back to back: twice the ramp time, peak speed length over ramp time."""
     length = 0.05

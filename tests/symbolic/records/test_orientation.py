@@ -11,7 +11,6 @@ from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
 from symbolic.records.poses import Orientation, rotation_from_rpy
 from symbolic.records.task import extended_waypoints, variable_names
-from tests.symbolic.read.samples import RACK
 from tests.turned_cells import turned_transfer
 
 
@@ -20,12 +19,6 @@ def changed(folder: Path, *lines: str) -> Path:
     path = turned_transfer(folder).source
     path.write_text(path.read_text().replace("[task]\n", "\n".join(["[task]", *lines, ""])))
     return path
-
-
-def test_roll_pitch_yaw_is_the_default() -> None:
-    orientation = load(RACK).task.orientation
-    assert orientation.rotation == "roll-pitch-yaw"
-    assert orientation.components == ("roll", "pitch", "yaw")
 
 
 def test_rotation_vectors_count_from_their_reference(tmp_path: Path) -> None:

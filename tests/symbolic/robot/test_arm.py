@@ -16,19 +16,14 @@ from scipy.spatial.transform import Rotation
 from studies.research.plain.arm import PlainArm
 from studies.research.plain.motion import rotation
 from symbolic.array import Array
-from symbolic.path.rotation import rotation_matrix
-from symbolic.records.poses import Orientation
 from symbolic.robot.arm import (
     CHEAP_STEPS,
     MAX_JOINT_STEP,
     NEWTON_STEPS,
     REACH_TOLERANCE,
     block_step,
-    flange_target,
     follow_function,
     joint_torque,
-    limit_margin,
-    manipulability,
     newton_step,
     pose_error,
     track_function,
@@ -65,21 +60,6 @@ def box_pose(arm: PlainArm, q: Array) -> Array:
 def random_posture(rng: np.random.Generator, margin: float = 0.2) -> Array:
     robot = CELL.robots[0]
     return rng.uniform(robot.position_lower + margin, robot.position_upper - margin)
-
-
-@pytest.mark.parametrize("arm", [0, 1])
-def test_flange_target_puts_the_pad_on_its_contact(arm: int) -> None:
-    rng = np.random.default_rng(arm)
-    position, rpy = ca.SX.sym("position", 3), ca.SX.sym("rpy", 3)
-    rotation = rotation_matrix(Orientation(), rpy)
-    R, p = flange_target(CELL.robots[arm], CELL.contacts[arm], position, rotation)
-    function = ca.Function("target", [position, rpy], [R, p])
-    for _ in range(20):
-        pose = np.concatenate([rng.uniform(-1, 1, 3), rng.uniform(-3, 3, 3)])
-        R_value, p_value = (np.array(v) for v in function(pose[:3], pose[3:]))
-        expected = ARMS[arm].flange_target(pose)
-        np.testing.assert_allclose(R_value, expected.rotation, atol=1e-14)
-        np.testing.assert_allclose(p_value[:, 0], expected.translation, atol=1e-14)
 
 
 @given(axis=st.integers(0, 2), angle=st.floats(-np.pi, np.pi), shift=st.floats(-1.0, 1.0))
@@ -136,26 +116,6 @@ def test_ten_thousand_random_poses_are_never_wrongly_reported_as_reached() -> No
     for q, target, claimed in zip(found.T, targets, residual[0], strict=True):
         actual = ARMS[0].residual(q, target)
         assert actual == pytest.approx(claimed, abs=1e-11, rel=1e-6)
-
-
-def test_limit_margin_is_the_least_distance_to_a_limit() -> None:
-    robot = CELL.robots[0]
-    margin = ca.Function("margin", [_q], [limit_margin(robot, _q)])
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        q = rng.uniform(-6.0, 6.0, 6)
-        expected = np.min([q - robot.position_lower, robot.position_upper - q])
-        assert float(margin(q)) == pytest.approx(expected, abs=1e-15)
-
-
-def test_manipulability_is_the_size_of_the_jacobian_determinant() -> None:
-    measure = ca.Function("measure", [_q], [manipulability(gofa_model().jacobian(_q))])
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        q = random_posture(rng)
-        ARMS[0].place(q)
-        expected = abs(np.linalg.det(ARMS[0].jacobian(q)))
-        assert float(measure(q)) == pytest.approx(expected, rel=1e-9, abs=1e-13)
 
 
 @pytest.mark.parametrize("arm", [0, 1])
@@ -248,15 +208,6 @@ def test_a_jump_to_another_branch_counts_as_lost() -> None:
     result = call(track, np.concatenate([previous, change, np.zeros(7)]), pose, np.zeros(6))
     assert result["lost"][0] == 1.0
     np.testing.assert_array_equal(result["q"], previous)
-
-
-def test_agrees_with_the_plain_arm() -> None:
-    start, poses = straight_path(1, np.array([-0.4, 0.05, 0.8, 0.1, 0.1, -0.1]))
-    wrenches = np.random.default_rng(0).normal(size=(40, 6)) * 30.0
-    follow = follow_function(CELL.robots[1], gofa_model(), CELL.contacts[1], 40, "follow")
-    expected = ARMS[1].follow(start, poses, wrenches)
-    for name, value in call(follow, start, poses, wrenches).items():
-        np.testing.assert_allclose(value, expected[name], atol=1e-8, rtol=1e-8, err_msg=name)
 
 
 def test_a_step_by_blocks_is_newtons() -> None:

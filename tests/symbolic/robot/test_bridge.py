@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Iterator
 from types import ModuleType, SimpleNamespace
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -121,18 +120,6 @@ def test_inverse_dynamics(case: Case, seed: int) -> None:
     expected = pin.rnea(case.model, case.data, q, v, a)
     scale = 1 + np.abs(expected).max()
     assert_allclose(torque, expected, rtol=0, atol=TOLERANCE * scale)
-
-
-def test_outputs_are_dense(case: Case) -> None:
-    for function in (case.kinematics, case.drift, case.joint_placements, case.inverse_dynamics):
-        assert all(function.sparsity_out(i).is_dense() for i in range(function.n_out()))
-
-
-def test_functions_take_mx(case: Case) -> None:
-    q, v, a = case.state(0)
-    symbols = [ca.MX.sym(name, len(value)) for name, value in (("q", q), ("v", v), ("a", a))]
-    wrapped = ca.Function("wrapped", symbols, [case.inverse_dynamics(*symbols)])
-    assert_allclose(np.array(wrapped(q, v, a)), np.array(case.inverse_dynamics(q, v, a)))
 
 
 def test_frame_that_does_not_exist() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from symbolic.read.arms import flange_problem, reduced_model, structure_problem
+from symbolic.read.arms import reduced_model
 from symbolic.read.urdf import read_urdf
 from tests.symbolic.read.samples import GOFA
 
@@ -34,11 +34,6 @@ def flange_pose(model: pin.Model, q: np.ndarray) -> pin.SE3:
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     return data.oMf[model.getFrameId("tool0")]
-
-
-def test_is_a_serial_arm_with_its_flange(model: pin.Model) -> None:
-    assert structure_problem(model) == ""
-    assert flange_problem(model, "tool0") == ""
 
 
 @pytest.mark.parametrize(("degrees", "position"), FLANGE_POSITIONS)
@@ -89,12 +84,6 @@ def test_gravity_torque_at_full_stretch_with_payload(model: pin.Model) -> None:
     torque = np.abs(gravity + jacobian[:3].T @ [0, 0, 12 * 9.81])
     np.testing.assert_allclose(torque[[1, 2, 4]], [367, 126, 16], atol=0.5)
     assert np.all(torque < model.effortLimit)
-
-
-def test_every_link_has_a_shape() -> None:
-    content = read_urdf(GOFA)
-    assert content.collision_links == ("base_link", *(f"link_{i}" for i in range(1, 7)))
-    assert content.collision_meshes == content.visual_meshes == ()
 
 
 def test_forearm_and_upper_arm_stand_on_opposite_sides(model: pin.Model) -> None:

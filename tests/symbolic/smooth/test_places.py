@@ -206,25 +206,3 @@ def test_joint_rows_are_their_definitions(arm: int) -> None:
     value = value_of(Reach(arm), pose, STILL, *q)
     assert value == pytest.approx(share**2 - 1.0, rel=1e-9)
     assert float(manipulability(jacobian)) == pytest.approx(abs(np.linalg.det(jacobian)))
-
-
-def test_members_of_a_family_share_their_functions() -> None:
-    a, b = (row_function(place(), JointLimit(0, k, "upper"), "first") for k in (1, 4))
-    assert a.name() == b.name()
-    assert a.n_instructions() == b.n_instructions()
-    first, second = (row_function(place(), Reach(arm), "first") for arm in (0, 1))
-    assert first.name() != second.name()
-
-
-def test_rows_know_their_arms() -> None:
-    names = model().geometry.pair_names
-    for index, pair in enumerate(names):
-        expected = tuple(
-            arm
-            for arm, robot in enumerate(model().workcell.robots)
-            if any(
-                name.startswith(f"{robot.name}/") and not name.endswith("base_link")
-                for name in pair
-            )
-        )
-        assert Clearance(index).arms(model()) == expected

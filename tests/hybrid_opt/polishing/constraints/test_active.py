@@ -58,21 +58,6 @@ def test_what_a_step_taught_counts_as_far_as_the_box_reaches(radius: float, shar
     assert required(known, radius) == pytest.approx({NEAR: 1.0, FAR: 1.0 + 2.0 * share})
 
 
-def test_what_was_taught_already_is_nothing_new() -> None:
-    """However little of it a small box was asked for."""
-    known = memory()
-    known.refuse(NOTHING, NOTHING, THERE, [FAR], {})
-    assert not known.refuse(NOTHING, NOTHING, THERE, [FAR], required(known, 0.01))
-    assert known.refuse(NOTHING, NOTHING, THERE, [GAP], required(known, 0.01))
-
-
-def test_a_move_forgets_what_was_relative_to_the_candidate_left_behind() -> None:
-    known = memory()
-    known.refuse(NOTHING, NOTHING, THERE, [FAR, GAP], {})
-    known.move(is_short=True)
-    assert set(required(known)) == {NEAR, FAR}
-
-
 def test_rows_that_pressed_stay_for_some_programs_while_steps_are_short() -> None:
     known = memory()
     known.press([FAR])

@@ -29,17 +29,6 @@ def test_where_an_edge_is_passed_there_is_one_kink(kink: float, height: float) -
     assert row == PlaceRow(Passing(7, 0, 1), place)
 
 
-def test_a_kink_that_stays_away_is_none() -> None:
-    assert edges(Gaps.of(np.full((PLACES, 3), 0.2)), LOW) == []
-    assert edges(v_shape(50.0, 0.2), LOW) == []
-
-
-def test_a_change_of_direction_that_is_no_dip_is_no_kink() -> None:
-    away = np.arange(PLACES) - 60.0
-    both_rise = np.column_stack([0.02 + 1e-4 * away, 0.02 + 2e-4 * away])
-    assert edges(Gaps.of(both_rise), LOW) == []
-
-
 def test_a_separation_is_of_the_largest_gap() -> None:
     gaps = v_shape(50.4, 0.01)
     assert separation(3, gaps, 20) == PlaceRow(Separation(3, 0), 20)

@@ -232,14 +232,3 @@ def test_multipliers_of_an_optimum_are_found() -> None:
     np.testing.assert_allclose(y, [1.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(bounds, [0.0, 1.0], atol=1e-9)
     np.testing.assert_allclose(cost - A.T @ y + bounds, 0.0, atol=1e-9)
-
-
-def test_what_is_far_from_its_limit_has_no_multiplier() -> None:
-    cost, A, far = np.array([-1.0, 0.0]), np.array([[-1.0, 0.0]]), np.full(2, 5.0)
-    bounds, y = estimated(cost, A, (np.array([2.0]), far, far))
-    assert not bounds.any()
-    assert not y.any()
-    # A bound far away takes nothing over from a row that is near.
-    bounds, y = estimated(cost, A, (np.array([0.0]), far, far))
-    assert not bounds.any()
-    assert y == pytest.approx([1.0])
