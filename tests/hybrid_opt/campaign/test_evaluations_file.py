@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -53,7 +53,6 @@ def test_files_from_before_a_reason_was_added_are_read() -> None:
     np.testing.assert_array_equal(after.reason, before.evaluations.reason)
 
 
-@settings(max_examples=50)
 @given(hnp.arrays(np.float64, (2, 4), elements=st.floats(allow_nan=False, allow_infinity=False)))
 def test_any_number_survives(x: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> None:
     found = verdicts(np.full((2, 4), 0.5))

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.campaign.journal import (
@@ -59,7 +59,6 @@ def test_blocks_of_another_problem_are_refused(n_var: int, n_obj: int) -> None:
         decode_generation(BLOCKS[0], n_var, n_obj)
 
 
-@settings(max_examples=60)
 @given(st.data())
 def test_cut_anywhere_keeps_the_whole_blocks(data: st.DataObject) -> None:
     with TemporaryDirectory() as folder:
@@ -74,7 +73,6 @@ def test_cut_anywhere_keeps_the_whole_blocks(data: st.DataObject) -> None:
         assert write(path, BLOCKS[kept:]) == whole
 
 
-@settings(max_examples=60)
 @given(st.data())
 def test_damage_anywhere_is_never_read(data: st.DataObject) -> None:
     with TemporaryDirectory() as folder:

@@ -9,7 +9,7 @@ from pathlib import Path
 import coal
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -213,7 +213,6 @@ def test_only_the_payload_is_kept_farther_for_displaced_pads() -> None:
     assert {0.001, 0.003} == set(np.round(geometry.tolerance, 6).tolist())
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.floats(-2e-5, 2e-5), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-3.0, 3.0))
 def test_touching_is_decided_alike_at_any_tilt(
     gap: float, roll: float, pitch: float, yaw: float

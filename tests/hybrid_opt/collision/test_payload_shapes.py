@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.collision.checker import RESTING_TOLERANCE
@@ -76,7 +76,6 @@ def test_the_mesh_is_more_than_one_piece_and_less_than_its_hull(tmp_path: Path) 
 
 
 @given(by=st.floats(1e-4, 5e-3), seed=st.integers(0, 2**31))
-@settings(max_examples=40, deadline=None)
 def test_shrinks_on_every_side(by: float, seed: int) -> None:
     """In every direction across a face by the length, or by more."""
     rng = np.random.default_rng(seed)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -22,7 +22,6 @@ from tests.symbolic.read.samples import RACK
 points = st.integers(1, 12).flatmap(
     lambda n: arrays(np.float64, (n, 2), elements=st.floats(0.0, 1.25, width=32))
 )
-modest = settings(max_examples=80, deadline=None)
 
 
 def dominates(a: Array, b: Array) -> bool:
@@ -39,7 +38,6 @@ def test_hypervolume_by_hand() -> None:
 
 
 @given(points, arrays(np.float64, 2, elements=st.floats(0.0, 1.25, width=32)))
-@modest
 def test_hypervolume_grows_by_points_not_dominated_only(front: Array, extra: Array) -> None:
     before = metrics.hypervolume(front)
     after = metrics.hypervolume(np.vstack([front, extra]))
@@ -49,7 +47,6 @@ def test_hypervolume_grows_by_points_not_dominated_only(front: Array, extra: Arr
 
 
 @given(points, st.integers(0, 1000))
-@modest
 def test_order_does_not_matter(front: Array, seed: int) -> None:
     order = np.random.default_rng(seed).permutation(len(front))
     reference = np.array([[0.0, 1.0], [0.4, 0.4], [1.0, 0.0]])
@@ -60,7 +57,6 @@ def test_order_does_not_matter(front: Array, seed: int) -> None:
 
 
 @given(points)
-@modest
 def test_non_dominated_is_the_definition(front: Array) -> None:
     feasible = front[:, 0] < 1.0
     mask = metrics.non_dominated(front, feasible)
@@ -91,7 +87,6 @@ def test_igd_is_the_mean_euclidean_distance() -> None:
 
 
 @given(points, points)
-@modest
 def test_igd_against_its_formula(front: Array, reference: Array) -> None:
     difference = front[None] - reference[:, None]
     distance = np.linalg.norm(difference, axis=2).min(axis=1).mean()
@@ -126,7 +121,6 @@ def test_best_so_far() -> None:
 
 
 @given(points, st.data())
-@modest
 def test_hypervolume_history_is_that_of_each_prefix(front: Array, data: st.DataObject) -> None:
     feasible = np.array(
         data.draw(st.lists(st.booleans(), min_size=len(front), max_size=len(front)))

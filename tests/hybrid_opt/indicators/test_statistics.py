@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import PermutationMethod, mannwhitneyu
 
@@ -61,7 +61,6 @@ def test_ten_against_ten_at_five_percent(u: int, level: float, significant: int)
 
 
 @given(samples.filter(lambda x: len(x) > 1), samples.filter(lambda x: len(x) > 1))
-@settings(max_examples=40, deadline=None)
 def test_exact_p_with_ties_is_that_of_all_permutations(x: list[float], y: list[float]) -> None:
     test = rank_test(x, y)
     oracle = mannwhitneyu(x, y, method=PermutationMethod(n_resamples=5000))
@@ -70,7 +69,6 @@ def test_exact_p_with_ties_is_that_of_all_permutations(x: list[float], y: list[f
 
 
 @given(samples, samples)
-@settings(max_examples=60, deadline=None)
 def test_a12_is_its_definition(x: list[float], y: list[float]) -> None:
     wins = sum((a > b) + 0.5 * (a == b) for a in x for b in y)
     assert rank_test(x, y).a12 == pytest.approx(wins / (len(x) * len(y)))
@@ -119,7 +117,6 @@ def test_a_family_is_corrected_together() -> None:
     st.tuples(st.integers(0, 9), st.integers(0, 9)),
     st.sampled_from([10.0, 25.0, 50.0, 75.0, 100.0]),
 )
-@settings(max_examples=150, deadline=None)
 def test_attainment_is_its_definition(
     fronts: list[list[tuple[int, int]]], goal: tuple[int, int], percentile: float
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pymoo.problems.multi.osy import OSY
@@ -93,7 +93,6 @@ def test_hypercubes_of_a_hand_made_case() -> None:
     seed=st.integers(0, 1000),
     data=st.data(),
 )
-@settings(max_examples=100, deadline=None)
 def test_thinning_levels_the_fullest_cubes(
     cubes: list[int], capacity: int, seed: int, data: st.DataObject
 ) -> None:
@@ -131,7 +130,6 @@ def test_leaders_follow_the_roulette_over_cubes() -> None:
     violation=arrays(np.float64, 30, elements=st.sampled_from([0.0, 0.5, 1.0, np.inf])),
     batch=st.integers(1, 30),
 )
-@settings(max_examples=100, deadline=None)
 def test_archive_is_the_non_dominated_set_of_least_violation(
     objectives: Array, violation: Array, batch: int
 ) -> None:

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.compiled_cell import CompiledCell
@@ -123,7 +123,6 @@ def test_duration_agrees_with_a_convex_program(seed: int) -> None:
     assert found.duration == pytest.approx(exact, rel=1e-3)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.floats(1.001, 1.6), st.floats(1.0, 1.5), st.integers(0, 2**32 - 1))
 def test_more_force_never_takes_longer(share: float, more: float, seed: int) -> None:
     (x,) = near_initial(np.random.default_rng(seed), 1)

@@ -6,7 +6,7 @@ import casadi as ca
 import clarabel
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import sparse
 
@@ -101,7 +101,6 @@ def test_agrees_with_a_conic_solver_on_every_branch(equal: bool) -> None:
 
 
 @given(f_n=st.floats(-200.0, 200.0), f_t=st.floats(0.01, 200.0), mu=st.floats(0.05, 3.0))
-@settings(max_examples=100, deadline=None)
 def test_equal_friction_gives_the_published_maximum_of_three(
     f_n: float, f_t: float, mu: float
 ) -> None:
@@ -118,7 +117,6 @@ def test_equal_friction_gives_the_published_maximum_of_three(
     seed=st.integers(0, 2**31),
     size=st.floats(1.0, 500.0),
 )
-@settings(max_examples=150, deadline=None)
 def test_balances_the_force_within_both_cones(seed: int, size: float) -> None:
     force, normal, mu = random_case(np.random.default_rng(seed), equal=False)
     force = size * force
@@ -135,7 +133,6 @@ def test_balances_the_force_within_both_cones(seed: int, size: float) -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=60, deadline=None)
 def test_no_other_admissible_pair_of_forces_is_smaller(seed: int) -> None:
     """Random internal forces are added; those that keep both cones cost more."""
     rng = np.random.default_rng(seed)
@@ -155,7 +152,6 @@ def test_no_other_admissible_pair_of_forces_is_smaller(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=60, deadline=None)
 def test_exchanging_the_contacts_exchanges_the_forces(seed: int) -> None:
     force, normal, mu = random_case(np.random.default_rng(seed), equal=False)
     here, there = call(ALLOCATION, force, normal, mu), call(ALLOCATION, force, -normal, mu[::-1])
@@ -164,7 +160,6 @@ def test_exchanging_the_contacts_exchanges_the_forces(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=100, deadline=None)
 def test_plain_reference_agrees_for_equal_and_unequal_friction(seed: int) -> None:
     rng = np.random.default_rng(seed)
     for equal in (True, False):

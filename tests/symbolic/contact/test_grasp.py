@@ -144,7 +144,7 @@ def caron_rows(pad: Contact, mu: float) -> Array:
 
 
 @given(seed=st.integers(0, 2**31), kinds=st.sampled_from(KINDS[:5]))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_turning_all_turns_the_forces(seed: int, kinds: tuple[str, ...]) -> None:
     rng = np.random.default_rng(seed)
     cell, load = random_grasp(rng, hand_cell(), kinds), random_load(rng)
@@ -161,7 +161,7 @@ def test_turning_all_turns_the_forces(seed: int, kinds: tuple[str, ...]) -> None
 
 
 @given(seed=st.integers(0, 2**31), kinds=st.sampled_from(KINDS[:5]))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_derivatives_are_those_of_the_forces(seed: int, kinds: tuple[str, ...]) -> None:
     rng = np.random.default_rng(seed)
     cell, load = random_grasp(rng, hand_cell(), kinds), random_load(rng)

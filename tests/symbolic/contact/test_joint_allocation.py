@@ -7,7 +7,7 @@ from collections import Counter
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from symbolic.array import Array
@@ -172,7 +172,6 @@ def test_known_cases(half_height: float, offset: float, published: float) -> Non
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=150, deadline=None)
 def test_balances_force_and_moment_within_both_patches(seed: int) -> None:
     case = random_case(np.random.default_rng(seed))
     forces, shifts, torsion = held(case)
@@ -186,14 +185,12 @@ def test_balances_force_and_moment_within_both_patches(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=150, deadline=None)
 def test_never_needs_less_than_the_paper(seed: int) -> None:
     case = random_case(np.random.default_rng(seed))
     assert effort(held(case)[0]) >= (1.0 - 1e-12) * paper_effort(case)
 
 
 @given(seed=st.integers(0, 2**31), larger=st.floats(1.01, 3.0))
-@settings(max_examples=60, deadline=None)
 def test_larger_patches_and_more_friction_never_cost_more(seed: int, larger: float) -> None:
     case = random_case(np.random.default_rng(seed))
     least = effort(held(case)[0])
@@ -205,7 +202,6 @@ def test_larger_patches_and_more_friction_never_cost_more(seed: int, larger: flo
 
 
 @given(seed=st.integers(0, 2**31), factor=st.floats(0.05, 20.0))
-@settings(max_examples=60, deadline=None)
 def test_forces_are_proportional_to_what_they_carry(seed: int, factor: float) -> None:
     case = random_case(np.random.default_rng(seed))
     scaled = Case(factor * case.force, factor * case.moment, case.arms, case.friction, case.radius)
@@ -215,7 +211,6 @@ def test_forces_are_proportional_to_what_they_carry(seed: int, factor: float) ->
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=60, deadline=None)
 def test_exchanging_the_contacts_exchanges_the_forces(seed: int) -> None:
     """Half a turn about a puts contact 2 in the place of contact 1."""
     case = random_case(np.random.default_rng(seed))
@@ -234,7 +229,6 @@ def test_exchanging_the_contacts_exchanges_the_forces(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=40, deadline=None)
 def test_derivatives_are_those_of_the_forces(seed: int) -> None:
     case = random_case(np.random.default_rng(seed))
     names = ("force", "moment", "arms", "friction", "radius")
@@ -279,7 +273,6 @@ def test_least_squeeze_agrees_with_clarabel() -> None:
 
 
 @given(seed=st.integers(0, 2**31), harder=st.floats(1.001, 10.0))
-@settings(max_examples=40, deadline=None)
 def test_what_holds_holds_when_pressed_harder(seed: int, harder: float) -> None:
     """Squeezed along the line of the centres of pressure, the wrenches stay within the cones."""
     case = random_case(np.random.default_rng(seed))

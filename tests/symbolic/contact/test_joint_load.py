@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from codegen.lanes import lane_text
@@ -57,7 +57,6 @@ def box_case(cell: Workcell, motion: tuple[Array, Array, Array]) -> Case:
 
 
 @given(seed=st.integers(0, 2**31), radius=st.floats(0.002, 0.2))
-@settings(max_examples=60, deadline=None)
 def test_is_the_papers_where_the_patches_suffice_and_costs_more_where_not(
     seed: int, radius: float
 ) -> None:
@@ -79,7 +78,6 @@ def test_is_the_papers_where_the_patches_suffice_and_costs_more_where_not(
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=80, deadline=None)
 def test_wrenches_balance_the_motion(seed: int) -> None:
     rng = np.random.default_rng(seed)
     cell = with_contacts(joint(random_cell(rng)), patch_radius=(0.01, 0.02))

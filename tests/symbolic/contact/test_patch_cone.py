@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
@@ -39,7 +39,6 @@ def inner_wrench(rng: np.random.Generator) -> Array:
 
 
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 8))
-@settings(max_examples=200, deadline=None)
 def test_whatever_pressure_with_coulomb_friction_lies_within(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     points = [point_wrench(x, f) for x, f in zip(on_disc(rng, n), on_disc(rng, n), strict=True)]
@@ -50,7 +49,6 @@ def test_whatever_pressure_with_coulomb_friction_lies_within(seed: int, n: int) 
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=25, deadline=None)
 def test_reaches_as_far_as_pressures_do_in_every_direction(seed: int) -> None:
     """Largest c.d + a.T + b M over the cone by its formula, and over points on the disc."""
     rng = np.random.default_rng(seed)
@@ -65,7 +63,6 @@ def test_reaches_as_far_as_pressures_do_in_every_direction(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=60, deadline=None)
 def test_torsion_about_the_centre_of_pressure_follows_the_ellipse(seed: int) -> None:
     rng = np.random.default_rng(seed)
     d, tangent = on_disc(rng, 1)[0], on_disc(rng, 1)[0]
@@ -98,7 +95,6 @@ def barrier(wrench: Array) -> float:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=20, deadline=None)
 def test_barrier_is_the_determinants(seed: int) -> None:
     rng = np.random.default_rng(seed)
     wrench = inner_wrench(rng)
@@ -117,7 +113,6 @@ def test_barrier_is_the_determinants(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=60, deadline=None)
 def test_barrier_of_a_cone_has_its_degree(seed: int) -> None:
     """A logarithmically homogeneous barrier of degree 3: -gradient.w = 3, hessian w = -gradient."""
     wrench = inner_wrench(np.random.default_rng(seed))

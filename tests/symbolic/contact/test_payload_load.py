@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -85,7 +85,6 @@ def test_reference_figures(
 
 
 @given(mass=st.floats(0.5, 25.0), mu=st.floats(0.1, 2.0))
-@settings(max_examples=40, deadline=None)
 def test_level_box_at_rest_needs_half_its_weight_over_friction(mass: float, mu: float) -> None:
     cell = with_contacts(with_payload(hand_cell(), mass=mass), friction=(mu, mu))
     result = at_rest(cell)
@@ -95,7 +94,6 @@ def test_level_box_at_rest_needs_half_its_weight_over_friction(mass: float, mu: 
 
 
 @given(mass=st.floats(0.5, 25.0), mu=st.floats(0.1, 2.0), a=st.floats(-5.0, 5.0))
-@settings(max_examples=60, deadline=None)
 def test_acceleration_along_the_squeeze_axis_shifts_the_difference(
     mass: float, mu: float, a: float
 ) -> None:
@@ -131,7 +129,6 @@ def test_offset_below_the_pads_needs_no_shift() -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=60, deadline=None)
 def test_agrees_with_the_plain_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
     cell, motion = random_cell(rng), random_motion(rng)
@@ -144,7 +141,6 @@ def test_agrees_with_the_plain_reference(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=80, deadline=None)
 def test_contact_forces_and_gravity_move_the_box_as_newton_and_euler_say(seed: int) -> None:
     """Balance recomputed from the motion of the centre of mass, itself differentiated in time."""
     rng = np.random.default_rng(seed)
@@ -179,7 +175,6 @@ def test_contact_forces_and_gravity_move_the_box_as_newton_and_euler_say(seed: i
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=80, deadline=None)
 def test_forces_stay_in_their_friction_cones(seed: int) -> None:
     rng = np.random.default_rng(seed)
     cell, (pose, rate, second) = random_cell(rng), random_motion(rng)
@@ -192,7 +187,6 @@ def test_forces_stay_in_their_friction_cones(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 2**31), turn=st.floats(-np.pi, np.pi))
-@settings(max_examples=60, deadline=None)
 def test_turning_the_world_about_the_vertical_turns_vectors_and_keeps_sizes(
     seed: int, turn: float
 ) -> None:
@@ -232,7 +226,6 @@ def mirrored(cell: Workcell) -> Workcell:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=60, deadline=None)
 def test_mirroring_the_cell_exchanges_the_forces(seed: int) -> None:
     rng = np.random.default_rng(seed)
     cell, motion = random_cell(rng), random_motion(rng)

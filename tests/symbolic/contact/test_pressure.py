@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -47,7 +47,6 @@ def lever(inputs: list[Array]) -> Array:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=150, deadline=None)
 def test_agrees_with_the_pseudo_inverse(seed: int) -> None:
     inputs, _ = random_case(seed)
     moment, arm_1, arm_2, force_1, force_2, a, b = inputs
@@ -64,7 +63,6 @@ def test_agrees_with_the_pseudo_inverse(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=100, deadline=None)
 def test_shifts_stay_in_the_contact_planes_and_carry_the_moment(seed: int) -> None:
     inputs, normal = random_case(seed)
     moment, arm_1, arm_2, force_1, force_2, *_ = inputs
@@ -97,7 +95,6 @@ def test_without_forces_nothing_is_carried() -> None:
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=50, deadline=None)
 def test_required_moment_is_the_rate_of_angular_momentum(seed: int) -> None:
     """Finite difference of R I R^T omega along a rotation with constant angular acceleration."""
     rng = np.random.default_rng(seed)

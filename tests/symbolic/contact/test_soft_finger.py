@@ -8,7 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.robust.cases import nominal_case
@@ -148,7 +148,6 @@ COEFFICIENT = st.floats(0.3, 1.2)
 PART = st.floats(-1.0, 1.0)
 
 
-@settings(max_examples=25)
 @given(
     friction=st.tuples(COEFFICIENT, COEFFICIENT),
     radii=st.tuples(st.floats(0.015, 0.05), st.floats(0.015, 0.05)),
@@ -212,7 +211,6 @@ def test_it_is_the_least_force_that_holds(
     np.testing.assert_allclose(found, [high + load[0][2], high], rtol=1e-5, atol=1e-3)
 
 
-@settings(max_examples=25)
 @given(
     friction=st.tuples(COEFFICIENT, COEFFICIENT),
     force=st.tuples(PART, PART, PART),

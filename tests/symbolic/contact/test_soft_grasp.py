@@ -9,7 +9,7 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from symbolic.array import Array
@@ -142,7 +142,6 @@ def differences(first: ca.Function, load: Array, step: float) -> tuple[Array, Ar
 
 
 @pytest.mark.parametrize("kinds", KINDS)
-@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10**6), factor=st.floats(0.1, 20.0))
 def test_forces_grow_with_the_load(kinds: tuple[str, ...], seed: int, factor: float) -> None:
     """Homogeneous of degree one: Euler's relations for values, gradients and second derivatives."""

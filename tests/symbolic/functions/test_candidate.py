@@ -17,6 +17,7 @@ from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.functions import CONSTRAINTS, candidate_function
 from symbolic.records import Robot, Waypoint, Workcell
+from symbolic.records.task import initial_decision
 from tests.symbolic.cells import (
     SEEDS,
     Evaluator,
@@ -92,16 +93,16 @@ def rack_model() -> CellModel:
 # --- against the plain reference ---
 
 
-def test_two_hundred_candidates_of_the_rack_compiled_interpreted_and_plain() -> None:
-    """Half of them within the bounds, half within bounds of twice the width."""
+@pytest.mark.parametrize("half", [12, pytest.param(100, marks=pytest.mark.slow)])
+def test_candidates_of_the_rack_compiled_interpreted_and_plain(half: int) -> None:
+    """The hand-made one, half of the others within the bounds, half within twice their width."""
     model = rack_model()
     task, rng = model.workcell.task, np.random.default_rng(2024)
     plain = PlainEvaluator(model.workcell, model.start)
     symbolic = interpreted(model)
     compiled = compile_function(candidate_function(model))
-    candidates = np.vstack(
-        [random_candidates(task, 100, rng, 1.0), random_candidates(task, 100, rng, 2.0)]
-    )
+    near, far = (random_candidates(task, half, rng, widen) for widen in (1.0, 2.0))
+    candidates = np.vstack([initial_decision(task), near, far])
     reasons: set[str] = set()
     for x in candidates:
         expected = plain(x)

@@ -8,7 +8,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from symbolic.array import Array
@@ -64,7 +64,6 @@ def test_bounds_never_exceed_the_distance(name: str, folder: Path) -> None:
     assert near > 0.9 * far
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10_000))
 def test_bounds_of_any_posture_are_safe(seed: int) -> None:
     geometry = geometry_of("rack")
@@ -154,7 +153,6 @@ def matrix(q: Array) -> Array:
     return np.asarray((w * w - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) + 2.0 * w * cross)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.tuples(*[st.floats(-np.pi, np.pi)] * 3))
 def test_quaternions_are_stable_for_every_angle(rpy: tuple[float, float, float]) -> None:
     R = ca.SX.sym("R", 3, 3)
@@ -180,7 +178,6 @@ def test_cleaning_only_touches_roundoff() -> None:
     ]  # fmt: skip
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(1e-6, 0.5))
 def test_soft_operations_err_to_their_side(a: float, b: float, width: float) -> None:
     soft = Softness(width)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
@@ -82,7 +82,6 @@ def surface_points(piece: Piece, rng: np.random.Generator, n: int = 400) -> Arra
     return np.asarray(points @ piece.rotation.T + piece.centre)
 
 
-@settings(max_examples=60, deadline=None)
 @given(pieces, st.integers(0, 99))
 def test_support_is_the_largest_coordinate(piece: Piece, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -96,7 +95,6 @@ def test_support_is_the_largest_coordinate(piece: Piece, seed: int) -> None:
     assert np.all(bound <= reached + 0.05 * size)
 
 
-@settings(max_examples=60, deadline=None)
 @given(pieces, st.integers(0, 99))
 def test_farthest_distances_are_never_exceeded(piece: Piece, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -109,7 +107,6 @@ def test_farthest_distances_are_never_exceeded(piece: Piece, seed: int) -> None:
     assert across.max() <= farthest_from_axis(piece, place, axis) + 1e-12
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(pieces, min_size=1, max_size=4), st.floats(0.5, 3.0), st.integers(0, 99))
 def test_chains_and_boxes_contain_their_pieces(
     found: list[Piece], slenderness: float, seed: int
@@ -135,7 +132,6 @@ def test_containment_is_exact_not_sampled() -> None:
         contains(cylinder, inner)
 
 
-@settings(max_examples=40, deadline=None)
 @given(pieces, angles, st.integers(0, 99))
 def test_swept_cylinder_contains_every_rotation(piece: Piece, angle: float, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -7,7 +7,7 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from studies.research.plain.motion import evaluate_spline, natural_quintic, waypoints
@@ -93,7 +93,6 @@ def integrated_squared_jerk(values: Array, parameter: Array) -> float:
     size=st.floats(0.01, 1.0),
     harmonic=st.integers(1, 3),
 )
-@settings(max_examples=40, deadline=None)
 def test_has_the_least_jerk_of_all_curves_through_the_waypoints(
     seed: int, count: int, size: float, harmonic: int
 ) -> None:
@@ -136,7 +135,6 @@ def test_fixed_inner_waypoints_stay_and_are_passed() -> None:
 @given(
     angles=st.lists(st.tuples(*[st.floats(-12.0, 12.0) for _ in range(3)]), min_size=2, max_size=6)
 )
-@settings(max_examples=60, deadline=None)
 def test_angles_are_unwrapped_as_numpy_does(angles: list[tuple[float, ...]]) -> None:
     poses = [np.concatenate([np.zeros(3), value]) for value in angles]
     task = task_with(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -56,7 +56,6 @@ def rates(
 
 
 @given(rpy=angles)
-@settings(max_examples=100, deadline=None)
 def test_rotation_is_yaw_pitch_roll_about_moving_axes(rpy: Array) -> None:
     expected = Rotation.from_euler("ZYX", rpy[::-1]).as_matrix()
     np.testing.assert_allclose(rates(rpy, rpy, rpy)[0], expected, atol=1e-14)
@@ -64,7 +63,6 @@ def test_rotation_is_yaw_pitch_roll_about_moving_axes(rpy: Array) -> None:
 
 
 @given(rpy=angles, rate=angles, second=angles)
-@settings(max_examples=100, deadline=None)
 def test_rates_agree_with_axes_carried_round(rpy: Array, rate: Array, second: Array) -> None:
     _, velocity, acceleration = rates(rpy, rate, second)
     expected_velocity, expected_acceleration = angular_rates(rpy, rate, second)
@@ -73,7 +71,6 @@ def test_rates_agree_with_axes_carried_round(rpy: Array, rate: Array, second: Ar
 
 
 @given(vector=vectors)
-@settings(max_examples=100, deadline=None)
 def test_a_rotation_vector_turns_the_reference(vector: Array) -> None:
     expected = Rotation.from_rotvec(vector).as_matrix() @ REFERENCE
     np.testing.assert_allclose(rates(vector, vector, vector, OF_VECTORS)[0], expected, atol=3e-14)
@@ -81,7 +78,6 @@ def test_a_rotation_vector_turns_the_reference(vector: Array) -> None:
 
 
 @given(vector=vectors, rate=angles, second=angles)
-@settings(max_examples=100, deadline=None)
 def test_rates_of_a_rotation_vector_agree_with_quadrature(
     vector: Array, rate: Array, second: Array
 ) -> None:
@@ -92,7 +88,6 @@ def test_rates_of_a_rotation_vector_agree_with_quadrature(
 
 
 @given(vector=vectors, rate=vectors)
-@settings(max_examples=50, deadline=None)
 def test_the_derivatives_of_a_rotation_vector_hold_at_and_near_zero(
     vector: Array, rate: Array
 ) -> None:
@@ -103,7 +98,6 @@ def test_the_derivatives_of_a_rotation_vector_hold_at_and_near_zero(
 
 
 @given(rpy=angles, xyz=angles)
-@settings(max_examples=50, deadline=None)
 def test_placements_of_many_poses_are_those_of_each(rpy: Array, xyz: Array) -> None:
     poses = np.array([[*xyz, *rpy], [*rpy, *xyz / 2.0]])
     for orientation in (ANGLES, VECTORS):
@@ -116,7 +110,6 @@ def test_placements_of_many_poses_are_those_of_each(rpy: Array, xyz: Array) -> N
 
 @pytest.mark.parametrize("chart", [OF_ANGLES, OF_VECTORS])
 @given(rpy=vectors, rate=angles, second=angles)
-@settings(max_examples=50, deadline=None)
 def test_rates_are_time_derivatives_of_the_rotation(
     chart: int, rpy: Array, rate: Array, second: Array
 ) -> None:

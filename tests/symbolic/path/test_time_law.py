@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
@@ -44,7 +44,6 @@ def random_task(seed: int, **changes: object) -> Task:
 
 
 @given(seed=st.integers(0, 2**31), samples=st.integers(3, 80))
-@settings(max_examples=40, deadline=None)
 def test_constant_law_differentiates_as_numpy_does(seed: int, samples: int) -> None:
     result = timed(random_task(seed, samples=samples))
     rate = np.gradient(result["pose"], result["time"], axis=0, edge_order=2)
@@ -137,7 +136,6 @@ CURVE = (
 
 
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=30, deadline=None)
 def test_ramped_law_starts_and_ends_at_rest(seed: int) -> None:
     result = timed(random_task(seed, time_law="ramped"))
     for end in (0, -1):

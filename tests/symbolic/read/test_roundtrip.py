@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -133,7 +133,6 @@ def assert_same_task(cell: Workcell, data: dict[str, Any]) -> None:
     assert [vars(contact) for contact in task.allowed_contacts] == data["allowed_contacts"]
 
 
-@settings(max_examples=100, deadline=None)
 @given(cells())
 def test_written_cells_are_read_back(data: dict[str, Any]) -> None:
     with tempfile.TemporaryDirectory() as folder:

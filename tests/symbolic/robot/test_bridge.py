@@ -9,7 +9,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
@@ -68,7 +68,6 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @given(seed=seeds)
-@settings(max_examples=50)
 def test_kinematics(case: Case, seed: int) -> None:
     q, _, _ = case.state(seed)
     rotation, position, jacobian = (np.array(out) for out in case.kinematics(q))
@@ -83,7 +82,6 @@ def test_kinematics(case: Case, seed: int) -> None:
 
 
 @given(seed=seeds)
-@settings(max_examples=50)
 def test_drift_completes_the_classical_acceleration(case: Case, seed: int) -> None:
     q, v, a = case.state(seed)
     pin.forwardKinematics(case.model, case.data, q, v, a)
@@ -98,7 +96,6 @@ def test_drift_completes_the_classical_acceleration(case: Case, seed: int) -> No
 
 
 @given(seed=seeds)
-@settings(max_examples=50)
 def test_joint_placements(case: Case, seed: int) -> None:
     q, _, _ = case.state(seed)
     rotations, positions = (np.array(out) for out in case.joint_placements(q))
@@ -113,7 +110,6 @@ def test_joint_placements(case: Case, seed: int) -> None:
 
 
 @given(seed=seeds)
-@settings(max_examples=50)
 def test_inverse_dynamics(case: Case, seed: int) -> None:
     q, v, a = case.state(seed)
     torque = np.array(case.inverse_dynamics(q, v, a))[:, 0]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
@@ -42,7 +42,6 @@ def flange_pose(arm: RobotModel, q: Array) -> tuple[Array, Array]:
 
 
 @given(q=angles)
-@settings(max_examples=40)
 def test_jacobian_is_the_derivative_of_the_placement(arm: RobotModel, q: Array) -> None:
     step = 1e-6
     jacobian = np.array(arm.jacobian(q))
@@ -57,7 +56,6 @@ def test_jacobian_is_the_derivative_of_the_placement(arm: RobotModel, q: Array) 
 
 
 @given(q=angles, v=rates)
-@settings(max_examples=40)
 def test_drift_is_the_rate_of_the_jacobian(arm: RobotModel, q: Array, v: Array) -> None:
     step = 1e-6
     change = np.array(arm.jacobian(q + step * v)) - np.array(arm.jacobian(q - step * v))
@@ -66,7 +64,6 @@ def test_drift_is_the_rate_of_the_jacobian(arm: RobotModel, q: Array, v: Array) 
 
 
 @given(q=angles, v=rates, a=rates, roll=st.floats(-np.pi, np.pi), pitch=st.floats(-1.5, 1.5))
-@settings(max_examples=40)
 def test_torque_on_a_tilted_base(q: Array, v: Array, a: Array, roll: float, pitch: float) -> None:
     """The same arm, hung in Pinocchio onto a tilted fixed joint under upright gravity."""
     T_world_base = np.eye(4)

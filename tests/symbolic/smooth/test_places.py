@@ -8,7 +8,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -89,7 +89,6 @@ def joints_at(pose: Array) -> tuple[Array, Array]:
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=20)
 def test_solved_joints_hold_the_box(seed: int) -> None:
     pose = pose_near_start(seed)
     for arm, q in enumerate(joints_at(pose)):
@@ -133,7 +132,6 @@ def test_the_largest_gap_is_never_less_than_the_sharp_bound() -> None:
     arrays(float, 3, elements=st.floats(-0.3, 0.3)),
     arrays(float, 3, elements=st.floats(-1.2, 1.2)),
 )
-@settings(max_examples=100)
 def test_one_direction_separates_boxes_that_are_apart(
     chosen: int, away: Array, turn: Array
 ) -> None:
