@@ -87,8 +87,8 @@ def test_a_joint_may_be_named_as_a_link(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("change", "place", "words"),
-    [case[1:] for case in CASES],
-    ids=[case[0] for case in CASES],
+    CASES,
+    ids=[f"{index}-{words or place}" for index, (_, place, words) in enumerate(CASES)],
 )
 def test_what_is_wrong_is_named(change: Callable[[str], str], place: str, words: str) -> None:
     changed = change(GOFA)
