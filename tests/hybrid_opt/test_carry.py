@@ -13,11 +13,11 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import REASONS
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK
+from tests.hybrid_opt.cells import shipped
 
 
-@cache
 def cell() -> Cell:
-    return Cell.load(RACK)
+    return shipped("rack")
 
 
 @cache
@@ -41,9 +41,7 @@ def test_its_own_torques_hold_the_arms_up() -> None:
     """Against Pinocchio's inverse dynamics, joint by joint along the carry."""
     import pinocchio as pin
 
-    from symbolic.cell_model import build_cell_model
-
-    models = build_cell_model(cell().workcell).robots
+    models = cell().compiled.model.robots
     for arm, robot in zip(initial().arms, models, strict=True):
         data = robot.model.createData()
         for k in (0, 37, len(initial()) - 1):

@@ -22,13 +22,13 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 from tests.hybrid_opt.campaign.fake import RACK
+from tests.hybrid_opt.cells import shipped
 
 EVALUATIONS = 120
 
 
-@cache
 def cell() -> ho.Cell:
-    return ho.Cell.load(RACK)
+    return shipped("rack")
 
 
 @cache

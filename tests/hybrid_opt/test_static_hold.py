@@ -18,6 +18,7 @@ from studies.programs.inspection import Inspection, told
 from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
 from symbolic.records import Workcell
+from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.proposing.problems import shipped_problem
 from tests.symbolic.cells import RACK
 
@@ -106,7 +107,7 @@ def test_the_joint_allocation_tells_a_patch_that_presses_less(tmp_path: Path) ->
 
 def test_a_joint_that_is_too_weak_is_told() -> None:
     """Held against the timing model's own torques of standing still."""
-    cell = ho.Cell.load(RACK)
+    cell = shipped("rack")
     model = TimingModel(cell.compiled)
     still = model.still(model.path_motion(cell.initial))
     ends = np.abs(still.torque)[[0, -1]]

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from studies.research.plain.arm import PlainArm
 from symbolic.array import Array
-from symbolic.cell_model import CellModel
+from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.functions import candidate_function
 from symbolic.geometry.pairs import build_geometry
 from symbolic.read.cell import load
@@ -186,6 +186,12 @@ def hand_model(cell: Workcell) -> CellModel:
 def rack_cell() -> Workcell:
     """The rack cell as it is shipped."""
     return load(RACK)
+
+
+@cache
+def rack_model() -> CellModel:
+    """The symbolic model of it, with the start postures that are found."""
+    return build_cell_model(rack_cell())
 
 
 Evaluator = Callable[[Array], dict[str, Array]]

@@ -29,12 +29,13 @@ from symbolic.records.cell import box_flange
 from symbolic.records.poses import inverse, pose_matrix
 from symbolic.records.task import extended_waypoints, initial_decision
 from symbolic.robot.model import build_robot_model
+from tests.hybrid_opt.cells import shipped
 from tests.symbolic.read.samples import RACK
 
 
 @pytest.fixture(scope="module")
 def evaluator() -> CandidateEvaluator:
-    return CandidateEvaluator(load(RACK))
+    return shipped("rack").evaluator
 
 
 def sampled(evaluator: CandidateEvaluator, x: Array) -> SampledPath:

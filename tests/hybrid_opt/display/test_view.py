@@ -19,11 +19,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.cell import Cell
 from hybrid_opt.display import scene
 from hybrid_opt.errors import DisplayError
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK
+from tests.hybrid_opt.cells import shipped
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 EVIL = "</title></script><script>window.broken = 1</script>"
@@ -31,7 +31,7 @@ EVIL = "</title></script><script>window.broken = 1</script>"
 
 @cache
 def carry() -> Carry:
-    cell = Cell.load(RACK)
+    cell = shipped("rack")
     return cell.carry(cell.initial)
 
 

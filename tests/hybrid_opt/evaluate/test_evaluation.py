@@ -18,11 +18,10 @@ from hybrid_opt.evaluate.kernel import reached_samples
 from studies.research.plain.collisions import PlainCollisionChecker
 from studies.research.plain.verdict import PlainJudge, PlainVerdict
 from symbolic.array import Array
-from symbolic.cell_model import build_cell_model
 from symbolic.functions import CONSTRAINTS
-from symbolic.read.cell import load
 from symbolic.records import CollisionSettings, Uncertainty, Workcell
 from symbolic.records.task import initial_decision
+from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.collision.test_checker import checker_of, resting_cell
 from tests.symbolic.cells import RACK
 from tests.symbolic.geometry.collision_cells import geometry_of, random_configurations
@@ -35,15 +34,14 @@ AGREEMENT = 1e-8
 """Largest difference of objectives and times to the plain reference."""
 
 
-@cache
 def evaluator(path: Path) -> CandidateEvaluator:
-    return CandidateEvaluator(load(path))
+    return shipped(path.stem).evaluator
 
 
 @cache
 def judge(path: Path) -> PlainJudge:
-    workcell = load(path)
-    return PlainJudge(workcell, build_cell_model(workcell).start)
+    cell = shipped(path.stem)
+    return PlainJudge(cell.workcell, cell.compiled.model.start)
 
 
 def candidates(workcell: Workcell, n: int, seed: int, widening: float) -> Array:

@@ -27,13 +27,14 @@ from symbolic.read.cell import load
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.campaign.fake import RACK
+from tests.hybrid_opt.cells import shipped
 
 CELL = RACK.with_name("transfer.toml")
 
 
 @pytest.fixture(scope="module")
 def evaluator() -> CandidateEvaluator:
-    return CandidateEvaluator(load(CELL))
+    return shipped("transfer").evaluator
 
 
 def replica_of(evaluator: CandidateEvaluator, count: int) -> Replica:

@@ -8,12 +8,11 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
 from hybrid_opt.timing import Timing, TimingLimits, time_path
-from tests.symbolic.cells import RACK
+from tests.hybrid_opt.cells import shipped
 
 
-@cache
 def rack() -> Cell:
-    return Cell.load(RACK)
+    return shipped("rack")
 
 
 @cache

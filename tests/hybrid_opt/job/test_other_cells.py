@@ -11,13 +11,12 @@ import yaml
 
 from hybrid_opt.bundles import FORMATS, BundleOptions, export
 from hybrid_opt.bundles.rapid import rapid_files
-from hybrid_opt.cell import Cell
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, sample_job
 from hybrid_opt.timing import TimingLimits, time_path
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.rapid_parser import parse
-from tests.symbolic.cells import RACK
+from tests.hybrid_opt.cells import shipped
 
 CELLS = ["transfer", "pandas"]
 FREE = ("csv", "json", "ros2", "mcap")
@@ -26,7 +25,7 @@ FREE = ("csv", "json", "ros2", "mcap")
 
 @cache
 def planned(name: str) -> Job:
-    cell = Cell.load(RACK.with_name(f"{name}.toml"))
+    cell = shipped(name)
     timing = time_path(cell.timing_model, cell.initial, TimingLimits(reference_speed=True))
     return JobModel(cell.compiled, cell.timing_model).plan(timing)
 

@@ -28,10 +28,10 @@ from hybrid_opt.polishing.rows import ForceRow, PlaceRow, PressureRow, Row
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.read.cell import load
 from symbolic.records.task import initial_decision
 from symbolic.smooth.passage import Passing, Separation
 from symbolic.smooth.places import Clearance, JointLimit, PlaceConstraint, Reach
+from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.polishing.cells import smooth_cell
 from tests.redundant_cells import rack_on_rail
 from tests.symbolic.read.samples import RACK
@@ -57,9 +57,8 @@ CELLS = pytest.mark.parametrize(
 )
 
 
-@cache
 def evaluator(path: Path) -> CandidateEvaluator:
-    return CandidateEvaluator(load(path))
+    return shipped(path.stem).evaluator
 
 
 @cache

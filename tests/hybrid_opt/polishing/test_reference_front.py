@@ -6,18 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators.metrics import front_of
 from studies.research.best_front import read_reference_front
-from symbolic.read.cell import load
-from tests.symbolic.read.samples import RACK
+from tests.hybrid_opt.cells import shipped
 
 FRONT = Path(__file__).with_name("rack_reference_front.csv")
 
 
 def test_every_point_is_feasible_certified_and_of_the_stored_value() -> None:
     front = read_reference_front(FRONT)
-    evaluator = CandidateEvaluator(load(RACK))
+    evaluator = shipped("rack").evaluator
     assert front.digest == evaluator.workcell.digest
     found = evaluator.certified(evaluator.evaluate(front.x))
     assert found.feasible.all()

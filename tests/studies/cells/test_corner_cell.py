@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid_opt.cell import Cell
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.solve import time_path
 from symbolic.contact.load import load_function
 from symbolic.read.cell import load
+from tests.hybrid_opt.cells import shipped
 from tests.symbolic.cells import ROOT, call
 
 CORNER = ROOT / "studies" / "workcells" / "corner.toml"
@@ -35,7 +35,7 @@ def test_at_rest_both_pads_hold_half_of_the_crate() -> None:
 
 @pytest.mark.slow
 def test_its_carry_is_feasible_certified_and_drivable_and_arms_carry_it() -> None:
-    cell = Cell.load(CORNER)
+    cell = shipped("corner")
     carry = cell.carry(cell.initial)
     assert carry.judgement is not None
     assert carry.judgement.feasible

@@ -21,6 +21,7 @@ from symbolic.contact.load import load_function
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.records import Uncertainty
+from tests.hybrid_opt.cells import shipped
 from tests.symbolic.cells import ROOT, call
 
 WORKCELLS = ROOT / "studies" / "workcells"
@@ -30,7 +31,7 @@ HOLDS = {"drum": 1.1, "fork": 1.25}
 
 @pytest.fixture(scope="module", params=list(HOLDS))
 def cell(request: pytest.FixtureRequest) -> Cell:
-    return Cell.load(WORKCELLS / f"{request.param}.toml")
+    return shipped(request.param)
 
 
 @pytest.mark.slow

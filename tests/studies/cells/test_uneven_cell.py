@@ -12,6 +12,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.solve import time_path
 from symbolic.read.cell import load
+from tests.hybrid_opt.cells import shipped
 from tests.symbolic.cells import ROOT
 
 # Its functions are compiled for these tests alone.
@@ -22,7 +23,7 @@ UNEVEN = ROOT / "studies" / "workcells" / "uneven.toml"
 
 @pytest.fixture(scope="module")
 def cell() -> Cell:
-    return Cell.load(UNEVEN)
+    return shipped("uneven")
 
 
 def test_only_the_joint_allocation_holds_it(cell: Cell, tmp_path: Path) -> None:

@@ -7,13 +7,12 @@ import pytest
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
-from symbolic.read.cell import load
-from tests.symbolic.read.samples import RACK
+from tests.hybrid_opt.cells import shipped
 
 
 @pytest.fixture(scope="module")
 def evaluator() -> CandidateEvaluator:
-    return CandidateEvaluator(load(RACK))
+    return shipped("rack").evaluator
 
 
 def test_the_hand_made_trajectory_is_feasible(evaluator: CandidateEvaluator) -> None:

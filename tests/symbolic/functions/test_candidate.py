@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from codegen.build import compile_function
 from studies.research.plain.candidate import PlainCandidate, PlainEvaluator
 from symbolic.array import Array
-from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.functions import CONSTRAINTS, candidate_function
 from symbolic.records import Robot, Waypoint, Workcell
 from symbolic.records.task import initial_decision
@@ -25,7 +23,7 @@ from tests.symbolic.cells import (
     hand_cell,
     hand_model,
     interpreted,
-    rack_cell,
+    rack_model,
     random_candidates,
     with_contacts,
     with_payload,
@@ -83,11 +81,6 @@ def odd_cell() -> Workcell:
         goal,
     )
     return with_task(cell, waypoints=waypoints, samples=50)
-
-
-@cache
-def rack_model() -> CellModel:
-    return build_cell_model(rack_cell())
 
 
 # --- against the plain reference ---

@@ -14,10 +14,9 @@ from studies.research.plain.candidate import evaluate
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.functions import candidate_function
-from symbolic.read.cell import load
 from symbolic.records.task import initial_decision
 from tests.redundant_cells import free_pandas, locked_pandas, machine_on_lift, rack_on_rail
-from tests.symbolic.read.samples import RACK
+from tests.symbolic.cells import rack_model
 
 PER_JOINT = ("q_1", "q_2", "joint_torque_1", "joint_torque_2")
 
@@ -72,7 +71,7 @@ def test_a_constant_redundant_joint_is_a_locked_one(tmp_path: Path, angle: float
 
 def test_an_arm_on_a_slide_is_one_whose_base_stands_there(tmp_path: Path) -> None:
     moved = build_cell_model(rack_on_rail(tmp_path, 0.3))
-    standing = build_cell_model(load(RACK))
+    standing = rack_model()
     chosen = nearest(moved, 0, np.concatenate([[0.3], standing.start[0]]))
     assert chosen == 0
     x = initial_decision(moved.workcell.task)

@@ -13,11 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from symbolic.array import Array
-from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import coal_distance
 from symbolic.path.rotation import rotation_matrix
-from symbolic.read.cell import load
 from symbolic.records.cell import PAYLOAD, Box
 from symbolic.records.poses import Orientation
 from symbolic.robot.arm import flange_target, manipulability, pose_error
@@ -40,20 +38,15 @@ from symbolic.smooth.places import (
     closure_name,
     row_function,
 )
-from tests.symbolic.read.samples import RACK
+from tests.symbolic.cells import rack_model
 
 STILL = np.zeros(6)
 """The rate of rows that do not depend on it."""
 
 
 @cache
-def model() -> CellModel:
-    return build_cell_model(load(RACK))
-
-
-@cache
 def place() -> Place:
-    return Place(model())
+    return Place(rack_model())
 
 
 def value_of(constraint: PlaceConstraint, *at: Array) -> float:
@@ -72,7 +65,7 @@ def gaps_at(index: int, pose: Array) -> Array:
 
 
 def pose_near_start(seed: int) -> Array:
-    start = model().workcell.task.waypoints[0].lower
+    start = rack_model().workcell.task.waypoints[0].lower
     away = np.array([-0.15, 0.0, 0.03, 0.0, 0.0, 0.0])
     spread = np.array([0.1, 0.04, 0.03, 0.1, 0.1, 0.1])
     return np.asarray(start + away + spread * np.random.default_rng(seed).uniform(-1, 1, 6))
@@ -80,11 +73,13 @@ def pose_near_start(seed: int) -> Array:
 
 @cache
 def closure(arm: int) -> ca.Function:
-    return closure_functions(model(), arm)[closure_name(arm, "first")]
+    return closure_functions(rack_model(), arm)[closure_name(arm, "first")]
 
 
 def joints_at(pose: Array) -> tuple[Array, Array]:
-    first, second = (np.array(closure(arm)(pose, model().start[arm])[0]).ravel() for arm in (0, 1))
+    first, second = (
+        np.array(closure(arm)(pose, rack_model().start[arm])[0]).ravel() for arm in (0, 1)
+    )
     return first, second
 
 
@@ -92,17 +87,17 @@ def joints_at(pose: Array) -> tuple[Array, Array]:
 def test_solved_joints_hold_the_box(seed: int) -> None:
     pose = pose_near_start(seed)
     for arm, q in enumerate(joints_at(pose)):
-        cell = model().workcell
+        cell = rack_model().workcell
         target = flange_target(
             cell.robots[arm], cell.contacts[arm], pose[:3], rotation_matrix(Orientation(), pose[3:])
         )
-        residual = pose_error(*target, *model().robots[arm].placement(q))[1]
+        residual = pose_error(*target, *rack_model().robots[arm].placement(q))[1]
         assert float(residual) < 1e-8
 
 
 def test_a_smooth_clearance_never_exceeds_the_sharp_bound() -> None:
-    placements = (model().robots[0].joint_placements, model().robots[1].joint_placements)
-    sharp = screening_functions(model().geometry, placements)["clearance"]
+    placements = (rack_model().robots[0].joint_placements, rack_model().robots[1].joint_placements)
+    sharp = screening_functions(rack_model().geometry, placements)["clearance"]
     for seed in range(3):
         pose = pose_near_start(seed)
         q = joints_at(pose)
@@ -114,9 +109,9 @@ def test_a_smooth_clearance_never_exceeds_the_sharp_bound() -> None:
 
 
 def test_the_largest_gap_is_never_less_than_the_sharp_bound() -> None:
-    placements = (model().robots[0].joint_placements, model().robots[1].joint_placements)
-    sharp = screening_functions(model().geometry, placements)["clearance"]
-    names = model().geometry.pair_names
+    placements = (rack_model().robots[0].joint_placements, rack_model().robots[1].joint_placements)
+    sharp = screening_functions(rack_model().geometry, placements)["clearance"]
+    names = rack_model().geometry.pair_names
     assert {"top board", "pallet in front"} <= {names[index][1] for index in place().separable()}
     for seed in range(3):
         pose = pose_near_start(seed)
@@ -138,13 +133,13 @@ def test_one_direction_separates_boxes_that_are_apart(
     """Against Coal, near an edge of an obstacle: the largest gap is positive where they are apart,
     and never more than their distance then."""
     index = place().separable()[chosen % len(place().separable())]
-    obstacle = model().geometry.bodies[model().geometry.active[index].second].pieces[0]
+    obstacle = rack_model().geometry.bodies[rack_model().geometry.active[index].second].pieces[0]
     assert isinstance(obstacle.shape, Box)
     half = np.asarray(obstacle.shape.size) / 2.0
     edge = half * np.where(np.arange(3) == chosen % 3, 0.0, 1.0 - 2.0 * (chosen // 3 % 2))
     pose = np.concatenate([obstacle.pose[:3, :3] @ edge + obstacle.pose[:3, 3] + away, turn])
-    rotation = rotation_matrix(model().workcell.task.orientation, turn)
-    payload = model().geometry.bodies[model().geometry.index(PAYLOAD)].pieces[0]
+    rotation = rotation_matrix(rack_model().workcell.task.orientation, turn)
+    payload = rack_model().geometry.bodies[rack_model().geometry.index(PAYLOAD)].pieces[0]
     placed = np.eye(4)
     placed[:3, :3], placed[:3, 3] = np.array(ca.DM(rotation)), pose[:3]
     edges = np.array(ca.DM(rotation)), obstacle.pose[:3, :3]
@@ -157,11 +152,11 @@ def test_one_direction_separates_boxes_that_are_apart(
 
 
 def test_a_row_of_a_gap_falls_short_of_it_by_what_its_kinks_are_rounded() -> None:
-    workcell = model().workcell
+    workcell = rack_model().workcell
     sizes = {b.name: b.shape.size for b in workcell.environment if isinstance(b.shape, Box)}
     pose = pose_near_start(1)
     for index in place().separable():
-        size = sizes[model().geometry.pair_names[index][1]]
+        size = sizes[rack_model().geometry.pair_names[index][1]]
         # Each rounded kink of a rotation's entry takes TURN of half an edge at most.
         rounded = TURN * (workcell.payload.size.sum() + size.sum()) / 2.0
         gaps = gaps_at(index, pose)
@@ -172,7 +167,9 @@ def test_a_row_of_a_gap_falls_short_of_it_by_what_its_kinks_are_rounded() -> Non
 
 
 def test_a_passing_row_is_the_height_at_which_the_gaps_meet() -> None:
-    index = next(k for k in place().separable() if model().geometry.pair_names[k][1] == "top board")
+    index = next(
+        k for k in place().separable() if rack_model().geometry.pair_names[k][1] == "top board"
+    )
     pose = np.array([-0.34, 0.01, 0.86, 0.01, 0.05, 0.02])
     rate = np.array([-2e-3, 1e-4, 2e-3, 1e-4, -2e-4, 1e-4])
     apart = np.flatnonzero(gaps_at(index, pose) > APART)
@@ -193,13 +190,13 @@ def test_a_passing_row_is_the_height_at_which_the_gaps_meet() -> None:
 def test_joint_rows_are_their_definitions(arm: int) -> None:
     pose = pose_near_start(1)
     q = joints_at(pose)
-    robot = model().workcell.robots[arm]
+    robot = rack_model().workcell.robots[arm]
     for joint in range(6):
         lower = value_of(JointLimit(arm, joint, "lower"), pose, STILL, *q)
         upper = value_of(JointLimit(arm, joint, "upper"), pose, STILL, *q)
         assert lower == pytest.approx(q[arm][joint] - robot.position_lower[joint])
         assert upper == pytest.approx(robot.position_upper[joint] - q[arm][joint])
-    jacobian = np.array(model().robots[arm].jacobian(q[arm]))
+    jacobian = np.array(rack_model().robots[arm].jacobian(q[arm]))
     share = abs(np.linalg.det(jacobian)) / robot.min_manipulability
     value = value_of(Reach(arm), pose, STILL, *q)
     assert value == pytest.approx(share**2 - 1.0, rel=1e-9)
