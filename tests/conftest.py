@@ -1,9 +1,11 @@
-"""Settings for the whole test suite: on CI, property tests draw the same examples every time, and
-Ctrl-C reaches the programs that tests start."""
+"""Settings for the whole test suite: on CI, property tests draw the same examples every time, what
+is compiled is compiled quickly unless CC is set, and Ctrl-C reaches the programs that tests start.
+"""
 
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 from pathlib import Path
 
@@ -16,6 +18,8 @@ settings.register_profile("local", deadline=None, print_blob=True, max_examples=
 settings.register_profile("ci", settings.get_profile("local"), derandomize=True, database=None)
 settings.register_profile("night", settings.get_profile("local"), max_examples=400)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
+
+os.environ.setdefault("CC", shlex.join(["bash", str(Path(__file__).with_name("quick-cc"))]))
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell that starts pytest in the background has it ignore Ctrl-C, which children inherit.

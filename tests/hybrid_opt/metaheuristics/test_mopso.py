@@ -209,6 +209,7 @@ def test_inside_the_bands_at_1000() -> None:
         assert row.infeasible_in_front == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("problem", "evaluations"), [("tnk", 10_000), ("zdt1", 25_000)])
 def test_inside_the_bands_of_longer_runs(problem: str, evaluations: int) -> None:
     (row,) = compare([problem], [evaluations], ["mopso"], seeds=4).scores

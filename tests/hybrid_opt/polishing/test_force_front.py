@@ -151,6 +151,7 @@ def test_recorded_attempts_are_not_repeated() -> None:
     np.testing.assert_array_equal(again.x, polished().x)
 
 
+@pytest.mark.slow
 def test_an_attempt_that_ended_its_process_costs_itself_alone() -> None:
     recorded: list[PolishOutcome | Lost] = [*polished().outcomes[:2], Lost("killed")]
     emitted: list[PolishOutcome] = []
@@ -165,7 +166,7 @@ def test_an_attempt_that_ended_its_process_costs_itself_alone() -> None:
 
 def test_a_front_of_one_point() -> None:
     one = evaluator().workcell.task.initial.reshape(1, -1)
-    result = Polisher(evaluator(), replace(SETTINGS, attempts=4)).polish(
+    result = Polisher(evaluator(), replace(SETTINGS, attempts=1)).polish(
         one, np.random.default_rng(0)
     )
     assert np.any(np.all(result.objectives <= objectives_of(one)[0], axis=1))

@@ -13,8 +13,10 @@ from tests.symbolic.cells import hand_cell
 FORCE_SHARES = (None, 1.005, 1.05, 1.2)
 """Force limits over the largest force at rest."""
 
+SEEDS = [pytest.param(seed, marks=pytest.mark.slow if seed >= 6 else ()) for seed in range(24)]
 
-@pytest.mark.parametrize("seed", range(24))
+
+@pytest.mark.parametrize("seed", SEEDS)
 def test_duration_agrees_with_a_convex_program(seed: int) -> None:
     model = hand_timing()
     (x,) = near_initial(np.random.default_rng(seed), 1)
@@ -37,7 +39,9 @@ def test_duration_agrees_with_a_convex_program(seed: int) -> None:
 
 
 @pytest.mark.parametrize("factor", [0.6, 0.55])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 def test_torque_limited_duration_agrees_with_a_nonlinear_program(factor: float, seed: int) -> None:
     model = timing_of(with_robots(hand_cell(), torque_max=factor), intervals=40)
     (x,) = near_initial(np.random.default_rng(seed), 1, size=0.5)

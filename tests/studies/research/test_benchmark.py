@@ -84,6 +84,7 @@ def test_derived_tasks_keep_the_ends_and_stay_on_the_trajectory(count: int) -> N
         np.testing.assert_allclose(derived.initial, task.initial, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_measures_the_rack_and_keeps_its_promises(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
