@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.waiting import HANGS
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 NAMES = [str(path.relative_to(ROOT)) for path in DOCUMENTS]
@@ -60,7 +62,7 @@ def help_of(module: str) -> str:
         [sys.executable, "-m", module, "--help"],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HANGS,
         cwd=ROOT,
         check=False,
     )

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from codegen.cache import Cache
 from codegen.compiled import CompiledFunction
 from codegen.compiler import find_compiler
 from codegen.errors import CodegenError
+from tests.waiting import HANGS, until
 
 SET = """
 import casadi as ca
@@ -43,7 +43,7 @@ def run(program: str, *arguments: object, **environment: str) -> subprocess.Comp
         env=os.environ | environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HANGS,
         check=False,
     )
 
@@ -154,7 +154,7 @@ def test_two_processes_at_once_build_once(cache: Cache, tmp_path: Path) -> None:
         for _ in range(2)
     ]
     for process in running:
-        assert process.communicate(timeout=120)[0] == "[1.0, 4.0, 9.0, 16.0]\n"
+        assert process.communicate(timeout=HANGS)[0] == "[1.0, 4.0, 9.0, 16.0]\n"
     assert len(log.read_text().splitlines()) == 2  # one per function, not per process
 
 
@@ -174,9 +174,7 @@ def test_killed_build_leaves_the_cache_usable(
         SET + "from codegen.build import load_or_build\nload_or_build('cell', lambda: functions)"
     )
     process = subprocess.Popen([sys.executable, "-c", program], start_new_session=True)
-    deadline = time.monotonic() + 60.0
-    while not started.exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
+    until(started.exists, process)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert list(cache.folder.glob("*.so")) == []

@@ -13,6 +13,7 @@ import pytest
 
 from codegen.cache import Cache, default_folder, digest, key_of
 from codegen.errors import CodegenError
+from tests.waiting import HANGS
 
 KEY = digest("test")
 
@@ -208,7 +209,7 @@ with cache.lock("key"):
         assert other.stdout.readline() == "waiting\n"
         with pytest.raises(subprocess.TimeoutExpired):
             other.wait(timeout=0.5)
-    assert other.communicate(timeout=60)[0] == "inside\n"
+    assert other.communicate(timeout=HANGS)[0] == "inside\n"
 
 
 def test_default_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ import pytest
 from codegen.build import build
 from codegen.cache import Cache
 from tests.codegen.test_build import SET, functions
+from tests.waiting import HANGS, soon, until
 
 
 @pytest.mark.parametrize("to_all", [True, False])
@@ -44,17 +44,12 @@ def test_ctrl_c_ends_the_compilers_and_keeps_what_is_compiled(
         text=True,
         start_new_session=True,
     )
-    deadline = time.monotonic() + 60.0
-    while not (left.exists() and left.read_text()) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    begin = time.monotonic()
-    (os.killpg if to_all else os.kill)(process.pid, signal.SIGINT)
-    # Compilers begin again with what is asked for next.
-    assert process.communicate(timeout=60) == ("interrupted\nFalse\n", "")
-    assert time.monotonic() - begin < 20.0  # of the 600 s that the compiler would take
-    while is_left(int(left.read_text())) and time.monotonic() - begin < 20.0:
-        time.sleep(0.02)
-    assert not is_left(int(left.read_text()))
+    until(lambda: left.exists() and bool(left.read_text()), process)
+    with soon():  # of the 600 s that the compiler would take
+        (os.killpg if to_all else os.kill)(process.pid, signal.SIGINT)
+        # Compilers begin again with what is asked for next.
+        assert process.communicate(timeout=HANGS) == ("interrupted\nFalse\n", "")
+        until(lambda: not is_left(int(left.read_text())))
     assert build({"square": functions()["square"]}, cache).reports[0].from_cache
 
 

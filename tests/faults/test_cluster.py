@@ -8,7 +8,6 @@ import random
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -29,10 +28,10 @@ from tests.faults.kills import (
     wait_for,
 )
 from tests.symbolic.cells import ROOT
+from tests.waiting import until
 
 pytest.importorskip("distributed")
 
-STARTED_SECONDS = 120.0
 STRUCK = ("search", "polish", "timing")
 """Stages that work on the cluster."""
 
@@ -68,10 +67,7 @@ def cluster(folder: Path, name: str) -> Iterator[Cluster]:
     each = ["--nworkers", "1", "--nthreads", "1", "--local-directory", str(folder / name)]
     with ExitStack() as stack:
         scheduler = stack.enter_context(_process(folder, "scheduler", [*quiet, *where]))
-        end = time.monotonic() + STARTED_SECONDS
-        while not file.exists() or not file.read_text().strip():
-            assert time.monotonic() < end, "the scheduler does not start"
-            time.sleep(0.1)
+        until(lambda: file.exists() and bool(file.read_text().strip()), scheduler)
         address = str(json.loads(file.read_text())["address"])
         workers = tuple(
             stack.enter_context(_process(folder, "worker", [address, *quiet, *each]))

@@ -15,7 +15,7 @@ import pytest
 from codegen.build import build
 from codegen.cache import Cache, digest
 from codegen.errors import CodegenError
-from tests.fuzz.promises import soon
+from tests.waiting import soon
 
 KEY = digest("fault")
 ASKED = '#!/bin/sh\ncase "$*" in -v|*" -E "*) exec gcc "$@" ;; esac\n'

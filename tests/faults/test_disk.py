@@ -18,6 +18,7 @@ from hybrid_opt.store.files import locked, read_json, sha256, write_atomically, 
 from hybrid_opt.store.trajectory_file import read_trajectory, write_trajectory
 from tests.faults.kills import contents, differences, ended, started, study
 from tests.symbolic.cells import ROOT, rack_cell
+from tests.waiting import HANGS
 
 NOBODY = 65534
 TINY = "256k"
@@ -179,7 +180,7 @@ def test_folders_of_others_are_told(action: str, words: str) -> None:
             capture_output=True,
             text=True,
             check=False,
-            timeout=120,
+            timeout=HANGS,
         )
         assert words in done.stdout, done.stdout + done.stderr
         assert done.stderr == ""

@@ -20,8 +20,8 @@ from symbolic.outside import MEBIBYTE, MESH_BYTES, MOST_VALUES, URDF_BYTES, WORK
 from symbolic.read.descriptions import MEMORY_BYTES, MEMORY_PER_BYTE
 from symbolic.read.elements import MOST_ATTRIBUTES
 from symbolic.read.meshes import MOST_WORDS
-from tests.fuzz.promises import MOST_SECONDS
 from tests.symbolic.cells import ROOT
+from tests.waiting import HANGS, MOST_SECONDS
 
 ROOM = 300 * MEBIBYTE
 XACRO = b'<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><link n="${1}"/>'
@@ -211,7 +211,7 @@ def test_reading_takes_little_memory(tmp_path: Path, case: str) -> None:
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True,
         check=True,
-        timeout=300.0,
+        timeout=HANGS,
     )
     found = json.loads(done.stdout)
     allowed = 10 * size + ROOM

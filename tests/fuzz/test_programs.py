@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 
 from symbolic.outside import MEBIBYTE
 from tests.fuzz.damage import Bytes, byte_damage, xml_damage
-from tests.fuzz.promises import soon
 from tests.symbolic.cells import ROOT
 from tests.symbolic.read.samples import GOFA, RACK, sample_data, write
+from tests.waiting import soon
 
 PATIENCE = 300.0
 """A program that hangs is ended after so long [s]."""

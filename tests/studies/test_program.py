@@ -15,6 +15,7 @@ from studies.__main__ import command, programs
 from studies.program import Program, carry_out
 from symbolic.errors import DualArmError
 from tests.symbolic.cells import ROOT
+from tests.waiting import HANGS
 
 PROGRAMS = programs()
 HEAVY = ("casadi", "coal", "matplotlib", "mujoco", "pinocchio", "pymoo", "scipy", "toppra")
@@ -40,7 +41,7 @@ def ended(body: str, *arguments: str) -> tuple[int, str, str]:
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HANGS,
         check=False,
     )
     return done.returncode, done.stdout, done.stderr
@@ -92,7 +93,7 @@ def test_output_that_nobody_reads_is_no_error() -> None:
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HANGS,
         check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "x", "")
@@ -111,7 +112,7 @@ def test_an_interrupt_during_the_start_is_no_traceback(module: str) -> None:
         if line.split("|")[-1].strip() == module:
             break
     process.send_signal(signal.SIGINT)
-    said = process.communicate(timeout=120)[1]
+    said = process.communicate(timeout=HANGS)[1]
     assert "Traceback" not in said
     assert "interrupted" in said or "nowhere.toml" in said
     assert process.returncode in (2, 130, -signal.SIGINT)
@@ -135,7 +136,7 @@ def test_help_imports_nothing_heavy() -> None:
         "print(len(programs()), *sorted(sys.modules))\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=HANGS
     )
     count, *imported = done.stdout.split()
     assert (done.stderr, int(count)) == ("", len(PROGRAMS))

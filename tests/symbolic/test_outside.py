@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from symbolic import outside
 from symbolic.errors import OutsideError
-from tests.fuzz.promises import soon
+from tests.waiting import soon
 
 MOST = 1000
 

@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -36,6 +35,7 @@ from tests.hybrid_opt.campaign.fake import (
     run_search,
     verdicts,
 )
+from tests.waiting import HANGS, until
 
 SETTINGS = CampaignSettings(evaluations=200, replicas=2)
 FEW = CampaignSettings(evaluations=80, replicas=1)
@@ -68,13 +68,6 @@ def start(output: Path, *options: str, limit: int | None = None) -> subprocess.P
         preexec_fn=limited,
         start_new_session=True,
     )
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)
 
 
 def has_seen(log: Path, size: int) -> bool:
@@ -142,7 +135,7 @@ def test_killed_at_any_moment_and_resumed(
     for generations in (2, 9, 13):
         process = start(output, *options)
         seen = 40 * 4 * 8 * generations
-        wait_for(partial(has_seen, log, seen))
+        until(partial(has_seen, log, seen))
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
         recorded = sum(map(recorded_in, output.glob("replicas/*/*")))
@@ -250,7 +243,7 @@ def test_full_disk_loses_nothing(tmp_path: Path, undisturbed: dict[str, bytes]) 
     output = tmp_path / "a"
     # Large enough for the workcell's copy, too small for a journal of 200 candidates.
     process = start(output, limit=40_000)
-    message = process.communicate(timeout=60)[1]
+    message = process.communicate(timeout=HANGS)[1]
     assert process.returncode == 2
     assert message.count("\n") == 1
     assert "no space left to write" in message
@@ -264,7 +257,7 @@ def test_full_disk_loses_nothing(tmp_path: Path, undisturbed: dict[str, bytes]) 
 def test_workers_end_with_the_campaign(tmp_path: Path) -> None:
     log = tmp_path / "log"
     process = start(tmp_path / "a", "--jobs", "2", "--delay", "0.05", "--log", str(log))
-    wait_for(log.exists)
+    until(log.exists)
     process.kill()
     process.wait()
 
@@ -275,13 +268,13 @@ def test_workers_end_with_the_campaign(tmp_path: Path) -> None:
             return True
         return False
 
-    wait_for(all_gone)
+    until(all_gone)
 
 
 def test_a_folder_serves_one_process(tmp_path: Path) -> None:
     log = tmp_path / "log"
     process = start(tmp_path / "a", "--delay", "0.1", "--log", str(log))
-    wait_for(log.exists)
+    until(log.exists)
     with pytest.raises(ResultsError, match=rf"in use by another process \(id {process.pid}\)"):
         run_search(SETTINGS, ExecutionSettings(tmp_path / "a", 1, resume=True))
     process.kill()

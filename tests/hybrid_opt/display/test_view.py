@@ -24,6 +24,7 @@ from hybrid_opt.errors import DisplayError
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK
 from tests.hybrid_opt.cells import shipped
+from tests.waiting import HANGS
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 EVIL = "</title></script><script>window.broken = 1</script>"
@@ -85,7 +86,7 @@ def test_it_draws_in_a_browser(tmp_path: Path) -> None:
     command = [BROWSER, "--headless=new", "--no-sandbox", "--disable-dev-shm-usage"]
     command += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--dump-dom"]
     command += ["--virtual-time-budget=20000", (tmp_path / "view.html").as_uri()]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    run = subprocess.run(command, capture_output=True, text=True, timeout=HANGS, check=True)
     assert 'data-ready="yes"' in run.stdout
     assert f"0.00 / {carry().duration:.2f} s" in run.stdout
     assert "<canvas" in run.stdout

@@ -16,9 +16,9 @@ import pytest
 from hybrid_opt.errors import WorkerError
 from hybrid_opt.work.processes import LocalExecutor, ProcessExecutor, local_executor
 from hybrid_opt.work.service import KILLED, MAX_DEATHS, SILENT, Service, answer_all
-from tests.fuzz.promises import soon
 from tests.hybrid_opt.work import services
 from tests.hybrid_opt.work.services import Kept, run
+from tests.waiting import HANGS, soon, until
 
 ROOT = Path(__file__).parents[3]
 
@@ -93,7 +93,7 @@ def test_ctrl_c_reaches_the_parent_alone(moment: float) -> None:
     process = started()
     time.sleep(moment)
     os.killpg(process.pid, signal.SIGINT)
-    told, complaints = process.communicate(timeout=30)
+    told, complaints = process.communicate(timeout=HANGS)
     assert told == "interrupted\n"
     assert complaints == ""
     wait_for_the_end_of_all(process.pid)
@@ -122,11 +122,11 @@ def started() -> subprocess.Popen[str]:
 
 
 def wait_for_the_end_of_all(group: int) -> None:
-    end = time.monotonic() + 20.0
-    while time.monotonic() < end:
+    def ended() -> bool:
         try:
             os.killpg(group, 0)
         except ProcessLookupError:
-            return
-        time.sleep(0.05)
-    raise AssertionError("processes are left")
+            return True
+        return False
+
+    until(ended)

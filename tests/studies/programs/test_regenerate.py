@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from codegen.cache import Cache
+from tests.waiting import HANGS
 
 # The command with a cell of one function in place of the workcell's file and evaluators.
 PROGRAM = """
@@ -49,7 +50,7 @@ def run(arguments: Sequence[str], edit: str = "") -> subprocess.CompletedProcess
         env=os.environ | {"COLUMNS": "100"},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HANGS,
         check=False,
     )
 

@@ -10,7 +10,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -31,6 +30,7 @@ from studies.study.recommendation import recommend_from, recommendation_text
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
+from tests.waiting import HANGS, until
 
 CELL = str(RACK.with_name("transfer.toml"))
 SMALL = ["--evaluations", "120", "--replicas", "2", "--jobs", "1", "--no-polish"]
@@ -181,13 +181,10 @@ def test_interrupt_tells_how_to_go_on(tmp_path: Path) -> None:
     process = subprocess.Popen(
         command, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
-    end = time.monotonic() + 120
-    while not any(path.stat().st_size > 40 for path in root.glob("replicas/*/*/journal.bin")):
-        assert process.poll() is None
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    journals = "replicas/*/*/journal.bin"
+    until(lambda: any(path.stat().st_size > 40 for path in root.glob(journals)), process)
     os.killpg(process.pid, signal.SIGINT)
-    message = process.communicate(timeout=60)[1]
+    message = process.communicate(timeout=HANGS)[1]
     assert process.returncode == 130
     last = message.strip().splitlines()[-1]
     assert last.startswith("interrupted, nothing is lost; continue with: python -m studies.run ")

@@ -16,8 +16,8 @@ from symbolic.errors import CollisionModelError
 from symbolic.geometry.hulls import CollisionModelWarning, convex_pieces
 from symbolic.geometry.pieces import Hull
 from symbolic.read.meshes import MOST_FACES
-from tests.fuzz.promises import soon
 from tests.robots import ur10_urdf
+from tests.waiting import soon
 
 MESHES = ur10_urdf().parents[1] / "meshes" / "ur10" / "collision"
 ONES = np.ones(3)

@@ -12,9 +12,9 @@ import pytest
 from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
 from symbolic.records import Workcell
-from tests.fuzz.promises import soon
 from tests.symbolic.read.problem_cases import CASES, put
 from tests.symbolic.read.samples import GOFA, RACK, sample_data, write
+from tests.waiting import soon
 
 
 def problems_of(path: Path) -> list[str]:

@@ -13,9 +13,9 @@ from symbolic.errors import UrdfError
 from symbolic.read.arms import arm_model, link_frame, reduced_model
 from symbolic.read.urdf import MOST_LINKS, UrdfMesh, parse_urdf, read_urdf
 from symbolic.records import Box, Cylinder
-from tests.fuzz.promises import soon
 from tests.robots import GOFA_URDF, robot_record, ur10_urdf
 from tests.symbolic.read.urdf_cases import CASES, LOOP
+from tests.waiting import soon
 
 GOFA = GOFA_URDF.read_text("utf-8")
 EVERY = sorted(ur10_urdf().parents[2].rglob("*.urdf"))
