@@ -1,5 +1,7 @@
-"""Settings for the whole test suite: on CI, property tests draw the same examples every time, what
-is compiled is compiled quickly unless CC is set, and Ctrl-C reaches the programs that tests start.
+"""Settings for the whole test suite.
+
+On CI, property tests draw the same examples every time; what is compiled is compiled quickly unless
+CC is set; Ctrl-C reaches the programs that tests start. Tests are marked by their rooms.
 """
 
 from __future__ import annotations
@@ -14,16 +16,72 @@ from hypothesis import settings
 
 from codegen.cache import Cache
 
+ROOMS = {
+    "compiled": (
+        *("codegen", "faults", "fuzz", "hybrid_opt", "studies"),
+        "symbolic/functions/test_candidate.py",
+    ),
+    "process": (
+        *("faults", "hybrid_opt/work", "studies/programs", "studies/study"),
+        *("fuzz/test_memory.py", "fuzz/test_programs.py", "hybrid_opt/campaign/test_search.py"),
+        *("studies/test_program.py", "symbolic/read/test_xacro_file.py", "test_docs.py"),
+    ),
+    "browser": (
+        "hybrid_opt/display/test_view.py",
+        "studies/report/test_report_browser.py",
+        "studies/report/test_report_own.py",
+    ),
+}
+"""Files and folders by what their tests need beside this process."""
+
+PLAIN = (
+    "hybrid_opt/indicators/test_metrics.py",
+    "hybrid_opt/indicators/test_statistics.py",
+    "hybrid_opt/metaheuristics/test_algorithms.py",
+    "hybrid_opt/metaheuristics/test_analytic_problems.py",
+    "hybrid_opt/metaheuristics/test_mopso.py",
+    "hybrid_opt/metaheuristics/test_problem.py",
+    "hybrid_opt/polishing/constraints",
+    "hybrid_opt/polishing/test_point.py",
+    "hybrid_opt/proposing/test_bounds.py",
+    "hybrid_opt/proposing/test_document.py",
+    "hybrid_opt/proposing/test_problem.py",
+    "hybrid_opt/timing/test_adapter.py",
+    "hybrid_opt/timing/test_jerk_program.py",
+    "studies/test_options.py",
+)
+"""What compiles nothing in rooms where most tests do."""
+
+TESTS = Path(__file__).parent
+
 settings.register_profile("local", deadline=None, print_blob=True, max_examples=40)
 settings.register_profile("ci", settings.get_profile("local"), derandomize=True, database=None)
 settings.register_profile("night", settings.get_profile("local"), max_examples=400)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
 
-os.environ.setdefault("CC", shlex.join(["bash", str(Path(__file__).with_name("quick-cc"))]))
+os.environ.setdefault("CC", shlex.join(["bash", str(TESTS / "quick-cc")]))
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell that starts pytest in the background has it ignore Ctrl-C, which children inherit.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Where tests that compile are left out, there is no compiler: what lacks the mark fails."""
+    expression = str(config.option.markexpr)
+    if expression.startswith("not") and "compiled" in expression:
+        os.environ["CC"] = "none-without-the-mark-compiled"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests by their rooms."""
+    for item in items:
+        path = item.path.relative_to(TESTS)
+        places = {path.as_posix(), *(folder.as_posix() for folder in path.parents)}
+        for mark, rooms in ROOMS.items():
+            if places & set(rooms) and not (mark == "compiled" and places & set(PLAIN)):
+                item.add_marker(mark)
 
 
 @pytest.fixture
