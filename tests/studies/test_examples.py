@@ -48,15 +48,31 @@ def test_it_runs(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    (tmp_path / "studies").symlink_to(ROOT / "studies")
-    monkeypatch.chdir(tmp_path)
     code = path.read_text("utf-8")
-    for full, small in (
-        SMALL.items() if path != EXAMPLES[0] else ()
-    ):  # README's: as they are printed
+    # README's, the first, runs as it is printed.
+    for full, small in SMALL.items() if path != EXAMPLES[0] else ():
         code = code.replace(full, small)
-    exec(compile(code, str(path), "exec"), {"__name__": "__main__"})
+    run(code, tmp_path, monkeypatch)
     assert capsys.readouterr().out or list((tmp_path / "out").iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 21))
+def test_the_first_runs_with_every_seed(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = EXAMPLES[0].read_text("utf-8")
+    assert "default_rng(1)" in code
+    run(code.replace("default_rng(1)", f"default_rng({seed})"), tmp_path, monkeypatch)
+    assert "Recommended" in capsys.readouterr().out
+    assert list((tmp_path / "out").iterdir())
+
+
+def run(code: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a user does in the repository, but for what it writes."""
+    (folder / "studies").symlink_to(ROOT / "studies")
+    monkeypatch.chdir(folder)
+    exec(compile(code, "example", "exec"), {"__name__": "__main__"})
 
 
 def test_the_library_page_holds_every_example_in_order() -> None:

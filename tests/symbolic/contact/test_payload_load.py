@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from studies.research.plain.load import sample_load
 from studies.research.plain.motion import angular_rates, rotation
 from symbolic.array import Array
 from symbolic.contact.load import load_function
-from symbolic.records import Contact, Workcell
+from symbolic.records import Workcell
 from tests.symbolic.cells import call, hand_cell, solid_box, with_contacts, with_payload
 
 MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
@@ -184,57 +181,3 @@ def test_forces_stay_in_their_friction_cones(seed: int) -> None:
         along = force @ normal
         assert along >= -1e-9
         assert np.linalg.norm(force - along * normal) <= contact.friction * along + 1e-8
-
-
-@given(seed=st.integers(0, 2**31), turn=st.floats(-np.pi, np.pi))
-def test_turning_the_world_about_the_vertical_turns_vectors_and_keeps_sizes(
-    seed: int, turn: float
-) -> None:
-    rng = np.random.default_rng(seed)
-    cell, (pose, rate, second) = random_cell(rng), random_motion(rng)
-    R = Rotation.from_euler("z", turn).as_matrix()
-    turned_pose = np.concatenate([R @ pose[:3], pose[3:] + turn * np.eye(3)[2]])
-    turned = [np.concatenate([R @ v[:3], v[3:]]) for v in (rate, second)]
-    here, there = load(cell, pose, rate, second), load(cell, turned_pose, *turned)
-    for name, value in here.items():
-        if name in ("normal_force", "tangential_force", "pressure_shift"):
-            expected = value
-        else:
-            expected = (value.reshape(-1, 3) @ R.T).reshape(-1)
-        np.testing.assert_allclose(
-            there[name], expected, atol=rounding(here), rtol=0.0, err_msg=name
-        )
-
-
-def mirrored(cell: Workcell) -> Workcell:
-    """The cell reflected at the plane y = 0, contacts renumbered so that 1 stays on +y."""
-    reflect = np.diag([1.0, -1.0, 1.0])
-    payload = replace(
-        cell.payload,
-        centre_of_mass=reflect @ cell.payload.centre_of_mass,
-        inertia=reflect @ cell.payload.inertia @ reflect,
-    )
-    first, second = cell.contacts
-    return replace(
-        cell,
-        payload=payload,
-        contacts=(
-            Contact(first.T_box_pad, second.friction, second.patch_radius),
-            Contact(second.T_box_pad, first.friction, first.patch_radius),
-        ),
-    )
-
-
-@given(seed=st.integers(0, 2**31))
-def test_mirroring_the_cell_exchanges_the_forces(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    cell, motion = random_cell(rng), random_motion(rng)
-    here = load(cell, *motion)
-    there = load(mirrored(cell), *(MIRROR * value for value in motion))
-    for name in ("normal_force", "tangential_force", "pressure_shift"):
-        np.testing.assert_allclose(there[name], here[name][::-1], atol=rounding(here), err_msg=name)
-    for name in ("contact_force", "shift_vector"):
-        expected = here[name].reshape(2, 3)[::-1] * MIRROR[:3]
-        np.testing.assert_allclose(
-            there[name].reshape(2, 3), expected, atol=rounding(here), err_msg=name
-        )
