@@ -14,7 +14,7 @@ import pytest
 from hybrid_opt.bundles.bundle import read_manifest, write_bundle
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.files import locked, read_json, sha256, write_atomically, write_json
+from hybrid_opt.store.files import read_json, sha256, write_atomically, write_json
 from hybrid_opt.store.trajectory_file import read_trajectory, write_trajectory
 from tests.faults.kills import contents, differences, ended, started, study
 from tests.symbolic.cells import ROOT, rack_cell
@@ -78,11 +78,6 @@ def _trajectory(path: Path) -> None:
 
 def _bundle(path: Path) -> None:
     write_bundle(path, {"sub/job.csv": "x" * 500_000}, {})
-
-
-def _lock(path: Path) -> None:
-    with locked(path.parent / "new"):
-        pass
 
 
 WRITERS: dict[str, Writer] = {

@@ -11,8 +11,8 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell, polish_functions
-from hybrid_opt.polishing.drive import DriveReached, DriveStep, DriveWay
-from hybrid_opt.polishing.point import Climb, Solution
+from hybrid_opt.polishing.drive import DriveWay
+from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from symbolic.array import Array
@@ -71,9 +71,6 @@ def way_of(owner: Polisher) -> DriveWay:
 def solved(by: DriveWay, x: Array) -> Solution:
     """All rounds of a point from a decision vector."""
     return by.finish(by.climb(x))
-
-
-DriveClimb = Climb[DriveReached, DriveStep]
 
 
 def smooth_cell(judge: CandidateEvaluator) -> SmoothCell:

@@ -14,9 +14,6 @@ from symbolic.contact.load import load_function
 from symbolic.records import Workcell
 from tests.symbolic.cells import call, hand_cell, solid_box, with_contacts, with_payload
 
-MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-"""Pose components under reflection at the plane y = 0: angles about x and z change sign."""
-
 
 def load(cell: Workcell, pose: Array, rate: Array, second: Array) -> dict[str, Array]:
     return call(load_function(cell), pose, rate, second)
