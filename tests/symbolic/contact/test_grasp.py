@@ -76,7 +76,7 @@ def check_against_clarabel(kinds: tuple[str, ...], grasps: int, loads: int, seed
 
 @pytest.mark.parametrize("kinds", KINDS)
 def test_agrees_with_clarabel(kinds: tuple[str, ...]) -> None:
-    check_against_clarabel(kinds, grasps=6, loads=3, seed=1)
+    check_against_clarabel(kinds, grasps=3, loads=6, seed=1)
 
 
 @pytest.mark.slow
@@ -144,7 +144,7 @@ def caron_rows(pad: Contact, mu: float) -> Array:
 
 
 @given(seed=st.integers(0, 2**31), kinds=st.sampled_from(KINDS[:5]))
-@settings(max_examples=12)
+@settings(max_examples=6)
 def test_turning_all_turns_the_forces(seed: int, kinds: tuple[str, ...]) -> None:
     rng = np.random.default_rng(seed)
     cell, load = random_grasp(rng, hand_cell(), kinds), random_load(rng)
@@ -161,7 +161,7 @@ def test_turning_all_turns_the_forces(seed: int, kinds: tuple[str, ...]) -> None
 
 
 @given(seed=st.integers(0, 2**31), kinds=st.sampled_from(KINDS[:5]))
-@settings(max_examples=8)
+@settings(max_examples=5)
 def test_derivatives_are_those_of_the_forces(seed: int, kinds: tuple[str, ...]) -> None:
     rng = np.random.default_rng(seed)
     cell, load = random_grasp(rng, hand_cell(), kinds), random_load(rng)
