@@ -88,7 +88,8 @@ def _solve(case: Case, size: float, squeeze: bool) -> tuple[Array, float]:
     ).solve()
     x = np.array(solution.x)
     assert str(solution.status) in ("Solved", "AlmostSolved"), solution.status
-    assert np.abs(rows @ x - right).max() < 5e-7 * max(1.0, float(np.abs(x).max()))
+    if not squeeze:  # there, what balance misses is part of how much the answer may be off
+        assert np.abs(rows @ x - right).max() < 5e-7 * max(1.0, float(np.abs(x).max()))
     wrenches: Array = size * x[:12].reshape(2, 6) * np.repeat([1.0, unit], 3)
     multipliers, missed = np.array(solution.z), matrix @ x + np.array(solution.s) - bound
     gap = abs(solution.obj_val - solution.obj_val_dual)
