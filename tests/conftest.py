@@ -31,8 +31,19 @@ ROOMS = {
         "studies/report/test_report_browser.py",
         "studies/report/test_report_own.py",
     ),
+    "heavy": (
+        "symbolic/contact/test_grasp.py",
+        "symbolic/contact/test_grasp_squeeze.py",
+        "symbolic/contact/test_soft_finger.py",
+        "symbolic/contact/test_soft_grasp.py",
+        "symbolic/functions/test_redundant_candidate.py",
+        "symbolic/geometry/test_clearance.py",
+        "symbolic/read/test_machines.py",
+        "symbolic/robot/test_branches.py",
+    ),
 }
-"""Files and folders by what their tests need beside this process."""
+"""Files and folders by what their tests need beside this process, or that they take long: whole
+models and conic programs, 14 to 33 s of computing per file."""
 
 PLAIN = (
     "hybrid_opt/indicators/test_metrics.py",
