@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +33,7 @@ from symbolic.read.descriptions import (
 )
 from symbolic.read.tables import Table, read_body, read_file, read_inertia, read_pose
 from symbolic.read.urdf import LARGEST_GYRATION, Urdf, read_srdf, read_urdf
-from symbolic.records import SEARCHED, Robot, ToolLoad
+from symbolic.records import SEARCHED, Driver, Robot, ToolLoad
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import read_only
 from symbolic.records.problems import shown
@@ -82,6 +83,7 @@ def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot,
         tool_load=_read_tool_load(table),
         redundant_joints=_read_redundant(table, model),
         jerk_max=_read_jerk(table, len(limits["acceleration_max"])),
+        driver=_read_driver(table),
     )
     branch = SEARCHED
     if table.raw("start_branch", -1) != "search":
@@ -125,6 +127,35 @@ def _read_tool_load(table: Table) -> ToolLoad | None:
         inertia = read_inertia(inner, mass * LARGEST_GYRATION**2)
     inner.close()
     return ToolLoad(mass, centre, inertia)
+
+
+ADDRESS = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.:-]{0,251}[A-Za-z0-9])?")
+"""Host names, IPv4 and IPv6 addresses; nothing that ends a string of a robot's language."""
+
+PREFIX = re.compile(r"(?:[A-Za-z][A-Za-z0-9_]{0,39})?")
+"""What names of joints may begin with in ROS; '' for nothing."""
+
+
+def _read_driver(table: Table) -> Driver:
+    inner = table.table("driver", {})
+    driver = Driver(
+        address=_matching(inner, "address", ADDRESS, "a host name or an IP address") or "",
+        prefix=_matching(inner, "prefix", PREFIX, "letters, digits, _, with a letter first"),
+        rate=inner.number("rate", quantity.RATE) if inner.has("rate") else None,
+        lag=inner.number("lag", quantity.LAG, 0.0),
+        force_control=inner.flag("force_control"),
+    )
+    inner.close()
+    return driver
+
+
+def _matching(table: Table, key: str, allowed: re.Pattern[str], meaning: str) -> str | None:
+    """A text of a form; None where there is none, or after a problem."""
+    value = table.raw(key, None)
+    if value is None or (isinstance(value, str) and allowed.fullmatch(value)):
+        return value
+    table.problems.add(table.at(key), f"found {shown(value)}; allowed: {meaning}")
+    return None
 
 
 def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array]:

@@ -146,6 +146,14 @@ class Table:
             return ""
         return str(value)
 
+    def flag(self, key: str) -> bool:
+        """True or false; false where the key is missing, or after a problem."""
+        value = self.raw(key, False)
+        if not isinstance(value, bool):
+            self.problems.add(self.at(key), f"found {shown(value)}; allowed is true or false")
+            return False
+        return value
+
     def table(self, key: str, default: Mapping[str, Any] | None = None) -> Table:
         """A sub-table; an empty one after a problem, which then reports nothing further."""
         value = self.raw(key, _REQUIRED if default is None else default)

@@ -104,6 +104,26 @@ class ToolLoad:
 
 
 @dataclass(frozen=True)
+class Driver:
+    """How the controller of an arm is reached, and what it is able to do.
+
+    Attributes:
+        address: host name or IP address; '' where nobody says.
+        prefix: of the arm's joints as its driver names them; None for the robot's name.
+        rate: of the driver's cycle [Hz]; None for what the target has.
+        lag: how late the arm follows what it is told [s].
+        force_control: whether the controller has its maker's force control, where that is an
+            option: a sensor at the flange, and instructions that press with a force.
+    """
+
+    address: str = ""
+    prefix: str | None = None
+    rate: float | None = None
+    lag: float = 0.0
+    force_control: bool = False
+
+
+@dataclass(frozen=True)
 class Robot:
     """One arm: its model file, where it stands, what it carries and what it may do.
 
@@ -132,6 +152,7 @@ class Robot:
         redundant_joints: names of the joints beyond six, whose paths are part of the decision
             vector; () where the arm has six.
         jerk_max: (n,) [rad/s^3], or None without limits.
+        driver: of its controller, for bundles.
     """
 
     name: str
@@ -155,6 +176,7 @@ class Robot:
     tool_load: ToolLoad | None = None
     redundant_joints: tuple[str, ...] = ()
     jerk_max: Array | None = None
+    driver: Driver = field(default_factory=Driver)
 
 
 # --- the payload, how it is held, and how sure that is ---

@@ -104,6 +104,8 @@ TOLERANCE = Quantity("m", 0.0, 0.1, mistaken=_MILLIMETRES)
 
 STAND_OFF = Quantity("m", 1e-3, 0.5, mistaken=_MILLIMETRES)
 LIFT = Quantity("m", 0.0, 0.5, mistaken=_MILLIMETRES)
+RATE = Quantity("Hz", 10.0, 8000.0, mistaken=(("kHz", 1e3),))
+LAG = Quantity("s", 0.0, 0.5, mistaken=(("ms", 1e-3),))
 FORCE_RATE = Quantity("N/s", 1.0, 1e4)
 
 

@@ -54,6 +54,16 @@ def robots(draw: st.DrawFn, name: str) -> dict[str, Any]:
         "position_upper": vectors(0.1, 6, 6),
         "min_manipulability": numbers(1e-6, 0.1),
         "start_branch": st.integers(-1, 7),
+        "driver": st.fixed_dictionaries(
+            {},
+            optional={
+                "address": st.sampled_from(["arm.local", "192.168.0.1", "fe80::1"]),
+                "prefix": st.sampled_from(["", "left_"]),
+                "rate": numbers(10.0, 8000.0),
+                "lag": numbers(0.0, 0.5),
+                "force_control": st.booleans(),
+            },
+        ),
     }
     return {
         "name": name,

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.read.cell import load
 from symbolic.read.payload import face_normal, pad_rotation
-from symbolic.records import USUAL, Body, Box, Cylinder, Sphere, Uncertainty, Workcell
+from symbolic.records import USUAL, Body, Box, Cylinder, Driver, Sphere, Uncertainty, Workcell
 from symbolic.records.poses import inverse, pose_matrix
 from tests.symbolic.read.samples import GOFA, sample_data, write
 from tests.symbolic.read.strategies import cells, numbers, vectors
@@ -57,6 +57,7 @@ def assert_same_cell(cell: Workcell, data: dict[str, Any]) -> None:
         assert (robot.jerk_max is None) == ("jerk_max" not in entry)
         if robot.jerk_max is not None:
             np.testing.assert_array_equal(robot.jerk_max, np.broadcast_to(entry["jerk_max"], 6))
+        assert robot.driver == Driver(**entry.get("driver", {}))
         assert robot.min_manipulability == entry.get("min_manipulability", 0.005)
         for tool, tool_entry in zip(robot.tool, entry["tool"], strict=True):
             assert_same_body(tool, tool_entry)
