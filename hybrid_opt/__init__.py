@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hybrid_opt.branches import search_branches
     from hybrid_opt.bundles.bundle import export
-    from hybrid_opt.bundles.manifest import BundleOptions, Origin
+    from hybrid_opt.bundles.job_file import BundleOptions
+    from hybrid_opt.bundles.manifest import Origin
     from hybrid_opt.carry import Carry
     from hybrid_opt.cell import Cell
     from hybrid_opt.door import (
@@ -78,7 +79,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "BundleOptions": "hybrid_opt.bundles.manifest",
+    "BundleOptions": "hybrid_opt.bundles.job_file",
     "Carry": "hybrid_opt.carry",
     "Cell": "hybrid_opt.cell",
     "DualArmError": "symbolic.errors",

@@ -18,10 +18,10 @@ TIMINGS = ("closest", "fastest", "force")
 def _add_options(parser: Parser) -> None:
     add(parser, "FILE")
     parser.add_argument(
-        "--form",
-        choices=stated("hybrid_opt.bundles.bundle.FORMATS"),
+        "--target",
+        choices=stated("hybrid_opt.bundles.bundle.TARGETS"),
         required=True,
-        help="what is written",
+        help="what is to run it",
     )
     add(
         parser,
@@ -59,28 +59,29 @@ def _add_options(parser: Parser) -> None:
         "averaged [s]; 0 leaves it as it is",
     )
     parser.add_argument(
-        "--step", type=float, metavar="S", help="time between samples [s] (default: the form's own)"
+        "--step",
+        type=float,
+        metavar="S",
+        help="time between samples [s] (default: the longest that keeps the forces)",
     )
     parser.add_argument(
         "--stiffness",
         type=float,
-        default=stated("hybrid_opt.bundles.manifest.BundleOptions.stiffness"),
+        default=stated("hybrid_opt.bundles.job_file.BundleOptions.stiffness"),
         metavar="N/m",
-        help="of each arm at its pad, for what a late arm does",
+        help="of each arm at its pad, for what a late arm and the time step do",
     )
     parser.add_argument(
         "--skew",
         type=float,
         metavar="S",
         help="between the starts of both arms [s]; a job whose squeeze it breaks is refused "
-        f"(default: {stated('hybrid_opt.bundles.manifest.SKEW'):g} where a controller of its own "
-        "drives each arm, else 0)",
+        "(default: what the target leaves to chance, 0 where one clock drives both arms)",
     )
     parser.add_argument(
-        "--per-arm", action="store_true", help="ros2: a trajectory and a controller per arm"
-    )
-    parser.add_argument(
-        "--any-arm", action="store_true", help="rapid, urscript: also for arms of other makers"
+        "--any-arm",
+        action="store_true",
+        help="also write a maker's own language for arms of others",
     )
 
 

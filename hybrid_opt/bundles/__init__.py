@@ -1,6 +1,7 @@
-"""Whole jobs as bundles: CSV, JSON, ROS 2, RAPID, URScript, MCAP. docs/export.md describes them."""
+"""Whole jobs as bundles that drivers run as they are. docs/export.md describes them."""
 
-from hybrid_opt.bundles.bundle import FORMATS, export
-from hybrid_opt.bundles.manifest import BundleOptions, Origin
+from hybrid_opt.bundles.bundle import TARGETS, export
+from hybrid_opt.bundles.job_file import BundleOptions
+from hybrid_opt.bundles.manifest import Origin
 
-__all__ = ["FORMATS", "BundleOptions", "Origin", "export"]
+__all__ = ["TARGETS", "BundleOptions", "Origin", "export"]

@@ -38,11 +38,14 @@ ABB = "ABB"
 
 UR = "UR e-series"
 
+FRANKA = "Franka"
+
 SIX, SEVEN = 6, 7
 """Axes of an arm that a language's targets can hold."""
 
 _SIGNS = {
     ABB: re.compile(r"(?<![a-z])(abb|irb|crb|gofa|yumi|swifti)(?![a-z])"),
+    FRANKA: re.compile(r"(?<![a-z])(panda|fr3|fp3|fer|franka)(?![a-z])"),
     UR: re.compile(r"(?<![a-z0-9])(ur(3|5|10|16)e|ur(7e|8|12e|15|18|20|30))(?![a-z0-9])"),
 }
 
@@ -51,7 +54,7 @@ def require_maker(workcell: Workcell, maker: str, language: str, any_arm: bool) 
     """Refuse a language for arms that do not look like its maker's.
 
     Args:
-        maker: `ABB` or `UR`.
+        maker: `ABB`, `FRANKA` or `UR`.
         language: for the message.
         any_arm: whether the user wants it all the same.
 
@@ -61,10 +64,10 @@ def require_maker(workcell: Workcell, maker: str, language: str, any_arm: bool) 
     if any_arm:
         return
     for robot in workcell.robots:
-        if not _SIGNS[maker].search(_named(robot)):
+        if not _SIGNS[maker].search(described(robot)):
             raise SettingsError(
                 f"robot {robot.name!r} is described by {robot.urdf.name}, which does not look like "
-                f"an arm of {maker}; {language} is theirs: choose another form, or force it "
+                f"an arm of {maker}; {language} is theirs: choose another target, or force it "
                 "(--any-arm) where zero and signs of its joints are the controller's"
             )
 
@@ -84,11 +87,25 @@ def require_axes(workcell: Workcell, language: str, allowed: Sequence[int] = (SI
             slide = "" if all(turning) else f", {turning.count(False)} of them sliding"
             raise SettingsError(
                 f"robot {robot.name!r} has {len(turning)} joints{slide}; targets of {language} "
-                f"hold {' or '.join(map(str, allowed))} turning axes, choose another form"
+                f"hold {' or '.join(map(str, allowed))} turning axes, choose another target"
             )
 
 
-def _named(robot: Robot) -> str:
+def require_address(workcell: Workcell, target: str) -> None:
+    """Refuse a target that has to know where both controllers are.
+
+    Raises:
+        SettingsError: a robot's driver has no address.
+    """
+    for robot in workcell.robots:
+        if not robot.driver.address:
+            raise SettingsError(
+                f"{target} has to know where the controller of {robot.name!r} is: write "
+                '[robots.driver] with address = "..." into its section of the workcell'
+            )
+
+
+def described(robot: Robot) -> str:
     """Words about the make in a description, in small letters."""
     words = [robot.urdf.name, *robot_urdf(robot).links]
     words += [value for _, value in robot.xacro_arguments]
@@ -110,8 +127,17 @@ def prefixes(workcell: Workcell) -> tuple[str, str]:
     """Prefixes of the names of each robot's links and joints."""
     if one_machine(workcell.robots):
         return "", ""
-    first, second = (robot_prefix(robot.name) for robot in workcell.robots)
+    stated = [robot.driver.prefix for robot in workcell.robots]
+    first, second = (
+        robot_prefix(robot.name) if prefix is None else prefix
+        for robot, prefix in zip(workcell.robots, stated, strict=True)
+    )
     return (first, second) if first != second else (f"a_{first}", f"b_{second}")
+
+
+def pad_frame(prefix: str, arm: int) -> str:
+    """Name of a pad's frame."""
+    return f"{prefix or f'arm_{arm + 1}_'}contact_pad"
 
 
 def description(workcell: Workcell, q: Array) -> str:

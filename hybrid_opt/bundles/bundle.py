@@ -13,12 +13,21 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from hybrid_opt.bundles.manifest import SKEW, BundleOptions, Contents, Form, Origin, manifest
+from hybrid_opt.bundles.egm import egm_files, require_egm
+from hybrid_opt.bundles.holding import stop_of
+from hybrid_opt.bundles.job_file import BundleOptions, Contents, Export, csv_text, json_files
+from hybrid_opt.bundles.manifest import SKEW, Origin, Target, manifest
 from hybrid_opt.bundles.mcap_file import mcap_files
-from hybrid_opt.bundles.rapid import rapid_files
-from hybrid_opt.bundles.ros2 import ros2_files
-from hybrid_opt.bundles.tables import csv_text, json_text
-from hybrid_opt.bundles.urscript import urscript_files
+from hybrid_opt.bundles.rapid import rapid_files, require_rapid
+from hybrid_opt.bundles.ros2 import (
+    control_files,
+    franka_files,
+    require_franka,
+    require_ur,
+    ur_files,
+)
+from hybrid_opt.bundles.steps import chosen_step, gap_of
+from hybrid_opt.bundles.urscript import require_urscript, urscript_files
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.job.compliance import require_skew
 from hybrid_opt.job.plan import plan_job
@@ -30,65 +39,111 @@ from symbolic.replacing import replace_file, sync_folder
 
 MANIFEST = "manifest.json"
 FORMAT = "dual-arm-carry bundle"
-VERSION = 1
+VERSION = 2
 
-FORMATS: Mapping[str, Form] = {
-    "csv": Form(
-        lambda sampled, options: {"job.csv": csv_text(sampled)},
-        0.008,
-        "one row per time step; read it with anything",
-    ),
-    "json": Form(
-        lambda sampled, options: {"job.json": json_text(sampled)},
-        0.008,
-        "read it with anything; docs/export.md lists the keys",
-    ),
-    "ros2": Form(
-        ros2_files,
-        0.02,
-        "ros2 launch launch/bringup.launch.py, then python3 run_job.py; mock hardware until "
-        "description/cell.urdf names your own",
+RUN = "run_job.py looks at both arms a hundred times a second and replaces their goals"
+
+TARGETS: Mapping[str, Target] = {
+    "ros2-control": Target(
+        control_files,
+        (0.02, 0.01, 0.005),
+        "quintic",
+        "ros2 launch launch/control.launch.py, then python3 run_job.py; mock hardware until "
+        "description/cell.urdf names your simulator's",
+        RUN,
         "one controller drives all joints: both arms start in the same cycle",
         0.0,
-        "the goals of both controllers bear one start time: what remains is the difference of "
-        "their machines' clocks",
     ),
-    "rapid": Form(
-        rapid_files,
-        0.1,
-        "load Carry1.mod in T_ROB1 and Carry2.mod in T_ROB2, connect CarryForce, jog both robots "
-        "to carryFirst, run Carry in both tasks; first without the box, and slowly",
-        "synchronised moves of one MultiMove controller",
-        0.0,
+    "franka-ros2": Target(
+        franka_files,
+        (0.02, 0.01, 0.005),
+        "quintic",
+        "no end effector in Desk; ros2 launch launch/franka.launch.py, then python3 run_job.py",
+        RUN,
+        "the goals of both controllers bear one start time of one computer's clock",
+        0.002,
+        require_franka,
     ),
-    "urscript": Form(
-        urscript_files,
-        0.008,
-        "wire digital output 0 of each arm to input 0 of the other, move both arms to the first "
-        "position, run one program on each; first without the box",
-        "both programs meet before each phase over a digital line each way: what remains is a "
-        "cycle and the lines' latency",
+    "ur-ros2": Target(
+        ur_files,
+        (0.04, 0.02, 0.01),
+        "quintic",
+        "power both arms on and release their brakes; ros2 launch launch/ur.launch.py, then "
+        "python3 run_job.py",
+        "run_job.py slows both arms down along their paths by their speed sliders, then cancels "
+        "their goals; force mode presses on",
+        "both controllers get their goals at once and begin when they have them",
         SKEW,
+        require_ur,
     ),
-    "mcap": Form(mcap_files, 0.02, "open job.mcap in Foxglove, or play it: ros2 bag play job.mcap"),
+    "ur-script": Target(
+        urscript_files,
+        (0.008, 0.004, 0.002),
+        "linear",
+        "wire digital outputs 0 and 1 of each arm to inputs 0 and 1 of the other, move both arms "
+        "to the first position, run one program on each; first without the box",
+        "either program stretches the time of its points until it stands, servoj and force mode "
+        "hold; so does the other's as soon as the heartbeat on output 1 stops",
+        "both programs meet before the job over a digital line each way: what remains is a cycle "
+        "and the lines' latency",
+        SKEW,
+        require_urscript,
+    ),
+    "abb-rapid": Target(
+        rapid_files,
+        (0.2, 0.1, 0.05, 0.02),
+        "linear",
+        "load T_ROB1/Carry1.mod and T_ROB2/Carry2.mod, jog both robots to carryFirst, run Carry "
+        "in both tasks; first without the box, and slowly",
+        "the controller stops both tasks at once; force control keeps its last reference where "
+        "the controller leaves it active",
+        "both tasks meet before every phase (WaitSyncTask): what remains is the difference of "
+        "two planners within a phase",
+        SKEW,
+        require_rapid,
+    ),
+    "abb-egm": Target(
+        egm_files,
+        (0.02, 0.01, 0.005),
+        "cubic",
+        "load T_ROB1/CarryEgm1.mod and T_ROB2/CarryEgm2.mod, jog both robots to carryFirst, run "
+        "CarryEgm in both tasks, then python3 run_egm.py; first without the box",
+        "run_egm.py streams both arms from one clock and lets it stand still",
+        "one clock streams the positions of both arms",
+        0.004,
+        require_egm,
+    ),
+    "mcap": Target(
+        mcap_files,
+        (0.02,),
+        "cubic",
+        "open job.mcap in Foxglove, or play it: ros2 bag play job.mcap",
+    ),
+    "csv": Target(
+        lambda export: {"job.csv": csv_text(export)},
+        (0.008,),
+        "cubic",
+        "one row per time step; read it with anything",
+    ),
+    "json": Target(json_files, (0.008,), "cubic", "job.schema.json describes job.json"),
 }
-"""Every form by its name."""
+"""Every target by its name."""
 
 
 def export(
     job: Job | Timing,
-    form: str,
+    target: str,
     folder: str | Path,
     *,
     origin: Origin | None = None,
     options: BundleOptions | None = None,
 ) -> tuple[Path, ...]:
-    """Write a whole job as one bundle, FOLDER/NAME/FORM, with a manifest.
+    """Write a whole job as one bundle, FOLDER/NAME/TARGET, with a manifest.
 
     Args:
         job: as `plan_job` makes it, or a timing that robots can drive, for the job around it with
             default forces.
-        form: name of one of `FORMATS`.
+        target: name of one of `TARGETS`.
         folder: what the bundle's own folder is made in.
         origin: where the carry comes from, for the name; by default the workcell's name.
         options: None for the defaults.
@@ -97,23 +152,40 @@ def export(
         The files written, the manifest first.
 
     Raises:
-        SettingsError: the form is unknown, the step out of range, the timing failed, or the form is
-            not for these arms.
-        JobError: the job cannot be done, or the skew between both arms breaks its squeeze.
+        SettingsError: the target is unknown, the step out of range or too long for the forces, the
+            timing failed, or the target is not for these arms.
+        JobError: the job cannot be done, a stop or the skew between both arms breaks its squeeze.
         ResultsError: the bundle cannot be written, or something else is in its place.
     """
-    if form not in FORMATS:
-        raise SettingsError(f"unknown format {form!r}; known are {', '.join(FORMATS)}")
+    if target not in TARGETS:
+        raise SettingsError(f"unknown target {target!r}; known are {', '.join(TARGETS)}")
     options, origin = options or BundleOptions(), origin or Origin()
+    found = TARGETS[target]
     whole = job if isinstance(job, Job) else plan_job(job)
-    _, skew = FORMATS[form].start_of(options)
+    found.require(whole, options)
+    skew = found.skew if options.skew is None else options.skew
     if skew is not None:
         require_skew(whole, skew, options.stiffness)
-    found = FORMATS[form]
-    sampled = sample_job(whole, found.step if options.step is None else options.step)
-    contents = found.files(sampled, options)
-    document = manifest(sampled, form, found, origin, options)
-    return write_bundle(Path(folder) / document["name"] / form, contents, document)
+    sheet = prepared(whole, found, options)
+    contents = found.files(sheet)
+    document = manifest(sheet, target, found, origin, skew)
+    return write_bundle(Path(folder) / document["name"] / target, contents, document)
+
+
+def prepared(job: Job, target: Target, options: BundleOptions) -> Export:
+    """A job sampled as a target wants it: at the step asked for, or at the longest of the target's
+    steps that keeps the forces.
+
+    Raises:
+        SettingsError: the step is out of range, or none keeps the forces.
+        JobError: no stop along the path does.
+    """
+    step, stiffness = options.step, options.stiffness
+    if step is None:
+        step = chosen_step(job, target.steps, target.interpolation, stiffness)
+    sampled = sample_job(job, step)
+    gap = gap_of(sampled, target.interpolation, stiffness)
+    return Export(sampled, options, gap, stop_of(job))
 
 
 def write_bundle(folder: Path, contents: Contents, manifest: Mapping[str, Any]) -> tuple[Path, ...]:

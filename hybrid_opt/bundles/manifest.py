@@ -1,26 +1,27 @@
-"""What every bundle has: a form, options, an origin, and a manifest that describes it."""
+"""What every bundle has: a target, an origin, and a manifest that describes it."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from hybrid_opt.bundles.job_file import BundleOptions, Contents, Export
+from hybrid_opt.bundles.steps import Interpolation
 from hybrid_opt.job.compliance import (
     SKEWS,
     STIFFNESSES,
+    TRACKED,
     PositionControl,
     Skew,
     largest_skew,
     position_control,
-    require_delay,
-    require_stiffness,
     skewed,
 )
-from hybrid_opt.job.records import Job, SampledJob
+from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
 from hybrid_opt.store.files import sha256
 
@@ -33,40 +34,12 @@ UNITS = {
     "stiffness": "N/m",
 }
 
-Contents = Mapping[str, str | bytes]
-"""File contents by path within a bundle."""
-
 SKEW = 0.01
 """Largest start skew expected of two controllers with clocks of their own [s]."""
 
 LONGEST_WORD = 40
 
 DIGEST_LENGTH = 8
-
-
-@dataclass(frozen=True)
-class BundleOptions:
-    """How a job is written.
-
-    Attributes:
-        step: time between samples [s]; None for the form's own.
-        per_arm: ROS 2: one trajectory and one controller per arm instead of one for both.
-        any_arm: write a maker's own language for arms that do not look like that maker's.
-        stiffness: of each arm at its pad, for what a skew and position control do [N/m].
-        skew: between the starts of both arms that the job has to survive [s]; None for what the
-            form leaves to chance (`Form.start_of`).
-    """
-
-    step: float | None = None
-    per_arm: bool = False
-    any_arm: bool = False
-    stiffness: float = 1e4
-    skew: float | None = None
-
-    def __post_init__(self) -> None:
-        require_stiffness(self.stiffness)
-        if self.skew is not None:
-            require_delay(self.skew)
 
 
 @dataclass(frozen=True)
@@ -122,42 +95,66 @@ class Origin:
 
 
 @dataclass(frozen=True)
-class Form:
-    """One form of bundles.
+class Target:
+    """What a bundle is for.
 
     Attributes:
-        files: from a sampled job to file contents by path.
-        step: time step where none is given [s].
+        files: from an export to file contents by path.
+        steps: time steps that it can have, the longest first [s].
+        interpolation: how it moves between two samples.
         how_to_run: in words.
+        reaction: who carries out a stop, in words; '' for data that nobody runs.
         start: how both arms start together, in words.
         skew: between their starts, which a job has to survive [s]; None where nobody asks.
-        start_per_arm: how both start where each has a controller of its own, '' where none has.
+        require: refuses a job before it is sampled.
     """
 
-    files: Callable[[SampledJob, BundleOptions], Contents]
-    step: float
+    files: Callable[[Export], Contents]
+    steps: tuple[float, ...]
+    interpolation: Interpolation
     how_to_run: str
+    reaction: str = ""
     start: str = "up to what plays the file"
     skew: float | None = None
-    start_per_arm: str = ""
+    require: Callable[[Job, BundleOptions], None] = lambda job, options: None
 
-    def start_of(self, options: BundleOptions) -> tuple[str, float | None]:
-        """How a bundle starts both arms, and the skew to survive: the one asked for, if any."""
-        how, skew = self.start, self.skew
-        if self.start_per_arm and options.per_arm:
-            how, skew = self.start_per_arm, SKEW
-        return how, skew if options.skew is None else options.skew
+
+STATES = {
+    "ready": "both arms are looked at: news from both, pads at their first places, nothing pressed",
+    "running": "both arms follow the path; phases follow one another without a gap",
+    "stopping": "both arms come to rest at the same place of the path, within the stop time",
+    "held": "both arms keep that place and the squeeze that belongs to it",
+    "done": "the job's end, or back at its beginning",
+}
+
+STOPS = (
+    "an arm is silent for longer than `silence`",
+    "a pad is farther from its path than `path`",
+    "an arm is later than `behind`, or both are farther apart along the path than `skew`",
+    "a measured force misses its reference by more than the share `force` while pads alone hold "
+    "the box",
+    "a controller refuses or ends its goal",
+    "someone asks for it: Ctrl-C, or the stop signal of the target",
+)
+
+SET_DOWN = (
+    "from `held` the job goes on to its end ('continue'), or back along the same path to where the "
+    "box stood ('back'), which takes the same forces"
+)
 
 
 def manifest(
-    sampled: SampledJob, name: str, form: Form, origin: Origin, options: BundleOptions
+    export: Export, name: str, target: Target, origin: Origin, skew: float | None
 ) -> dict[str, Any]:
-    """JSON values: what a bundle of a form and its name holds, from which trajectory, and what it
-    keeps to."""
-    job, stiffness = sampled.job, options.stiffness
-    how, skew = form.start_of(options)
+    """JSON values: what a bundle of a target and its name holds, from which trajectory, and what it
+    keeps to.
+
+    Args:
+        skew: between the starts of both arms that the job was asked to survive [s].
+    """
+    job, stiffness = export.job, export.options.stiffness
     return {
-        "form": name,
+        "target": name,
         "name": origin.name(job),
         "digest": job_digest(job),
         "workcell": {"name": job.workcell.name, "digest": job.workcell.digest},
@@ -171,7 +168,7 @@ def manifest(
         },
         "timing": {"status": job.timing.status.value, "reason": job.timing.reason},
         "duration": job.duration,
-        "samples": len(sampled.time),
+        "samples": len(export.sampled.time),
         "robots": [
             {"name": robot.name, "joints": list(joints)}
             for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True)
@@ -183,12 +180,21 @@ def manifest(
             "factor": job.squeeze.factor,
             "force": job.squeeze.force,
             "parts": {part.name: part.force for part in job.squeeze.parts},
-            "force_controlled": job.workcell.robots[1 - job.squeeze.leader].name,
+            "force_controlled": job.workcell.robots[export.follower].name,
             "peak_normal_force": job.peak_normal_force.tolist(),
         },
+        "machine": {
+            "carried_out_by": target.reaction,
+            "states": STATES,
+            "stops_when": list(STOPS),
+            "stop": asdict(export.stop),
+            "limits": asdict(export.limits),
+            "set_down": SET_DOWN,
+        },
+        "time_step": asdict(export.gap) | {"stiffness": stiffness, "allowed_share": TRACKED},
         "position_control": [_position(position_control(job, k)) for k in STIFFNESSES],
         "start_skew": {
-            "how": how,
+            "how": target.start,
             "required": skew,
             "survived": largest_skew(job, stiffness),
             "stiffness": stiffness,
@@ -196,7 +202,7 @@ def manifest(
         },
         "warnings": warnings_of(job),
         "units": UNITS,
-        "how_to_run": form.how_to_run,
+        "how_to_run": target.how_to_run,
         "written_by": f"dual-arm-carry {_version()}",
     }
 

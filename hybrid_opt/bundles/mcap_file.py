@@ -3,91 +3,88 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.bundles.arms import WORLD, description, prefixes
-from hybrid_opt.bundles.manifest import BundleOptions
-from hybrid_opt.bundles.ros2 import (
-    duration,
-    job_joints,
-    pad_frame,
-    pad_wrench,
-    wrench_message,
-)
+from hybrid_opt.bundles.arms import WORLD, description, pad_frame, prefixes
+from hybrid_opt.bundles.job_file import Export
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.job.records import SampledJob
 from symbolic.array import Array
 from symbolic.read.arms import arm_model, link_frame
-from symbolic.records.poses import box_placement
+from symbolic.records.poses import box_placement, box_rotation
 
-_TIME = "builtin_interfaces/Time"
-_DEFINITIONS = {
-    _TIME: "int32 sec\nuint32 nanosec",
-    "std_msgs/Header": f"{_TIME} stamp\nstring frame_id",
-    "std_msgs/String": "string data",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
-    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-    "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
-    "geometry_msgs/Wrench": "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque",
-    "geometry_msgs/WrenchStamped": "std_msgs/Header header\ngeometry_msgs/Wrench wrench",
-    "geometry_msgs/Transform": (
-        "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation"
-    ),
-    "geometry_msgs/TransformStamped": (
-        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
-    ),
-    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-    "sensor_msgs/JointState": (
-        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\n"
-        "float64[] effort"
-    ),
-}
-"""Fields of ROS 2's messages."""
+TYPES = (
+    "sensor_msgs/msg/JointState",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/WrenchStamped",
+    "tf2_msgs/msg/TFMessage",
+    "std_msgs/msg/String",
+)
 
 Message = tuple[str, str, dict[str, Any]]
 """Topic, type and content."""
 
 
-def mcap_files(sampled: SampledJob, options: BundleOptions) -> dict[str, str | bytes]:
+def mcap_files(export: Export) -> dict[str, str | bytes]:
     """One recording; times count from zero.
 
     Raises:
-        ResultsError: the package that writes it is not installed.
+        ResultsError: the packages that write it are not installed.
     """
-    writing = _writer_module()
+    writing, store = _packages()
     file = io.BytesIO()
     writer = writing.Writer(file)
+    writer.start(profile="ros2", library="dual-arm-carry")
     schemas = {
-        name: writer.register_msgdef(_long_name(name), _definition(name))
-        for name in (
-            "sensor_msgs/JointState",
-            "geometry_msgs/PoseStamped",
-            "geometry_msgs/WrenchStamped",
-            "tf2_msgs/TFMessage",
-            "std_msgs/String",
+        name: writer.register_schema(
+            name, "ros2msg", store.generate_msgdef(name, ros_version=2)[0].encode()
         )
+        for name in TYPES
     }
-    recording = _Recording(sampled)
-    for k, time in enumerate(sampled.time.tolist()):
+    channels: dict[str, int] = {}
+    recording = _Recording(export)
+    for k, time in enumerate(export.sampled.time.tolist()):
         stamp = round(time * 1e9)
-        for topic, kind, message in recording.messages(k, duration(time)):
-            writer.write_message(topic, schemas[kind], message, stamp, stamp)
+        for topic, kind, content in recording.messages(k, duration(time)):
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "cdr", schemas[kind])
+            data = bytes(store.serialize_cdr(message_of(store, content, kind), kind))
+            writer.add_message(channels[topic], stamp, data, stamp)
     writer.finish()
     return {"job.mcap": file.getvalue()}
+
+
+def message_of(store: Any, content: Mapping[str, Any], kind: str) -> Any:
+    """A message of a type store from plain values; unknown and missing fields are errors."""
+    fields = store.get_msgdef(kind).fields
+    values = {name: _field(store, content[name], node) for name, node in fields}
+    return store.types[kind](**values)
+
+
+def _field(store: Any, value: Any, node: Any) -> Any:
+    sort, described = node
+    if sort.name == "NAME":
+        return message_of(store, value, described)
+    if sort.name == "BASE":
+        return value
+    (inner, name), _ = described
+    if inner.name == "NAME":
+        return [message_of(store, each, name) for each in value]
+    return list(value) if name[0] == "string" else np.array(value, dtype=name[0])
 
 
 class _Recording:
     """The messages of each sample."""
 
-    def __init__(self, sampled: SampledJob) -> None:
-        self._sampled = sampled
+    def __init__(self, export: Export) -> None:
+        self._sampled = sampled = export.sampled
+        self._joints = [*export.ros_joints(0), *export.ros_joints(1)]
         self._cell = sampled.job.workcell
         self._prefixes = prefixes(self._cell)
         self._wrenches = [pad_wrench(sampled, arm).tolist() for arm in (0, 1)]
@@ -102,28 +99,28 @@ class _Recording:
         sampled = self._sampled
         if k == 0:
             text = description(self._cell, sampled.q[0])
-            yield "/robot_description", "std_msgs/String", {"data": text}
+            yield "/robot_description", "std_msgs/msg/String", {"data": text}
         if k in self._begins:
-            yield "/phase", "std_msgs/String", {"data": self._begins[k]}
+            yield "/phase", "std_msgs/msg/String", {"data": self._begins[k]}
         world = {"stamp": stamp, "frame_id": WORLD}
         joints = {
             "header": world,
-            "name": list(job_joints(sampled.job)),
+            "name": self._joints,
             "position": sampled.q[k].tolist(),
             "velocity": sampled.q_rate[k].tolist(),
             "effort": sampled.effort[k].tolist(),
         }
-        yield "/joint_states", "sensor_msgs/JointState", joints
+        yield "/joint_states", "sensor_msgs/msg/JointState", joints
         box = self._boxes[k]
-        yield "/box_pose", "geometry_msgs/PoseStamped", {"header": world, "pose": _pose(box)}
+        yield "/box_pose", "geometry_msgs/msg/PoseStamped", {"header": world, "pose": _pose(box)}
         for arm, prefix in enumerate(self._prefixes):
             frame = pad_frame(prefix, arm)
             header = {"stamp": stamp, "frame_id": frame}
             message = {"header": header, "wrench": wrench_message(self._wrenches[arm][k])}
-            yield f"/{frame}/wrench_reference", "geometry_msgs/WrenchStamped", message
+            yield f"/{frame}/wrench_reference", "geometry_msgs/msg/WrenchStamped", message
         frames = [("box", box), *self._frames(k)]
         transforms = [_transform(world, name, pose) for name, pose in frames]
-        yield "/tf", "tf2_msgs/TFMessage", {"transforms": transforms}
+        yield "/tf", "tf2_msgs/msg/TFMessage", {"transforms": transforms}
 
     def _frames(self, k: int) -> Iterator[tuple[str, Array]]:
         """Every link of both arms with its pose (4, 4) in the world, and both pads."""
@@ -153,31 +150,38 @@ def _pose(T: Array) -> dict[str, Any]:
     }
 
 
-def _definition(name: str) -> str:
-    """A message's definition with those of all messages in it, as recordings hold it."""
-    found = [name]
-    for each in found:
-        for line in _DEFINITIONS[each].splitlines():
-            kind = line.split()[0].removesuffix("[]")
-            if kind in _DEFINITIONS and kind not in found:
-                found.append(kind)
-    parts = [_DEFINITIONS[name]]
-    parts += [f"{'=' * 80}\nMSG: {each}\n{_DEFINITIONS[each]}" for each in found[1:]]
-    return "\n".join(parts) + "\n"
+def duration(seconds: float) -> dict[str, int]:
+    """A builtin_interfaces/msg/Duration, or Time."""
+    nanoseconds = round(seconds * 1e9)
+    return {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
 
 
-def _long_name(name: str) -> str:
-    package, kind = name.split("/")
-    return f"{package}/msg/{kind}"
+def pad_wrench(sampled: SampledJob, arm: int) -> Array:
+    """(n, 6) force and moment that a pad exerts on the box, along the pad's axes [N, N m]."""
+    T_box_pad = sampled.job.workcell.contacts[arm].T_box_pad
+    turned = box_rotation(sampled.job.workcell.task.orientation, sampled.pose)
+    R_world_pad = turned @ T_box_pad[:3, :3]
+    both = sampled.wrench[:, arm].reshape(-1, 2, 3)
+    return np.asarray(np.einsum("nji,nkj->nki", R_world_pad, both).reshape(-1, 6))
 
 
-def _writer_module() -> ModuleType:
+def wrench_message(wrench: Sequence[float]) -> dict[str, Any]:
+    """A geometry_msgs/msg/Wrench of force and moment (6,)."""
+    return {
+        "force": dict(zip("xyz", wrench[:3], strict=True)),
+        "torque": dict(zip("xyz", wrench[3:], strict=True)),
+    }
+
+
+def _packages() -> tuple[ModuleType, Any]:
+    """What writes recordings, and ROS 2's message types."""
     try:
-        import mcap_ros2.writer
+        import mcap.writer
+        from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ResultsError(
-            "the package mcap-ros2-support is not installed; install the extra: "
+            "the packages mcap and rosbags are not installed; install the extra: "
             "pip install -e '.[ros]'"
         ) from error
-    module: ModuleType = mcap_ros2.writer
-    return module
+    module: ModuleType = mcap.writer
+    return module, get_typestore(Stores.ROS2_JAZZY)

@@ -1,8 +1,13 @@
-"""Two synchronised RAPID tasks (ABB MultiMove) that drive a job. docs/export.md has limits.
+"""Two RAPID tasks that drive a job, the pressing arm under ABB's Force Control.
 
-Syntax after ABB's technical reference manual for RAPID instructions (MoveAbsJ, SyncMoveOn,
-SyncMoveOff, GripLoad) and the MultiMove application manual: every move between SyncMoveOn and
-SyncMoveOff carries an ID, the same in both tasks, ascending.
+Moves synchronised by MultiMove (SyncMoveOn) and Force Control exclude one another, so that the
+tasks plan by themselves and meet before every phase (WaitSyncTask). The pressing arm follows its
+path with FCPress1LStart, FCPressL and FCPressEnd, each move with its own force; the leader with
+MoveAbsJ. Forces are along z of a work object whose axes are those of the pad where it grips.
+
+After ABB's manuals: technical reference of RAPID instructions; application manuals MultiMove and
+Force Control Standard (FC Pressure; its limitations name MultiMove's coordinated mode).
+docs/export.md tells what nobody has tried.
 """
 
 from __future__ import annotations
@@ -13,11 +18,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.bundles.arms import ABB, SEVEN, SIX, comment, require_axes, require_maker
-from hybrid_opt.bundles.manifest import BundleOptions
-from hybrid_opt.job.records import SampledJob
+from hybrid_opt.bundles.job_file import BundleOptions, Export
+from hybrid_opt.bundles.steps import pad_places
+from hybrid_opt.job.compliance import HELD
+from hybrid_opt.job.records import Job
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.records.poses import inverse
+from symbolic.records.poses import box_rotation, inverse
 
 TASKS = ("T_ROB1", "T_ROB2")
 TWO_ARMED_TASKS = ("T_ROB_L", "T_ROB_R")
@@ -34,105 +41,219 @@ LEAST_MOVE_TIME = 0.02
 
 ZONE = "z1"
 START_TOLERANCE = 1.0
-"""How far an arm may be from the first position [degrees]; farther, the program stops."""
+"""How far an arm may be from the first position [degrees]; farther, the program ends."""
 
 UNKNOWN_TOOL_MASS = 0.1
 """[kg] where the workcell gives no `tool_load`; RAPID wants more than none."""
 
-FORCE_EVERY = 5
-"""Moves between two force references."""
+MEETING = 60
+"""Longest wait of a task for the other [s]."""
 
-REFERENCES = 100
-"""Entries of the table of force references."""
+THRESHOLD = 90
+"""Share of the force at which the first move under force begins [%]."""
+
+SUPERVISED = 30
+"""Farthest of the pressing pad from its path [mm]."""
+
+MOST_TURN = 15.0
+"""Most that the box may turn while it is held [degrees]: the force keeps its direction in the work
+object, and misses 3.4 % of the normal force there."""
+
+LEAST_SPEED = 0.1
+"""Of a move under force [mm/s], [degrees/s]."""
 
 
-def rapid_files(sampled: SampledJob, options: BundleOptions) -> dict[str, str | bytes]:
+def require_force_control(job: Job, target: str) -> None:
+    """Refuse a job whose pressing arm has no force control.
+
+    Raises:
+        SettingsError: with the reason.
+    """
+    robot = job.workcell.robots[1 - job.squeeze.leader]
+    if not robot.driver.force_control:
+        raise SettingsError(
+            f"{target} would not squeeze: positions alone do not press, and {robot.name!r} is not "
+            "said to have ABB's Force Control; where it has the option and its sensor, write "
+            "[robots.driver] with force_control = true into the workcell, or choose the arm that "
+            "keeps its place (--leader)"
+        )
+
+
+def require_rapid(job: Job, options: BundleOptions) -> None:
+    """Refuse a job for arms that are not ABB's, without Force Control, or that turns the box."""
+    require_maker(job.workcell, ABB, "RAPID", options.any_arm)
+    require_axes(job.workcell, "RAPID", (SIX, SEVEN))
+    require_force_control(job, "abb-rapid")
+    turned = _turned(job)
+    if turned > MOST_TURN:
+        raise SettingsError(
+            f"the box turns by {turned:.0f} degrees; under abb-rapid the force keeps its direction "
+            f"in the room, at most {MOST_TURN:g} degrees are allowed: choose abb-egm"
+        )
+
+
+def _turned(job: Job) -> float:
+    """Largest turn of the box against where it is gripped, while it is held [degrees]."""
+    poses = np.concatenate([p.motion.pose for p in job.phases if p.name in HELD])
+    rotation = Rotation.from_matrix(box_rotation(job.workcell.task.orientation, poses))
+    return float(np.rad2deg((rotation[0].inv() * rotation).magnitude().max()))
+
+
+def rapid_files(export: Export) -> dict[str, str | bytes]:
     """The modules of both tasks.
 
     Raises:
-        SettingsError: an arm is not ABB's or has neither six nor seven turning joints, or the time
-            step is too short or the job too long.
+        SettingsError: the time step is too short or the job too long.
     """
-    require_maker(sampled.job.workcell, ABB, "RAPID", options.any_arm)
-    require_axes(sampled.job.workcell, "RAPID", (SIX, SEVEN))
-    moves = len(sampled.time) - 1
-    step = float(np.diff(sampled.time).min())
+    moves = len(export.sampled.time) - 1
+    step = float(np.diff(export.sampled.time).min())
     if step < LEAST_MOVE_TIME or moves > MAX_MOVES:
         raise SettingsError(
             f"{moves} moves of {step:g} s are too many or too short for RAPID; choose a time "
             f"step of at least {LEAST_MOVE_TIME:g} s that gives at most {MAX_MOVES} moves"
         )
-    tasks = _tasks(sampled)
+    tasks = tasks_of(export)
     # RAPID files have Windows line ends.
     return {
-        f"{tasks[arm]}/Carry{arm + 1}.mod": "\r\n".join(_module(sampled, arm)) + "\r\n"
+        f"{tasks[arm]}/Carry{arm + 1}.mod": "\r\n".join(_module(export, arm)) + "\r\n"
         for arm in (0, 1)
     }
 
 
-def _tasks(sampled: SampledJob) -> tuple[str, str]:
+def tasks_of(export: Export) -> tuple[str, str]:
     """Names of both tasks."""
-    two_armed = all(len(joints) == SEVEN for joints in sampled.job.joint_names)
+    two_armed = all(len(joints) == SEVEN for joints in export.job.joint_names)
     return TWO_ARMED_TASKS if two_armed else TASKS
 
 
-def _module(sampled: SampledJob, arm: int) -> Iterator[str]:
-    job, robot, tasks = sampled.job, sampled.job.workcell.robots[arm], _tasks(sampled)
-    degrees = np.rad2deg(sampled.arm(arm, sampled.q))
+def _module(export: Export, arm: int) -> Iterator[str]:
+    job, robot, tasks = export.job, export.workcell.robots[arm], tasks_of(export)
+    degrees = np.rad2deg(export.sampled.arm(arm, export.sampled.q))
+    presses = arm == export.follower
     yield f"MODULE Carry{arm + 1}"
     yield f"  ! {comment(job.workcell.name)}"
     yield f"  ! Robot {comment(robot.name)} in task {tasks[arm]}"
-    yield f"  ! {len(degrees)} positions, {float(sampled.time[-1]):.3f} s"
-    yield "  ! Positions alone do not squeeze: CarryForce has to make this arm press."
+    yield f"  ! {len(degrees)} positions, {float(export.sampled.time[-1]):.3f} s"
     yield f'  PERS tasks carryTasks{{2}} := [["{tasks[0]}"],["{tasks[1]}"]];'
-    yield f"  PERS tooldata carryPad := {_tool_data(sampled, arm)};"
-    yield f"  PERS loaddata carryHalfBox := {_load_data(sampled, arm)};"
-    yield "  ! Set to TRUE when CarryForce does what it says."
-    yield "  PERS bool carryForceReady := FALSE;"
-    yield from _force_references(sampled, arm)
-    yield "  VAR syncident carryStart;"
-    yield "  VAR syncident carryEnd;"
-    yield f"  CONST jointtarget carryFirst := {_target(degrees[0])};"
+    yield f"  PERS tooldata carryPad := {tool_data(export, arm)};"
+    yield f"  PERS loaddata carryHalfBox := {_load_data(export, arm)};"
+    if presses:
+        pad = pad_places(export.workcell, arm, export.sampled.arm(arm, export.sampled.q))
+        frame = inverse(robot.T_world_base) @ pad[export.sampled.span(1).start]
+        yield f'  PERS wobjdata carryGrip := [FALSE,TRUE,"",{_frame(frame)},{_frame(np.eye(4))}];'
+        yield "  ! 1 or -1: with which sign of Fz FCPress1LStart moves this pad along +z of"
+        yield "  ! carryPad. Find it out in the air, with 5 N; 0 ends the program."
+        yield "  PERS num carrySign := 0;"
+    for number in range(len(job.phases) + 1):
+        yield f"  VAR syncident carryMeet{number + 1};"
+    yield f"  CONST jointtarget carryFirst := {target_text(degrees[0])};"
     yield ""
-    yield from _main(sampled)
-    yield from _start_check(degrees.shape[1])
-    yield from _force_hook(sampled, arm)
+    yield from _main(export, presses)
+    yield from checked_start(degrees.shape[1])
+    places = _places(export, arm) if presses else []
     for index, phase in enumerate(job.phases):
         yield f"  PROC Carry_{phase.name}()"
         yield f"    ! {phase.duration:.3f} s"
-        span = sampled.span(index)
-        for k in range(span.start + 1, span.stop):
-            zone = ZONE if k < span.stop - 1 else "fine"
-            time = float(sampled.time[k] - sampled.time[k - 1])
-            if k % FORCE_EVERY == 0 or k == span.stop - 1:
-                # Until the next reference, no move may get less than it needs.
-                needed = sampled.normal_force[k - 1 : min(k + FORCE_EVERY, span.stop), arm].max()
-                yield f"    CarryForce {needed:.3f};"
-            yield (
-                f"    MoveAbsJ {_target(degrees[k])} \\ID:={10 * k} \\NoEOffs, "
-                f"v1000 \\T:={time:.6f}, {zone}, carryPad;"
-            )
+        span = export.sampled.span(index)
+        if presses and phase.name in ("press", "release", *HELD):
+            yield from _pressed(export, arm, index, places)
+        elif phase.name in ("press", "release"):
+            yield f"    WaitTime {phase.duration:.3f};"
+        else:
+            for k in range(span.start + 1, span.stop):
+                zone = ZONE if k < span.stop - 1 else "fine"
+                time = float(export.sampled.time[k] - export.sampled.time[k - 1])
+                yield (
+                    f"    MoveAbsJ {target_text(degrees[k])} \\NoEOffs, v1000 \\T:={time:.6f}, "
+                    f"{zone}, carryPad;"
+                )
         yield "  ENDPROC"
         yield ""
     yield "ENDMODULE"
 
 
-def _main(sampled: SampledJob) -> Iterator[str]:
+def _main(export: Export, presses: bool) -> Iterator[str]:
     yield "  PROC Carry()"
+    if presses:
+        yield "    IF Abs(carrySign) <> 1 THEN"
+        yield '      TPWrite "Carry: find out carrySign first, see the module.";'
+        yield "      EXIT;"
+        yield "    ENDIF"
     yield "    CarryCheckStart;"
-    yield "    SyncMoveOn carryStart, carryTasks;"
-    for phase in sampled.job.phases:
+    yield "    ConfL \\Off;"
+    if presses:
+        yield "    FCCalib carryPad.tload;"
+    for number, phase in enumerate(export.job.phases, start=1):
+        yield f"    WaitSyncTask \\InPos, carryMeet{number}, carryTasks \\TimeOut:={MEETING};"
+        if phase.name == "release":
+            yield "    GripLoad load0;"
         yield f"    Carry_{phase.name};"
         if phase.name == "press":
             yield "    GripLoad carryHalfBox;"
-        if phase.name == "release":
-            yield "    GripLoad load0;"
-    yield "    SyncMoveOff carryEnd;"
+    last = len(export.job.phases) + 1
+    yield f"    WaitSyncTask \\InPos, carryMeet{last}, carryTasks \\TimeOut:={MEETING};"
+    yield "  ERROR"
+    yield "    IF ERRNO = ERR_WAITSYNCTASK THEN"
+    yield '      TPWrite "Carry: the other task did not come; this arm holds.";'
+    yield "      EXIT;"
+    yield "    ENDIF"
     yield "  ENDPROC"
     yield ""
 
 
-def _start_check(joints: int) -> Iterator[str]:
+def _pressed(export: Export, arm: int, index: int, places: list[str]) -> Iterator[str]:
+    """A phase of the pressing arm under force control."""
+    sampled, phase = export.sampled, export.job.phases[index]
+    span, force = sampled.span(index), sampled.normal_force[:, arm]
+    tool = "carryPad \\WObj:=carryGrip"
+    if phase.name == "press":
+        yield (
+            f"    FCPress1LStart {places[span.stop - 1]}, v5, "
+            f"\\Fz:=carrySign*{force[span.stop - 1]:.3f}, {THRESHOLD} "
+            f"\\PosSupvDist:={SUPERVISED}, fine, {tool};"
+        )
+        return
+    if phase.name == "release":
+        yield f"    FCPressEnd {places[span.stop - 1]}, v5, \\DeactOnly, {tool};"
+        return
+    q = sampled.arm(arm, sampled.q)
+    pad = pad_places(export.workcell, arm, q[span.start : span.stop])
+    way = 1e3 * np.linalg.norm(np.diff(pad[:, :3, 3], axis=0), axis=1)
+    rotation = Rotation.from_matrix(pad[:, :3, :3])
+    turn = np.rad2deg((rotation[:-1].inv() * rotation[1:]).magnitude())
+    steps = np.diff(sampled.time[span.start : span.stop])
+    for j, k in enumerate(range(span.start + 1, span.stop)):
+        zone = ZONE if k < span.stop - 1 else "fine"
+        speed, spin = (max(each[j] / steps[j], LEAST_SPEED) for each in (way, turn))
+        # Until the next move no less than is needed.
+        newton = force[k - 1 : k + 1].max()
+        yield (
+            f"    FCPressL {places[k]}, [{speed:.3f},{spin:.3f},5000,1000], "
+            f"{newton:.3f}, {zone}, {tool};"
+        )
+
+
+def _places(export: Export, arm: int) -> list[str]:
+    """The pad's places as robtargets in the work object in which it grips."""
+    sampled, robot = export.sampled, export.workcell.robots[arm]
+    q = sampled.arm(arm, sampled.q)
+    pad = pad_places(export.workcell, arm, q)
+    grip = inverse(pad[sampled.span(1).start]) @ pad
+    quadrant = np.floor(np.rad2deg(q) / 90.0).astype(int)
+    first, fourth, sixth = (0, 3, 5) if len(robot.torque_max) == SIX else (0, 4, 6)
+    found = []
+    for T, turns, degrees in zip(grip, quadrant, np.rad2deg(q), strict=True):
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+        further = "9E9" if len(degrees) == SIX else f"{degrees[EXTRA]:.6f}"
+        found.append(
+            f"[{_numbers(1e3 * T[:3, 3])},{_numbers(np.array([w, x, y, z]))},"
+            f"[{turns[first]},{turns[fourth]},{turns[sixth]},0],"
+            f"[{further},9E9,9E9,9E9,9E9,9E9]]"
+        )
+    return found
+
+
+def checked_start(joints: int) -> Iterator[str]:
     """No move to the first position: the way there is not checked for collisions."""
     axes = [f"robax.rax_{axis}" for axis in range(1, SIX + 1)]
     axes += ["extax.eax_a"] if joints == SEVEN else []
@@ -142,45 +263,16 @@ def _start_check(joints: int) -> Iterator[str]:
     for joint in axes:
         yield f"    IF Abs(here.{joint} - carryFirst.{joint}) > {START_TOLERANCE:g} THEN"
         yield '      TPWrite "Carry: jog the robot to carryFirst, pads away from the box.";'
-        yield "      Stop;"
+        # After Stop, a press of Start would go on behind the check.
+        yield "      EXIT;"
         yield "    ENDIF"
     yield "  ENDPROC"
     yield ""
 
 
-def _force_hook(sampled: SampledJob, arm: int) -> Iterator[str]:
-    leads = arm == sampled.job.squeeze.leader
-    yield "  PROC CarryForce(num newton)"
-    if leads:
-        yield "    ! This arm keeps its place; the other one presses. Nothing to do here."
-    else:
-        yield "    ! Here the force controller gets its reference, along z of carryPad,"
-        yield "    ! e.g. that of the Force Control option, or a value for an EGM stream."
-        yield "    IF carryForceReady = FALSE THEN"
-        yield '      TPWrite "Carry: CarryForce is not connected; nothing would squeeze.";'
-        yield "      Stop;"
-        yield "    ENDIF"
-    yield "  ENDPROC"
-    yield ""
-
-
-def _force_references(sampled: SampledJob, arm: int) -> Iterator[str]:
-    """Normal forces at even times, for force controllers that take a table: interpolated between
-    them, nowhere less than is needed."""
-    time = np.linspace(0.0, float(sampled.time[-1]), REFERENCES)
-    needed = sampled.normal_force[:, arm]
-    force = np.interp(time, sampled.time, needed)
-    cell = np.clip(np.searchsorted(time, sampled.time, side="right") - 1, 0, REFERENCES - 2)
-    np.maximum.at(force, cell, needed)
-    np.maximum.at(force, cell + 1, needed)
-    for name, values in (("carryForceTime", time), ("carryForceNewton", force)):
-        listed = ",".join(f"{value:.3f}" for value in values)
-        yield f"  PERS num {name}{{{REFERENCES}}} := [{listed}];"
-
-
-def _tool_data(sampled: SampledJob, arm: int) -> str:
+def tool_data(export: Export, arm: int) -> str:
     """A tooldata: the pad's frame on the flange, and the tool's load where it is known."""
-    robot = sampled.job.workcell.robots[arm]
+    robot = export.workcell.robots[arm]
     frame = _frame(robot.T_flange_pad)
     if robot.tool_load is None:
         middle = 500.0 * robot.T_flange_pad[:3, 3]
@@ -189,9 +281,9 @@ def _tool_data(sampled: SampledJob, arm: int) -> str:
     return f"[TRUE,{frame},{_load(load.mass, 1e3 * load.centre_of_mass, np.diag(load.inertia))}]"
 
 
-def _load_data(sampled: SampledJob, arm: int) -> str:
+def _load_data(export: Export, arm: int) -> str:
     """A loaddata: half of the box about its centre of mass, in the pad's frame."""
-    payload, contact = sampled.job.workcell.payload, sampled.job.workcell.contacts[arm]
+    payload, contact = export.workcell.payload, export.workcell.contacts[arm]
     centre = inverse(contact.T_box_pad) @ np.append(payload.centre_of_mass, 1.0)
     return _load(payload.mass / 2.0, 1e3 * centre[:3], np.zeros(3))
 
@@ -207,7 +299,7 @@ def _frame(pose: Array) -> str:
     return f"[{_numbers(1e3 * pose[:3, 3])},{_numbers(np.array([w, x, y, z]))}]"
 
 
-def _target(degrees: Array) -> str:
+def target_text(degrees: Array) -> str:
     """A jointtarget; a seventh axis is an external one to RAPID, other external axes are unused."""
     if len(degrees) == SIX:
         return f"[{_numbers(degrees)},[9E9,9E9,9E9,9E9,9E9,9E9]]"

@@ -1,363 +1,450 @@
-"""A job for ROS 2: trajectories and goals as messages in YAML, wrench references, a launch file.
+"""Jobs for ROS 2: one controller for both arms of any cell, and the drivers of Franka and UR.
 
-Messages as ROS 2 defines them: trajectory_msgs/JointTrajectory, control_msgs/action/
-FollowJointTrajectory (its goal), geometry_msgs/WrenchStamped. docs/export.md says how to run it.
+Facts about controllers and drivers are those of their sources: joint_trajectory_controller of
+ros2_controllers, franka_ros2, ur_robot_driver and its ur_controllers. docs/export.md lists them.
 """
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
-from hybrid_opt.bundles.arms import description, prefixes
-from hybrid_opt.bundles.manifest import BundleOptions
-from hybrid_opt.job.records import Job, SampledJob
+from hybrid_opt.bundles.arms import (
+    COMMANDS,
+    FRANKA,
+    SEVEN,
+    UR,
+    described,
+    description,
+    prefixes,
+    require_address,
+    require_axes,
+    require_maker,
+)
+from hybrid_opt.bundles.job_file import BundleOptions, Export, job_text
+from hybrid_opt.bundles.programs import program
+from hybrid_opt.job.records import Job, contact_effort
 from symbolic.array import Array
-from symbolic.records.poses import box_rotation
+from symbolic.errors import SettingsError
+from symbolic.records import Workcell
+
+CONTROLLER = "carry_controller"
+TRAJECTORY_CONTROLLER = "joint_trajectory_controller/JointTrajectoryController"
+BROADCASTER = "joint_state_broadcaster"
+FRANKA_STATE = "franka_robot_state_broadcaster"
+ACTION = "follow_joint_trajectory"
 
 UPDATE_RATE = 1000
-"""Update rate of the controller manager [Hz]."""
+"""Of a controller manager [Hz], unless the driver says otherwise."""
 
-PATH_TOLERANCE = 0.02
-GOAL_TOLERANCE = 0.002
-"""Tolerances of every joint on the path and at the goal [rad]."""
+MONITOR_RATE = 100.0
+"""At which a controller tells how its goal ended [Hz]."""
 
-GOAL_TIME = 0.5
-"""How much later than planned a goal may be reached [s]."""
+GAIN, DAMPING = 7.0, 0.7
+"""Of Franka's joints: their whole torque at so many radians' inverse, and the share of the root of
+the gain that damps: about those of the maker's own examples."""
 
-JOINT_STATES = "joint_state_broadcaster"
-CONTROLLER = "joint_trajectory_controller/JointTrajectoryController"
+TORQUE_RATE = 1000.0
+"""Fastest change of a torque that libfranka takes [N m/s] (kMaxTorqueRate)."""
 
-LAUNCH = '''"""Mock hardware, controllers, description: ros2 launch launch/bringup.launch.py"""
+CONTACT, SPARE_FORCE, SPARE_TORQUE = 1.5, 20.0, 5.0
+"""A collision is what exceeds so many times the planned contact by so much [N], [N m]."""
 
-from pathlib import Path
+UR_RATE = 500
+"""Of an e-series controller [Hz]."""
 
-import yaml
-from launch import LaunchDescription
-from launch_ros.actions import Node
+FORCE_EVERY = 0.1
+"""Time between two force references of a UR [s]: each is a call of a service."""
 
-BUNDLE = Path(__file__).resolve().parent.parent
+FORCE_DAMPING, FORCE_GAIN = 0.1, 0.5
+"""Of UR's force mode: more damping than its default of 0.025, the default gain."""
 
+FORCE_SPEED, DEVIATION = 0.05, 0.02
+"""Largest speed along the normal [m/s], largest deviation across it [m], [rad]."""
 
-def generate_launch_description():
-    description = {"robot_description": (BUNDLE / "description/cell.urdf").read_text()}
-    controllers = str(BUNDLE / "config/controllers.yaml")
-    names = yaml.safe_load((BUNDLE / "config/controllers.yaml").read_text())
-    parameters = names["controller_manager"]["ros__parameters"]
-    to_start = [name for name, value in parameters.items() if isinstance(value, dict)]
-    return LaunchDescription(
-        [
-            Node(
-                package="robot_state_publisher",
-                executable="robot_state_publisher",
-                parameters=[description],
-            ),
-            Node(
-                package="controller_manager",
-                executable="ros2_control_node",
-                parameters=[description, controllers],
-            ),
-            Node(package="controller_manager", executable="spawner", arguments=to_start),
-        ]
-    )
-'''
-
-RUN = '''"""Drives the job, phase by phase: python3 run_job.py (beside a running bringup)
-
-All goals of a phase are stamped with one start time, so that controllers of two arms start in the
-same cycle. Wrench references are published along with the motion. The next phase begins only when
-every goal of the last one was reached.
-"""
-
-import sys
-from pathlib import Path
-
-import rclpy
-import yaml
-from control_msgs.action import FollowJointTrajectory
-from geometry_msgs.msg import WrenchStamped
-from rclpy.action import ActionClient
-from rclpy.duration import Duration
-from rosidl_runtime_py import set_message_fields
-
-BUNDLE = Path(__file__).resolve().parent
-LEAD = 0.2  # [s] from sending a goal to its start
+UR_LAG = 0.05
+"""By which a UR follows what its driver reports, where the workcell does not say [s]."""
 
 
-def read(name):
-    return yaml.safe_load((BUNDLE / name).read_text())
+# --- one controller for both arms ---
 
 
-class References:
-    def __init__(self, node):
-        self.node = node
-        self.robots = []
-        for robot in read("wrench_references.yaml")["robots"]:
-            publisher = node.create_publisher(WrenchStamped, robot["topic"], 10)
-            times = [m["header"]["stamp"] for m in robot["messages"]]
-            seconds = [t["sec"] + 1e-9 * t["nanosec"] for t in times]
-            self.robots.append((publisher, seconds, robot["messages"]))
-
-    def publish(self, moment):
-        for publisher, seconds, messages in self.robots:
-            index = max(0, sum(second <= moment for second in seconds) - 1)
-            message = WrenchStamped()
-            set_message_fields(message, messages[index])
-            message.header.stamp = self.node.get_clock().now().to_msg()
-            publisher.publish(message)
-
-
-def main():
-    rclpy.init()
-    node = rclpy.create_node("run_job")
-    references = References(node)
-    clients = {}
-    for phase in read("job.yaml")["phases"]:
-        node.get_logger().info(f"phase {phase['name']}")
-        goals = {}
-        for controller, path in phase["goals"].items():
-            goal = FollowJointTrajectory.Goal()
-            set_message_fields(goal, read(path))
-            goals[controller] = goal
-            if controller not in clients:
-                action = f"/{controller}/follow_joint_trajectory"
-                clients[controller] = ActionClient(node, FollowJointTrajectory, action)
-                if not clients[controller].wait_for_server(timeout_sec=10.0):
-                    sys.exit(f"{action} is not there; is the bringup running?")
-        start = node.get_clock().now() + Duration(seconds=LEAD)
-        sent = []
-        for controller, goal in goals.items():
-            goal.trajectory.header.stamp = start.to_msg()
-            sent.append(clients[controller].send_goal_async(goal))
-        for future in sent:
-            rclpy.spin_until_future_complete(node, future)
-        handles = [future.result() for future in sent]
-        if not all(handle.accepted for handle in handles):
-            for handle in handles:
-                if handle.accepted:
-                    handle.cancel_goal_async()
-            sys.exit(f"phase {phase['name']}: a controller refused its goal; nothing moves")
-        results = [handle.get_result_async() for handle in handles]
-        while not all(result.done() for result in results):
-            rclpy.spin_once(node, timeout_sec=0.005)
-            elapsed = (node.get_clock().now() - start).nanoseconds * 1e-9
-            references.publish(min(phase["begin"] + max(elapsed, 0.0), phase["end"]))
-            failed = [r for r in results if r.done() and r.result().result.error_code != 0]
-            if failed:
-                for handle in handles:
-                    handle.cancel_goal_async()
-                sys.exit(f"phase {phase['name']}: {failed[0].result().result.error_string}")
-    node.get_logger().info("done")
-
-
-if __name__ == "__main__":
-    main()
-'''
-
-
-def ros2_files(sampled: SampledJob, options: BundleOptions) -> dict[str, str | bytes]:
-    """All files of a bundle for ROS 2 by their paths."""
-    job = sampled.job
-    groups = joint_groups(job, options.per_arm)
-    files: dict[str, str | bytes] = {
-        "description/cell.urdf": description(job.workcell, sampled.q[0]),
-        "config/controllers.yaml": _yaml(controllers(job, groups)),
-        "launch/bringup.launch.py": LAUNCH,
-        "run_job.py": RUN,
-        "wrench_references.yaml": _yaml(wrench_references(sampled)),
+def control_files(export: Export) -> dict[str, str | bytes]:
+    """One joint trajectory controller for all joints, with mock hardware in the description."""
+    joints = [*export.ros_joints(0), *export.ros_joints(1)]
+    rates = [r.driver.rate for r in export.workcell.robots if r.driver.rate is not None]
+    config = _config(export, "with_gravity", stamped=True) | {
+        "groups": [{"action": f"/{CONTROLLER}/{ACTION}", "arms": [0, 1]}],
+        "joint_states": ["/joint_states"],
     }
-    phases = []
-    for index, phase in enumerate(job.phases):
-        goals = {}
-        for name, columns in groups.items():
-            path = f"goals/{index + 1}_{phase.name}{'' if len(groups) == 1 else f'_{name}'}.yaml"
-            names = [job_joints(job)[column] for column in columns]
-            message = joint_trajectory(sampled, sampled.span(index), names, columns)
-            files[path] = _yaml(follow_goal(message))
-            goals[f"{name}_controller"] = path
-        span = sampled.span(index)
-        phases.append(
+    controllers = {
+        "controller_manager": _manager(round(min(rates, default=UPDATE_RATE))),
+        CONTROLLER: _trajectory_controller(joints, COMMANDS),
+    }
+    return {
+        **_programs(export, config, "control.launch.py"),
+        "description/cell.urdf": description(export.workcell, export.sampled.q[0]),
+        "config/controllers.yaml": _yaml(controllers),
+    }
+
+
+def _manager(rate: int, **further: str) -> dict[str, Any]:
+    kinds = {
+        BROADCASTER: f"{BROADCASTER}/JointStateBroadcaster",
+        CONTROLLER: TRAJECTORY_CONTROLLER,
+        **further,
+    }
+    return {
+        "ros__parameters": {
+            "update_rate": rate,
+            **{name: {"type": kind} for name, kind in kinds.items()},
+        }
+    }
+
+
+def _trajectory_controller(
+    joints: Sequence[str], commands: Sequence[str], gains: Sequence[float] = ()
+) -> dict[str, Any]:
+    """Parameters of a joint trajectory controller that never gives up by itself: what it holds then
+    has the efforts of another place, or none. `run_job.py` looks after the arms."""
+    parameters: dict[str, Any] = {
+        "joints": list(joints),
+        "command_interfaces": list(commands),
+        "state_interfaces": ["position", "velocity"],
+        "interpolate_from_desired_state": True,
+        "allow_nonzero_velocity_at_trajectory_end": False,
+        "action_monitor_rate": MONITOR_RATE,
+        "constraints": {"stopped_velocity_tolerance": 0.0, "goal_time": 0.0},
+    }
+    if len(gains):
+        parameters["gains"] = {
+            joint: {"p": float(gain), "d": float(DAMPING * gain**0.5)}
+            for joint, gain in zip(joints, gains, strict=True)
+        }
+    return {"ros__parameters": parameters}
+
+
+# --- Franka ---
+
+
+def require_franka(job: Job, options: BundleOptions) -> None:
+    """Refuse a job for arms that are not Franka's, or whose controllers have no address."""
+    require_maker(job.workcell, FRANKA, "franka_ros2", options.any_arm)
+    require_axes(job.workcell, "franka_ros2", (SEVEN,))
+    require_address(job.workcell, "franka-ros2")
+    for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
+        if not _franka_type(joints):
+            raise SettingsError(
+                f"the joints of {robot.name!r} are called {joints[0]!r} ... {joints[-1]!r}; "
+                "franka_ros2 knows TYPE_joint1 to TYPE_joint7"
+            )
+
+
+def franka_files(export: Export) -> dict[str, str | bytes]:
+    """Per arm a joint trajectory controller that commands torques without gravity.
+
+    Raises:
+        SettingsError: a torque changes faster than libfranka takes.
+    """
+    _require_torque_rate(export)
+    spaces = _namespaces(export.workcell)
+    config = _config(export, "without_gravity", stamped=True) | {
+        "groups": [
+            {"action": f"/{space}/{CONTROLLER}/{ACTION}", "arms": [arm]}
+            for arm, space in enumerate(spaces)
+        ],
+        "joint_states": [f"/{space}/franka/joint_states" for space in spaces],
+        "wrench": [
             {
-                "name": phase.name,
-                "begin": float(sampled.time[span.start]),
-                "end": float(sampled.time[span.stop - 1]),
-                "goals": goals,
+                "topic": f"/{space}/{FRANKA_STATE}/external_wrench_in_stiffness_frame",
+                "axis": export.workcell.robots[arm].T_flange_pad[:3, 2].tolist(),
             }
-        )
-    files["job.yaml"] = _yaml({"phases": phases})
-    whole = slice(0, len(sampled.time))
-    for name, columns in groups.items():
-        names = [job_joints(job)[column] for column in columns]
-        message = joint_trajectory(sampled, whole, names, columns)
-        files[f"{name}_joint_trajectory.yaml"] = _yaml(message)
+            for arm, space in enumerate(spaces)
+        ],
+        "prepare": [
+            call for arm, space in enumerate(spaces) for call in _franka(export, arm, space)
+        ],
+    }
+    for driver, joints in zip(config["drivers"], export.job.joint_names, strict=True):
+        driver["type"] = _franka_type(joints)
+    files = dict(_programs(export, config, "franka.launch.py"))
+    for arm, robot in enumerate(export.workcell.robots):
+        state = {FRANKA_STATE: f"{FRANKA_STATE}/FrankaRobotStateBroadcaster"}
+        gains = (GAIN * robot.torque_max).tolist()
+        controllers = {
+            "/**": {
+                "controller_manager": _manager(UPDATE_RATE, **state),
+                CONTROLLER: _trajectory_controller(export.ros_joints(arm), ["effort"], gains),
+            }
+        }
+        files[f"config/controllers_{arm + 1}.yaml"] = _yaml(controllers)
     return files
 
 
-def job_joints(job: Job) -> tuple[str, ...]:
-    """Names of all joints in ROS: each behind its robot's prefix."""
-    return tuple(
-        f"{prefix}{joint}"
-        for prefix, joints in zip(prefixes(job.workcell), job.joint_names, strict=True)
-        for joint in joints
-    )
+def _franka_type(joints: Sequence[str]) -> str:
+    """The TYPE of joints TYPE_joint1 ...; '' where they are called otherwise."""
+    found = {re.sub(r"_joint[1-7]$", "", name) for name in joints}
+    (kind,) = found if len(found) == 1 else ("",)
+    return kind if list(joints) == [f"{kind}_joint{k}" for k in range(1, 8)] else ""
 
 
-def joint_groups(job: Job, per_arm: bool) -> dict[str, list[int]]:
-    """The joints that one controller drives, by its name: their columns."""
+def _require_torque_rate(export: Export) -> None:
+    torque = export.efforts.moving - export.efforts.gravity
+    rate = np.abs(np.diff(torque, axis=0)) / np.diff(export.sampled.time)[:, None]
+    if rate.max() > TORQUE_RATE:
+        raise SettingsError(
+            f"a joint torque changes by {rate.max():.0f} N m/s; libfranka takes "
+            f"{TORQUE_RATE:.0f}: limit the jerk (jerk_max), or choose a slower timing"
+        )
+
+
+def _franka(export: Export, arm: int, space: str) -> list[dict[str, Any]]:
+    """What a Franka has to know before it moves: its tool, and what is no collision."""
+    mass, centre = export.carried(arm, loaded=False)
+    load = export.workcell.robots[arm].tool_load
+    inertia = np.zeros((3, 3)) if load is None else load.inertia
+    torque, wrench = _contact(export.job, arm)
+    torques = (CONTACT * torque + SPARE_TORQUE).tolist()
+    forces = [float(CONTACT * wrench[0] + SPARE_FORCE)] * 3
+    forces += [float(CONTACT * wrench[1] + SPARE_TORQUE)] * 3
+    thresholds = {
+        f"{end}_{what}_thresholds_{when}": values
+        for what, values in (("torque", torques), ("force", forces))
+        for when in ("acceleration", "nominal")
+        for end in ("lower", "upper")
+    }
+    server = f"/{space}/service_server"
+    return [
+        {
+            "name": f"{server}/set_load",
+            "kind": "franka_msgs/srv/SetLoad",
+            "request": {
+                "mass": mass,
+                "center_of_mass": centre.tolist(),
+                "load_inertia": inertia.T.ravel().tolist(),
+            },
+        },
+        {
+            "name": f"{server}/set_full_collision_behavior",
+            "kind": "franka_msgs/srv/SetFullCollisionBehavior",
+            "request": thresholds,
+        },
+    ]
+
+
+def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
+    """The most of contact: of each joint (n_joints,) [N m], force [N] and moment [N m]."""
     first = len(job.joint_names[0])
-    everything = list(range(first + len(job.joint_names[1])))
-    if not per_arm:
-        return {"dual_arm": everything}
-    return {"arm_1": everything[:first], "arm_2": everything[first:]}
+    span = slice(0, first) if arm == 0 else slice(first, None)
+    torque = [np.abs(contact_effort(p.motion, p.force.wrench)[:, span]).max(0) for p in job.phases]
+    wrench = np.concatenate([phase.force.wrench[:, arm] for phase in job.phases])
+    size = [float(np.linalg.norm(part, axis=1).max()) for part in (wrench[:, :3], wrench[:, 3:])]
+    return np.max(torque, axis=0), (size[0], size[1])
 
 
-def joint_trajectory(
-    sampled: SampledJob, span: slice, names: Sequence[str], columns: Sequence[int]
-) -> dict[str, Any]:
-    """A trajectory_msgs/msg/JointTrajectory of some joints over some samples."""
-    begin = float(sampled.time[span.start])
+# --- UR ---
 
-    def rows(values: Array) -> list[list[float]]:
-        found: list[list[float]] = values[span][:, list(columns)].tolist()
-        return found
 
-    quantities = zip(
-        rows(sampled.q),
-        rows(sampled.q_rate),
-        rows(sampled.q_second),
-        rows(sampled.effort),
-        sampled.time[span].tolist(),
-        strict=True,
-    )
-    return {
-        "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
-        "joint_names": list(names),
-        "points": [
+def require_ur(job: Job, options: BundleOptions) -> None:
+    """Refuse a job for arms that are not UR's e-series, or whose controllers have no address."""
+    require_maker(job.workcell, UR, "ur_robot_driver with force mode", options.any_arm)
+    require_axes(job.workcell, "ur_robot_driver")
+    require_address(job.workcell, "ur-ros2")
+
+
+def ur_files(export: Export) -> dict[str, str | bytes]:
+    """Per arm the whole path passed through to the controller; the follower in force mode."""
+    spaces, cell = _namespaces(export.workcell), export.workcell
+    config = _config(export, "", stamped=False)
+    lags = [robot.driver.lag or UR_LAG for robot in cell.robots]
+    follower, space = export.follower, spaces[export.follower]
+    config |= {
+        "lag": max(lags),
+        "groups": [
+            {"action": f"/{each}/passthrough_trajectory_controller/{ACTION}", "arms": [arm]}
+            for arm, each in enumerate(spaces)
+        ],
+        "joint_states": [f"/{each}/joint_states" for each in spaces],
+        "wrench": [
             {
-                "positions": q,
-                "velocities": rate,
-                "accelerations": second,
-                "effort": effort,
-                "time_from_start": duration(time - begin),
+                "topic": f"/{each}/force_torque_sensor_broadcaster/ft_data",
+                "axis": cell.robots[arm].T_flange_pad[:3, 2].tolist(),
             }
-            for q, rate, second, effort, time in quantities
+            for arm, each in enumerate(spaces)
+        ],
+        "prepare": [
+            call
+            for arm, each in enumerate(spaces)
+            for call in (
+                _payload_call(export, arm, each),
+                _trigger(f"/{each}/io_and_status_controller/zero_ftsensor"),
+            )
+        ],
+        "force": [
+            {
+                "arm": follower,
+                "every": FORCE_EVERY,
+                "name": f"/{space}/force_mode_controller/start_force_mode",
+                "end": f"/{space}/force_mode_controller/stop_force_mode",
+                "type": "ur_msgs/srv/SetForceMode",
+                "request": _force_mode(export, follower),
+            }
+        ],
+        "payload": [
+            {
+                "arm": arm,
+                "name": f"/{each}/io_and_status_controller/set_payload",
+                "type": "ur_msgs/srv/SetPayload",
+                "empty": _carried(export, arm, loaded=False),
+                "loaded": _carried(export, arm, loaded=True),
+            }
+            for arm, each in enumerate(spaces)
+        ],
+        "sliders": [
+            {
+                "name": f"/{each}/io_and_status_controller/set_speed_slider",
+                "type": "ur_msgs/srv/SetSpeedSliderFraction",
+            }
+            for each in spaces
+        ],
+    }
+    for driver, robot in zip(config["drivers"], cell.robots, strict=True):
+        found = re.search(r"(?<![a-z0-9])ur\d+e?(?![a-z0-9])", described(robot))
+        driver["type"] = found.group() if found else "ur10e"
+    files = dict(_programs(export, config, "ur.launch.py"))
+    for arm, each in enumerate(spaces):
+        files[f"config/controllers_{arm + 1}.yaml"] = _yaml(_ur_controllers(export, arm, each))
+    return files
+
+
+def _ur_controllers(export: Export, arm: int, space: str) -> dict[str, Any]:
+    prefix, joints = prefixes(export.workcell)[arm], export.ros_joints(arm)
+    scaling = f"{prefix}speed_scaling/speed_scaling_factor"
+    rate = export.workcell.robots[arm].driver.rate or UR_RATE
+    kinds = {
+        BROADCASTER: f"{BROADCASTER}/JointStateBroadcaster",
+        "io_and_status_controller": "ur_controllers/GPIOController",
+        "speed_scaling_state_broadcaster": "ur_controllers/SpeedScalingStateBroadcaster",
+        "force_torque_sensor_broadcaster": (
+            "force_torque_sensor_broadcaster/ForceTorqueSensorBroadcaster"
+        ),
+        "passthrough_trajectory_controller": "ur_controllers/PassthroughTrajectoryController",
+        "force_mode_controller": "ur_controllers/ForceModeController",
+    }
+    manager = {"update_rate": round(rate), **{name: {"type": k} for name, k in kinds.items()}}
+    sensor = {
+        "sensor_name": f"{prefix}tcp_fts_sensor",
+        "state_interface_names": [f"{w}.{a}" for w in ("force", "torque") for a in "xyz"],
+        "frame_id": f"{prefix}tool0_controller",
+        "topic_name": "ft_data",
+    }
+    own = {
+        "controller_manager": manager,
+        "io_and_status_controller": {"tf_prefix": prefix},
+        "speed_scaling_state_broadcaster": {"tf_prefix": prefix, "state_publish_rate": 100.0},
+        "force_torque_sensor_broadcaster": sensor,
+        "passthrough_trajectory_controller": {
+            "tf_prefix": prefix,
+            "joints": joints,
+            "state_interfaces": ["position", "velocity"],
+            "speed_scaling_interface_name": scaling,
+        },
+        "force_mode_controller": {"tf_prefix": prefix},
+    }
+    return {f"/{space}/{name}": {"ros__parameters": values} for name, values in own.items()}
+
+
+def _force_mode(export: Export, arm: int) -> dict[str, Any]:
+    """A ur_msgs/srv/SetForceMode request: compliant along z of the pad, into the box, alone."""
+    robot = export.workcell.robots[arm]
+    prefix = prefixes(export.workcell)[arm]
+    turn = Rotation.from_matrix(robot.T_flange_pad[:3, :3]).as_quat().tolist()
+    axes = ("x", "y", "z", "rx", "ry", "rz")
+    return {
+        "task_frame": {
+            "header": {"frame_id": f"{prefix}{robot.flange}"},
+            "pose": {
+                "position": dict(zip("xyz", robot.T_flange_pad[:3, 3].tolist(), strict=True)),
+                "orientation": dict(zip("xyzw", turn, strict=True)),
+            },
+        },
+        **{f"selection_vector_{axis}": axis == "z" for axis in axes},
+        "type": 2,
+        "speed_limits": {"linear": {"z": FORCE_SPEED}},
+        "deviation_limits": [DEVIATION] * 6,
+        "damping_factor": FORCE_DAMPING,
+        "gain_scaling": FORCE_GAIN,
+    }
+
+
+def _payload_call(export: Export, arm: int, space: str) -> dict[str, Any]:
+    mass, centre = export.carried(arm, loaded=False)
+    request = {"mass": mass, "center_of_gravity": dict(zip("xyz", centre.tolist(), strict=True))}
+    name = f"/{space}/io_and_status_controller/set_payload"
+    return {"name": name, "kind": "ur_msgs/srv/SetPayload", "request": request}
+
+
+def _trigger(name: str) -> dict[str, Any]:
+    return {"name": name, "kind": "std_srvs/srv/Trigger", "request": {}}
+
+
+# --- what all have ---
+
+
+def _config(export: Export, effort: str, stamped: bool) -> dict[str, Any]:
+    """What `run_job.py` reads beside the job; see there."""
+    cell = export.workcell
+    return {
+        "effort": effort,
+        "stamped": stamped,
+        "lag": export.lag,
+        "step": export.step,
+        "wrench": [None, None],
+        "prepare": [],
+        "force": [],
+        "payload": [],
+        "sliders": [],
+        "drivers": [
+            {
+                "robot": robot.name,
+                "address": robot.driver.address,
+                "namespace": space,
+                "prefix": prefix,
+            }
+            for robot, space, prefix in zip(
+                cell.robots, _namespaces(cell), prefixes(cell), strict=True
+            )
         ],
     }
 
 
-def follow_goal(trajectory: dict[str, Any]) -> dict[str, Any]:
-    """A control_msgs/action/FollowJointTrajectory goal that drives a trajectory."""
-
-    def tolerances(position: float) -> list[dict[str, Any]]:
-        return [
-            {"name": name, "position": position, "velocity": 0.0, "acceleration": 0.0}
-            for name in trajectory["joint_names"]
-        ]
-
+def _programs(export: Export, config: dict[str, Any], launch: str) -> dict[str, str | bytes]:
     return {
-        "trajectory": trajectory,
-        "path_tolerance": tolerances(PATH_TOLERANCE),
-        "goal_tolerance": tolerances(GOAL_TOLERANCE),
-        "goal_time_tolerance": duration(GOAL_TIME),
+        "job.json": job_text(export),
+        "config/cell.json": json.dumps(config, indent=1, allow_nan=False) + "\n",
+        "run_job.py": program("run_job.py"),
+        "carry_job.py": program("carry_job.py"),
+        f"launch/{launch}": program(launch),
     }
 
 
-def wrench_references(sampled: SampledJob) -> dict[str, Any]:
-    """Per robot the force that its pad exerts on the box, as geometry_msgs/msg/WrenchStamped.
-
-    Along the pad's own axes, z into the box, about its centre: so the reference of a force
-    controller is `force.z`.
-    """
-    robots = []
-    for arm, (prefix, robot) in enumerate(
-        zip(prefixes(sampled.job.workcell), sampled.job.workcell.robots, strict=True)
-    ):
-        frame = pad_frame(prefix, arm)
-        robots.append(
-            {
-                "robot": robot.name,
-                "force_controlled": arm != sampled.job.squeeze.leader,
-                "topic": f"/{frame}/wrench_reference",
-                "messages": [
-                    {
-                        "header": {"stamp": duration(time), "frame_id": frame},
-                        "wrench": wrench_message(row),
-                    }
-                    for time, row in zip(
-                        sampled.time.tolist(), pad_wrench(sampled, arm).tolist(), strict=True
-                    )
-                ],
-            }
-        )
-    return {"robots": robots}
+def _namespaces(workcell: Workcell) -> list[str]:
+    """A namespace per arm."""
+    names = [prefix.rstrip("_") for prefix in prefixes(workcell)]
+    return names if all(names) and names[0] != names[1] else ["arm_1", "arm_2"]
 
 
-def pad_wrench(sampled: SampledJob, arm: int) -> Array:
-    """(n, 6) force and moment that a pad exerts on the box, along the pad's axes [N, N m]."""
-    T_box_pad = sampled.job.workcell.contacts[arm].T_box_pad
-    turned = box_rotation(sampled.job.workcell.task.orientation, sampled.pose)
-    R_world_pad = turned @ T_box_pad[:3, :3]
-    both = sampled.wrench[:, arm].reshape(-1, 2, 3)
-    return np.asarray(np.einsum("nji,nkj->nki", R_world_pad, both).reshape(-1, 6))
-
-
-def wrench_message(wrench: Sequence[float]) -> dict[str, Any]:
-    """A geometry_msgs/msg/Wrench of force and moment (6,)."""
-    return {
-        "force": dict(zip("xyz", wrench[:3], strict=True)),
-        "torque": dict(zip("xyz", wrench[3:], strict=True)),
-    }
-
-
-def pad_frame(prefix: str, arm: int) -> str:
-    """Name of a pad's frame."""
-    return f"{prefix or f'arm_{arm + 1}_'}contact_pad"
-
-
-def controllers(job: Job, groups: dict[str, list[int]]) -> dict[str, Any]:
-    """The parameters of ros2_control's controller manager and controllers."""
-    document: dict[str, Any] = {
-        "controller_manager": {
-            "ros__parameters": {
-                "update_rate": UPDATE_RATE,
-                JOINT_STATES: {"type": f"{JOINT_STATES}/JointStateBroadcaster"},
-                **{f"{name}_controller": {"type": CONTROLLER} for name in groups},
-            }
-        }
-    }
-    for name, columns in groups.items():
-        joints = [job_joints(job)[column] for column in columns]
-        document[f"{name}_controller"] = {
-            "ros__parameters": {
-                "joints": joints,
-                # The effort of each point is passed on as it is: a feed-forward beside positions.
-                "command_interfaces": ["position", "effort"],
-                "state_interfaces": ["position", "velocity"],
-                "allow_nonzero_velocity_at_trajectory_end": False,
-                "constraints": {
-                    "stopped_velocity_tolerance": 0.01,
-                    "goal_time": GOAL_TIME,
-                    **{
-                        joint: {"trajectory": PATH_TOLERANCE, "goal": GOAL_TOLERANCE}
-                        for joint in joints
-                    },
-                },
-            }
-        }
-    return document
-
-
-def duration(seconds: float) -> dict[str, int]:
-    """A builtin_interfaces/msg/Duration, or Time."""
-    nanoseconds = round(seconds * 1e9)
-    return {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
+def _carried(export: Export, arm: int, loaded: bool) -> dict[str, Any]:
+    mass, centre = export.carried(arm, loaded)
+    return {"mass": mass, "centre": centre.tolist()}
 
 
 def _yaml(document: Any) -> str:
-    # The C library's dumper is some times faster, and not part of every PyYAML.
-    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    text: str = yaml.dump(document, Dumper=dumper, sort_keys=False, width=10_000)
+    text: str = yaml.safe_dump(document, sort_keys=False, width=10_000)
     return text

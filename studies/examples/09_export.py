@@ -7,6 +7,6 @@ carry = cell.carry(cell.initial)
 timing = ho.time_path(cell, carry, ho.TimingLimits(reference_speed=True))
 job = ho.plan_job(timing)
 print(job)
-for form in ("csv", "json", "ros2", "rapid"):
-    print(*ho.export(job, form, "out"))
+for target in ("csv", "json", "ros2-control", "mcap"):
+    print(*ho.export(job, target, "out"))
 ho.save(carry, "out/carry.json", {"by": "hand"})

@@ -1,4 +1,4 @@
-"""What programs do with a stored trajectory: replay it, export it, find forces that hold."""
+"""What programs do with a trajectory: replay it, export it, judge it, find forces that hold."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.bundles import BundleOptions, Origin, export
+from hybrid_opt.bundles.check import as_document, check
+from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
 from hybrid_opt.bundles.manifest import warnings_of
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
@@ -48,6 +50,7 @@ from hybrid_opt.timing import (
 )
 from hybrid_opt.timing.document import timing_document
 from hybrid_opt.timing.model import TimingModel
+from studies.program import load_workcell
 from studies.study.terminal import number
 from studies.study.timing import timing_text
 from symbolic.array import Array
@@ -126,14 +129,12 @@ def export_file(options: argparse.Namespace) -> int:
     """Write the bundle of a trajectory file and print its job; returns the exit code."""
     path = Path(options.file)
     stored = read_trajectory(path)
-    bundle = BundleOptions(
-        options.step, options.per_arm, options.any_arm, options.stiffness, options.skew
-    )
+    bundle = BundleOptions(options.step, options.any_arm, options.stiffness, options.skew)
     squeeze = SqueezeSettings(options.squeeze, options.leader - 1)
     with TemporaryDirectory() as folder:
         job = _planned(stored, Path(folder), options, squeeze)
         origin = Origin.of_file(path, read_bytes(path), stored.provenance)
-        files = export(job, options.form, options.output, origin=origin, options=bundle)
+        files = export(job, options.target, options.output, origin=origin, options=bundle)
         print(_report(job, options.stiffness))
     print(f"\n{len(files)} files in {files[0].parent}")
     return 0
@@ -172,6 +173,16 @@ def _report(job: Job, stiffness: float) -> str:
     ]
     parts += [f"\nwarning: {warning}" for warning in warnings_of(job)]
     return "\n".join(parts)
+
+
+def check_file(options: argparse.Namespace) -> int:
+    """Print what a joint trajectory does in a cell; returns the exit code."""
+    cell = Cell(load_workcell(options.workcell)).drivable()
+    trajectory = joint_trajectory(options.trajectory, cell.workcell)
+    held = None if options.held is None else (options.held[0], options.held[1])
+    found = check(cell, trajectory, held)
+    print(json.dumps(as_document(found), indent=1) if options.json else found)
+    return EXIT_DIFFERENT if found.problems else 0
 
 
 def robust_forces(options: argparse.Namespace) -> int:

@@ -235,7 +235,7 @@ def _row(label: str, found: list[Array]) -> StoredDurations:
     return StoredDurations(label, len(found), *figures)
 
 
-EXPORT_FORM = "ros2"
+EXPORT_TARGET = "ros2-control"
 
 ADVICE = 3
 """Changes that a terminal tells."""
@@ -303,9 +303,9 @@ def recommendation_text(found: StoredRecommendation, folder: str) -> Recommendat
 def export_command(path: Path, force: float) -> str:
     """The command that makes of a trajectory file, timed within a force limit [N], what robots
     need."""
-    output = path.with_name(f"{path.stem}-{EXPORT_FORM}")
+    output = path.with_name(f"{path.stem}-{EXPORT_TARGET}")
     return (
-        f"python -m studies.export {shlex.quote(str(path))} --form {EXPORT_FORM} "
+        f"python -m studies.export {shlex.quote(str(path))} --target {EXPORT_TARGET} "
         f"--force-limit {force:.6g} --output {shlex.quote(str(output))}"
     )
 

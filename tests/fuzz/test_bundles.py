@@ -18,7 +18,7 @@ from tests.fuzz.promises import MANY, Checks, all_kept, kept
 
 FILES: dict[str, str | bytes] = {"job.csv": "time\n0.0\n", "goals/1_press.yaml": b"a: 1\n"}
 ABOUT: dict[str, Any] = {
-    "form": "csv",
+    "target": "csv",
     "name": "rack-00000000",
     "duration": 7.25,
     "phases": [{"name": "press", "peak_normal_force": [61.5, 60.25], "limits": {"torque": 0.75}}],

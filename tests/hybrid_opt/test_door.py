@@ -151,8 +151,8 @@ def test_a_carry_is_timed_and_exported(tmp_path: Path) -> None:
     np.testing.assert_array_equal(timing.carry.x, carry.x)
     assert "joint acceleration" in repr(timing)
     assert "<table" in timing._repr_html_()
-    files = ho.export(timing, "ros2", tmp_path)
-    assert {"manifest.json", "job.yaml"} <= {file.name for file in files}
+    files = ho.export(timing, "ros2-control", tmp_path)
+    assert {"manifest.json", "job.json"} <= {file.name for file in files}
     (folder,) = {file.parent for file in files if file.name == "manifest.json"}
     told = read_manifest(folder)["files"]
     assert {folder / name for name in told} == set(files) - {folder / "manifest.json"}

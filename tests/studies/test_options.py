@@ -74,7 +74,7 @@ def test_what_the_source_does_not_state_is_an_error() -> None:
     ("main", "arguments"),
     [
         (replay.main, ["t.json", "--force-limit", "0"]),
-        (export.main, ["t.json", "--form", "csv", "--force-limit", "-1"]),
+        (export.main, ["t.json", "--target", "csv", "--force-limit", "-1"]),
         (recommend.main, ["results", "--force-limit", "nan"]),
         (robust.main, ["t.json", "--cases", "0"]),
         (robust.main, ["t.json", "--points", "-1"]),

@@ -1,30 +1,48 @@
-"""The rack's job in every form, made once per test process."""
+"""The rack's job for every target, made once per test process."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
-from hybrid_opt.bundles import FORMATS, BundleOptions
-from hybrid_opt.bundles.manifest import Contents
-from hybrid_opt.job.records import SampledJob, sample_job
+from hybrid_opt.bundles import TARGETS, BundleOptions
+from hybrid_opt.bundles.bundle import prepared
+from hybrid_opt.bundles.job_file import Contents, Export
+from hybrid_opt.job.records import Job
+from symbolic.records import Driver
 from tests.hybrid_opt.job.jobs import rack_job
 
-STEPS = {"rapid": 0.1, "urscript": 0.008}
+DRIVER = Driver("192.168.0.10", None, None, 0.03, force_control=True)
+"""What every target is content with."""
+
+STEPS = {"ur-script": 0.008, "abb-rapid": 0.1}
+
+
+def driven(job: Job, driver: Driver = DRIVER) -> Job:
+    """A job of a cell whose robots have a driver."""
+    first, second = (replace(robot, driver=driver) for robot in job.workcell.robots)
+    return replace(job, workcell=replace(job.workcell, robots=(first, second)))
 
 
 @cache
-def sampled(step: float = 0.05) -> SampledJob:
-    return sample_job(rack_job(), step)
+def rack_driven() -> Job:
+    return driven(rack_job())
 
 
 @cache
-def contents(form: str, per_arm: bool = False) -> Contents:
-    """The files of a bundle by path, of 0.05 s steps where the form allows that."""
-    options = BundleOptions(per_arm=per_arm, any_arm=True)
-    return FORMATS[form].files(sampled(STEPS.get(form, 0.05)), options)
+def exported(target: str, step: float | None = None) -> Export:
+    """The rack's job as a target takes it, at 0.05 s steps where the target allows that."""
+    options = BundleOptions(step=step or STEPS.get(target, 0.05), any_arm=True)
+    return prepared(rack_driven(), TARGETS[target], options)
 
 
-def text_of(form: str, name: str, per_arm: bool = False) -> str:
-    found = contents(form, per_arm)[name]
+@cache
+def contents(target: str) -> Contents:
+    """The files of a bundle by path."""
+    return TARGETS[target].files(exported(target))
+
+
+def text_of(target: str, name: str) -> str:
+    found = contents(target)[name]
     assert isinstance(found, str)
     return found

@@ -17,7 +17,10 @@ _TOKEN = re.compile(
     r"|(?P<number>[-+]?\d+(?:\.\d+)?(?:E[-+]?\d+)?)|(?P<word>[A-Za-z][A-Za-z0-9_]*)"
     r"|(?P<mark>:=|<>|<=|>=|[\[\]{},;\\().<>=+*/-])"
 )
-_RESERVED = {"MODULE", "ENDMODULE", "PROC", "ENDPROC", "VAR", "PERS", "CONST", "IF", "ENDIF"}
+_RESERVED = {
+    *("MODULE", "ENDMODULE", "PROC", "ENDPROC", "ERROR"),
+    *("VAR", "PERS", "CONST", "IF", "ENDIF"),
+}
 MAX_NAME = 32
 
 
@@ -92,6 +95,9 @@ class _Parser:
         if kind == "text":
             return found[1:-1]
         if kind == "word":
+            # A component, or a product.
+            while self.peek() in (".", "*"):
+                found += self.take() + self.take()
             return found
         raise RapidError(f"{found!r} is no value")
 
@@ -111,27 +117,35 @@ class _Parser:
 
     def call(self) -> Call:
         call = Call(self.name())
+        self._options(call)
         while self.peek() != ";":
-            if call.arguments:
+            if call.arguments or call.optional:
                 self.take(",")
+            given = len(call.optional)
+            self._options(call)
+            if len(call.optional) > given and self.peek() in (",", ";"):
+                continue
             call.arguments.append(self.value())
-            while self.peek() == "\\":
-                self.take()
-                option = self.name()
-                if option in call.optional:
-                    raise RapidError(f"\\{option} given twice")
-                call.optional[option] = True if self.peek() != ":=" else self._assigned()
+            self._options(call)
         self.take(";")
         return call
+
+    def _options(self, call: Call) -> None:
+        while self.peek() == "\\":
+            self.take()
+            option = self.name()
+            if option in call.optional:
+                raise RapidError(f"\\{option} given twice")
+            call.optional[option] = True if self.peek() != ":=" else self._assigned()
 
     def _assigned(self) -> Value:
         self.take(":=")
         return self.value()
 
-    def statements(self, end: str) -> list[Call]:
+    def statements(self, *ends: str) -> list[Call]:
         """Statements up to a closing word; what a condition holds follows it."""
         calls = []
-        while self.peek() != end:
+        while self.peek() not in ends:
             if self.peek() == "IF":
                 self.take()
                 calls.append(Call("IF", [self.expression("THEN")]))
@@ -142,7 +156,7 @@ class _Parser:
                 calls.append(Call(":=", [target, self.expression(";")]))
             else:
                 calls.append(self.call())
-        self.take(end)
+        self.take()
         return calls
 
     def declared(self) -> tuple[str, str, str, Value | None]:
@@ -174,7 +188,9 @@ class _Parser:
             self.take(")")
             while self.peek() == "VAR":
                 self.declared()
-            module.procedures[name] = self.statements("ENDPROC")
+            module.procedures[name] = self.statements("ENDPROC", "ERROR")
+            if self.peek(-1) == "ERROR":
+                self.statements("ENDPROC")
         self.take("ENDMODULE")
         if self.peek():
             raise RapidError(f"{self.peek()!r} after the module")

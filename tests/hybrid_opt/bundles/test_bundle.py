@@ -10,13 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from hybrid_opt.bundles import FORMATS, BundleOptions, Origin, export
+from hybrid_opt.bundles import TARGETS, BundleOptions, Origin, export
 from hybrid_opt.bundles.bundle import read_manifest, write_bundle
 from hybrid_opt.errors import JobError, ResultsError
 from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.store.files import sha256
 from hybrid_opt.timing import TimingLimits, time_path
 from symbolic.errors import SettingsError
+from tests.hybrid_opt.bundles.bundles import DRIVER, driven
 from tests.hybrid_opt.job.jobs import rack, rack_job, rack_jobs, rack_timing
 
 FILES: dict[str, str | bytes] = {"a.txt": "one", "sub/b.bin": b"two"}
@@ -33,14 +34,14 @@ def tree(folder: Path) -> dict[str, bytes]:
 
 def test_a_bundle_is_replaced_as_a_whole(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "bundle"
-    paths = write_bundle(folder, FILES, {"form": "x"})
+    paths = write_bundle(folder, FILES, {"target": "x"})
     assert [path.relative_to(folder).as_posix() for path in paths] == [
         "manifest.json",
         "a.txt",
         "sub/b.bin",
     ]
     assert read_manifest(folder)["files"]["a.txt"] == sha256(b"one")
-    write_bundle(folder, {"c.txt": "three"}, {"form": "x"})
+    write_bundle(folder, {"c.txt": "three"}, {"target": "x"})
     assert set(tree(folder)) == {"manifest.json", "c.txt"}
     assert [path.name for path in folder.parent.iterdir()] == ["bundle"]
 
@@ -181,30 +182,89 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
     assert skew["required"] is None
 
 
+def test_the_manifest_says_how_the_job_stops(tmp_path: Path) -> None:
+    document = json.loads(export(rack_job(), "ros2-control", tmp_path)[0].read_text())
+    machine = document["machine"]
+    assert set(machine["states"]) == {"ready", "running", "stopping", "held", "done"}
+    assert machine["carried_out_by"].startswith("run_job.py")
+    assert machine["stop"]["force_use"] <= 1.0
+    assert machine["limits"]["stop_time"] == machine["stop"]["time"]
+    assert "'back'" in machine["set_down"]
+    step = document["time_step"]
+    assert step["interpolation"] == "quintic"
+    assert step["share"] <= step["allowed_share"]
+    assert step["force"] == pytest.approx(step["stiffness"] / 2.0 * step["along"])
+
+
+def test_the_step_follows_from_the_stiffness(tmp_path: Path) -> None:
+    """RAPID's straight lines between the joints: stiffer arms need shorter steps."""
+    job = driven(rack_job())
+    found = []
+    for stiffness in (2e3, 5e4):
+        options = BundleOptions(stiffness=stiffness, skew=0.0)
+        paths = export(job, "abb-rapid", tmp_path / f"{stiffness:g}", options=options)
+        found.append(json.loads(paths[0].read_text())["time_step"]["step"])
+    assert found[0] > found[1]
+
+
 def test_two_controllers_have_to_survive_their_skew(tmp_path: Path) -> None:
-    """One clock needs nothing; where each arm has its own, 10 ms or what is asked for."""
-    stiff = BundleOptions(step=0.2, stiffness=5e4)
-    document = json.loads(export(rack_job(), "ros2", tmp_path, options=stiff)[0].read_text())
+    """One clock needs nothing; where each arm plans by itself, 10 ms or what is asked for."""
+    job = driven(rack_job())
+    stiff = BundleOptions(step=0.1, stiffness=5e4)
+    document = json.loads(export(job, "ros2-control", tmp_path, options=stiff)[0].read_text())
     assert document["start_skew"]["required"] == 0.0
     assert document["start_skew"]["survived"] < 0.01
     with pytest.raises(JobError, match="a skew of 10 ms"):
-        export(rack_job(), "ros2", tmp_path, options=replace(stiff, per_arm=True))
+        export(job, "abb-rapid", tmp_path, options=stiff)
     with pytest.raises(JobError, match="a skew of 20 ms"):
-        export(rack_job(), "csv", tmp_path, options=replace(stiff, skew=0.02))
-    reached = replace(stiff, per_arm=True, skew=1e-3)
-    document = json.loads(export(rack_job(), "ros2", tmp_path, options=reached)[0].read_text())
+        export(job, "csv", tmp_path, options=replace(stiff, skew=0.02))
+    reached = replace(stiff, skew=1e-3)
+    document = json.loads(export(job, "abb-rapid", tmp_path, options=reached)[0].read_text())
     assert document["start_skew"]["required"] == 1e-3
     with pytest.raises(SettingsError, match="skew"):
         BundleOptions(skew=-1.0)
 
 
+REFUSED = {
+    "franka-ros2": (DRIVER, "does not look like an arm of Franka"),
+    "ur-ros2": (DRIVER, "does not look like an arm of UR"),
+    "ur-script": (DRIVER, "does not look like an arm of UR"),
+    "abb-rapid": (replace(DRIVER, force_control=False), "would not squeeze: positions alone"),
+    "abb-egm": (replace(DRIVER, lag=0.0), "compensates the lag of 'left'"),
+}
+
+
+@pytest.mark.parametrize("target", REFUSED)
+def test_a_target_says_what_it_lacks(target: str, tmp_path: Path) -> None:
+    driver, told = REFUSED[target]
+    with pytest.raises(SettingsError, match=told):
+        export(driven(rack_job(), driver), target, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_driver_has_to_have_an_address(tmp_path: Path) -> None:
+    job = driven(rack_job(), replace(DRIVER, address=""))
+    with pytest.raises(SettingsError, match=r"ur-ros2 has to know where .* address"):
+        export(job, "ur-ros2", tmp_path, options=BundleOptions(any_arm=True))
+
+
 def test_a_timing_is_exported_with_its_job(tmp_path: Path) -> None:
     paths = export(rack_timing(), "json", tmp_path)
     assert json.loads(paths[1].read_text())["phases"][0]["name"] == "approach"
-    with pytest.raises(SettingsError, match="unknown format"):
+    with pytest.raises(SettingsError, match="unknown target"):
         export(rack_job(), "xml", tmp_path)
     with pytest.raises(SettingsError, match="no timing to export"):
         export(replace(rack_timing(), carry=None), "csv", tmp_path)
     with pytest.raises(SettingsError, match="time step"):
         export(rack_job(), "csv", tmp_path, options=BundleOptions(step=-1.0))
-    assert set(FORMATS) == {"csv", "json", "ros2", "rapid", "urscript", "mcap"}
+    assert set(TARGETS) == {
+        "ros2-control",
+        "franka-ros2",
+        "ur-ros2",
+        "ur-script",
+        "abb-rapid",
+        "abb-egm",
+        "mcap",
+        "csv",
+        "json",
+    }

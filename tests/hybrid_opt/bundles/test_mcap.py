@@ -8,13 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from tests.hybrid_opt.bundles.bundles import contents, sampled, text_of
+from hybrid_opt.bundles.mcap_file import message_of
+from hybrid_opt.job.records import SampledJob
+from tests.hybrid_opt.bundles.bundles import contents, exported, text_of
 from tests.hybrid_opt.job.jobs import rack_job
+
+
+def sampled() -> SampledJob:
+    return exported("mcap").sampled
 
 
 def recording() -> io.BytesIO:
@@ -59,7 +66,9 @@ def test_every_message_is_one_of_ros2() -> None:
 def test_the_job_is_read_back() -> None:
     found, job = decoded(), sampled()
     assert [message.data for _, message in found["/phase"]] == [p.name for p in rack_job().phases]
-    assert found["/robot_description"][0][1].data == text_of("ros2", "description/cell.urdf")
+    assert found["/robot_description"][0][1].data == text_of(
+        "ros2-control", "description/cell.urdf"
+    )
     assert len(found["/joint_states"]) == len(job.time)
     for k, (stamp, state) in enumerate(found["/joint_states"]):
         assert stamp == pytest.approx(1e9 * job.time[k], abs=1.0)
@@ -88,3 +97,16 @@ def test_frames_hang_together() -> None:
     distance = np.linalg.norm([box.x - pad.x, box.y - pad.y, box.z - pad.z])
     assert distance == pytest.approx(np.hypot(0.2, 0.055), abs=1e-5)
     assert {"left_base_link", "right_link_6"} <= set(frames)
+
+
+def test_a_damaged_recording_is_refused() -> None:
+    content = recording().getvalue()
+    for damaged in (content[:-40], b"x" + content, content[:200] + b"damage" + content[206:]):
+        with pytest.raises((McapError, EndOfFile, ValueError)):
+            list(make_reader(io.BytesIO(damaged), validate_crcs=True).iter_messages())
+
+
+def test_messages_have_all_fields() -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with pytest.raises(KeyError):
+        message_of(store, {"force": {"x": 0.0, "y": 0.0}}, "geometry_msgs/msg/Wrench")

@@ -1,118 +1,96 @@
-"""The ROS 2 bundle, read by PyYAML, by ROS 2's message definitions (rosbags) and by Pinocchio."""
+"""Files of the ROS 2 targets: descriptions by Pinocchio, parameters by controllers' rules."""
 
 from __future__ import annotations
 
 import ast
+import json
+import math
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
-from rosbags.typesys import Stores, get_typestore
 
+from hybrid_opt.bundles.steps import pad_places
 from symbolic.records.poses import pose_matrix
-from tests.hybrid_opt.bundles.bundles import contents, sampled, text_of
-from tests.hybrid_opt.job.jobs import rack, rack_job
+from tests.hybrid_opt.bundles.bundles import contents, exported, text_of
+from tests.hybrid_opt.job.jobs import rack
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINTS = [f"{arm}_joint_{k}" for arm in ("left", "right") for k in range(1, 7)]
 
-
-def message(value: dict[str, Any], kind: str) -> Any:
-    """A message object of ROS 2's own definition; unknown or missing fields are errors."""
-    fields = STORE.get_msgdef(kind).fields
-    assert [name for name, _ in fields] == list(value), kind
-    return STORE.types[kind](
-        **{
-            name: _field(value[name], node)
-            for name, (name, node) in zip(value, fields, strict=True)
-        }
-    )
-
-
-def _field(value: Any, node: Any) -> Any:
-    sort, description = node
-    if sort.name == "NAME":
-        return message(value, description)
-    if sort.name == "BASE":
-        return value
-    (inner, name), _ = description
-    if inner.name == "NAME":
-        return [message(each, name) for each in value]
-    return list(value) if name[0] == "string" else np.array(value, dtype=name[0])
+# joint_trajectory_controller_parameters.yaml of ros2_controllers: name -> kind.
+JTC: dict[str, Any] = {
+    "joints": list,
+    "command_interfaces": list,
+    "state_interfaces": list,
+    "interpolate_from_desired_state": bool,
+    "allow_nonzero_velocity_at_trajectory_end": bool,
+    "action_monitor_rate": float,
+    "constraints": dict,
+    "gains": dict,
+}
+GAINS = {"p", "i", "d", "ff_velocity_scale", "u_clamp_max", "u_clamp_min"}
 
 
-def round_trip(value: dict[str, Any], kind: str) -> Any:
-    """A message through ROS 2's own serialisation."""
-    return STORE.deserialize_cdr(STORE.serialize_cdr(message(value, kind), kind), kind)
+def judged(parameters: dict[str, Any]) -> None:
+    """A joint trajectory controller's parameters as it judges them when it is configured."""
+    assert set(parameters) <= set(JTC), set(parameters) - set(JTC)
+    for name, value in parameters.items():
+        assert isinstance(value, JTC[name]), name
+    commands, states = parameters["command_interfaces"], parameters["state_interfaces"]
+    # `command_interface_type_combinations`, `state_interface_type_combinations`.
+    assert set(commands) <= {"position", "velocity", "acceleration", "effort"}
+    if "effort" in commands:
+        assert set(commands) in ({"effort"}, {"position", "effort"})
+        assert {"position", "velocity"} <= set(states)
+    if "velocity" in commands and len(commands) > 1:
+        assert "position" in commands
+    assert parameters["joints"]
+    assert len(set(parameters["joints"])) == len(parameters["joints"])
+    assert parameters["action_monitor_rate"] >= 0.1
+    for joint, gains in parameters.get("gains", {}).items():
+        assert joint in parameters["joints"]
+        assert set(gains) <= GAINS
+    if commands == ["effort"]:
+        assert set(parameters.get("gains", {})) == set(parameters["joints"]), "it would fall"
 
 
-def test_the_whole_job_is_one_joint_trajectory() -> None:
-    document = yaml.safe_load(text_of("ros2", "dual_arm_joint_trajectory.yaml"))
-    found = round_trip(document, "trajectory_msgs/msg/JointTrajectory")
-    job = sampled()
-    assert found.joint_names == JOINTS
-    assert len(found.points) == len(job.time)
-    for k, point in enumerate(found.points):
-        stamp = point.time_from_start
-        assert stamp.sec + 1e-9 * stamp.nanosec == pytest.approx(job.time[k], abs=1e-9)
-        np.testing.assert_array_equal(point.positions, job.q[k])
-        np.testing.assert_array_equal(point.velocities, job.q_rate[k])
-        np.testing.assert_array_equal(point.accelerations, job.q_second[k])
-        np.testing.assert_array_equal(point.effort, job.effort[k])
+def test_controllers_accept_their_parameters() -> None:
+    document = yaml.safe_load(text_of("ros2-control", "config/controllers.yaml"))
+    parameters = document["carry_controller"]["ros__parameters"]
+    judged(parameters)
+    assert parameters["joints"] == JOINTS
+    for arm in (1, 2):
+        franka = yaml.safe_load(text_of("franka-ros2", f"config/controllers_{arm}.yaml"))["/**"]
+        judged(franka["carry_controller"]["ros__parameters"])
+        assert franka["controller_manager"]["ros__parameters"]["update_rate"] == 1000
 
 
-@pytest.mark.parametrize("per_arm", [False, True])
-def test_each_phase_is_a_goal(per_arm: bool) -> None:
-    index = yaml.safe_load(text_of("ros2", "job.yaml", per_arm))
-    assert [phase["name"] for phase in index["phases"]] == [p.name for p in rack_job().phases]
-    controllers = yaml.safe_load(text_of("ros2", "config/controllers.yaml", per_arm))
-    job = sampled()
-    for place, phase in enumerate(index["phases"]):
-        columns: list[str] = []
-        for controller, path in phase["goals"].items():
-            goal = yaml.safe_load(text_of("ros2", path, per_arm))
-            names = goal["trajectory"]["joint_names"]
-            columns += names
-            assert controllers[controller]["ros__parameters"]["joints"] == names
-            assert {"trajectory", "path_tolerance", "goal_tolerance", "goal_time_tolerance"} == set(
-                goal
-            )
-            assert [each["name"] for each in goal["goal_tolerance"]] == names
-            trajectory = round_trip(goal["trajectory"], "trajectory_msgs/msg/JointTrajectory")
-            span = job.span(place)
-            assert trajectory.points[0].time_from_start.sec == 0
-            last = trajectory.points[-1]
-            wanted = [JOINTS.index(name) for name in names]
-            np.testing.assert_array_equal(last.positions, job.q[span.stop - 1, wanted])
-            np.testing.assert_allclose(last.velocities, 0.0, atol=1e-9)
-            end = last.time_from_start.sec + 1e-9 * last.time_from_start.nanosec
-            assert end == pytest.approx(phase["end"] - phase["begin"], abs=1e-8)
-        assert columns == JOINTS
-        assert len(phase["goals"]) == (2 if per_arm else 1)
-
-
-def test_wrench_references_are_along_the_pads() -> None:
-    document = yaml.safe_load(text_of("ros2", "wrench_references.yaml"))
-    job = sampled()
-    assert [robot["force_controlled"] for robot in document["robots"]] == [False, True]
-    for arm, robot in enumerate(document["robots"]):
-        assert len(robot["messages"]) == len(job.time)
-        for k in range(0, len(job.time), 20):
-            found = round_trip(robot["messages"][k], "geometry_msgs/msg/WrenchStamped")
-            assert found.wrench.force.z == pytest.approx(job.normal_force[k, arm], abs=1e-6)
-            size = np.linalg.norm(job.wrench[k, arm, :3])
-            both = [found.wrench.force.x, found.wrench.force.y, found.wrench.force.z]
-            assert np.linalg.norm(both) == pytest.approx(size, abs=1e-6)
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"command_interfaces": ["velocity", "effort"]},
+        {"command_interfaces": ["effort"]},
+        {"state_interfaces": ["position"]},
+        {"joints": ["a", "a"]},
+        {"jonts": ["a"]},
+        {"action_monitor_rate": 0.0},
+    ],
+)
+def test_wrong_parameters_are_refused(wrong: dict[str, Any]) -> None:
+    document = yaml.safe_load(text_of("ros2-control", "config/controllers.yaml"))
+    with pytest.raises(AssertionError):
+        judged(document["carry_controller"]["ros__parameters"] | wrong)
 
 
 def test_the_description_places_both_pads_on_the_box() -> None:
-    """Read by Pinocchio: joints in the trajectory's order lead both pads to the box."""
-    model = pin.buildModelFromXML(text_of("ros2", "description/cell.urdf"))
+    """Read by Pinocchio: joints in the job's order lead both pads to the box."""
+    model = pin.buildModelFromXML(text_of("ros2-control", "description/cell.urdf"))
     assert list(model.names)[1:] == JOINTS
     data = model.createData()
-    job = sampled()
+    job = exported("ros2-control").sampled
     press = job.span(1)
     for k in range(press.start, job.span(5).stop, 15):
         pin.framesForwardKinematics(model, data, job.q[k])
@@ -124,34 +102,110 @@ def test_the_description_places_both_pads_on_the_box() -> None:
 
 
 def test_the_description_weighs_what_the_efforts_hold() -> None:
-    model = pin.buildModelFromXML(text_of("ros2", "description/cell.urdf"))
-    data, job = model.createData(), sampled()
+    model = pin.buildModelFromXML(text_of("ros2-control", "description/cell.urdf"))
+    data, job = model.createData(), exported("ros2-control").sampled
     for k in (0, 5, len(job.time) - 3):  # the pads touch nothing
         torque = pin.rnea(model, data, job.q[k], job.q_rate[k], job.q_second[k])
         np.testing.assert_allclose(job.effort[k], torque, atol=0.01)
 
 
 def test_mock_hardware_begins_at_the_first_position() -> None:
-    import xml.etree.ElementTree as tree
-
-    root = tree.fromstring(text_of("ros2", "description/cell.urdf"))
+    root = ElementTree.fromstring(text_of("ros2-control", "description/cell.urdf"))
     control = root.find("ros2_control")
     assert control is not None
     assert control.findtext("hardware/plugin") == "mock_components/GenericSystem"
     joints = control.findall("joint")
     assert [joint.get("name") for joint in joints] == JOINTS
     values = [joint.findtext("state_interface/param") for joint in joints]
-    np.testing.assert_array_equal([float(value or "nan") for value in values], sampled().q[0])
+    first = exported("ros2-control").sampled.q[0]
+    np.testing.assert_array_equal([float(value or "nan") for value in values], first)
     commands = [each.get("name") for each in joints[0].findall("command_interface")]
-    parameters = yaml.safe_load(text_of("ros2", "config/controllers.yaml"))
-    controller = parameters["dual_arm_controller"]["ros__parameters"]
+    parameters = yaml.safe_load(text_of("ros2-control", "config/controllers.yaml"))
+    controller = parameters["carry_controller"]["ros__parameters"]
     assert controller["command_interfaces"] == commands == ["position", "effort"]
-    assert parameters["controller_manager"]["ros__parameters"]["update_rate"] == 1000
+
+
+def test_a_broken_description_is_refused() -> None:
+    text = text_of("ros2-control", "description/cell.urdf")
+    for broken in (text[:-20], text.replace('link="left_link_2"', 'link="nobody"', 1)):
+        with pytest.raises(Exception, match=r".+"):
+            assert list(pin.buildModelFromXML(broken).names)[1:] == JOINTS
+
+
+def test_efforts_say_whose_gravity_they_hold() -> None:
+    """A simulator needs the whole torque, Franka adds gravity by itself, UR takes no torques."""
+    told = {
+        target: json.loads(text_of(target, "config/cell.json"))["effort"]
+        for target in ("ros2-control", "franka-ros2", "ur-ros2")
+    }
+    assert told == {
+        "ros2-control": "with_gravity",
+        "franka-ros2": "without_gravity",
+        "ur-ros2": "",
+    }
+
+
+def test_frankas_know_their_tool_and_what_is_no_collision() -> None:
+    calls = json.loads(text_of("franka-ros2", "config/cell.json"))["prepare"]
+    assert [call["name"].rsplit("/", 1)[1] for call in calls] == [
+        "set_load",
+        "set_full_collision_behavior",
+    ] * 2
+    found = exported("franka-ros2")
+    for arm, call in enumerate(calls[1::2]):
+        torque = np.array(call["request"]["upper_torque_thresholds_nominal"])
+        contact = found.efforts.holding - found.efforts.gravity
+        assert (torque > np.abs(found.sampled.arm(arm, contact)).max(axis=0)).all()
+        force = call["request"]["upper_force_thresholds_nominal"]
+        assert min(force[:3]) > found.sampled.normal_force[:, arm].max()
+    rate = np.diff(found.efforts.moving - found.efforts.gravity, axis=0)
+    assert np.abs(rate / np.diff(found.sampled.time)[:, None]).max() < 1000.0
+
+
+def test_force_mode_presses_into_the_box() -> None:
+    """Its task frame on the flange is the pad's, whose z axis points into the box."""
+    config = json.loads(text_of("ur-ros2", "config/cell.json"))
+    (force,) = config["force"]
+    found = exported("ur-ros2")
+    arm = force["arm"]
+    assert arm == found.follower
+    request = force["request"]
+    pose = request["task_frame"]["pose"]
+    T = np.eye(4)
+    x, y, z, w = (pose["orientation"][k] for k in "xyzw")
+    T[:3, :3] = pin.Quaternion(w, x, y, z).toRotationMatrix()
+    T[:3, 3] = [pose["position"][k] for k in "xyz"]
+    robot = found.workcell.robots[arm]
+    np.testing.assert_allclose(T, robot.T_flange_pad, atol=1e-12)
+    assert request["task_frame"]["header"]["frame_id"] == f"right_{robot.flange}"
+    span = found.sampled.span(3)
+    q = found.sampled.arm(arm, found.sampled.q)[span.start : span.start + 1]
+    pad = pad_places(found.workcell, arm, q)[0]
+    towards = found.sampled.pose[span.start, :3] - pad[:3, 3]
+    assert pad[:3, 2] @ towards > 0.0
+    assert [request[f"selection_vector_{axis}"] for axis in ("x", "y", "z", "rx")] == [
+        False,
+        False,
+        True,
+        False,
+    ]
+    assert 0.0 <= request["damping_factor"] <= 1.0
+    assert 0.0 < request["gain_scaling"] <= 1.0
 
 
 def test_its_programs_are_python() -> None:
-    for name in ("run_job.py", "launch/bringup.launch.py"):
-        tree = ast.parse(text_of("ros2", name))
-        functions = [each.name for each in ast.walk(tree) if isinstance(each, ast.FunctionDef)]
-        assert {"main", "generate_launch_description"} & set(functions)
-    assert {"run_job.py", "job.yaml"} <= set(contents("ros2"))
+    for target, launch in (
+        ("ros2-control", "control"),
+        ("franka-ros2", "franka"),
+        ("ur-ros2", "ur"),
+    ):
+        files = contents(target)
+        for name in ("run_job.py", "carry_job.py", f"launch/{launch}.launch.py"):
+            text = text_of(target, name)
+            compile(text, name, "exec")
+            modules = [
+                n.module or "" for n in ast.walk(ast.parse(text)) if isinstance(n, ast.ImportFrom)
+            ]
+            assert not any(module.startswith("hybrid_opt") for module in modules), name
+        assert "job.json" in files
+    assert math.isfinite(json.loads(text_of("ur-ros2", "config/cell.json"))["step"])

@@ -1,4 +1,4 @@
-"""CSV and JSON read back, and the samples that they hold."""
+"""CSV and JSON read back, by others too, and the samples that they hold."""
 
 from __future__ import annotations
 
@@ -6,14 +6,21 @@ import csv
 import io
 import json
 import math
+from collections.abc import Callable
+from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 
-from hybrid_opt.job.records import sample_job
+from hybrid_opt.job.records import SampledJob, sample_job
 from symbolic.errors import SettingsError
-from tests.hybrid_opt.bundles.bundles import sampled, text_of
+from tests.hybrid_opt.bundles.bundles import exported, text_of
 from tests.hybrid_opt.job.jobs import rack_job
+
+
+def sampled() -> SampledJob:
+    return exported("csv").sampled
 
 
 def test_samples_lie_on_the_job() -> None:
@@ -47,14 +54,16 @@ def test_csv_read_back() -> None:
     rows = list(csv.DictReader(io.StringIO(text_of("csv", "job.csv"))))
     job = sampled()
     assert len(rows) == len(job.time)
-    assert len(rows[0]) == 2 + 6 + 48 + 2 + 12
+    assert len(rows[0]) == 2 + 6 + 60 + 2 + 12
     for k, row in enumerate(rows):
         assert float(row["time [s]"]) == job.time[k]
         assert row["phase"] == job.phase_names[k]
         assert float(row["right/joint_4 position [rad]"]) == job.q[k, 9]
         assert float(row["left/joint_1 velocity [rad/s]"]) == job.q_rate[k, 0]
         assert float(row["right/joint_6 acceleration [rad/s^2]"]) == job.q_second[k, 11]
-        assert float(row["left/joint_2 effort [N m]"]) == job.effort[k, 1]
+        assert float(row["left/joint_2 effort with gravity [N m]"]) == job.effort[k, 1]
+        less = job.effort[k, 1] - exported("csv").efforts.gravity[k, 1]
+        assert float(row["left/joint_2 effort without gravity [N m]"]) == less
         assert float(row["box z [m]"]) == job.pose[k, 2]
         assert float(row["left normal force [N]"]) == job.normal_force[k, 0]
         assert float(row["right wrench fy [N]"]) == job.wrench[k, 1, 1]
@@ -77,8 +86,32 @@ def test_json_read_back() -> None:
         np.testing.assert_array_equal(robot["position"], job.q[:, columns])
         np.testing.assert_array_equal(robot["velocity"], job.q_rate[:, columns])
         np.testing.assert_array_equal(robot["acceleration"], job.q_second[:, columns])
-        np.testing.assert_array_equal(robot["effort"], job.effort[:, columns])
+        np.testing.assert_array_equal(robot["effort_with_gravity"], job.effort[:, columns])
         np.testing.assert_array_equal(robot["normal_force"], job.normal_force[:, i])
+
+
+def test_the_schema_describes_the_file() -> None:
+    schema = json.loads(text_of("json", "job.schema.json"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    document = json.loads(text_of("json", "job.json"))
+    jsonschema.validate(document, schema, jsonschema.Draft202012Validator)
+    broken: list[Callable[[Any], object]] = [
+        lambda d: d.update(version=1),
+        lambda d: d.pop("machine"),
+        lambda d: d["robots"].pop(),
+        lambda d: d["robots"][0].pop("effort_without_gravity"),
+        lambda d: d["robots"][0].update(effort=[[0.0]]),
+        lambda d: d["robots"][1]["normal_force"].__setitem__(0, -1.0),
+        lambda d: d["phases"][0].update(name="lunch"),
+        lambda d: d["machine"]["limits"].update(stop_time=0.0),
+        lambda d: d["box"]["pose"][3].pop(),
+        lambda d: d["time"].__setitem__(0, "0"),
+    ]
+    for each in broken:
+        damaged = json.loads(text_of("json", "job.json"))
+        each(damaged)
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(damaged, schema, jsonschema.Draft202012Validator)
 
 
 @pytest.mark.parametrize("step", [0.0, -1.0, math.nan, math.inf, 2.0])

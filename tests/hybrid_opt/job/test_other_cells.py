@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 from pathlib import Path
 
@@ -9,18 +10,19 @@ import numpy as np
 import pytest
 import yaml
 
-from hybrid_opt.bundles import FORMATS, BundleOptions, export
-from hybrid_opt.bundles.rapid import rapid_files
+from hybrid_opt.bundles import TARGETS, BundleOptions, export
+from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.job.records import Job, sample_job
+from hybrid_opt.job.records import Job
 from hybrid_opt.timing import TimingLimits, time_path
 from symbolic.errors import SettingsError
+from tests.hybrid_opt.bundles.bundles import driven
 from tests.hybrid_opt.bundles.rapid_parser import parse
 from tests.hybrid_opt.cells import shipped
 
 CELLS = ["transfer", "pandas"]
-FREE = ("csv", "json", "ros2", "mcap")
-"""Forms that are nobody's own."""
+FREE = ("csv", "json", "ros2-control", "mcap")
+"""Targets that are nobody's own."""
 
 
 @cache
@@ -53,33 +55,53 @@ def test_the_job_is_whole(name: str) -> None:
 def test_bundles_hold_every_joint(name: str, tmp_path: Path) -> None:
     job = planned(name)
     joints = sum(map(len, job.joint_names))
-    for form in FREE:
-        assert export(job, form, tmp_path, options=BundleOptions(step=0.1))[0].exists()
-    text = FORMATS["ros2"].files(sample_job(job, 0.1), BundleOptions())
-    message = yaml.load(text["dual_arm_joint_trajectory.yaml"], Loader=yaml.CSafeLoader)
-    assert len(set(message["joint_names"])) == joints
-    for point in message["points"]:
-        assert {len(point[key]) for key in ("positions", "velocities", "effort")} == {joints}
+    for target in FREE:
+        assert export(job, target, tmp_path, options=BundleOptions(step=0.1))[0].exists()
+    document = prepared(job, TARGETS["json"], BundleOptions(step=0.1)).document
+    assert len({n for robot in document["robots"] for n in robot["ros_joints"]}) == joints
+    for robot in document["robots"]:
+        for name in ("position", "velocity", "effort_with_gravity", "hold_effort_with_gravity"):
+            assert {len(row) for row in robot[name]} == {joints // 2}
 
 
 def test_a_seventh_axis_is_an_external_one_to_rapid() -> None:
     """ABB counts the axes of a YuMi 1, 2, 7, 3, 4, 5, 6 along its chain."""
-    sampled = sample_job(planned("pandas"), 0.1)
+    job, target = driven(planned("pandas")), TARGETS["abb-rapid"]
     with pytest.raises(SettingsError, match=r"panda.urdf, which does not look like an arm of ABB"):
-        rapid_files(sampled, BundleOptions())
-    files = rapid_files(sampled, BundleOptions(any_arm=True))
+        target.require(job, BundleOptions())
+    options = BundleOptions(step=0.1, any_arm=True)
+    target.require(job, options)
+    sheet = prepared(job, target, options)
+    files = target.files(sheet)
     assert set(files) == {"T_ROB_L/Carry1.mod", "T_ROB_R/Carry2.mod"}
     for arm, text in enumerate(files.values()):
         assert isinstance(text, str)
         module = parse(text)
-        degrees = np.rad2deg(sampled.arm(arm, sampled.q))
+        degrees = np.rad2deg(sheet.sampled.arm(arm, sheet.sampled.q))
         (first,) = (value for _, _, name, value in module.declarations if name == "carryFirst")
         assert isinstance(first, list)
         robot, external = (np.array(each, dtype=float) for each in first)
         np.testing.assert_allclose(robot, degrees[0, [0, 1, 3, 4, 5, 6]], atol=1e-6)
         np.testing.assert_allclose(external, [degrees[0, 2], *[9e9] * 5], atol=1e-6)
         check = module.procedures["CarryCheckStart"]
-        assert [call.name for call in check].count("Stop") == 7
+        assert [call.name for call in check].count("EXIT") == 7
         assert "here.extax.eax_a" in text
     with pytest.raises(SettingsError, match="7 joints; targets of URScript hold 6"):
-        FORMATS["urscript"].files(sample_job(planned("pandas"), 0.008), BundleOptions(any_arm=True))
+        TARGETS["ur-script"].require(job, options)
+
+
+def test_franka_takes_the_pandas() -> None:
+    job, target = driven(planned("pandas")), TARGETS["franka-ros2"]
+    target.require(job, BundleOptions())
+    with pytest.raises(SettingsError, match=r"has to know where the controller of 'north' is"):
+        target.require(planned("pandas"), BundleOptions())
+    sheet = prepared(job, target, BundleOptions(step=0.05))
+    files = target.files(sheet)
+    config = json.loads(files["config/cell.json"])
+    assert [driver["type"] for driver in config["drivers"]] == ["panda", "panda"]
+    assert config["effort"] == "without_gravity"
+    for arm in (0, 1):
+        controllers = yaml.safe_load(files[f"config/controllers_{arm + 1}.yaml"])["/**"]
+        parameters = controllers["carry_controller"]["ros__parameters"]
+        assert parameters["command_interfaces"] == ["effort"]
+        assert list(parameters["gains"]) == parameters["joints"] == sheet.ros_joints(arm)

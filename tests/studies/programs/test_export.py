@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 import hybrid_opt as ho
+from studies.check import main as check_main
 from studies.export import main
 from tests.hybrid_opt.job.jobs import rack
+from tests.symbolic.cells import RACK
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +27,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_bundle_is_written(
     stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = [str(stored), "--form", "csv", "--output", str(tmp_path)]
+    arguments = [str(stored), "--target", "csv", "--output", str(tmp_path)]
     assert main(arguments) == 0
     text = capsys.readouterr().out
     for part in ("approach", "set down", "Position control", "Either arm late", "warning"):
@@ -46,16 +48,16 @@ def test_a_bundle_is_written(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--form", "csv", "--step", "0"], "time step"),
-        (["--form", "csv", "--use", "force"], "--force-limit"),
-        (["--form", "csv", "--force-limit", "1"], "no timing to export"),
-        (["--form", "csv", "--squeeze", "0.5"], "allowed is 1 to 10"),
-        (["--form", "csv", "--stiffness", "0"], "stiffness"),
-        (["--form", "csv", "--smoothing", "-1"], "smoothing"),
-        (["--form", "csv", "--smoothing", "nan"], "smoothing"),
-        (["--form", "urscript"], "--any-arm"),
-        (["--form", "csv", "--skew", "0.02", "--stiffness", "50000"], "a skew of 20 ms"),
-        (["--form", "csv", "--skew", "-1"], "skew"),
+        (["--target", "csv", "--step", "0"], "time step"),
+        (["--target", "csv", "--use", "force"], "--force-limit"),
+        (["--target", "csv", "--force-limit", "1"], "no timing to export"),
+        (["--target", "csv", "--squeeze", "0.5"], "allowed is 1 to 10"),
+        (["--target", "csv", "--stiffness", "0"], "stiffness"),
+        (["--target", "csv", "--smoothing", "-1"], "smoothing"),
+        (["--target", "csv", "--smoothing", "nan"], "smoothing"),
+        (["--target", "ur-script"], "--any-arm"),
+        (["--target", "csv", "--skew", "0.02", "--stiffness", "50000"], "a skew of 20 ms"),
+        (["--target", "csv", "--skew", "-1"], "skew"),
     ],
 )
 def test_what_is_wrong_is_told_in_one_line(
@@ -70,3 +72,11 @@ def test_what_is_wrong_is_told_in_one_line(
     assert message in error
     assert len(error.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_a_job_is_judged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The door of the check; what it finds is tested in tests/hybrid_opt/bundles."""
+    path = tmp_path / "job.csv"
+    path.write_text("time,left_joint_1\n0,0\n")
+    assert check_main([str(RACK), str(path)]) == 2
+    assert "no joint trajectory of both arms" in capsys.readouterr().err

@@ -26,6 +26,6 @@ def test_the_page_runs_from_its_first_block_to_the_last(
     assert "approach" in out
     (folder,) = (tmp_path / "bundles").iterdir()
     assert folder.name.startswith("rack-nsga2-r00-p0001-")
-    assert {form.name for form in folder.iterdir()} == {"ros2", "rapid", "csv"}
-    for form in folder.iterdir():
-        assert read_manifest(form)["form"] == form.name
+    assert {target.name for target in folder.iterdir()} == {"ros2-control", "json", "csv"}
+    for target in folder.iterdir():
+        assert read_manifest(target)["target"] == target.name

@@ -143,7 +143,7 @@ def test_what_is_exported_keeps_the_robust_limit(
 ) -> None:
     root, _ = study
     found = recommended(root)
-    options = ["--form", "json", "--force-limit", f"{found.force_limit:.6g}"]
+    options = ["--target", "json", "--force-limit", f"{found.force_limit:.6g}"]
     file = str(root / found.file)
     assert export.main([file, *options, "--output", str(tmp_path / "out")]) == 0
     assert "carry" in capsys.readouterr().out

@@ -1,0 +1,365 @@
+"""Judges any joint trajectory of both arms that claims to carry the box of a cell.
+
+The trajectory may be a bundle's after someone's post-processing, or another planner's: CSV, JSON or
+ROS 2's JointTrajectory in YAML. The first arm's pad says where the box is; the second one's has to
+be where the box then has it (the closed chain). What the box needs in between follows from the
+cell's own forces.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+from scipy.spatial.transform import Rotation
+
+from hybrid_opt.bundles.arms import prefixes
+from hybrid_opt.bundles.steps import pad_errors, pad_places
+from hybrid_opt.cell import Cell
+from hybrid_opt.collision.checker import Touch
+from hybrid_opt.display.table import text_table
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.store.files import read_bytes
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.read.arms import arm_model
+from symbolic.records import Workcell
+from symbolic.records.poses import inverse
+
+LARGEST_FILE = 64 * 2**20
+"""[bytes]."""
+
+SHORTEST = 4
+"""Least samples of a trajectory."""
+
+TOUCHING = 0.005
+"""Largest change of the pads' places to one another at which they are taken to hold the box [m]."""
+
+CLOSED = 1e-3
+"""Largest change at which the closed chain counts as closed [m]."""
+
+EXCESS = 1.005
+"""Use of a limit beyond which it counts as exceeded."""
+
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class JointTrajectory:
+    """Both arms' joints over time.
+
+    Attributes:
+        time: (n,) ascending [s].
+        q: (n, joints) both arms side by side [rad, m].
+        q_rate: (n, joints) or None where the file has none [rad/s].
+        carry: from when to when it carries, where the file says so [s].
+    """
+
+    time: Array
+    q: Array
+    q_rate: Array | None
+    carry: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """What a trajectory does.
+
+    Attributes:
+        held: (n,) whether the pads hold the box there.
+        along, across: largest change of the pads' places to one another while they hold it, along
+            the normal and across it [m].
+        use: largest value over its limit by constraint.
+        collides: what collides first while the box is held; '' for nothing.
+        normal_force: (2,) largest normal force that each arm needs [N].
+        rated: (2,) their reference forces [N].
+        balanced: whether friction and patches can hold the box everywhere.
+        duration: of the trajectory [s].
+    """
+
+    held: Mask
+    along: float
+    across: float
+    use: dict[str, float]
+    collides: str
+    normal_force: Array
+    rated: Array
+    balanced: bool
+    duration: float
+
+    @property
+    def problems(self) -> list[str]:
+        """What speaks against driving it."""
+        if not self.held.any():
+            return ["the pads hold the box nowhere: another cell, or another order of the joints?"]
+        found = []
+        if max(self.along, self.across) > CLOSED:
+            found.append(
+                f"the chain is not closed: the pads miss one another by {1e3 * self.along:.2f} mm "
+                f"along and {1e3 * self.across:.2f} mm across the normal"
+            )
+        found += [
+            f"uses {100.0 * ratio:.1f} % of the limit on {name}"
+            for name, ratio in self.use.items()
+            if ratio > EXCESS
+        ]
+        if self.collides:
+            found.append(f"collides: {self.collides}")
+        if not self.balanced:
+            found.append("no forces of the pads balance the box everywhere")
+        for arm, (force, most) in enumerate(zip(self.normal_force, self.rated, strict=True), 1):
+            if force > most:
+                found.append(f"arm {arm} needs {force:.1f} N, its reference force is {most:.1f} N")
+        return found
+
+    def __repr__(self) -> str:
+        share = float(self.held.mean())
+        rows = [
+            ["duration", f"{self.duration:.3f} s"],
+            ["the box is held", f"{100.0 * share:.0f} % of the samples"],
+            ["closed chain", f"{1e3 * self.along:.3f} mm along, {1e3 * self.across:.3f} mm across"],
+            *([f"use of {name}", f"{100.0 * ratio:.1f} %"] for name, ratio in self.use.items()),
+            ["collisions", self.collides or "none at its samples"],
+            ["normal forces", " / ".join(f"{force:.2f} N" for force in self.normal_force)],
+        ]
+        verdict = "; ".join(self.problems) or "it can be driven"
+        return f"{text_table([['what', 'found'], *rows], left=(0, 1))}\nverdict: {verdict}"
+
+
+def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
+    """The joints of a cell in a file: CSV, JSON (a job's, or ROS 2's message), or YAML of ROS 2.
+
+    Raises:
+        ResultsError: it cannot be read, or lacks joints of the cell.
+    """
+    content = read_bytes(path)
+    if len(content) > LARGEST_FILE:
+        raise ResultsError(f"{path}: larger than {LARGEST_FILE // 2**20} MiB")
+    try:
+        text = content.decode("utf-8")
+        if path.suffix.lower() == ".csv":
+            columns, carry = _csv_columns(text), None
+        else:
+            is_json = path.suffix.lower() == ".json"
+            document = json.loads(text) if is_json else yaml.load(text, Loader=yaml.CSafeLoader)
+            columns = _document_columns(document)
+            carry = _carry_of(document)
+        return replace(_chosen(columns, workcell), carry=carry)
+    except (ValueError, KeyError, TypeError, IndexError, yaml.YAMLError, csv.Error) as error:
+        raise ResultsError(f"{path}: no joint trajectory of both arms ({error})") from error
+
+
+Columns = tuple[Array, dict[str, Array], dict[str, Array]]
+"""Times (n,), positions and velocities (n,) by the joint's name."""
+
+
+def _csv_columns(text: str) -> Columns:
+    rows = list(csv.reader(io.StringIO(text)))
+    header, body = rows[0], [row for row in rows[1:] if row]
+    words = [re.sub(r"\s*\[.*\]$", "", name).strip() for name in header]
+    (at,) = (k for k, word in enumerate(words) if word.lower() in ("time", "t"))
+
+    def column(k: int) -> Array:
+        return np.array([float(row[k]) for row in body])
+
+    position, velocity = {}, {}
+    for k, word in enumerate(words):
+        name, _, what = word.rpartition(" ")
+        if what == "velocity":
+            velocity[name] = column(k)
+        elif what == "position":
+            position[name] = column(k)
+        elif not name and k != at and what != "phase":
+            position[what] = column(k)
+    return column(at), position, velocity
+
+
+def _document_columns(document: Any) -> Columns:
+    position: dict[str, Array] = {}
+    velocity: dict[str, Array] = {}
+    if "robots" in document:
+        for robot in document["robots"]:
+            for name, kept in (("position", position), ("velocity", velocity)):
+                for joint, values in zip(robot["joints"], np.array(robot[name]).T, strict=True):
+                    kept[f"{robot['name']}/{joint}"] = values.astype(float)
+        return np.array(document["time"], dtype=float), position, velocity
+    for key in ("goal", "joint_trajectory", "trajectory"):
+        document = document.get(key, document)
+    names, points = document["joint_names"], document["points"]
+    stamps = [point["time_from_start"] for point in points]
+    time = np.array([stamp["sec"] + 1e-9 * stamp.get("nanosec", 0) for stamp in stamps])
+    position = _by_name(names, [point["positions"] for point in points])
+    has_rates = all(point.get("velocities") for point in points)
+    velocity = _by_name(names, [point["velocities"] for point in points]) if has_rates else {}
+    return time, position, velocity
+
+
+def _carry_of(document: Any) -> tuple[float, float] | None:
+    """The carry of a whole job: before and after it the box touches what it stands on."""
+    for phase in document.get("phases", ()):
+        if phase["name"] == "carry":
+            return document["time"][phase["first"]], document["time"][phase["last"]]
+    return None
+
+
+def _by_name(names: Sequence[str], rows: Sequence[Sequence[float]]) -> dict[str, Array]:
+    return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
+
+
+def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
+    """The cell's joints among named columns, under any of their usual names."""
+    time, position, velocity = columns
+    names = [
+        (f"{robot.name}/{joint}", f"{prefix}{joint}", joint)
+        for robot, prefix in zip(workcell.robots, prefixes(workcell), strict=True)
+        for joint in list(arm_model(robot).names)[1:]
+    ]
+    plain = [each[2] for each in names]
+    picked = []
+    for known in names:
+        # A name that both arms have says nothing.
+        usable = known if plain.count(known[2]) == 1 else known[:2]
+        found = next((name for name in usable if name in position), None)
+        if found is None:
+            raise ValueError(f"there is no joint {usable[1]!r}; it has {', '.join(position)}")
+        picked.append(found)
+    q = np.column_stack([position[name] for name in picked])
+    rates = None
+    if all(name in velocity for name in picked):
+        rates = np.column_stack([velocity[name] for name in picked])
+    if len(time) < SHORTEST or q.shape != (len(time), len(names)):
+        raise ValueError(f"{len(time)} times for {len(q)} postures; at least {SHORTEST} are needed")
+    if not (np.isfinite(q).all() and np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
+        raise ValueError("times have to ascend, all numbers to be finite")
+    return JointTrajectory(time - time[0], q, rates)
+
+
+def check(
+    cell: Cell, trajectory: JointTrajectory, held: tuple[float, float] | None = None
+) -> Finding:
+    """What a trajectory does in a cell.
+
+    Args:
+        held: from when to when the pads hold the box [s]; None for the carry that the file names,
+            else for the longest while in which the pads stand to one another as they hold it.
+
+    Raises:
+        SettingsError: nothing lies in that time.
+    """
+    workcell, time, q = cell.workcell, trajectory.time, trajectory.q
+    held = held or trajectory.carry
+    if trajectory.q_rate is None:
+        spline: Any = CubicSpline(time, q)
+    else:
+        spline = CubicHermiteSpline(time, q, trajectory.q_rate)
+    along, across = pad_errors(workcell, q)
+    mask = _held(along, across)
+    if held is not None:
+        mask = np.asarray((time >= held[0]) & (time <= held[1]))
+    if held is not None and mask.sum() < SHORTEST:
+        raise SettingsError(f"under {SHORTEST} samples lie between {held[0]:g} and {held[1]:g} s")
+    use = _joint_use(workcell, q, spline(time, 1), spline(time, 2))
+    rated = np.asarray(workcell.task.reference_force, dtype=float)
+    if not mask.any():
+        nothing = np.zeros(2)
+        return Finding(mask, np.inf, np.inf, use, "", nothing, rated, False, float(time[-1]))
+    rows = np.flatnonzero(mask)
+    pose = _poses(workcell, q[rows])
+    motion = CubicSpline(time[rows], pose)
+    rate, second = motion(time[rows], 1), motion(time[rows], 2)
+    load = cell.timing_model.load(*(np.ascontiguousarray(v) for v in (pose, rate, second)))
+    payload = workcell.payload
+    use["payload velocity"] = _most(rate[:, :3], payload.velocity_max)
+    use["payload acceleration"] = _most(second[:, :3], payload.acceleration_max)
+    first = len(workcell.robots[0].torque_max)
+    verdict = cell.evaluator.checker.check(
+        pose,
+        np.ascontiguousarray(q[rows, :first]),
+        np.ascontiguousarray(q[rows, first:]),
+        time[rows],
+    )
+    force = load["normal_force"]
+    return Finding(
+        held=mask,
+        along=float(np.abs(along[rows]).max()),
+        across=float(across[rows].max()),
+        use=use,
+        collides="" if verdict.first_touch is None else _told(verdict.first_touch, time[rows[0]]),
+        normal_force=np.nanmax(force, axis=0),
+        rated=rated,
+        balanced=bool(np.isfinite(force).all()),
+        duration=float(time[-1]),
+    )
+
+
+def _told(touch: Touch, begin: float) -> str:
+    return f"{touch.first} and {touch.second} at {begin + touch.time:.3f} s"
+
+
+def _held(along: Array, across: Array) -> Mask:
+    """(n,) the longest run of samples at which the pads stand as they hold the box."""
+    near = (np.abs(along) < TOUCHING) & (across < TOUCHING)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(int), [0]])))
+    runs = list(zip(edges[::2], edges[1::2], strict=True))
+    mask = np.zeros(len(near), dtype=bool)
+    if runs:
+        begin, end = max(runs, key=lambda run: run[1] - run[0])
+        if end - begin >= SHORTEST:
+            mask[begin:end] = True
+    return mask
+
+
+def _poses(workcell: Workcell, q: Array) -> Array:
+    """(n, 6) of the box that the first pad holds, in the task's own numbers."""
+    first = len(workcell.robots[0].torque_max)
+    T_pad_box = inverse(workcell.contacts[0].T_box_pad)
+    T = pad_places(workcell, 0, q[:, :first]) @ T_pad_box
+    orientation = workcell.task.orientation
+    if orientation.is_vector:
+        turned = T[:, :3, :3] @ orientation.reference.T
+        numbers = Rotation.from_matrix(turned).as_rotvec()
+    else:
+        numbers = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz")
+    return np.ascontiguousarray(np.column_stack([T[:, :3, 3], orientation.unwrapped(numbers)]))
+
+
+def _joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[str, float]:
+    def joints(name: str) -> Array:
+        return np.concatenate([getattr(robot, name) for robot in workcell.robots])
+
+    lower, upper = joints("position_lower"), joints("position_upper")
+    return {
+        "joint position": float((np.abs(2.0 * q - lower - upper) / (upper - lower)).max()),
+        "joint velocity": float((np.abs(rate) / joints("velocity_max")).max()),
+        "joint acceleration": float((np.abs(second) / joints("acceleration_max")).max()),
+    }
+
+
+def _most(values: Array, limit: float) -> float:
+    return float(np.linalg.norm(values, axis=1).max()) / limit
+
+
+def as_document(finding: Finding) -> Mapping[str, Any]:
+    """JSON values of a finding."""
+    return {
+        "duration": finding.duration,
+        "held": float(finding.held.mean()),
+        "closed_chain": {"along": finding.along, "across": finding.across},
+        "use": finding.use,
+        "collides": finding.collides,
+        "normal_force": finding.normal_force.tolist(),
+        "reference_force": finding.rated.tolist(),
+        "balanced": finding.balanced,
+        "problems": finding.problems,
+    }

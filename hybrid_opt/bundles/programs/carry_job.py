@@ -1,0 +1,495 @@
+"""A job as programs run it: what the arms do at each place of its path, and when they have to stop.
+
+The job is a path that both arms follow together; its coordinate is the planned time s [s]. A clock
+drives s: at rate 1 the job runs as planned, at rate 0 both arms hold their places and press, at
+rate -1 the job runs backwards, which takes the same forces. Whatever goes wrong, the clock stops
+smoothly: both arms come to rest at the same coordinate and keep the squeeze that belongs to it.
+
+Positions are cubic between samples, forces linear. Standard library only, Python 3.10 or newer.
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+HELD = ("lift", "carry", "set_down")
+"""Phases in which pads alone hold the box."""
+
+STILL = 1e-9
+"""Rates below this are none."""
+
+SEARCH_STEP = 0.004
+"""Between places that are compared with a measured posture [s]."""
+
+NEAR = 0.002
+"""A pad so near to its place is there [m]."""
+
+LEAST_SPEED, SLOW = 0.02, 0.25
+"""Of a pad that begins to move [m/s]; and the share of the fastest below which a posture says too
+little of the coordinate to call an arm late."""
+
+WAIT = 3.0
+"""Longest time for arms to begin to move [s]."""
+
+STRIKES = 3
+"""Looks in a row at which something has to be wrong, beside a stop that is asked for."""
+
+
+class Refused(Exception):
+    """The job cannot begin, or go on; the message says why."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a job stops, from its file.
+
+    Attributes:
+        stop_time: from the planned speed to rest along the path [s].
+        quick_stop: the same where an arm does not do what it is told [s].
+        start: largest distance of a pad from its first place [m].
+        path: largest distance of a pad from its path [m].
+        behind: how far an arm may lag behind its reference [s].
+        skew: how far both arms may be apart along the path [s].
+        force: share by which a measured force may miss its reference while the box is held.
+        silence: longest time without news from an arm [s].
+    """
+
+    stop_time: float
+    quick_stop: float
+    start: float
+    path: float
+    behind: float
+    skew: float
+    force: float
+    silence: float
+
+
+class Job:
+    """A job from its file.
+
+    Attributes:
+        document: as it was read.
+        time: planned time of each sample [s].
+        robots: both arms' parts of the document.
+        limits: when to stop.
+    """
+
+    def __init__(self, document: dict[str, Any]) -> None:
+        """Take a document of this format.
+
+        Raises:
+            Refused: it is none, or of another version.
+        """
+        if document.get("format") != "dual-arm-carry job" or document.get("version") != 2:
+            raise Refused("this is no job of version 2")
+        self.document = document
+        self.time: list[float] = document["time"]
+        self.robots: list[dict[str, Any]] = document["robots"]
+        self.limits = Limits(**document["machine"]["limits"])
+        self._phases: list[tuple[float, str]] = [
+            (self.time[phase["last"]], phase["name"]) for phase in document["phases"]
+        ]
+
+    @classmethod
+    def read(cls, path: Path) -> Job:
+        """The job in a file.
+
+        Raises:
+            Refused: it cannot be read.
+        """
+        try:
+            return cls(json.loads(path.read_text("utf-8")))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise Refused(f"{path}: no job can be read ({error})") from error
+
+    @cached_property
+    def fastest(self) -> float:
+        """At most so fast is the first arm's pad [m/s]."""
+        return max(self.speed(0, s) for s in self.time)
+
+    @property
+    def end(self) -> float:
+        """The last coordinate [s]."""
+        return self.time[-1]
+
+    def phase(self, s: float) -> str:
+        """The phase at a coordinate."""
+        return next((name for last, name in self._phases if s <= last), self._phases[-1][1])
+
+    def begin(self, name: str) -> float:
+        """The coordinate at which a phase begins; that of its follower where it is left out."""
+        first = 0.0
+        for last, phase in self._phases:
+            if phase == name:
+                return first
+            first = last
+        return self.end
+
+    def _place(self, s: float) -> tuple[int, float, float]:
+        """The sample before s, the share of its interval and the interval's length [s]."""
+        k = min(max(bisect_right(self.time, s) - 1, 0), len(self.time) - 2)
+        step = self.time[k + 1] - self.time[k]
+        return k, min(max((s - self.time[k]) / step, 0.0), 1.0), step
+
+    def position(self, arm: int, s: float) -> list[float]:
+        """Joint positions of an arm at a coordinate [rad, m]."""
+        k, x, step = self._place(s)
+        q, v = self.robots[arm]["position"], self.robots[arm]["velocity"]
+        a, b = (1.0 + 2.0 * x) * (1.0 - x) ** 2, x * (1.0 - x) ** 2 * step
+        c, d = x * x * (3.0 - 2.0 * x), x * x * (x - 1.0) * step
+        return [
+            a * q0 + b * v0 + c * q1 + d * v1
+            for q0, v0, q1, v1 in zip(q[k], v[k], q[k + 1], v[k + 1], strict=True)
+        ]
+
+    def linear(self, arm: int, name: str, s: float) -> list[float]:
+        """A list per sample of an arm, linear between samples."""
+        k, x, _ = self._place(s)
+        rows = self.robots[arm][name]
+        return [(1.0 - x) * a + x * b for a, b in zip(rows[k], rows[k + 1], strict=True)]
+
+    def force(self, arm: int, s: float) -> float:
+        """Commanded normal force of an arm [N]."""
+        k, x, _ = self._place(s)
+        rows = self.robots[arm]["normal_force"]
+        return float((1.0 - x) * rows[k] + x * rows[k + 1])
+
+    def effort(self, arm: int, gravity: str, s: float, rate: float) -> list[float]:
+        """Joint torques of an arm at a coordinate and rate [N m, N].
+
+        What moves arm and box goes with the square of the rate, what holds and presses stays.
+
+        Args:
+            gravity: 'with_gravity' or 'without_gravity'.
+        """
+        moving = self.linear(arm, f"effort_{gravity}", s)
+        holding = self.linear(arm, f"hold_effort_{gravity}", s)
+        return [b + (a - b) * rate * rate for a, b in zip(moving, holding, strict=True)]
+
+    def distance(self, arm: int, q: Sequence[float], s: float) -> float:
+        """At most so far is the pad of a posture from its place at a coordinate [m]."""
+        reach = self.robots[arm]["reach"]
+        planned = self.position(arm, s)
+        return float(sum(r * abs(a - b) for r, a, b in zip(reach, q, planned, strict=True)))
+
+    def speed(self, arm: int, s: float) -> float:
+        """At most so fast is the pad at a coordinate [m/s]."""
+        rates = self.linear(arm, "velocity", s)
+        reach = self.robots[arm]["reach"]
+        return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))
+
+    def coordinate(
+        self, arm: int, q: Sequence[float], s: float, window: tuple[float, float]
+    ) -> float:
+        """The coordinate that fits a posture best, of equals the nearest to s [s].
+
+        Args:
+            window: how far from s it may be, before and behind [s].
+        """
+        if self.distance(arm, q, s) <= NEAR:
+            return s
+        best, low, high = s, *window
+        for step in (4.0 * SEARCH_STEP, SEARCH_STEP):
+            numbers = sorted(range(round(low / step), round(high / step) + 1), key=abs)
+            places = [min(max(best + k * step, 0.0), self.end) for k in numbers]
+            best = min(places, key=lambda place: round(self.distance(arm, q, place), 7))
+            low, high = -step, step
+        return best
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The path at a time from now [s]: its coordinate, its rate, and how the rate changes."""
+
+    time: float
+    s: float
+    rate: float
+    change: float
+
+
+class Clock:
+    """The coordinate of the path and its rate.
+
+    Attributes:
+        s: where both arms are told to be [s].
+        rate: of s over time.
+    """
+
+    def __init__(self, end: float, stop_time: float, s: float = 0.0, rate: float = 0.0) -> None:
+        """Stand at a coordinate, or run through it."""
+        self.s, self.rate, self._end, self._stop_time = s, rate, end, stop_time
+        self._takes = stop_time
+        self._from, self._to, self._since = rate, rate, 0.0
+
+    @property
+    def turning(self) -> bool:
+        """Whether the rate changes."""
+        return self._from != self._to
+
+    def turn(self, rate: float, after: float = 0.0, takes: float | None = None) -> None:
+        """Change the rate smoothly.
+
+        Args:
+            after: when it begins, from now [s].
+            takes: time of a change by one; the stop time by default [s].
+        """
+        if rate != self._to:
+            self._from, self._to, self._since = self.rate, rate, -after
+            self._takes = self._stop_time if takes is None else takes
+
+    def advance(self, dt: float) -> None:
+        """Let time pass [s]."""
+        before = self.rate
+        if self.turning:
+            self._since += dt
+            x = self._share
+            smooth = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+            self.rate = self._from + (self._to - self._from) * smooth
+            if x >= 1.0:
+                self.rate = self._from = self._to
+        self.s = min(max(self.s + dt * (before + self.rate) / 2.0, 0.0), self._end)
+
+    @property
+    def _share(self) -> float:
+        """Of the change of the rate that is over."""
+        return min(max(self._since / (self._takes * abs(self._to - self._from)), 0.0), 1.0)
+
+    @property
+    def change(self) -> float:
+        """Of the rate over time [1/s]."""
+        if not self.turning:
+            return 0.0
+        x = self._share
+        sign = 1.0 if self._to > self._from else -1.0
+        return sign * 30.0 * x * x * (1.0 - x) ** 2 / self._takes
+
+    def ahead(self, rate: float, step: float) -> Iterator[Moment]:
+        """From now on each step, turning to a rate, until it stands or the path ends."""
+        clock = Clock(self._end, self._stop_time, self.s, self.rate)
+        clock._from, clock._to, clock._since = self._from, self._to, self._since
+        clock._takes = self._takes
+        clock.turn(rate)
+        yield Moment(0.0, clock.s, clock.rate, clock.change)
+        last = self._end if rate > 0.0 else 0.0
+        count = 0
+        while clock.turning or (abs(clock.rate) > STILL and clock.s != last):
+            clock.advance(step)
+            count += 1
+            yield Moment(count * step, clock.s, clock.rate, clock.change)
+
+
+@dataclass
+class Seen:
+    """What is known of the arms at a moment.
+
+    Attributes:
+        q: measured joint positions of each arm; None where there are none [rad, m].
+        force: measured normal force of each pad; None where nobody measures it [N].
+        silence: time since the last news from each arm [s].
+        fault: why to stop; '' for no reason.
+    """
+
+    q: list[list[float] | None] = field(default_factory=lambda: [None, None])
+    force: list[float | None] = field(default_factory=lambda: [None, None])
+    silence: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    fault: str = ""
+
+
+class Machine:
+    """Runs a job: `ready`, `running`, `stopping`, `held`, `done`.
+
+    Attributes:
+        state: one of these.
+        reason: why it stopped last.
+        clock: of the path.
+    """
+
+    def __init__(self, job: Job, lag: float = 0.0, lead: float = 0.0, waits: bool = False) -> None:
+        """Stand at the beginning.
+
+        Args:
+            lag: by which the arms follow what they are told in any case [s].
+            lead: from the decision to stop to what the arms hear of it [s].
+            waits: whether arms begin to move some time after they are told, so that the clock has
+                to wait for them.
+        """
+        self.job, self.lag, self.lead = job, lag, lead
+        self.state, self.reason = "ready", ""
+        self.clock = Clock(job.end, job.limits.stop_time)
+        self._waits, self._expected = waits, list[Moment]()
+        self._strikes, self._waited = 0, 0.0
+
+    def start(self, seen: Seen) -> None:
+        """Begin the job.
+
+        Raises:
+            Refused: an arm is silent or not at its first place, or a pad is pressed.
+        """
+        self._require_places(seen, self.job.limits.start)
+        for arm, force in enumerate(seen.force):
+            most = 0.2 * max(self.job.robots[arm]["normal_force"])
+            if force is not None and abs(force) > most:
+                raise Refused(
+                    f"{self._name(arm)} feels {force:.1f} N before it touches the box: zero its "
+                    "sensor, state its tool_load"
+                )
+        self.state = "running"
+        self.clock = Clock(self.job.end, self.job.limits.stop_time, 0.0, 1.0)
+        self._wait(1.0)
+
+    def hold(self, reason: str) -> None:
+        """Hold where the arms were told to be, because they cannot go on."""
+        self.clock = Clock(self.job.end, self.job.limits.stop_time, self.clock.s)
+        self.state, self.reason, self._expected = "held", reason, []
+
+    def resume(self, direction: float, seen: Seen) -> None:
+        """Go on from where it is held: 1 to the end of the job, -1 back to its beginning.
+
+        Raises:
+            Refused: it is not held, an arm is silent or not where it is held.
+        """
+        if self.state != "held":
+            raise Refused(f"the job is {self.state}; it goes on only from where it is held")
+        if seen.fault:
+            raise Refused(seen.fault)
+        self._require_places(seen, self.job.limits.path)
+        self.state, self._strikes = "running", 0
+        self._wait(direction)
+        self.clock.turn(direction)
+
+    def tick(self, dt: float, seen: Seen) -> None:
+        """Let time pass and look at the arms."""
+        if self._expected and self.state == "running":
+            self._meet(dt, seen)
+            return
+        self.clock.advance(dt)
+        if self.state == "running":
+            if not self.clock.turning and (
+                (self.clock.rate > 0.0 and self.clock.s >= self.job.end)
+                or (self.clock.rate < 0.0 and self.clock.s <= 0.0)
+            ):
+                self.state = "done"
+                return
+            wrong = self._wrong(seen)
+            self._strikes = self._strikes + 1 if wrong else 0
+            if seen.fault or self._strikes >= STRIKES:
+                self.stop(seen.fault or wrong, quick=not seen.fault)
+        elif self.state == "stopping" and not self.clock.turning:
+            self.state = "held"
+            if self._waits:
+                self._locate(seen)
+
+    def _wait(self, rate: float) -> None:
+        if self._waits:
+            moments = self.clock.ahead(rate, SEARCH_STEP)
+            self._expected = list(islice(moments, round(WAIT / SEARCH_STEP)))
+            self._waited = 0.0
+
+    def _meet(self, dt: float, seen: Seen) -> None:
+        """Let the clock begin where arms are that have begun to move."""
+        self._waited += dt
+        found = []
+        for arm, q in enumerate(seen.q):
+            if q is not None:
+                row: list[float] = q
+                near = [self.job.distance(arm, row, m.s) for m in self._expected]
+                found.append(min(range(len(near)), key=lambda k: round(near[k], 7)))
+        begun = [self._expected[k] for k in found]
+        if len(begun) == 2 and all(
+            abs(m.rate) * self.job.speed(arm, m.s) > LEAST_SPEED for arm, m in enumerate(begun)
+        ):
+            self._expected = []
+            self.clock.advance(min(m.time for m in begun) + self.lag)
+        elif seen.fault or self._waited > WAIT:
+            self.hold(seen.fault or "the arms do not begin to move")
+
+    def stop(self, reason: str, quick: bool = False) -> None:
+        """Stop along the path and hold; quickly where an arm does not do what it is told."""
+        if self.state == "running":
+            self.state, self.reason = "stopping", reason
+            self._expected = []
+            limits = self.job.limits
+            self.clock.turn(0.0, self.lead, limits.quick_stop if quick else limits.stop_time)
+
+    def told(self) -> str:
+        """What has happened, and how to go on."""
+        where = f"{self.job.phase(self.clock.s)}, {self.clock.s:.3f} s"
+        if self.state in ("stopping", "held"):
+            return (
+                f"{self.state} in {where}: {self.reason}. Both arms hold their places and press. "
+                "To set the box down: 'continue' to the end of the job, or 'back' to where the "
+                "box stood"
+            )
+        return f"{self.state} ({where})"
+
+    def _locate(self, seen: Seen) -> None:
+        """Stand where arms are that came to rest by themselves."""
+        reach = self.job.limits.stop_time + self.lag
+        found = [
+            self.job.coordinate(arm, q, self.clock.s, (-reach, reach))
+            for arm, q in enumerate(seen.q)
+            if q is not None
+        ]
+        if found:
+            s = sum(found) / len(found)
+            self.clock = Clock(self.job.end, self.job.limits.stop_time, s)
+
+    def _name(self, arm: int) -> str:
+        return str(self.job.robots[arm]["name"])
+
+    def _require_places(self, seen: Seen, most: float) -> None:
+        for arm, q in enumerate(seen.q):
+            if q is None or seen.silence[arm] > self.job.limits.silence:
+                raise Refused(f"there is no news from {self._name(arm)}")
+            away = self.job.distance(arm, q, self.clock.s)
+            if away > most:
+                raise Refused(
+                    f"the pad of {self._name(arm)} is up to {1e3 * away:.1f} mm from its place, "
+                    f"allowed are {1e3 * most:.1f} mm: move it there first"
+                )
+
+    def _wrong(self, seen: Seen) -> str:
+        """What speaks against going on, or ''."""
+        limits, s = self.job.limits, self.clock.s
+        coordinates = []
+        direction = 1.0 if self.clock.rate >= 0.0 else -1.0
+        told = s - direction * self.lag
+        for arm, q in enumerate(seen.q):
+            if seen.silence[arm] > limits.silence:
+                return f"no news from {self._name(arm)} for {seen.silence[arm]:.2f} s"
+            if q is None:
+                continue
+            # Twice as far behind as is allowed, and a little ahead.
+            far, near = -2.0 * direction * limits.behind, direction * limits.behind / 2.0
+            at = self.job.coordinate(arm, q, told, (min(far, near), max(far, near)))
+            away = self.job.distance(arm, q, at)
+            if away > limits.path:
+                return f"{self._name(arm)} has left its path by up to {1e3 * away:.1f} mm"
+            if self.job.speed(arm, s) > SLOW * self.job.fastest:
+                if direction * (told - at) > limits.behind:
+                    late = 1e3 * direction * (told - at)
+                    return f"{self._name(arm)} is {late:.0f} ms behind its reference"
+                coordinates.append(at)
+        if len(coordinates) == 2:
+            # What counts is how far the pads are apart: at low speed, time says little.
+            apart = abs(coordinates[0] - coordinates[1])
+            if apart * self.job.speed(0, s) > limits.skew * self.job.fastest:
+                return f"the arms are {1e3 * apart:.0f} ms apart along the path"
+        return self._wrong_force(seen)
+
+    def _wrong_force(self, seen: Seen) -> str:
+        s = self.clock.s
+        if self.job.phase(s) not in HELD:
+            return ""
+        for arm, measured in enumerate(seen.force):
+            wanted = self.job.force(arm, s)
+            if measured is not None and abs(measured - wanted) > self.job.limits.force * wanted:
+                return f"{self._name(arm)} presses {measured:.1f} N instead of {wanted:.1f} N"
+        return ""

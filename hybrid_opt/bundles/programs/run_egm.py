@@ -1,0 +1,254 @@
+"""Streams the job to both arms of an ABB cell: python3 run_egm.py [--check]
+
+Start CarryEgm in both tasks first. One clock drives both arms: each message of a controller is
+answered with where its arm has to be, its lag ahead. The arm that presses is moved along its pad's
+normal until its sensor feels the force of the job. Ctrl-C, an arm that is silent, late or off its
+path, a force out of its band: the clock stops, both arms hold their places and press on. Then type
+'continue' or 'back' to set the box down; 'leave' ends the stream, the controllers hold the arms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import select
+import signal
+import socket
+import sys
+import time
+from bisect import bisect_left
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hybrid_opt.bundles.programs.carry_job import Job, Machine, Refused, Seen
+from hybrid_opt.bundles.programs.egm_wire import FromRobot, read_robot, to_robot
+
+BUNDLE = Path(__file__).resolve().parent
+
+PATIENCE = 30.0
+"""Longest wait for both controllers [s]."""
+
+LONGEST_TICK = 0.02
+"""At most so much of the job passes between two messages [s]: a pause of this computer does not
+make the arms jump."""
+
+CTRL_C = "Ctrl-C"
+
+
+class Press:
+    """The way of the pressing pad along its normal, from the force that it has to make and the one
+    that it feels.
+
+    Attributes:
+        way: beyond the planned place, into the box [m].
+    """
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        """Begin at the planned place."""
+        self.way = 0.0
+        self._missing = 0.0
+        self._gain, self._most = config["gain"], config["most"]
+        self._speed, self._compliance = config["speed"], config["compliance"]
+
+    def tick(self, dt: float, wanted: float, soon: float, felt: float | None) -> None:
+        """Let time pass.
+
+        Args:
+            wanted, soon: normal force now, and when the arm has followed [N].
+            felt: what the sensor feels [N]; None before it tells.
+        """
+        if wanted <= 0.0:
+            self._missing = 0.0
+        elif felt is not None:
+            self._missing += self._gain * (wanted - felt) * dt
+        target = self._compliance * max(soon, 0.0) + self._missing
+        target = min(max(target, -self._most), self._most)
+        step = self._speed * dt
+        self.way += min(max(target - self.way, -step), step)
+
+
+class Stream:
+    """Answers both controllers."""
+
+    def __init__(self, job: Job, config: dict[str, Any]) -> None:
+        """Wait for both controllers."""
+        self.job, self.config = job, config
+        self.machine = Machine(job)
+        self.press = Press(config["press"])
+        self.fault, self.command = "", ""
+        self._arm: int = config["press"]["arm"]
+        self._q: list[list[float] | None] = [None, None]
+        self._first: list[list[float] | None] = [None, None]
+        self._force: list[float | None] = [None, None]
+        self._news = [-math.inf, -math.inf]
+        self._last: float | None = None
+
+    def seen(self, now: float) -> Seen:
+        """What is known of the arms."""
+        silence = [now - then for then in self._news]
+        q = list(self._q)
+        pressing = q[self._arm]
+        if pressing is not None:
+            # Where it would be without what it is moved into the box.
+            inward = self._inward(self.machine.clock.s)
+            way = self.press.way
+            q[self._arm] = [a - way * slope for a, slope in zip(pressing, inward, strict=True)]
+        return Seen(q=q, force=list(self._force), silence=silence, fault=self.fault)
+
+    def hear(self, arm: int, message: FromRobot, now: float) -> None:
+        """Take a message of an arm's controller."""
+        degrees = self._in_chain(arm, message.joints, message.further)
+        if degrees is None:
+            return
+        self._q[arm] = [math.radians(value) for value in degrees]
+        self._first[arm] = self._first[arm] or self._q[arm]
+        self._news[arm] = now
+        if self.config["sensors"][arm] and len(message.force) >= 3:
+            # About carryPad, whose z axis is the pad's normal.
+            self._force[arm] = abs(message.force[2])
+        if self.machine.state == "running" and not message.running:
+            self.fault = self.fault or f"the controller of {self._name(arm)} does not follow"
+
+    def tick(self, now: float) -> None:
+        """Let time pass."""
+        dt = 0.0 if self._last is None else min(now - self._last, LONGEST_TICK)
+        self._last = now
+        before = self.machine.state
+        if before == "ready":
+            return
+        self.machine.tick(dt, self.seen(now))
+        clock = self.machine.clock
+        soon = clock.s + clock.rate * self.config["lags"][self._arm]
+        wanted, later = (self.job.force(self._arm, s) for s in (clock.s, soon))
+        # A job that stops may do so because a sensor is wrong: what was integrated stays.
+        felt = self._felt if self.machine.state == "running" else None
+        self.press.tick(dt, wanted, later, felt)
+        if self.machine.state == "held" and self.command in ("continue", "back"):
+            direction = 1.0 if self.command == "continue" else -1.0
+            self.command = self.fault = ""
+            try:
+                self.machine.resume(direction, self.seen(now))
+            except Refused as error:
+                self.machine.hold(str(error))
+                print(self.machine.told(), file=sys.stderr)
+        if before != self.machine.state:
+            print(self.machine.told(), file=sys.stderr)
+
+    @property
+    def _felt(self) -> float | None:
+        """What the pressing pad feels, from its own sensor or the other's."""
+        own = self._force[self._arm]
+        return own if own is not None else self._force[1 - self._arm]
+
+    def answer(self, arm: int, number: int, now: float) -> bytes:
+        """Where an arm has to be, as a message: its lag ahead of the clock."""
+        clock, first = self.machine.clock, self._first[arm]
+        if self.machine.state == "ready" and first is not None:
+            q = first
+        else:
+            ahead = clock.s + clock.rate * self.config["lags"][arm]
+            q = self.job.position(arm, ahead)
+            if arm == self._arm:
+                inward = self._inward(clock.s)
+                q = [value + self.press.way * slope for value, slope in zip(q, inward, strict=True)]
+        joints, further = self._as_abb(arm, [math.degrees(value) for value in q])
+        return to_robot(number, now, joints, further)
+
+    def _inward(self, s: float) -> list[float]:
+        """Joints per way of the pressing pad along its normal [rad/m]."""
+        rows, time = self.config["inward"], self.job.time
+        k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
+        share = min(max((s - time[k]) / (time[k + 1] - time[k]), 0.0), 1.0)
+        return [a + share * (b - a) for a, b in zip(rows[k], rows[k + 1], strict=True)]
+
+    def _in_chain(
+        self, arm: int, joints: Sequence[float], further: Sequence[float]
+    ) -> list[float] | None:
+        """Axes along the chain [degrees]: the third of seven is an external one to ABB."""
+        count = len(self.job.robots[arm]["joints"])
+        if len(joints) < 6 or (count == 7 and not further):
+            return None
+        found = list(joints[:6])
+        return found if count == 6 else [*found[:2], further[0], *found[2:]]
+
+    def _as_abb(self, arm: int, degrees: list[float]) -> tuple[list[float], list[float]]:
+        count = len(self.job.robots[arm]["joints"])
+        if count == 6:
+            return degrees, []
+        return degrees[:2] + degrees[3:], [degrees[2]]
+
+    def _name(self, arm: int) -> str:
+        return str(self.job.robots[arm]["name"])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Stream the job; returns the exit code: 0 when it is done."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="look at both arms and move nothing")
+    options = parser.parse_args(arguments)
+    try:
+        job = Job.read(BUNDLE / "job.json")
+        config = json.loads((BUNDLE / "config/egm.json").read_text("utf-8"))
+        stream = Stream(job, config)
+        sockets = [opened(port) for port in config["ports"]]
+        return streamed(stream, sockets, options.check)
+    except (OSError, Refused) as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def opened(port: int) -> socket.socket:
+    """A port that a controller writes to."""
+    found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    found.bind(("", port))
+    return found
+
+
+def streamed(stream: Stream, sockets: Sequence[socket.socket], check: bool) -> int:
+    """Answer both controllers until the job is done; returns the exit code.
+
+    Raises:
+        Refused: a controller does not begin, or an arm is not at its first place.
+    """
+
+    def interrupted(*_: object) -> None:
+        if stream.fault == CTRL_C:
+            stream.command = "leave"
+        stream.fault = stream.fault or CTRL_C
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, interrupted)
+    begin = time.monotonic()
+    waiting: list[Any] = [*sockets, sys.stdin]
+    while stream.machine.state != "done":
+        ready, _, _ = select.select(waiting, [], [], 0.01)
+        now = time.monotonic()
+        stream.tick(now)
+        for arm, source in enumerate(sockets):
+            if source in ready:
+                data, address = source.recvfrom(4096)
+                message = read_robot(data)
+                stream.hear(arm, message, now)
+                source.sendto(stream.answer(arm, message.number, now), address)
+        if sys.stdin in ready:
+            line = sys.stdin.readline()
+            stream.command = line.strip()
+            if not line:
+                waiting.remove(sys.stdin)
+        if stream.machine.state == "ready" and all(q is not None for q in stream.seen(now).q):
+            stream.machine.start(stream.seen(now))
+            if check:
+                print("both arms are at their first places", file=sys.stderr)
+                return 0
+        if stream.machine.state == "ready" and now - begin > PATIENCE:
+            raise Refused("a controller is silent: is CarryEgm running in both tasks?")
+        if stream.machine.state == "held" and stream.command == "leave":
+            print(f"left while {stream.machine.told()}", file=sys.stderr)
+            return 1
+    return 0 if stream.machine.clock.s > 0.0 else 3
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""Judge any joint trajectory of both arms: `python -m studies.check WORKCELL TRAJECTORY`.
+
+The trajectory may be a bundle's, edited or not, or another planner's: CSV, JSON, or ROS 2's
+JointTrajectory in YAML. Tells how well the chain of arms and box is closed, the limits that it
+uses, collisions and the forces that the box needs. Exit code 1 where it cannot be driven.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from studies.options import add, number
+from studies.program import Parser, Program, later, run_program
+
+
+def _add_options(parser: Parser) -> None:
+    add(parser, "WORKCELL")
+    parser.add_argument("trajectory", metavar="TRAJECTORY", type=Path, help="the file to judge")
+    parser.add_argument(
+        "--held",
+        nargs=2,
+        type=number(0.0, 1e6),
+        metavar=("BEGIN", "END"),
+        help="from when to when the pads hold the box [s] (default: the carry that the file names, "
+        "else the longest while in which they stand as they hold it)",
+    )
+    add(parser, "--json")
+
+
+main = Program("check", __doc__, _add_options, later("studies.programs.trajectory.check_file"))
+
+
+if __name__ == "__main__":
+    sys.exit(run_program(main))

@@ -1,0 +1,172 @@
+"""What all programs read and decide: the path's clock, the job's file, when a job stops."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline
+
+from hybrid_opt.bundles.programs.carry_job import Clock, Job, Machine, Refused, Seen
+from tests.hybrid_opt.bundles.bundles import exported
+
+PERIOD = 0.01
+
+
+@cache
+def job() -> Job:
+    return Job(json.loads(json.dumps(exported("json").document)))
+
+
+def posture(s: float) -> list[list[float] | None]:
+    return [job().position(arm, s) for arm in (0, 1)]
+
+
+def running(s: float) -> Machine:
+    """A machine that runs at a coordinate."""
+    machine = Machine(job())
+    machine.start(Seen(posture(0.0)))
+    machine.clock = Clock(job().end, job().limits.stop_time, s, 1.0)
+    return machine
+
+
+def test_a_job_is_between_its_samples() -> None:
+    sampled = exported("json").sampled
+    spline = CubicHermiteSpline(sampled.time, sampled.q, sampled.q_rate)
+    for s in np.random.default_rng(1).uniform(0.0, job().end, 50):
+        q = np.concatenate([job().position(arm, float(s)) for arm in (0, 1)])
+        np.testing.assert_allclose(q, spline(s), atol=1e-12)
+        force = np.interp(s, sampled.time, sampled.normal_force[:, 1])
+        assert job().force(1, float(s)) == pytest.approx(force, abs=1e-9)
+    names = [phase.name for phase in sampled.job.phases]
+    begins = [phase.begin for phase in sampled.job.phases]
+    for name, begin in zip(names, begins, strict=True):
+        assert job().begin(name) == pytest.approx(begin, abs=1e-9)
+        assert job().phase(begin + 1e-3) == name
+
+
+def test_what_moves_goes_with_the_square_of_the_rate() -> None:
+    s = job().begin("carry") + 1.0
+    still, whole = (np.array(job().effort(0, "with_gravity", s, r)) for r in (0.0, 1.0))
+    np.testing.assert_allclose(job().effort(0, "with_gravity", s, -1.0), whole)
+    half = job().effort(0, "with_gravity", s, 0.5)
+    np.testing.assert_allclose(half, still + (whole - still) / 4.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("first", "last"), [(1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (0.4, -1.0)])
+def test_the_clock_turns_smoothly(first: float, last: float) -> None:
+    clock = Clock(100.0, 0.8, 50.0, first)
+    clock.turn(last, after=0.04)
+    found = [(clock.rate, clock.change)]
+    while clock.turning:
+        clock.advance(1e-3)
+        found.append((clock.rate, clock.change))
+    rate, change = np.array(found).T
+    assert rate[-1] == last
+    assert len(rate) == pytest.approx((0.04 + 0.8 * abs(last - first)) * 1e3, abs=3)
+    np.testing.assert_allclose(np.diff(rate)[45:-5] / 1e-3, change[45:-6], atol=0.02)
+    assert np.abs(change[[0, 30, -1]]).max() < 1e-9
+    assert clock.s == pytest.approx(50.0 + np.trapezoid(rate, dx=1e-3), abs=1e-6)
+
+
+def test_what_is_ahead_is_what_happens() -> None:
+    clock = Clock(10.0, 0.5, 9.0, 1.0)
+    clock.turn(0.0, after=0.02)
+    clock.advance(0.1)
+    ahead = list(clock.ahead(0.0, 0.05))
+    for moment in ahead[1:]:
+        clock.advance(0.05)
+        assert (moment.s, moment.rate) == pytest.approx((clock.s, clock.rate), abs=1e-12)
+    assert ahead[-1].rate == 0.0
+    assert list(Clock(1.0, 0.5, 0.0, 1.0).ahead(1.0, 0.3))[-1].s == 1.0
+
+
+def test_a_sound_run_ends() -> None:
+    machine = Machine(job())
+    with pytest.raises(Refused, match="no news from left"):
+        machine.start(Seen())
+    machine.start(Seen(posture(0.0)))
+    time = 0.0
+    while machine.state == "running":
+        machine.tick(0.05, Seen(posture(machine.clock.s)))
+        time += 0.05
+    assert machine.state == "done", machine.told()
+    assert time == pytest.approx(job().end, abs=0.2)
+
+
+def moved(q: list[float] | None, by: float) -> list[float]:
+    assert q is not None
+    return [value + by for value in q]
+
+
+WRONG: dict[str, tuple[Callable[[float], Seen], str]] = {
+    "off its path": (lambda s: Seen([moved(posture(s)[0], 0.05), posture(s)[1]]), "left its path"),
+    "late": (lambda s: Seen([posture(s - 0.08)[0], posture(s - 0.08)[1]]), "behind"),
+    "apart": (lambda s: Seen([posture(s)[0], posture(s - 0.045)[1]]), "apart|behind"),
+    "silent": (lambda s: Seen(posture(s), silence=[0.0, 0.3]), "no news from right for 0.30 s"),
+    "weak": (lambda s: Seen(posture(s), force=[None, 10.0]), "right presses 10.0 N instead of"),
+    "told": (lambda s: Seen(posture(s), fault="the door opens"), "the door opens"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_stops_the_job_on_its_path(name: str) -> None:
+    seen, told = WRONG[name]
+    machine = running(job().begin("carry") + 2.0)
+    ticks = 0
+    while machine.state != "held":
+        machine.tick(PERIOD, seen(machine.clock.s))
+        ticks += 1
+        assert ticks < 300, machine.told()
+    assert any(part in machine.reason for part in told.split("|")), machine.reason
+    assert machine.clock.rate == 0.0
+    # Three looks, and the stop.
+    assert ticks * PERIOD <= job().limits.stop_time + 5.0 * PERIOD
+    stood = machine.clock.s
+    machine.tick(1.0, Seen())
+    assert machine.clock.s == stood
+    with pytest.raises(Refused, match="no news"):
+        machine.resume(1.0, Seen())
+    with pytest.raises(Refused, match="mm from its place"):
+        machine.resume(1.0, Seen([moved(q, 0.1) for q in posture(stood)]))
+    machine.resume(-1.0, Seen(posture(stood)))
+    while machine.state == "running":
+        machine.tick(0.05, Seen(posture(machine.clock.s)))
+    assert (machine.state, machine.clock.s) == ("done", 0.0)
+
+
+def test_one_strange_look_stops_nothing() -> None:
+    machine = running(job().begin("carry") + 2.0)
+    machine.tick(PERIOD, Seen(posture(0.0)))
+    machine.tick(PERIOD, Seen(posture(0.0)))
+    machine.tick(PERIOD, Seen(posture(machine.clock.s + PERIOD)))
+    machine.tick(PERIOD, Seen(posture(0.0)))
+    assert machine.state == "running"
+
+
+def test_a_job_begins_only_in_its_first_places() -> None:
+    with pytest.raises(Refused, match="the pad of left is up to"):
+        Machine(job()).start(Seen([moved(posture(0.0)[0], 0.02), posture(0.0)[1]]))
+    with pytest.raises(Refused, match="zero its sensor"):
+        Machine(job()).start(Seen(posture(0.0), force=[0.0, 50.0]))
+    for document in ({}, {"format": "dual-arm-carry job", "version": 1}):
+        with pytest.raises(Refused, match="no job of version 2"):
+            Job(document)
+
+
+def test_distances_are_bounds() -> None:
+    """Of a pad's way between two postures, by Pinocchio's kinematics."""
+    from hybrid_opt.bundles.steps import pad_places
+
+    found, rng = exported("json"), np.random.default_rng(2)
+    for arm in (0, 1):
+        q = found.sampled.arm(arm, found.sampled.q)
+        for k in range(0, len(q), 200):
+            other = q[k] + rng.normal(0.0, 1e-3, q.shape[1])
+            places = pad_places(found.workcell, arm, np.array([q[k], other]))[:, :3, 3]
+            way = float(np.linalg.norm(places[1] - places[0]))
+            s = float(found.sampled.time[k])
+            assert way <= job().distance(arm, other.tolist(), s) + 1e-6

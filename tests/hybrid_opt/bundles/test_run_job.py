@@ -1,0 +1,260 @@
+"""`run_job.py` of the ROS 2 targets, unedited, against mocks of their controllers, with faults."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_opt.bundles.programs.carry_job import Job
+from symbolic.array import Array
+from tests.hybrid_opt.bundles.bundles import contents
+from tests.hybrid_opt.bundles.mock_ros import World, run
+
+TARGETS = ("ros2-control", "franka-ros2", "ur-ros2")
+SETTLED = 0.5
+"""What a program waits before its first look [s]."""
+
+Fault = Callable[[World], None]
+
+
+def files_of(target: str) -> dict[str, str | bytes]:
+    """The bundle's files; the GoFas of the rack stand in for the makers' own arms."""
+    return dict(contents(target))
+
+
+def job_of(target: str) -> Job:
+    return Job(json.loads(contents(target)["job.json"]))
+
+
+def column(world: World, index: int) -> Array:
+    return np.array([row[index] for row in world.record])
+
+
+def coordinate(job: Job, world: World) -> list[float]:
+    """Where along the path either arm stands at the end [s]."""
+    found = []
+    for arm in (0, 1):
+        q = world.q(arm).tolist()
+        places = np.arange(0.0, job.end, 0.002)
+        found.append(float(min(places, key=lambda s: job.distance(arm, q, float(s)))))
+    return found
+
+
+@pytest.mark.parametrize("target", ["ros2-control", "ur-ros2"])
+def test_the_job_is_done(target: str, tmp_path: Path) -> None:
+    code, world = run(files_of(target), tmp_path, lambda world: None, [])
+    assert code == 0, world.log
+    job = job_of(target)
+    q = column(world, 1)
+    last = np.concatenate([job.position(arm, job.end) for arm in (0, 1)])
+    np.testing.assert_allclose(q[-1], last, atol=1e-6)
+    assert world.log[-1].startswith("done")
+    moved = np.flatnonzero(np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-9)
+    time = column(world, 0)
+    assert time[moved[-1]] - time[moved[0]] == pytest.approx(job.end, abs=0.3)
+
+
+def test_positions_and_efforts_are_those_of_the_job(tmp_path: Path) -> None:
+    """Both arms' commands against the job, by the mock's own interpolation."""
+    for target, gravity in (("franka-ros2", "without_gravity"),):
+        _, world = run(files_of(target), tmp_path / target, lambda world: None, [])
+        job, time = job_of(target), column(world, 0)
+        q, effort = column(world, 1), column(world, 2)
+        moved = np.flatnonzero(np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-12)
+        begin = time[moved[0]]
+        for k in range(moved[0] + 40, moved[-1] - 40, 97):
+            s = time[k] - begin
+            planned = np.concatenate([job.position(arm, s) for arm in (0, 1)])
+            # The world's steps are 5 ms apart.
+            speed = max(job.speed(arm, s) for arm in (0, 1))
+            assert np.abs(q[k] - planned).max() < 0.02 * speed + 1e-4
+            wanted = np.concatenate([job.effort(arm, gravity, s, 1.0) for arm in (0, 1)])
+            assert np.abs(effort[k] - wanted).max() < 3.0
+        assert np.abs(effort[moved[0] + 1000]).max() > (20.0 if gravity == "with_gravity" else 1.0)
+
+
+def freeze(world: World, arm: int) -> None:
+    """An arm's drives stop."""
+    controller, part = world.of(arm)
+    controller.stands[part] = True
+
+
+def fall_silent(world: World, arm: int) -> None:
+    world.silent[arm] = True
+
+
+def shift(world: World, arm: int) -> None:
+    world.offset[arm] = 0.2
+
+
+def abort(world: World) -> None:
+    world.of(0)[0].aborts_at = world.now
+
+
+FAULTS: dict[str, tuple[Fault, str]] = {
+    "one arm stops": (partial(freeze, arm=0), "left its path|behind|apart"),
+    "the other arm stops": (partial(freeze, arm=1), "left its path|behind|apart"),
+    "no news": (partial(fall_silent, arm=1), "no news from right|apart"),
+    "an encoder jumps": (partial(shift, arm=0), "left its path"),
+    "Ctrl-C": (World.interrupt, "Ctrl-C"),
+    "a controller gives up": (abort, "ended: Aborted"),
+}
+
+
+USUAL = (("ros2-control", "one arm stops"), ("ros2-control", "Ctrl-C"), ("ur-ros2", "no news"))
+"""Faults of the short tests; the slow ones inject all of them in all phases that hold the box."""
+
+
+@pytest.mark.parametrize(
+    ("target", "name", "share"),
+    [
+        pytest.param(
+            target,
+            name,
+            share,
+            marks=() if (target, name) in USUAL and share == 0.45 else pytest.mark.slow,
+        )
+        for target in TARGETS
+        for name in FAULTS
+        for share in (0.05, 0.3, 0.45, 0.7, 0.95)
+    ],
+)
+def test_both_arms_hold_and_press(target: str, name: str, share: float, tmp_path: Path) -> None:
+    """In the carry: the arms that still move stop at one place of the path; the squeeze stays."""
+    fault, told = FAULTS[name]
+    job = job_of(target)
+    when = job.begin("carry") + share * (job.begin("set_down") - job.begin("carry"))
+
+    def prepare(world: World) -> None:
+        world.later(SETTLED + when + 1.5, lambda: fault(world))
+        world.later(SETTLED + when + 1.5 + 4.0, world.interrupt)
+        world.later(SETTLED + when + 1.5 + 4.5, world.interrupt)
+        world.later(SETTLED + when + 1.5 + 5.0, world.interrupt)
+
+    code, world = run(files_of(target), tmp_path, prepare, [])
+    assert code == 1, world.log
+    text = " ".join(world.log)
+    assert any(part in text for part in told.split("|")), text
+    assert "held in carry" in text
+    assert "'back'" in text
+    rest = column(world, 1)[-200:]
+    assert np.ptp(rest, axis=0).max() < 1e-9
+    places = coordinate(job, world)
+    stopped = 0.1 if name in ("Ctrl-C", "no news", "an encoder jumps") else 0.5
+    assert abs(places[0] - places[1]) < stopped
+    if target == "ros2-control" and name != "a controller gives up":
+        held = [job.effort(arm, "with_gravity", places[arm], 0.0) for arm in (0, 1)]
+        moving = 1 if name == "one arm stops" else 0
+        np.testing.assert_allclose(world.effort(moving), held[moving], atol=2.0)
+    if target == "ur-ros2":
+        assert world.force[1] == pytest.approx(job.force(1, places[1]), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("target", "word", "code"),
+    [
+        ("ros2-control", "continue", 0),
+        ("ur-ros2", "back", 3),
+        pytest.param("ros2-control", "back", 3, marks=pytest.mark.slow),
+        pytest.param("ur-ros2", "continue", 0, marks=pytest.mark.slow),
+        pytest.param("franka-ros2", "back", 3, marks=pytest.mark.slow),
+    ],
+)
+def test_a_held_job_sets_the_box_down(target: str, word: str, code: int, tmp_path: Path) -> None:
+    job = job_of(target)
+    when = job.begin("carry") + 1.0
+
+    def prepare(world: World) -> None:
+        world.later(SETTLED + when + 1.5, world.interrupt)
+        world.later(SETTLED + when + 1.5 + 5.0, lambda: world.command(word))
+
+    found, world = run(files_of(target), tmp_path, prepare, [])
+    assert found == code, world.log
+    end = job.end if word == "continue" else 0.0
+    last = np.concatenate([job.position(arm, end) for arm in (0, 1)])
+    np.testing.assert_allclose(column(world, 1)[-1], last, atol=1e-4)
+    assert np.abs(np.diff(column(world, 1), axis=0)).max() < 0.02, "no arm jumps"
+
+
+def test_a_pause_of_the_computer_changes_nothing(tmp_path: Path) -> None:
+    def prepare(world: World) -> None:
+        world.later(5.0, lambda: setattr(world, "pause", 0.05))
+
+    code, world = run(files_of("ros2-control"), tmp_path, prepare, [])
+    assert code == 0, world.log
+
+
+def test_nothing_moves_that_should_not(tmp_path: Path) -> None:
+    def elsewhere(world: World) -> None:
+        controller, part = world.of(0)
+        controller.q[part] += 0.05
+
+    code, world = run(files_of("ros2-control"), tmp_path / "a", elsewhere, [])
+    assert code == 2
+    assert "mm from its place" in world.log[-1]
+    code, world = run(
+        files_of("franka-ros2"),
+        tmp_path / "b",
+        lambda world: setattr(world.of(1)[0], "refuses", True),
+        [],
+    )
+    assert code == 2
+    assert "does not take its goal" in world.log[-1]
+    moved = np.abs(column(world, 1) - column(world, 1)[0]).max()
+    assert moved < 0.01, "the other goal is taken back before it begins"
+    code, world = run(files_of("ur-ros2"), tmp_path / "c", lambda world: None, ["--check"])
+    assert code == 0
+    assert np.ptp(column(world, 1), axis=0).max() == 0.0
+
+
+def test_a_wrong_force_stops_the_job(tmp_path: Path) -> None:
+    """Sensors that feel what is commanded, until one has an offset in the carry."""
+    job = job_of("ur-ros2")
+    off = [0.0]
+
+    def prepare(world: World) -> None:
+        def feel() -> None:
+            for arm in (0, 1):
+                world.feel(arm, world.force[1] + off[0])
+            world.later(0.01, feel)
+
+        world.later(0.1, feel)
+        world.later(SETTLED + job.begin("carry") + 2.5, lambda: off.__setitem__(0, 40.0))
+        for k in range(3):
+            world.later(SETTLED + job.begin("carry") + 8.0 + k, world.interrupt)
+
+    code, world = run(files_of("ur-ros2"), tmp_path, prepare, [])
+    assert code == 1, world.log
+    assert "instead of" in " ".join(world.log)
+
+
+def test_pads_that_feel_something_already_do_not_begin(tmp_path: Path) -> None:
+    def prepare(world: World) -> None:
+        world.later(0.2, lambda: world.feel(0, 60.0))
+
+    code, world = run(files_of("ur-ros2"), tmp_path, prepare, [])
+    assert code == 2
+    assert "zero its sensor" in world.log[-1]
+
+
+def test_a_ur_presses_before_it_lifts_and_bears_the_box_with_it(tmp_path: Path) -> None:
+    _, world = run(files_of("ur-ros2"), tmp_path, lambda world: None, [])
+    names = [name for name, _ in world.calls]
+    assert names[:4] == [
+        f"/{arm}/io_and_status_controller/{what}"
+        for arm in ("left", "right")
+        for what in ("set_payload", "zero_ftsensor")
+    ]
+    force = np.array([row[3][1] for row in world.record])
+    job = job_of("ur-ros2")
+    assert force.max() == pytest.approx(max(job.robots[1]["normal_force"]), rel=0.01)
+    assert force[-1] == 0.0
+    loads = [r["mass"] for n, r in world.calls if n == "/left/io_and_status_controller/set_payload"]
+    assert np.abs(np.diff(loads)).max() < 1.0, "the payload is a ramp"
+    assert max(loads) == pytest.approx(5.0, abs=0.01)
+    assert loads[-1] < 0.5
