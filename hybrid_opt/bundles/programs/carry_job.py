@@ -330,8 +330,11 @@ class Machine:
         """Begin the job.
 
         Raises:
-            Refused: an arm is silent or not at its first place, or a pad is pressed.
+            Refused: someone or something asks to stop, an arm is silent or not at its first place,
+                or a pad is pressed.
         """
+        if seen.fault:
+            raise Refused(seen.fault)
         self._require_places(seen, self.job.limits.start)
         for arm, force in enumerate(seen.force):
             most = 0.2 * max(self.job.robots[arm]["normal_force"])

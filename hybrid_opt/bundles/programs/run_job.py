@@ -49,6 +49,8 @@ SETTLE = 0.5
 
 CTRL_C = "Ctrl-C"
 
+TRIGGER = "std_srvs/srv/Trigger"
+
 WINDOW = 8
 """A force reference is the largest of so many until the one after the next."""
 
@@ -141,16 +143,17 @@ class Cell:
 
     def call(self, name: str, kind: str, request: dict[str, Any]) -> Any:
         """Call a service; a refusal becomes a fault when it arrives."""
-        service = get_service(kind)
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(service, name)
-            if not self._clients[name].wait_for_service(timeout_sec=PATIENCE):
-                raise Refused(f"{name} is not there; are the controllers launched?")
-        message = service.Request()
+        message = get_service(kind).Request()
         set_message_fields(message, request)
         future = self._clients[name].call_async(message)
         self._calls.append((name, future))
         return future
+
+    def _find(self, name: str, kind: str) -> None:
+        """Find a service before anything moves."""
+        self._clients[name] = self.node.create_client(get_service(kind), name)
+        if not self._clients[name].wait_for_service(timeout_sec=PATIENCE):
+            raise Refused(f"{name} is not there; are the controllers launched?")
 
     def prepare(self) -> None:
         """Whatever the arms need before they move, one after the other.
@@ -161,6 +164,12 @@ class Cell:
         for group, client in zip(self.config["groups"], self._actions, strict=True):
             if not client.wait_for_server(timeout_sec=PATIENCE):
                 raise Refused(f"{group['action']} is not there; are the controllers launched?")
+        for call in self.config["prepare"]:
+            self._find(call["name"], call["kind"])
+        for each in (*self.config["force"], *self.config["payload"], *self.config["sliders"]):
+            self._find(each["name"], each["type"])
+        for force in self.config["force"]:
+            self._find(force["end"], TRIGGER)
         for call in self.config["prepare"]:
             self.wait([self.call(**call)], call["name"])
             if self.seen().fault:
@@ -278,7 +287,7 @@ class Cell:
     def release(self) -> None:
         """End what presses, once the pads are off the box."""
         for force in self.config["force"]:
-            self.call(force["end"], "std_srvs/srv/Trigger", {})
+            self.call(force["end"], TRIGGER, {})
 
     def full_speed(self) -> None:
         """Give the speed sliders back what they had."""

@@ -170,3 +170,57 @@ def test_distances_are_bounds() -> None:
             way = float(np.linalg.norm(places[1] - places[0]))
             s = float(found.sampled.time[k])
             assert way <= job().distance(arm, other.tolist(), s) + 1e-6
+
+
+KINDS = ("freeze", "late", "silent", "sensor", "encoder", "asked", "pause")
+
+
+def test_two_hundred_faults_in_all_phases() -> None:
+    """Both arms follow, then something happens at a random moment: the job ends held, on its path,
+    within the stop that it states, pressing what belongs there. A pause of 50 ms stops nothing."""
+    rng = np.random.default_rng(7)
+    for number in range(200):
+        kind, arm = KINDS[number % len(KINDS)], int(rng.integers(2))
+        when = float(rng.uniform(0.3, job().end - 2.0))
+        machine = running(when - 0.05)
+        frozen = posture(when)
+        for tick in range(400):
+            s, pause = machine.clock.s, 0.05 if kind == "pause" and tick == 6 else 0.0
+            happens = s >= when
+            q = posture(s)
+            force: list[float | None] = [job().force(a, s) for a in (0, 1)]
+            silence, fault = [0.0, 0.0], ""
+            if happens:
+                if kind == "freeze":
+                    q[arm] = frozen[arm]
+                elif kind == "late":
+                    q[arm] = posture(max(s - 0.15, 0.0))[arm]
+                elif kind == "silent":
+                    silence[arm] = 0.2
+                elif kind == "sensor":
+                    force[arm] = job().force(arm, s) + 60.0
+                elif kind == "encoder":
+                    q[arm] = moved(q[arm], 0.1)
+                elif kind == "asked":
+                    fault = "Ctrl-C"
+            machine.tick(PERIOD + pause, Seen(q, force, silence, fault))
+            if machine.state == "stopping":
+                # Nothing that is told moves faster than the job would.
+                assert abs(machine.clock.rate) <= 1.0
+            if machine.state in ("held", "done"):
+                break
+        told = f"{kind} at {when:.2f} s in {job().phase(when)}: {machine.told()}"
+        stops = kind in ("silent", "encoder", "asked")
+        held_box = job().begin("lift") < when < job().begin("release") - 0.3
+        moves = min(job().speed(a, when + d) for a in (0, 1) for d in (0.1, 0.4)) > 0.5 * (
+            job().fastest
+        )
+        if stops or (kind == "sensor" and held_box) or (kind in ("freeze", "late") and moves):
+            assert machine.state == "held", told
+            limits = job().limits
+            # To see it: 20 mm of path at most, three looks; then the stop.
+            seen = 20.0 * PERIOD + limits.behind
+            assert machine.clock.s <= when + seen + limits.stop_time / 2.0 + PERIOD, told
+            assert machine.clock.rate == 0.0
+        elif kind == "pause":
+            assert machine.state in ("running", "done"), told
