@@ -124,10 +124,21 @@ def comment(text: str) -> str:
 
 
 def prefixes(workcell: Workcell) -> tuple[str, str]:
-    """Prefixes of the names of each robot's links and joints."""
+    """Prefixes of the names of each robot's links and joints.
+
+    Raises:
+        SettingsError: the drivers' own would give both arms' joints the same names.
+    """
     if one_machine(workcell.robots):
         return "", ""
     stated = [robot.driver.prefix for robot in workcell.robots]
+    if stated[0] is not None and stated[0] == stated[1]:
+        if set(_moving(workcell.robots[0])) & set(_moving(workcell.robots[1])):
+            raise SettingsError(
+                f"both drivers have the prefix {stated[0]!r}, so that both arms' joints have the "
+                "same names: give [robots.driver] of each robot a prefix of its own"
+            )
+        return stated[0], stated[0]
     first, second = (
         robot_prefix(robot.name) if prefix is None else prefix
         for robot, prefix in zip(workcell.robots, stated, strict=True)

@@ -242,6 +242,19 @@ def test_a_target_says_what_it_lacks(target: str, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_joints_have_names_of_their_own(tmp_path: Path) -> None:
+    """As drivers name them: by the robot, or by a prefix that is stated."""
+    job = driven(rack_job(), replace(DRIVER, prefix="same_"))
+    with pytest.raises(SettingsError, match="the prefix 'same_', so that both arms' joints"):
+        export(job, "ros2-control", tmp_path)
+    first, second = job.workcell.robots
+    named = replace(first, driver=replace(DRIVER, prefix="l_"))
+    cell = replace(job.workcell, robots=(named, second))
+    paths = export(replace(job, workcell=cell), "json", tmp_path)
+    robots = json.loads(next(p for p in paths if p.name == "job.json").read_text())["robots"]
+    assert [robot["ros_joints"][0] for robot in robots] == ["l_joint_1", "same_joint_1"]
+
+
 def test_a_driver_has_to_have_an_address(tmp_path: Path) -> None:
     job = driven(rack_job(), replace(DRIVER, address=""))
     with pytest.raises(SettingsError, match=r"ur-ros2 has to know where .* address"):
