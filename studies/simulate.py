@@ -12,19 +12,22 @@ import sys
 from studies.options import add, number, stated, whole
 from studies.program import Parser, Program, later, run_program
 
-PADS = "pads"
-"""The witness without arms, beside the controllers of those with them."""
+DRIVEN = "pads-driven"
+
+PADS = ("pads", DRIVEN)
+"""The witnesses without arms, beside the controllers of those with them."""
 
 
 def _add_options(parser: Parser) -> None:
     add(parser, "FILE")
     parser.add_argument(
         "--controller",
-        choices=(PADS, *stated("hybrid_opt.witness.reference.Control")),
+        choices=(*PADS, *stated("hybrid_opt.witness.reference.Control")),
         default="leader",
         help="of the arms: one leads and the other is force-controlled along the normal (leader), "
         "both are (both), both are springs about the plan (impedance); or no arms, pads on a "
-        "carriage that follows the plan exactly (pads)",
+        "carriage that follows the plan exactly (pads), or pads at their rims, turned by the "
+        "planned moments, as the allocations paper and joint assume (pads-driven)",
     )
     parser.add_argument(
         "--timing",
@@ -47,6 +50,13 @@ def _add_options(parser: Parser) -> None:
         help="amplitude of each joint's error in the random cases, a sinusoid of 0.3 to 1.5 Hz",
     )
     parser.add_argument(
+        "--force-error",
+        type=number(0.0, 0.99),
+        default=0.05,
+        metavar="SHARE",
+        help="of the commanded normal force that is missing in the random cases",
+    )
+    parser.add_argument(
         "--stiffness",
         type=number(1e-3, 1e9),
         default=stated("hybrid_opt.witness.scene.ArmSettings.stiffness"),
@@ -56,17 +66,9 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--time-step",
         type=number(1e-6, 1.0),
+        default=stated("hybrid_opt.witness.scene.ContactSettings.time_step"),
         metavar="S",
-        help="of the simulation (default: "
-        f"{stated('hybrid_opt.witness.scene.ArmSettings.time_step'):g} with arms, "
-        f"{stated('hybrid_opt.witness.scene.ContactSettings.time_step'):g} without)",
-    )
-    parser.add_argument(
-        "--contact-time",
-        type=number(1e-5, 10.0),
-        default=stated("hybrid_opt.witness.scene.ContactSettings.contact_time"),
-        metavar="S",
-        help="time constant of contacts",
+        help="of the simulation",
     )
     parser.add_argument(
         "--sweep", action="store_true", help="the threshold at half and twice the time step, too"

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicHermiteSpline
-from scipy.spatial.transform import Rotation
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.squeeze import Squeeze
 from hybrid_opt.witness.box import (
-    RIM_POINTS,
     SAME_TIME,
+    HeldBox,
     Outcome,
     Threshold,
+    between,
     bisected,
     mujoco_module,
 )
@@ -36,12 +36,15 @@ from hybrid_opt.witness.reference import (
     pressed_reference,
 )
 from hybrid_opt.witness.scene import (
+    IMPEDANCE,
+    PRESSES,
     ArmSettings,
     cell_text,
+    compiled,
     joint_names,
     joint_torque_max,
+    patch_area,
     quaternion,
-    rim,
 )
 from symbolic.array import Array
 from symbolic.records import Workcell
@@ -80,37 +83,28 @@ class ArmOutcome(Outcome):
     arrives: bool
 
 
-class HeldBox:
-    """Reads one simulation's state, and mends what its contacts neglect.
-
-    Attributes:
-        sites: of the two pads.
-        pose: where the box's pose (7,) is among the simulator's positions.
-    """
+class PressedBox(HeldBox):
+    """Also reads how hard the pads press, and mends what their contacts neglect."""
 
     def __init__(self, mujoco: ModuleType, model: Any, data: Any, workcell: Workcell) -> None:
-        """Find pads and box in the model of `hybrid_opt.witness.scene`."""
-        self._mujoco, self._model, self._data = mujoco, model, data
-        self.sites = [int(model.site(f"pad_{i + 1}").id) for i in (0, 1)]
+        """Find the pads' contact points as well."""
+        super().__init__(model, data, workcell)
+        self._mujoco, self._model = mujoco, model
         self._bodies = [int(model.site_bodyid[site]) for site in self.sites]
-        self._box_body = int(model.body("box").id)
-        first = int(model.joint("box").qposadr[0])
-        self.pose = slice(first, first + 7)
         self._pad_of_geom = np.full(model.ngeom, -1)
+        self._seen = np.zeros(2)
         for i, body in enumerate(self._bodies):
-            self._pad_of_geom[(model.geom_bodyid == body) & (model.geom_contype == 1)] = i
-        rims = np.array([rim(contact, RIM_POINTS) for contact in workcell.contacts])
-        self._rims = np.concatenate([rims, np.zeros((2, RIM_POINTS, 1))], axis=2)
-        self._contact_time = float(model.geom_solref[self._pad_of_geom >= 0, 0].max())
+            points = (model.geom_bodyid == body) & (model.geom_contype == PRESSES)
+            self._pad_of_geom[points] = i
+            damping = -float(model.geom_solref[points, 1].min()) / IMPEDANCE
+            self._seen[i] = 1.0 - damping * model.opt.timestep / 2.0
         self._change = np.zeros((3, model.nv))
 
     @property
     def normal_forces(self) -> Array:
         """(2,) what the points of each pad press together, in the last step [N]."""
         pad, _, address, _ = self._contacts()
-        force = np.zeros(2)
-        np.add.at(force, pad, self._data.efc_force[address])
-        return force
+        return np.bincount(pad, self._data.efc_force[address], 2).astype(float)
 
     def mend_contacts(self) -> None:
         """Contacts of this step, all accelerations included.
@@ -120,50 +114,20 @@ class HeldBox:
         per second and lift off. Call it between the two halves of a step.
 
         A step takes joints along arcs and the box along a line, which parts them by half of
-        dJ/dt v dt^2. The contacts' damping, 2 over their time constant, is told to make up for it.
+        dJ/dt v dt^2. The contacts' damping is told to make up for it.
         """
         pad, is_first, address, axes = self._contacts()
         if not len(pad):
             return
-        share = 1.0 - self._model.opt.timestep / self._contact_time
-        unseen = share * np.array([self._unseen(i) for i in (0, 1)])[pad]
+        unseen = np.array([self._seen[i] * self._unseen(i) for i in (0, 1)])[pad]
         sign = np.where(is_first, -1.0, 1.0)[:, None]  # the second body's less the first's
         rows = address[:, None] + np.arange(3)
         self._data.efc_aref[rows] -= sign * np.einsum("nij,nj->ni", axes, unseen)
 
-    @property
-    def rims_on_box(self) -> Array:
-        """(2, RIM_POINTS, 3) the patches' rims in the box frame [m]."""
-        (places, axes), (position, rotation) = self._placed(), self.box
-        world = self._rims @ np.swapaxes(axes, 1, 2) + places[:, None]
-        on_box: Array = (world - position) @ rotation
-        return on_box
-
-    def slip(self, on_box: Array) -> Array:
-        """(2,) how far points of the box, once on the rims, are from there in the planes of the
-        pads [m]."""
-        (places, axes), (position, rotation) = self._placed(), self.box
-        world = on_box @ rotation.T + position
-        moved = (world - places[:, None]) @ axes - self._rims
-        largest: Array = np.linalg.norm(moved[..., :2], axis=2).max(axis=1)
-        return largest
-
-    @property
-    def box(self) -> tuple[Array, Array]:
-        """Position (3,) [m] and rotation (3, 3) of the box frame in the world."""
-        pose = self._data.qpos[self.pose]
-        return pose[:3].copy(), Rotation.from_quat(pose[[4, 5, 6, 3]]).as_matrix()
-
-    @property
-    def box_in_pad(self) -> Array:
-        """(3, 3) rotation of the box in the axes of the first pad."""
-        in_pad: Array = self._placed()[1][0].T @ self.box[1]
-        return in_pad
-
     def _unseen(self, pad: int) -> Array:
         """(3,) dJ/dt v of a pad less that of the box beneath it, world axes [m/s^2]."""
         place, found = self._data.site_xpos[self.sites[pad]], []
-        for body in (self._bodies[pad], self._box_body):
+        for body in (self._bodies[pad], self.box):
             self._mujoco.mj_jacDot(self._model, self._data, self._change, None, place, body)
             found.append(self._change @ self._data.qvel)
         less: Array = found[0] - found[1]
@@ -179,18 +143,13 @@ class HeldBox:
         axes = contact.frame[active].reshape(-1, 3, 3)
         return pad[active], sides[active, 0] >= 0, contact.efc_address[active], axes
 
-    def _placed(self) -> tuple[Array, Array]:
-        """Places (2, 3) and axes (2, 3, 3) of both pads in the world."""
-        return self._data.site_xpos[self.sites], self._data.site_xmat[self.sites].reshape(2, 3, 3)
-
 
 class CellWitness:
     """A workcell with its arms, as it really is.
 
     Attributes:
         workcell, settings: what is simulated, and how.
-        text: the MJCF document.
-        mujoco, model: the simulator and its model.
+        mujoco, model, text: the simulator, its model, and this as MJCF.
         disturbance: (3,) [m/s^2].
     """
 
@@ -211,10 +170,9 @@ class CellWitness:
         """
         self.workcell = workcell
         self.settings = settings or ArmSettings()
-        self.text = cell_text(workcell, self.settings)
         self.disturbance = np.asarray(disturbance, dtype=float)
         self.mujoco = mujoco_module()
-        self.model = self.mujoco.MjModel.from_xml_string(self.text)
+        self.model, self.text = compiled(self.mujoco, cell_text(workcell, self.settings))
 
     def simulate(
         self,
@@ -230,21 +188,6 @@ class CellWitness:
             factor: multiple of the normal forces to press with.
         """
         return _Run(self, reference, control, factor).outcome()
-
-    def threshold(
-        self,
-        reference: Reference,
-        control: Control,
-        low: float,
-        high: float,
-        steps: int,
-    ) -> Threshold[ArmOutcome]:
-        """The least factor that holds, by bisection; see `hybrid_opt.witness.box.bisected`.
-
-        Raises:
-            WitnessError: the box holds at the lower or slips at the higher factor.
-        """
-        return bisected(lambda s: self.simulate(reference, control, s), low, high, steps)
 
 
 class _Run:
@@ -262,12 +205,13 @@ class _Run:
         self._shares_squeeze = control == "both"
         self._mujoco, self._model = witness.mujoco, witness.model
         self._data = self._mujoco.MjData(self._model)
-        self._pads = HeldBox(self._mujoco, self._model, self._data, self._workcell)
+        self._pads = PressedBox(self._mujoco, self._model, self._data, self._workcell)
         names = joint_names(self._workcell)
         self._q = np.array([int(self._model.joint(name).qposadr[0]) for name in names])
         self._v = np.array([int(self._model.joint(name).dofadr[0]) for name in names])
-        box = int(self._model.joint("box").dofadr[0])
-        self._box_v = slice(box, box + 6)
+        box = self._model.joint("box")
+        self._pose = slice(int(box.qposadr[0]), int(box.qposadr[0]) + 7)
+        self._box_v = slice(int(box.dofadr[0]), int(box.dofadr[0]) + 6)
         split = len(self._workcell.robots[0].torque_max)
         self._arms = (slice(0, split), slice(split, None))
         self._ticks = _Ticks.of(reference, factor, self._settings)
@@ -279,8 +223,9 @@ class _Run:
         critical = 2.0 * np.sqrt(stiffness * self._joint_inertia())
         damping = self._settings.damping_ratio * critical
         gains = [(stiffness[arm], damping[arm]) for arm in self._arms]
+        layers = [self._settings.layer * patch_area(c) for c in self._workcell.contacts]
         self._controllers = controllers(
-            control, reference.leader, self._settings, (gains[0], gains[1])
+            control, reference.leader, self._settings, (gains[0], gains[1]), (layers[0], layers[1])
         )
 
     def outcome(self) -> ArmOutcome:
@@ -289,7 +234,6 @@ class _Run:
         per_tick = round(settings.control_period / settings.time_step)
         every = max(1, round(LOOKED_AT / settings.control_period))
         seen: list[tuple[Any, ...]] = []
-        settled: tuple[Array, Array] | None = None
         holds = True
         for k, time in enumerate(self._ticks.time):
             measured = pads.normal_forces
@@ -298,12 +242,11 @@ class _Run:
             if k % every == 0:
                 slip, turn = np.zeros(2), 0.0
                 if held[0] <= time <= held[1]:
-                    settled = settled or (pads.rims_on_box, pads.box_in_pad)
-                    slip = pads.slip(settled[0])
-                    turned = Rotation.from_matrix(settled[1].T @ pads.box_in_pad)
-                    turn = float(turned.magnitude())
+                    slip, turn = pads.look()
                 joints = self._data.qpos[self._q].copy()
-                seen.append((time, slip, turn, measured, k, joints, *pads.box))
+                place = self._data.xpos[pads.box].copy()
+                rotation = self._data.xmat[pads.box].reshape(3, 3).copy()
+                seen.append((time, slip, turn, measured, k, joints, place, rotation))
                 if not slip.max() <= settings.slip:
                     holds = False
                     break
@@ -345,16 +288,15 @@ class _Run:
         displaced = np.mean([real.T_box_pad - told.T_box_pad for real, told in pairs], axis=0)
         position = job.start[:3] - rotation @ displaced[:3, 3]
         standing = np.concatenate([position, quaternion(rotation)])
-        data.qpos[self._pads.pose] = standing
-        box = int(self._model.body("box").id)
-        data.xfrc_applied[box, :3] = -self._workcell.payload.mass * disturbance
+        data.qpos[self._pose] = standing
+        data.xfrc_applied[self._pads.box, :3] = -self._workcell.payload.mass * disturbance
         self._mujoco.mj_forward(self._model, data)
         return standing
 
     def _begin_step(self, time: float) -> None:
         """First half of a step: places and contacts of this very moment."""
         if time < self._reference.job.stands:
-            self._data.qpos[self._pads.pose] = self._standing
+            self._data.qpos[self._pose] = self._standing
             self._data.qvel[self._box_v] = 0.0
         self._mujoco.mj_step1(self._model, self._data)
         self._pads.mend_contacts()
@@ -414,9 +356,6 @@ class _Ticks:
         spline = CubicHermiteSpline(motion.time[single], motion.q[single], motion.q_rate[single])
         at = np.minimum(time, end)
 
-        def linear(values: Array) -> Array:
-            return np.column_stack([np.interp(at, motion.time, column) for column in values.T])
-
         counts = [len(robot.torque_max) for robot in reference.workcell.robots]
         motors = settings.joint_armature(reference.workcell) * motion.q_second
         more = (factor - 1.0) * np.repeat(reference.normal_force, counts, axis=1)
@@ -424,8 +363,10 @@ class _Ticks:
             time=time,
             q=spline(at),
             q_rate=spline(at, 1),
-            effort=linear(reference.effort + motors + more * reference.press_torque),
-            normal_force=factor * linear(reference.normal_force),
+            effort=between(
+                at, motion.time, reference.effort + motors + more * reference.press_torque
+            ),
+            normal_force=factor * between(at, motion.time, reference.normal_force),
         )
 
 
@@ -468,7 +409,9 @@ def account_of(
     reference = carry_reference(cell, carry, leader=leader)
     threshold, problem = None, ""
     try:
-        threshold = witness.threshold(reference, control, LOW, HIGH, BISECTIONS)
+        threshold = bisected(
+            lambda s: witness.simulate(reference, control, s), LOW, HIGH, BISECTIONS
+        )
     except WitnessError as error:
         problem = str(error)
     pressed, squeeze = pressed_reference(cell, carry, leader)

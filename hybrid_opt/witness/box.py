@@ -1,13 +1,13 @@
 """A driven box in MuJoCo: pressed with a multiple of a force, does it stay in place?
 
 The carriage is set to the planned state of the box frame at every step and accelerated as planned
-within it, so that the pads move exactly as planned; the box, free, is held by friction alone.
-`Outcome` and `Threshold` are those of whole cells, too.
+within it, so that the pads move exactly as planned, as on stiff arms; the box, free, is held by
+friction alone. `Outcome`, `Threshold` and `HeldBox` are those of whole cells, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Generic, TypeVar
@@ -24,6 +24,7 @@ from hybrid_opt.witness.scene import (
     CARRIAGE_MASS,
     PAD_MASS,
     SimulationSettings,
+    compiled,
     quaternion,
     rim,
     scene_text,
@@ -41,7 +42,7 @@ BEGINS = 0.1
 SAME_TIME = 1e-9
 """Samples closer than this stand for both sides of one instant [s]."""
 
-LOOKED_AT = 1e-3
+LOOKED_AT = 2e-3
 """Time between two looks at the slip [s]."""
 
 RIM_POINTS = 8
@@ -136,72 +137,89 @@ def mujoco_module() -> ModuleType:
     return module
 
 
+class HeldBox:
+    """Where the box is between its pads in one simulation, at the beginning of its last step.
+
+    Attributes:
+        sites: of the two pads.
+        box: the body.
+    """
+
+    def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
+        """Find pads and box in a model of `hybrid_opt.witness.scene`."""
+        self.sites = [int(model.site(f"pad_{i + 1}").id) for i in (0, 1)]
+        self.box = int(model.body("box").id)
+        self._data = data
+        rims = np.array([rim(contact, RIM_POINTS) for contact in workcell.contacts])
+        self._rims = np.concatenate([rims, np.zeros((2, RIM_POINTS, 1))], axis=2)
+        self._settled: tuple[Array, Array] | None = None
+
+    def look(self) -> tuple[Array, float]:
+        """How far places of the box have moved from the patches' rims in the planes of the pads
+        (2,) [m], and the angle by which it turned between them [rad], since the first look."""
+        axes = self._data.site_xmat[self.sites].reshape(2, 3, 3)
+        places = self._data.site_xpos[self.sites][:, None]
+        position = self._data.xpos[self.box]
+        rotation = self._data.xmat[self.box].reshape(3, 3)
+        turned = axes[0].T @ rotation
+        if self._settled is None:
+            world = self._rims @ np.swapaxes(axes, 1, 2) + places
+            self._settled = (world - position) @ rotation, turned
+        on_box, at_first = self._settled
+        moved = (on_box @ rotation.T + position - places) @ axes - self._rims
+        slip = np.linalg.norm(moved[..., :2], axis=2).max(axis=1)
+        return slip, float(Rotation.from_matrix(at_first.T @ turned).magnitude())
+
+
 @dataclass(frozen=True)
 class Drive:
-    """The carriage's motion and the pressing force at n time steps; world frame.
+    """The carriage's motion and the pressing force at n time steps.
 
     Attributes:
         leader: index of the pad that keeps its place on the carriage.
         time: (n,) from minus the time to settle to the end of the carry [s].
-        position, velocity, acceleration: (n, 3) of the box frame [m, s].
-        rotation: (n, 3, 3) R_world_box.
-        quaternion: (n, 4) the same, real part first.
-        spin, spin_rate: (n, 3) angular velocity and acceleration in the box frame [rad, s].
+        pose: (n, 7) of the box frame: place in the world [m], unit quaternion, real part first.
+        velocity, acceleration: (n, 6) linear in the world, angular in the box frame [m, rad, s].
         press: (n,) normal force of the other pad [N].
-        tilt: (n, 2, 2) planned moments of both pads about the x and y axes of their frames [N m].
         own: (n,) force that the sliding pad's own mass takes along its normal [N].
+        tilt: (n, 2, 2) planned moments of both pads about the x and y axes of their frames [N m].
     """
 
     leader: int
     time: Array
-    position: Array
+    pose: Array
     velocity: Array
     acceleration: Array
-    rotation: Array
-    quaternion: Array
-    spin: Array
-    spin_rate: Array
     press: Array
-    tilt: Array
     own: Array
+    tilt: Array
 
 
-@dataclass(frozen=True, eq=False)
-class PlannedMoments:
-    """Moments that each robot's pads are to exert on the box about their middle, world frame.
-
-    Attributes:
-        along: (n, 2, 3) at the carry's samples [N m].
-        at_rest: (2, 3) at rest before it [N m].
-    """
-
-    along: Array
-    at_rest: Array
-
-
-def planned_moments(cell: Cell, carry: Carry) -> PlannedMoments:
-    """The moments of a carry's planned wrenches, for its own friction and centre of mass."""
+def planned_moments(cell: Cell, carry: Carry) -> Array:
+    """(n + 1, 2, 3) moments of each robot's planned wrenches about the middle of its pads, for the
+    carry's own friction and centre of mass [N m], world frame: at rest before it, then at its
+    samples."""
     workcell = carry.workcell
-    friction = np.array([contact.friction for contact in workcell.contacts])
-    still = np.zeros_like(carry.pose[:1])
-    resting = replace(carry, pose=carry.pose[:1], rate=still, second_rate=still)
-    along, at_rest = (
-        np.stack([_about_middle(each, load, i) for i in (0, 1)], axis=1)
-        for each, load in (
-            (c, cell.timing_model.uncertain_load(c, friction, workcell.payload.centre_of_mass))
-            for c in (carry, resting)
-        )
+    still = np.zeros_like(carry.rate[:1])
+    known = replace(
+        carry,
+        pose=np.concatenate([carry.pose[:1], carry.pose]),
+        rate=np.concatenate([still, carry.rate]),
+        second_rate=np.concatenate([still, carry.second_rate]),
     )
-    return PlannedMoments(along, at_rest[0])
+    friction = np.array([contact.friction for contact in workcell.contacts])
+    load = cell.timing_model.uncertain_load(known, friction, workcell.payload.centre_of_mass)
+    wrenches = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
+    arms = to_middles(workcell, known.pose)
+    return np.asarray(wrenches[..., 3:] - np.cross(arms, wrenches[..., :3]))
 
 
-def _about_middle(carry: Carry, load: Mapping[str, Array], robot: int) -> Array:
-    """(n, 3) moments of one robot's planned wrenches about the middle of its pads."""
-    workcell, wrench = carry.workcell, load[f"wrench_{robot + 1}"]
-    contact = workcell.contacts[robot]
-    in_box = contact.T_box_pad[:3, :3] @ tilt_centre(contact)
-    arm = box_rotation(workcell.task.orientation, carry.pose) @ in_box
-    return np.asarray(wrench[:, 3:] - np.cross(arm, wrench[:, :3]))
+def to_middles(workcell: Workcell, pose: Array) -> Array:
+    """(n, 2, 3) from the place of each robot's first pad to the middle of its pads, at box poses
+    (n, 6), world frame [m]."""
+    rotation = box_rotation(workcell.task.orientation, pose)
+    in_box = [contact.T_box_pad[:3, :3] @ tilt_centre(contact) for contact in workcell.contacts]
+    return np.stack([rotation @ arm for arm in in_box], axis=1)
 
 
 def drive_of(
@@ -209,7 +227,7 @@ def drive_of(
     settings: SimulationSettings,
     press: Array | None = None,
     leader: int = 0,
-    moments: PlannedMoments | None = None,
+    moments: Array | None = None,
 ) -> Drive:
     """A carry from rest to rest, with the box at rest before it.
 
@@ -217,67 +235,64 @@ def drive_of(
         press: (n,) force to press with at the carry's samples; the planned normal force of the
             arm that does not lead by default [N].
         leader: index of the arm that keeps its place.
-        moments: what drives pads that tilt; none by default.
+        moments: what turns driven pads, see `planned_moments`; none by default.
 
     Raises:
         SettingsError: the carry does not start and end at rest, or the force does not fit it.
     """
-    if max(np.abs(carry.rate[[0, -1]]).max(), np.abs(carry.angular_velocity[[0, -1]]).max()) > 1e-3:
-        raise SettingsError("the carry does not start and end at rest; give one with a timing")
+    refuse_motion_at_ends(carry)
     force = carry.normal_force[:, 1 - leader] if press is None else press
     if force.shape != carry.time.shape:
         raise SettingsError(f"forces of shape {force.shape} for {len(carry)} samples")
     begin, end = float(carry.time[0]), float(carry.time[-1])
     steps = int(np.ceil((end - begin + settings.settle) / settings.time_step)) + 1
     time = begin - settings.settle + settings.time_step * np.arange(steps)
-    clipped = np.clip(time, begin, end)
-    moving = ((time > begin) & (time < end))[:, None]
-    pose, rate = _pose(carry, clipped)
-    rotation = box_rotation(carry.workcell.task.orientation, pose)
-    acceleration, omega, alpha = (
-        moving * _interpolated(clipped, carry.time, values)
-        for values in (carry.second_rate[:, :3], carry.angular_velocity, carry.angular_acceleration)
+    # A step takes the new velocity all along it: poses and accelerations are those amid steps.
+    clipped, amid = (np.clip(at, begin, end) for at in (time, time + settings.time_step / 2.0))
+    single = np.concatenate([[True], np.diff(carry.time) > SAME_TIME])
+    path = CubicHermiteSpline(carry.time[single], carry.pose[single], carry.rate[single])
+    rotation = box_rotation(carry.workcell.task.orientation, path(amid))
+    omega = between(clipped, carry.time, carry.angular_velocity)
+    acceleration, alpha = (
+        ((amid > begin) & (amid < end))[:, None] * between(amid, carry.time, values)
+        for values in (carry.second_rate[:, :3], carry.angular_acceleration)
     )
-    T_box_pad = carry.workcell.contacts[1 - leader].T_box_pad
-    arm, normal = rotation @ T_box_pad[:3, 3], rotation @ T_box_pad[:3, 2]
+    slider = carry.workcell.contacts[1 - leader]
+    R_box_pad = slider.T_box_pad[:3, :3]
+    arm = rotation @ (slider.T_box_pad[:3, 3] + R_box_pad @ tilt_centre(slider))
     at_pad = acceleration + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
+    in_box = (np.einsum("nji,nj->ni", rotation, values) for values in (omega, alpha))
+    spin, spin_rate = in_box
+    tilt = np.zeros((steps, 2, 2))
+    for i, contact in enumerate(carry.workcell.contacts if moments is not None else ()):
+        assert moments is not None
+        moment = between(clipped, carry.time, moments[1:, i])
+        moment[time < begin] = moments[0, i]
+        tilt[:, i] = np.einsum("nji,nj->ni", rotation @ contact.T_box_pad[:3, :2], moment)
     return Drive(
         leader=leader,
         time=np.asarray(time),
-        position=pose[:, :3],
-        velocity=moving * rate[:, :3],
-        acceleration=acceleration,
-        rotation=rotation,
-        quaternion=quaternion(rotation),
-        spin=np.einsum("nji,nj->ni", rotation, omega),
-        spin_rate=np.einsum("nji,nj->ni", rotation, alpha),
+        pose=np.column_stack([path(amid)[:, :3], quaternion(rotation)]),
+        velocity=np.column_stack([path(clipped, 1)[:, :3], spin]),
+        acceleration=np.column_stack([acceleration, spin_rate]),
         press=np.interp(clipped, carry.time, force),
-        tilt=_tilt(carry, np.asarray(time), rotation, moments),
-        own=PAD_MASS * np.einsum("ni,ni->n", at_pad, normal),
+        own=PAD_MASS * np.einsum("ni,ni->n", at_pad, rotation @ R_box_pad[:, 2]),
+        tilt=tilt,
     )
 
 
-def _tilt(carry: Carry, time: Array, rotation: Array, moments: PlannedMoments | None) -> Array:
-    """(steps, 2, 2) moments about the axes in the planes of the pads."""
-    tilt = np.zeros((len(time), 2, 2))
-    if moments is None:
-        return tilt
-    for i, contact in enumerate(carry.workcell.contacts):
-        moment = _interpolated(time, carry.time, moments.along[:, i])
-        moment[time < carry.time[0]] = moments.at_rest[i]
-        axes = rotation @ contact.T_box_pad[:3, :2]
-        tilt[:, i] = np.einsum("nji,nj->ni", axes, moment)
-    return tilt
+def refuse_motion_at_ends(carry: Carry) -> None:
+    """Refuse what no simulation can begin with.
+
+    Raises:
+        SettingsError: the carry does not start and end at rest.
+    """
+    if max(np.abs(carry.rate[[0, -1]]).max(), np.abs(carry.angular_velocity[[0, -1]]).max()) > 1e-3:
+        raise SettingsError("the carry does not start and end at rest; give one with a timing")
 
 
-def _pose(carry: Carry, time: Array) -> tuple[Array, Array]:
-    """Poses and rates (n, 6) at times within the carry, which fit one another."""
-    single = np.concatenate([[True], np.diff(carry.time) > SAME_TIME])
-    spline = CubicHermiteSpline(carry.time[single], carry.pose[single], carry.rate[single])
-    return spline(time), spline(time, 1)
-
-
-def _interpolated(at: Array, time: Array, values: Array) -> Array:
+def between(at: Array, time: Array, values: Array) -> Array:
+    """Columns (n, k) at times, interpolated linearly."""
     return np.column_stack([np.interp(at, time, column) for column in values.T])
 
 
@@ -307,86 +322,43 @@ class Witness:
         self._mujoco = mujoco_module()
         self._disturbance = disturbance
         self._models: dict[int, Any] = {}
-        pads = [(contact.T_box_pad, rim(contact, RIM_POINTS)) for contact in workcell.contacts]
-        self._normals = np.array([T[:3, 2] for T, _ in pads])[:, None]
-        self._rims = np.array([T[:3, 3] + around @ T[:3, :2].T for T, around in pads])
 
     def simulate(self, drive: Drive, factor: float = 1.0) -> Outcome:
         """One carry with the pressing force times a factor, up to its end or to a slip."""
         mujoco, model, settings = self._mujoco, self._model(drive.leader), self.settings
         data = mujoco.MjData(model)
+        held = HeldBox(model, data, self.workcell)
         box = int(model.joint("box").qposadr[0])
         press = int(model.joint("press").dofadr[0])
-        pads = ("pad_1", "pad_2") if settings.tilt_stiffness is not None else ()
-        names = [tilt_names(pad) for pad in pads]
-        joints = [[int(model.joint(name).dofadr[0]) for name in both] for both in names]
-        tilts = np.array(joints, int).reshape(-1, 2)
-        data.qpos[:3], data.qpos[3:7] = drive.position[0], drive.quaternion[0]
-        data.qpos[box : box + 3], data.qpos[box + 3 : box + 7] = data.qpos[:3], data.qpos[3:7]
+        driven = (0, 1) if settings.pads == "driven" else ()
+        tilts = [[int(model.joint(name).dofadr[0]) for name in tilt_names(i)] for i in driven]
+        data.qpos[box : box + 7] = drive.pose[0]
         force = factor * drive.press + drive.own
         every = max(1, round(LOOKED_AT / settings.time_step))
-        settled: tuple[Array, Array] | None = None
         time, slip, turn = [], [], []
-        for k in range(len(drive.time) - 1):
-            data.qpos[:3], data.qpos[3:7] = drive.position[k], drive.quaternion[k]
-            data.qvel[:3], data.qvel[3:6] = drive.velocity[k], drive.spin[k]
-            data.qfrc_applied[:3] = CARRIAGE_MASS * drive.acceleration[k]
-            data.qfrc_applied[3:6] = CARRIAGE_MASS * drive.spin_rate[k]
+        for k in range(len(drive.time)):
+            data.qpos[:7], data.qvel[:6] = drive.pose[k], drive.velocity[k]
+            data.qfrc_applied[:6] = CARRIAGE_MASS * drive.acceleration[k]
             data.qfrc_applied[press] = force[k]
-            data.qfrc_applied[tilts] = drive.tilt[k, : len(tilts)]
+            for i in driven:
+                data.qfrc_applied[tilts[i]] = drive.tilt[k, i]
             mujoco.mj_step(model, data)
             if k % every or drive.time[k] < drive.time[0] + settings.settle / 2.0:
                 continue
-            moved, turned = self._displaced(drive, k + 1, data.qpos[box : box + 7])
-            settled = settled or (moved, turned)
-            time.append(float(drive.time[k + 1]))
-            slip.append(np.linalg.norm(moved - settled[0], axis=2).max(axis=1))
-            turn.append(float(Rotation.from_matrix(settled[1].T @ turned).magnitude()))
-            if not slip[-1].max() <= settings.slip:
-                return Outcome(factor, False, np.array(time), np.array(slip), np.array(turn))
-        return Outcome(factor, True, np.array(time), np.array(slip), np.array(turn))
-
-    def threshold(self, drive: Drive, low: float, high: float, steps: int) -> Threshold[Outcome]:
-        """The least factor that holds, by bisection.
-
-        Args:
-            low, high: factors between which it is looked for.
-            steps: bisections.
-
-        Raises:
-            WitnessError: the box holds at the lower or slips at the higher factor.
-        """
-        return bisected(lambda factor: self.simulate(drive, factor), low, high, steps)
+            moved, turned = held.look()
+            time.append(float(drive.time[k]))
+            slip.append(moved)
+            turn.append(turned)
+            if not moved.max() <= settings.slip:
+                break
+        holds = bool(slip[-1].max() <= settings.slip)
+        return Outcome(factor, holds, np.array(time), np.array(slip), np.array(turn))
 
     def _model(self, leader: int) -> Any:
         if leader not in self._models:
             text = scene_text(self.workcell, self.settings, leader, self._disturbance)
-            self._models[leader] = self._mujoco.MjModel.from_xml_string(text)
+            self._models[leader] = compiled(self._mujoco, text)[0]
         return self._models[leader]
-
-    def _displaced(self, drive: Drive, k: int, pose: Array) -> tuple[Array, Array]:
-        """Displacements (2, RIM_POINTS, 3) in the planes of the pads, and rotation (3, 3), of the
-        box on the carriage."""
-        R_world_box = Rotation.from_quat(pose[[4, 5, 6, 3]]).as_matrix()
-        turned = drive.rotation[k].T @ R_world_box
-        offset = drive.rotation[k].T @ (pose[:3] - drive.position[k])
-        moved = self._rims @ turned.T + offset - self._rims
-        along = (moved * self._normals).sum(axis=2, keepdims=True)
-        return moved - along * self._normals, turned
-
-
-def witness_of_case(
-    workcell: Workcell, case: Array, settings: SimulationSettings | None = None
-) -> Witness:
-    """A witness whose box, friction and pads are those of a case.
-
-    Args:
-        case: (15,), see `symbolic.contact.worst_cases.CASE_SIZES`.
-
-    Raises:
-        WitnessError: MuJoCo is not installed.
-    """
-    return Witness(workcell_of_case(workcell, case), settings, case[8:11])
 
 
 def workcell_of_case(workcell: Workcell, case: Array) -> Workcell:

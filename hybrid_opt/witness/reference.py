@@ -1,7 +1,8 @@
 """References of a simulated cell, and the controllers that follow them.
 
-References say where joints have to be, and how hard pads press. Controllers are as a cell has them:
-joint impedance, and force control along the contact normal. All feed the planned torques forward.
+References say where joints have to be, and how hard pads press. Controllers are as real cells have
+them: joint impedance, and force control along the contact normal. All feed forward the arms' own
+inverse dynamics and the planned forces at the pads, but no moments: these are left to stiffness.
 `impedance`: every joint is a spring and a damper about its reference. `leader`: so is the leading
 arm; the other has no stiffness along the normal and an integral control of its normal force
 instead. `both`: both are so, with the mean of their force errors and a weak spring along the normal
@@ -19,10 +20,13 @@ import pinocchio as pin
 from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
+from hybrid_opt.job.smooth import without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.model import contact_torque
+from hybrid_opt.timing.records import JerkLimits, Timing
 from hybrid_opt.timing.solve import time_path
+from hybrid_opt.witness.box import refuse_motion_at_ends, to_middles
 from hybrid_opt.witness.scene import ArmSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -133,7 +137,7 @@ def job_reference(
 def carry_reference(
     cell: Cell, carry: Carry, press: Array | None = None, leader: int = 0
 ) -> Reference:
-    """A carry from rest to rest, after some time at rest, with its whole planned wrenches.
+    """A carry from rest to rest, after some time at rest, with the forces of its planned wrenches.
 
     Args:
         press: (n,) normal force to command the arm that does not lead; its planned one by default
@@ -143,8 +147,7 @@ def carry_reference(
     Raises:
         SettingsError: the carry does not start and end at rest, or the force does not fit it.
     """
-    if max(np.abs(carry.rate[[0, -1]]).max(), np.abs(carry.angular_velocity[[0, -1]]).max()) > 1e-3:
-        raise SettingsError("the carry does not start and end at rest; give one with a timing")
+    refuse_motion_at_ends(carry)
     planned = carry.normal_force[:, 1 - leader]
     if press is not None and press.shape != planned.shape:
         raise SettingsError(f"forces of shape {press.shape} for {len(carry)} samples")
@@ -164,7 +167,11 @@ def carry_reference(
     known = replace(carry, pose=pose, rate=rate, second_rate=second)
     friction = np.array([contact.friction for contact in workcell.contacts])
     load = model.uncertain_load(known, friction, workcell.payload.centre_of_mass)
-    torque = contact_torque(workcell, model.wrench_torque(motion.q, pose), load)
+    arms, pushed = to_middles(workcell, pose), {}
+    for i, name in enumerate(("wrench_1", "wrench_2")):
+        force = load[name][:, :3]
+        pushed[name] = np.column_stack([force, np.cross(arms[:, i], force)])
+    torque = contact_torque(workcell, model.wrench_torque(motion.q, pose), pushed)
     # At rest before the carry the pads press as they will have to when it begins.
     extra = np.concatenate([[extra[0]] * 2, extra])
     starting = (carry.normal_force[0] - load["normal_force"][0]).max()
@@ -291,6 +298,7 @@ class ArmController:
         self,
         settings: ArmSettings,
         gains: tuple[Array, Array],
+        pad_stiffness: float,
         is_force_controlled: bool,
         drift_stiffness: float,
     ) -> None:
@@ -298,11 +306,14 @@ class ArmController:
 
         Args:
             gains: stiffness and damping of the joints [N m/rad, N m s/rad].
+            pad_stiffness: of the pads' layers; without force control, the arm aims as far beyond
+                the contact as they give [N/m].
             drift_stiffness: what is left of it along the normal [N/m].
         """
         self.is_force_controlled = is_force_controlled
         self._settings = settings
         self._stiffness, self._damping = gains
+        self._pad_stiffness = pad_stiffness
         self._drift_stiffness = drift_stiffness
         self._integral = 0.0
 
@@ -313,19 +324,19 @@ class ArmController:
             effort: (n_joints,) to feed forward [N m].
             normal_force: reference [N].
         """
-        error, pressed = state.error, 0.0
+        pressed, moved = 0.0, -normal_force / self._pad_stiffness
         along = state.normal @ state.jacobian[:3]
-        touches = min(1.0, max(0.0, normal_force / TOUCHES))
-        if self.is_force_controlled and touches > 0.0:
-            distance = float(along @ error)
-            missing = normal_force - state.force
+        if self.is_force_controlled:
+            touches = min(1.0, max(0.0, normal_force / TOUCHES))
             if touches == 1.0 and state.force > 0.0:
                 gain = self._settings.force_gain * self._settings.control_period
-                self._integral += gain * missing
+                self._integral += gain * (normal_force - state.force)
+            distance = float(along @ state.error)
             pressed = touches * (self._integral + self._drift_stiffness * distance)
-            # Without the part that moves the pad along its normal.
-            moved = np.concatenate([distance * state.normal, np.zeros(3)])
-            error = error - touches * np.linalg.pinv(state.jacobian) @ moved
+            moved = touches * distance
+        # Without the part that moves the pad along its normal, or with more of it.
+        linear = np.concatenate([moved * state.normal, np.zeros(3)])
+        error = state.error - np.linalg.pinv(state.jacobian) @ linear
         sprung: Array = self._stiffness * error + self._damping * state.error_rate
         return effort + sprung + pressed * along
 
@@ -335,6 +346,7 @@ def controllers(
     leader: int,
     settings: ArmSettings,
     gains: tuple[tuple[Array, Array], tuple[Array, Array]],
+    pad_stiffness: tuple[float, float],
 ) -> tuple[ArmController, ArmController]:
     """One controller per arm.
 
@@ -346,7 +358,7 @@ def controllers(
     def one(i: int) -> ArmController:
         by_force = control == "both" or (control == "leader" and i != leader)
         drift = settings.drift_stiffness if control == "both" else 0.0
-        return ArmController(settings, gains[i], by_force, drift)
+        return ArmController(settings, gains[i], pad_stiffness[i], by_force, drift)
 
     return one(0), one(1)
 
@@ -359,16 +371,31 @@ def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Refere
 
 
 def driven_carry(cell: Cell, x: Array) -> Carry:
-    """A decision vector's carry from rest to rest: the fastest within its force limit where it has
-    one, else the closest to the reference speeds.
+    """A decision vector's carry from rest to rest as a job drives it: the fastest within its force
+    limit where it has one, else the closest to the reference speeds, without jumps of acceleration.
 
     Raises:
         WitnessError: there is none.
+        JobError: there is none without jumps.
     """
-    if cell.workcell.task.time_law == "optimal":
-        timing = time_path(cell.timing_model, x, cell.timing_model.drive_limits(float(x[-1])))
+    model, workcell = cell.timing_model, cell.workcell
+    if workcell.task.time_law == "optimal":
+        timing = time_path(model, x, model.drive_limits(float(x[-1])))
     else:
-        timing = closest_to_reference_timing(cell.timing_model, x)
+        timing = closest_to_reference_timing(model, x)
+    return exported_carry(cell, timing)
+
+
+def exported_carry(cell: Cell, timing: Timing) -> Carry:
+    """The carry of a timing as a job drives it.
+
+    Raises:
+        WitnessError: there is none.
+        JobError: there is none without jumps of acceleration.
+    """
     if not timing.ok or timing.carry is None:
         raise WitnessError(f"the trajectory cannot be driven: {timing.reason}")
-    return timing.carry
+    jerk = JerkLimits.of(cell.workcell) if cell.workcell.has_facing_pads else None
+    found = without_jumps(cell.timing_model, timing, jerk).carry
+    assert found is not None, "a timing without jumps has a carry"
+    return found

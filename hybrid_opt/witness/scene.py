@@ -1,8 +1,9 @@
 """The witness's scenes as MJCF: a free box between two pads on a carriage, and the whole cell.
 
-Each pad is a ring of small spheres that touch the face of the box at the rim of the patch, or one
-at each corner of a rectangle. On the carriage the leader's pad is fixed, the other slides along its
-normal. Gravity does not act on carriage and pads, which are driven.
+Each pad is a set of small spheres that touch the face of the box: all over its patch, for an
+elastic pad that presses evenly while an arm keeps its orientation. On the carriage the leader's pad
+is fixed, the other slides along its normal. Gravity does not act on carriage and pads, which are
+driven.
 
 The whole cell has both arms with their links' masses, pads, box and environment. Joints are as in
 the workcell's kinematic model, moved by torques. Pads touch the box, the box touches the
@@ -13,7 +14,8 @@ ruled out elsewhere (`hybrid_opt.collision`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from types import ModuleType
+from typing import Any, Literal
 
 import numpy as np
 import pinocchio
@@ -34,11 +36,14 @@ CARRIAGE_MASS = 1e5
 """[kg], and [kg m^2] about every axis: what the box does to the carriage within a step is lost in
 it, and its state is set anew at each step."""
 
-PAD_MASS = 0.1
+PAD_MASS = 10.0
 """[kg]; its inertia is fed forward."""
 
-PAD_INERTIA = 5e-4
+PAD_INERTIA = 2e-3
 """[kg m^2]; what its turning takes is lost in the planned moments."""
+
+TILT_STIFFNESS = 20.0
+"""Of each driven pad about the axes in its plane [N m/rad]."""
 
 TILT_DAMPING_TIME = 2e-3
 """Damping of a pad's tilt over its stiffness [s]."""
@@ -49,12 +54,26 @@ POINT_RADIUS = 2e-3
 PLATE_REACH, PLATE_THICKNESS = 3.0, 0.01
 """Half the side of a plate under a pad over the patch's radius, and its thickness [m]."""
 
-Pads = Literal["even", "rim"]
-"""Where the contact points of a pad lie."""
+IMPEDANCE = 0.1
+"""MuJoCo's d of the pads' contacts: the less, the less their regularisation weighs."""
 
-SOFTNESS = "0.7 0.7 0.001"
-"""Softness of contacts: at 0.7 MuJoCo's regularisation lets a pad give by some hundredths of a
-millimetre. Much stiffer ones lose contact for single steps where accelerations jump."""
+LAYER_DAMPING = 0.7
+"""Damping ratio of a pad's layer. With less the pads lose contact where accelerations jump; with
+more a pad that slides is pushed off by its damping, which widens its pressure."""
+
+CREEP = 3e3
+"""MuJoCo's impratio: by so much frictional contacts creep less than they would give normally."""
+
+SUPPORT = 'solref="0.01 1" solimp="0.7 0.7 0.001"'
+"""What the box stands on. Much stiffer contacts lose touch where accelerations jump."""
+
+LARGEST_STEP = 2e-3
+"""Beyond it the pads' layers are too stiff to be followed [s]."""
+
+Pads = Literal["even", "driven"]
+
+PRESSES = 1
+"""The bit of what presses on the box, among MuJoCo's types of contacts."""
 
 SOLID = 'contype="2" conaffinity="0"'
 
@@ -67,31 +86,24 @@ class ContactSettings:
 
     Attributes:
         time_step: of the physics [s].
-        contact_time: time constant of a contact [s]; at least a few time steps. The stiffer, the
-            more a threshold depends on the time step.
-        pads: 'even' for elastic pads, whose points lie evenly over their patches; 'rim' for pads
-            that press where the planner's freest pressures do: at the rim of a round patch, at the
-            corners of a rectangle.
         points: about how many contact points a patch has.
-        noslip_iterations: of MuJoCo's solver against the creep of frictional contacts.
+        layer: stiffness of the pads' elastic layer per area [N/m^3]; the usual one is rubber of
+            2 MPa, 5 mm thick.
         slip: displacement in the plane of a pad that counts as slip [m].
     """
 
-    time_step: float = 2e-4
-    contact_time: float = 0.01
-    pads: Pads = "rim"
-    points: int = 32
-    noslip_iterations: int = 30
+    time_step: float = 1e-3
+    points: int = 37
+    layer: float = 4e8
     slip: float = 1e-3
 
     def __post_init__(self) -> None:
-        if not 0.0 < 2.0 * self.time_step <= self.contact_time:
+        if not 0.0 < self.time_step <= LARGEST_STEP:
             raise SettingsError(
-                f"time step {self.time_step:g} s with contacts of {self.contact_time:g} s: give a "
-                "contact time of at least two time steps"
+                f"time step {self.time_step:g} s: allowed is up to {LARGEST_STEP:g} s"
             )
-        if self.points < 3 or self.noslip_iterations < 0:
-            raise SettingsError("give at least three contact points and no negative iterations")
+        if self.points < 3 or not self.layer > 0.0:
+            raise SettingsError("give at least three contact points and a positive layer stiffness")
         if not self.slip > 0.0:
             raise SettingsError("give a positive slip")
 
@@ -101,19 +113,17 @@ class SimulationSettings(ContactSettings):
     """How the witness simulates pads alone.
 
     Attributes:
-        tilt_stiffness: of each pad about the axes in its plane, where it is driven by the planned
-            moments; None for pads that keep their planned orientation, whatever they feel
-            [N m/rad].
+        pads: 'even' for points all over the patches of pads that keep their planned orientation;
+            'driven' for what the allocations `paper` and `joint` assume: points at the rim of a
+            round patch or the corners of a rectangle, turned by the planned moments.
         settle: time at rest before the carry begins [s].
     """
 
-    tilt_stiffness: float | None = None
+    pads: Pads = "even"
     settle: float = 0.15
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.tilt_stiffness is not None and not self.tilt_stiffness > 0.0:
-            raise SettingsError("give a positive stiffness of the pads' tilt, or none")
         if not self.settle > 0.0:
             raise SettingsError("give a positive time to settle")
 
@@ -134,7 +144,6 @@ class ArmSettings(ContactSettings):
         support_friction: between the box and what it stands on.
     """
 
-    time_step: float = 5e-4
     control_period: float = 1e-3
     arrival: float = 5e-3
     stiffness: float = 20.0
@@ -166,31 +175,23 @@ class ArmSettings(ContactSettings):
 def scene_text(
     workcell: Workcell, settings: SimulationSettings, leader: int, disturbance: ArrayLike
 ) -> str:
-    """The MJCF document.
+    """The MJCF document of pads alone; see `compiled`.
 
     Args:
         leader: index of the pad that is fixed to the carriage.
         disturbance: (3,) acceleration that the pads have to give the box beside the motion's,
             world frame [m/s^2]; it acts like a change of gravity.
     """
-    gravity = np.array(GRAVITY) - np.asarray(disturbance)
-    payload = workcell.payload
-    touched = 'contype="0" conaffinity="1"'
+    payload, touched = workcell.payload, 'contype="0" conaffinity="1"'
     if presses_on_box(workcell):
         faces = f'<geom type="box" size="{mjcf_text(payload.size / 2.0)}" {touched}/>'
     else:
         faces = plates(workcell, touched)
-    pads = "\n".join(
-        _pad_text(contact, f"pad_{i + 1}", settings, slides=i != leader)
-        for i, contact in enumerate(workcell.contacts)
-    )
+    pads = "\n".join(_pad_text(workcell, settings, i, slides=i != leader) for i in (0, 1))
     return f"""
 <mujoco>
   <compiler angle="radian"/>
-  {solver_options(settings, gravity)}
-  <default>
-    <geom solref="{settings.contact_time!r} 1" solimp="0.99 0.9999 0.0001" condim="3"/>
-  </default>
+  {solver_options(settings, np.array(GRAVITY) - np.asarray(disturbance))}
   <worldbody>
     <body name="carriage" gravcomp="1">
       <freejoint/>
@@ -201,6 +202,26 @@ def scene_text(
     {box_body(payload, faces)}
   </worldbody>
 </mujoco>"""
+
+
+def compiled(mujoco: ModuleType, text: str) -> tuple[Any, str]:
+    """The simulator's model of a scene, and the scene as MuJoCo reads it.
+
+    The pads' points state their stiffness [N/m] as negative `solref`. MuJoCo wants it times a
+    regularisation, which follows from the masses that are compiled.
+    """
+    scene = mujoco.MjSpec.from_string(text)
+    model = scene.compile()
+    box = int(model.body("box").id)
+    for geom in scene.geoms:
+        if geom.contype != PRESSES:
+            continue
+        pad = int(model.geom_bodyid[geom.id])
+        inverse_mass = float(model.body_invweight0[[pad, box], 0].sum())
+        pulled = -float(geom.solref[0]) * inverse_mass * (1.0 - IMPEDANCE) / IMPEDANCE
+        damped = 2.0 * LAYER_DAMPING * np.sqrt(pulled)
+        geom.solref = [-pulled * IMPEDANCE, -damped * IMPEDANCE]
+    return scene.compile(), scene.to_xml()
 
 
 def box_body(payload: Payload, geoms: str) -> str:
@@ -215,14 +236,15 @@ def box_body(payload: Payload, geoms: str) -> str:
 
 
 def solver_options(settings: ContactSettings, gravity: Array) -> str:
-    """MuJoCo's options: cones as they are, solved to many digits."""
-    step, rounds = settings.time_step, settings.noslip_iterations
-    return f"""<option timestep="{step!r}" gravity="{mjcf_text(gravity)}" cone="elliptic"
-    impratio="20" integrator="implicitfast" solver="Newton" iterations="200" tolerance="1e-12"
-    noslip_iterations="{rounds}" noslip_tolerance="1e-12"/>"""
+    """MuJoCo's options: cones as they are, solved to many digits, hardly any creep."""
+    return f"""<option timestep="{settings.time_step!r}" gravity="{mjcf_text(gravity)}"
+    cone="elliptic" impratio="{CREEP!r}" integrator="implicitfast" solver="Newton"
+    iterations="200" tolerance="1e-12"/>"""
 
 
-def contact_points(contact: Contact, settings: ContactSettings, T_body_pad: Array) -> str:
+def contact_points(
+    contact: Contact, settings: ContactSettings, T_body_pad: Array, pads: Pads = "even"
+) -> str:
     """Spheres where a robot's patches press, touching their planes, as geoms of the body that holds
     its pads.
 
@@ -230,29 +252,42 @@ def contact_points(contact: Contact, settings: ContactSettings, T_body_pad: Arra
         T_body_pad: (4, 4) of the first pad.
     """
     T_body_box = T_body_pad @ inverse(contact.T_box_pad)
-    places = []
+    text = []
     for pad in (contact, *contact.further):
-        around = pressed_places(pad, settings.pads, settings.points)
+        around = pressed_places(pad, pads, settings.points)
         in_pad = np.column_stack([around, np.full(len(around), -POINT_RADIUS)])
         T = T_body_pad if pad is contact else T_body_box @ pad.T_box_pad
-        places.append(in_pad @ T[:3, :3].T + T[:3, 3])
-    return "\n".join(
-        f'<geom type="sphere" size="{POINT_RADIUS!r}" contype="1" conaffinity="0" priority="1" '
-        f'friction="{contact.friction!r} 0 0" pos="{mjcf_text(place)}"/>'
-        for place in np.concatenate(places)
-    )
+        stiffness = settings.layer * _area(pad) / len(around)
+        text += [
+            f'<geom type="sphere" size="{POINT_RADIUS!r}" contype="{PRESSES}" conaffinity="0" '
+            f'priority="1" friction="{contact.friction!r} 0 0" pos="{mjcf_text(place)}" '
+            f'solref="{-stiffness!r} -1" solimp="{IMPEDANCE!r} {IMPEDANCE!r} 0.001"/>'
+            for place in in_pad @ T[:3, :3].T + T[:3, 3]
+        ]
+    return "\n".join(text)
+
+
+def patch_area(contact: Contact) -> float:
+    """Of all pads of a robot [m^2]."""
+    return sum(_area(pad) for pad in (contact, *contact.further))
+
+
+def _area(pad: Contact) -> float:
+    if pad.half_sides is None:
+        return float(np.pi * pad.patch_radius**2)
+    return float(4.0 * np.prod(pad.half_sides))
 
 
 def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
     """(n, 2) places of a patch, in its pad's plane, that press on the payload [m].
 
-    Those of the planner's freest pressures lie evenly around a round patch's rim, and at the
-    corners of a rectangle: all that presses on its sides could be shared by them and twists less.
+    Those of driven pads lie evenly around a round patch's rim, and at the corners of a rectangle:
+    all that presses on its sides could be shared by them and twists less.
 
     Args:
-        pads, points: see `ContactSettings`.
+        points: about how many.
     """
-    if pads == "rim":
+    if pads == "driven":
         return rim(contact, points if contact.half_sides is None else 4)
     if contact.half_sides is None:
         # Sunflower: equal areas, each turned on by the golden angle.
@@ -336,26 +371,31 @@ def piece_geom(piece: Piece, touch: str, meshes: list[str]) -> str:
     return f"<geom {kind} {placed(piece.pose)} {touch}/>"
 
 
-def tilt_names(pad: str) -> tuple[str, str]:
-    """Names of the joints about a pad's x and y axes."""
-    return f"{pad}_tilt_x", f"{pad}_tilt_y"
+def tilt_names(robot: int) -> tuple[str, str]:
+    """Names of the joints about the x and y axes of a robot's pad."""
+    return f"tilt_x_{robot + 1}", f"tilt_y_{robot + 1}"
 
 
-def _pad_text(contact: Contact, name: str, settings: SimulationSettings, slides: bool) -> str:
-    joint = '<joint name="press" type="slide" axis="0 0 1"/>' if slides else ""
-    stiffness = settings.tilt_stiffness
-    if stiffness is not None:
-        centre = mjcf_text(tilt_centre(contact))
-        joint += "".join(
+def pad_site(robot: int, T_body_pad: Array) -> str:
+    """Where a robot's first pad is, for who looks at it."""
+    return f'<site name="pad_{robot + 1}" {placed(T_body_pad)} size="0.005"/>'
+
+
+def _pad_text(workcell: Workcell, settings: SimulationSettings, i: int, slides: bool) -> str:
+    contact = workcell.contacts[i]
+    centre = mjcf_text(tilt_centre(contact))
+    joints = '<joint name="press" type="slide" axis="0 0 1"/>' if slides else ""
+    if settings.pads == "driven":
+        joints += "".join(
             f'<joint name="{tilt}" type="hinge" axis="{axis}" pos="{centre}" '
-            f'stiffness="{stiffness!r}" '
-            f'damping="{TILT_DAMPING_TIME * stiffness!r}"/>'
-            for tilt, axis in zip(tilt_names(name), ("1 0 0", "0 1 0"), strict=True)
+            f'stiffness="{TILT_STIFFNESS!r}" damping="{TILT_DAMPING_TIME * TILT_STIFFNESS!r}"/>'
+            for tilt, axis in zip(tilt_names(i), ("1 0 0", "0 1 0"), strict=True)
         )
-    return f"""<body name="{name}" gravcomp="1" {placed(contact.T_box_pad)}>
-        {joint}
-        <inertial pos="0 0 0" mass="{PAD_MASS!r}" diaginertia="{mjcf_text([PAD_INERTIA] * 3)}"/>
-        {contact_points(contact, settings, np.eye(4))}
+    return f"""<body gravcomp="1" {placed(contact.T_box_pad)}>
+        {joints}
+        <inertial pos="{centre}" mass="{PAD_MASS!r}" diaginertia="{mjcf_text([PAD_INERTIA] * 3)}"/>
+        {pad_site(i, np.eye(4))}
+        {contact_points(contact, settings, np.eye(4), settings.pads)}
       </body>"""
 
 
@@ -381,7 +421,7 @@ def joint_torque_max(workcell: Workcell) -> Array:
 
 
 def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
-    """The MJCF document.
+    """The MJCF document of a whole cell; see `compiled`.
 
     Joints are named `joint_ROBOT_NUMBER`, sites of the pads `pad_1` and `pad_2`, the box `box`.
 
@@ -415,8 +455,7 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
   <compiler angle="radian" boundmass="0.001" boundinertia="0.000001" balanceinertia="true"/>
   {solver_options(settings, np.array(GRAVITY))}
   <default>
-    <geom solref="{settings.contact_time!r} 1" solimp="{SOFTNESS}" condim="3"
-      friction="{settings.support_friction!r} 0 0"/>
+    <geom {SUPPORT} friction="{settings.support_friction!r} 0 0"/>
   </default>
   <asset>{"".join(meshes)}</asset>
   <worldbody>
@@ -435,7 +474,7 @@ def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, l
     # The pad stands where the nominal contact has it, whatever the place on the box is.
     T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
     armature = settings.armature * workcell.robots[i].torque_max
-    inner = f"""<site name="pad_{i + 1}" {placed(T_joint_pad)} size="0.005"/>
+    inner = f"""{pad_site(i, T_joint_pad)}
       {contact_points(contact, settings, T_joint_pad)}"""
     for j in reversed(range(len(geometry.axes))):
         kind = "hinge" if geometry.turning[j] else "slide"

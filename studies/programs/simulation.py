@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,7 +15,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.cases import nominal_case, random_cases
-from hybrid_opt.robust.force import RobustModel
+from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.store.files import AGAIN, storing
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingLimits
@@ -22,11 +23,13 @@ from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.arms import BISECTIONS, HIGH, LOW, ArmOutcome, CellWitness, account_of
 from hybrid_opt.witness.box import (
+    Outcome,
     Shown,
     Threshold,
     Witness,
+    bisected,
     drive_of,
-    witness_of_case,
+    planned_moments,
     workcell_of_case,
 )
 from hybrid_opt.witness.reference import (
@@ -34,11 +37,12 @@ from hybrid_opt.witness.reference import (
     Reference,
     carry_reference,
     driven_carry,
+    exported_carry,
     with_tracking_error,
 )
-from hybrid_opt.witness.scene import ArmSettings, SimulationSettings
+from hybrid_opt.witness.scene import LARGEST_STEP, ArmSettings, Pads, SimulationSettings
 from studies.report.animation import Film, write_animation
-from studies.simulate import PADS
+from studies.simulate import DRIVEN, PADS
 from symbolic.array import Array
 from symbolic.records import Workcell
 
@@ -51,32 +55,25 @@ def simulate_arms(
     Raises:
         WitnessError: with --sweep, the box holds at the lower or slips at the upper factor.
     """
-    control, leader = options.controller, options.leader - 1
-    witness = CellWitness(cell.workcell, settings)
-    reference = carry_reference(cell, carry, leader=leader)
+    control, leader, workcell = options.controller, options.leader - 1, cell.workcell
+    witness = CellWitness(workcell, settings)
     found = account_of(cell, carry, witness, control, leader)
     threshold = found.threshold
     print(f"  {found.problem}" if threshold is None else threshold_text(threshold, settings.slip))
+    reference = carry_reference(cell, carry, leader=leader)
     if options.sweep:
-        for factor in (0.5, 2.0):
-            step = factor * settings.time_step
+        for step in _swept(settings.time_step):
             period = max(step, settings.control_period)
-            other = replace(settings, time_step=step, control_period=period)
-            swept = CellWitness(cell.workcell, other).threshold(
-                reference, control, LOW, HIGH, BISECTIONS
-            )
-            print(f"  with a time step of {step:g} s: {swept.factor:.4f}")
+            other = CellWitness(workcell, replace(settings, time_step=step, control_period=period))
+            simulate = partial(other.simulate, reference, control)
+            _tell_sweep(step, bisected(simulate, LOW, HIGH, BISECTIONS))
     peak = found.reference.normal_force.max(axis=0)
     print(f"  pressed up to {peak[0]:.2f} / {peak[1]:.2f} N, {found.squeeze}:")
     _tell(found.shown, carry)
     if found.squeeze.uncertainty is not None:
         _cases(cell, found.reference, settings, options)
-        rubs_less = CellWitness(
-            workcell_of_case(cell.workcell, worst_friction(cell.workcell)), settings
-        )
-        least = rubs_less.simulate(reference, control)
-        word = "hold" if least.holds else "slip"
-        print(f"  least forces with the set's worst friction: {word}")
+        rubs_less = workcell_of_case(workcell, worst_friction(workcell))
+        tell_least(CellWitness(rubs_less, settings).simulate(reference, control))
     if options.film:
         _film(cell, found.shown, Path(options.film))
     return witness.text
@@ -107,12 +104,13 @@ def _cases(
     for case in random_cases(workcell, workcell.uncertainty, options.runs, rng):
         witness = CellWitness(workcell_of_case(workcell, case), settings, case[8:11])
         told = with_tracking_error(pressed, options.tracking_error, rng)
-        outcome = witness.simulate(told, control)
+        outcome = witness.simulate(told, control, 1.0 - options.force_error)
         arrived += outcome.arrives
         slips.append(outcome.slip.max())
     print(
         f"  {arrived} of {len(slips)} random cases arrive (seed {options.seed}, joints off by up "
-        f"to {options.tracking_error:g} rad); slip up to {1e3 * max(slips):.3f} mm"
+        f"to {options.tracking_error:g} rad, {100.0 * options.force_error:g} % of the force "
+        f"missing); slip up to {1e3 * max(slips):.3f} mm"
     )
 
 
@@ -134,24 +132,56 @@ def simulate_pads(
     cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
 ) -> None:
     """The threshold of a carry, its creep, and random cases, printed."""
-    leader = options.leader - 1
-    witness = Witness(cell.workcell, settings)
-    drive = drive_of(carry, settings, leader=leader)
-    print(threshold_text(witness.threshold(drive, LOW, HIGH, PAD_BISECTIONS), settings.slip))
-    creep = witness.simulate(drive, CREEP_FACTOR)
+    leader, workcell = options.leader - 1, cell.workcell
+    moments = planned_moments(cell, carry) if settings.pads == "driven" else None
+    witness = Witness(workcell, settings)
+    drive = drive_of(carry, settings, leader=leader, moments=moments)
+    threshold = bisected(partial(witness.simulate, drive), LOW, HIGH, PAD_BISECTIONS)
+    print(threshold_text(threshold, settings.slip))
+    creep = witness.simulate(drive, CREEP_FACTOR * threshold.factor)
     if creep.holds:
         rate = creep.slip[-1].max() / carry.duration
-        print(f"  at {CREEP_FACTOR:g} times the force the box creeps {1e6 * rate:.2f} um/s")
+        print(f"  at {CREEP_FACTOR:g} times this force the box creeps {1e6 * rate:.2f} um/s")
     if options.sweep:
-        for factor in (0.5, 2.0):
-            other = SimulationSettings(factor * options.time_step, options.contact_time)
-            swept = Witness(cell.workcell, other)
-            found = swept.threshold(
-                drive_of(carry, other, leader=leader), LOW, HIGH, PAD_BISECTIONS
-            )
-            print(f"  with a time step of {other.time_step:g} s: {found.factor:.4f}")
-    if not cell.workcell.uncertainty.is_empty:
-        _pad_cases(cell, carry, settings, options)
+        for step in _swept(settings.time_step):
+            other = replace(settings, time_step=step)
+            finer = drive_of(carry, other, leader=leader, moments=moments)
+            simulate = partial(Witness(workcell, other).simulate, finer)
+            _tell_sweep(step, bisected(simulate, LOW, HIGH, PAD_BISECTIONS))
+    if workcell.uncertainty.is_empty:
+        return
+    forces, squeeze = commanded_forces(workcell, carry, SqueezeSettings(leader=leader))
+    pressed = drive_of(carry, settings, forces[:, 1 - leader], leader, moments)
+    rng = np.random.default_rng(options.seed)
+    cases = random_cases(workcell, workcell.uncertainty, options.runs, rng)
+    held = sum(
+        Witness(workcell_of_case(workcell, case), settings, case[8:11])
+        .simulate(pressed, 1.0 - options.force_error)
+        .holds
+        for case in cases
+    )
+    print(
+        f"  pressed up to {forces[:, 0].max():.2f} / {forces[:, 1].max():.2f} N, {squeeze}: {held} "
+        f"of {len(cases)} random cases hold (seed {options.seed}, "
+        f"{100.0 * options.force_error:g} % of the force missing)"
+    )
+    rubs_less = workcell_of_case(workcell, worst_friction(workcell))
+    tell_least(Witness(rubs_less, settings).simulate(drive))
+
+
+def _swept(step: float) -> tuple[float, float]:
+    """Half the time step, and twice it where that can be followed."""
+    return step / 2.0, min(2.0 * step, LARGEST_STEP)
+
+
+def _tell_sweep(step: float, threshold: Threshold[Shown]) -> None:
+    print(f"  with a time step of {step:g} s: {threshold.factor:.4f}")
+
+
+def tell_least(outcome: Outcome) -> None:
+    """What becomes of a box under its least forces."""
+    word = "hold" if outcome.holds else "slip"
+    print(f"  least forces with the set's worst friction: {word}")
 
 
 def threshold_text(threshold: Threshold[Shown], slip: float) -> str:
@@ -171,36 +201,25 @@ def worst_friction(workcell: Workcell) -> Array:
     return case
 
 
-def _pad_cases(
-    cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
-) -> None:
-    """Random cases under the robust force, and the set's worst friction under the least force."""
-    workcell, leader = cell.workcell, options.leader - 1
-    force = RobustModel(workcell).robust_force(carry, leader=leader)
-    drive = drive_of(carry, settings, force.commanded, leader)
-    cases = random_cases(
-        workcell, workcell.uncertainty, options.runs, np.random.default_rng(options.seed)
-    )
-    held = sum(witness_of_case(workcell, case, settings).simulate(drive).holds for case in cases)
-    print(
-        f"  robust forces up to {force.peak[0]:.2f} / {force.peak[1]:.2f} N: {held} of "
-        f"{len(cases)} random cases hold (seed {options.seed})"
-    )
-    least = drive_of(carry, settings, leader=leader)
-    outcome = witness_of_case(workcell, worst_friction(workcell), settings).simulate(least)
-    print(f"  least forces with the set's worst friction: {'hold' if outcome.holds else 'slip'}")
-
-
 def simulate_file(options: argparse.Namespace) -> int:
     """Drive a trajectory file in the simulator and print what happens; returns the exit code."""
-    if options.controller == PADS and (options.film or options.mjcf):
+    alone = options.controller in PADS
+    if alone and (options.film or options.mjcf):
         raise WitnessError("films and MJCF files are of cells with arms; give another --controller")
-    usual = SimulationSettings() if options.controller == PADS else ArmSettings()
-    options.time_step = options.time_step or usual.time_step
-    pads = SimulationSettings(options.time_step, options.contact_time)
+    if alone:
+        pads: Pads = "driven" if options.controller == DRIVEN else "even"
+        settings = SimulationSettings(options.time_step, pads=pads)
+    else:
+        period = max(options.time_step, ArmSettings.control_period)
+        arms = ArmSettings(options.time_step, control_period=period, stiffness=options.stiffness)
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
+        if options.controller == DRIVEN and cell.workcell.task.allocation == "soft-finger":
+            raise WitnessError(
+                "pads that are driven by planned moments are what the allocations 'paper' and "
+                "'joint' assume; this carry's pads press evenly: give another --controller"
+            )
         carry = _timed(cell, stored.x, options)
         peak = carry.peak_normal_force
         print(
@@ -208,15 +227,9 @@ def simulate_file(options: argparse.Namespace) -> int:
             f"{peak[0]:.2f} / {peak[1]:.2f} N; controller {options.controller}, arm "
             f"{options.leader} leads"
         )
-        if options.controller == PADS:
-            simulate_pads(cell, carry, pads, options)
+        if alone:
+            simulate_pads(cell, carry, settings, options)
             return 0
-        arms = ArmSettings(
-            time_step=options.time_step,
-            control_period=max(options.time_step, ArmSettings().control_period),
-            contact_time=options.contact_time,
-            stiffness=options.stiffness,
-        )
         text = simulate_arms(cell, carry, arms, options)
     if options.mjcf:
         path = Path(options.mjcf)
@@ -227,15 +240,12 @@ def simulate_file(options: argparse.Namespace) -> int:
 
 
 def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
+    """The carry of an exported job with that timing."""
     model = cell.timing_model
     if options.force_limit is not None:
-        timing = time_path(model, x, model.drive_limits(options.force_limit))
-    elif options.timing == "fastest":
-        timing = time_path(model, x, TimingLimits())
-    elif options.timing == "search":
-        return driven_carry(cell, x)
-    else:
-        timing = closest_to_reference_timing(model, x)
-    if not timing.ok or timing.carry is None:
-        raise WitnessError(f"the trajectory cannot be driven: {timing.reason}")
-    return timing.carry
+        return exported_carry(cell, time_path(model, x, model.drive_limits(options.force_limit)))
+    if options.timing == "fastest":
+        return exported_carry(cell, time_path(model, x, TimingLimits()))
+    if options.timing == "closest":
+        return exported_carry(cell, closest_to_reference_timing(model, x))
+    return driven_carry(cell, x)

@@ -1,162 +1,227 @@
-"""Slip thresholds of many carries in the simulator."""
+"""Slip thresholds of many carries in the simulator, stored one by one."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import count, islice
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
+from hybrid_opt.door import search
 from hybrid_opt.errors import WitnessError
-from hybrid_opt.store.trajectory_file import read_trajectory
-from hybrid_opt.timing import TimingLimits
+from hybrid_opt.store.files import write_json
+from hybrid_opt.store.json_records import Figure, read_record, to_json
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.witness.box import Witness, drive_of, planned_moments
+from hybrid_opt.witness.box import Witness, bisected, drive_of
 from hybrid_opt.witness.scene import SimulationSettings
 from symbolic.array import Array
-from symbolic.records.task import initial_decision
 
-CELLS = ("rack", "transfer")
+WORKCELLS = Path(__file__).parents[1] / "workcells"
+
+KINDS = ("hand-made", "fastest", "random", "middle", "random", "gentlest")
+"""Candidates of a cell, in turn; all but the hand-made and the random ones of a short search."""
+
 FRICTIONS = (1.0, 0.6, 0.3)
-TIMINGS = {
-    "closest": TimingLimits(reference_speed=True),
-    "55 N": TimingLimits(force=55.0),
-    "fastest": TimingLimits(),
-}
-DRAWN = 400
-"""Random candidates among which feasible ones are looked for at a time."""
+SEARCHED = 500
+"""Evaluations of the search whose front members are simulated."""
 
-LOW, HIGH, BISECTIONS = 0.98, 1.04, 3
-"""Factors between which a threshold is looked for, to 0.4 %."""
+DRAWN = 100
+"""Random candidates among which a feasible one is looked for at a time."""
 
-WIDER, MORE_BISECTIONS = 1.62, 6
-"""Upper end for what slips at the usual one, and what is as exact there."""
+LOW, HIGH, BISECTIONS = 0.97, 1.03, 4
+"""Factors between which a threshold is looked for, to 0.2 %."""
+
+WIDER, MORE_BISECTIONS = (0.5, 2.0), 9
+"""What a threshold beyond them is looked for with."""
 
 PRESSED_SHARE = 0.97
 """Share of the holding force that is pressed all along to see where the box slips first."""
 
-TILT_STIFFNESS = 300.0
-"""Tilt stiffness of pads that the planned moments drive [N m/rad]."""
+ALLOWED = {"disc": 0.03, "rectangle": 0.05}
+"""How far from one a threshold may be, by the kind of pads."""
+
+SAME_PLACE = 0.1
+"""So near the plan's first demand the first slip counts as there [s]."""
 
 
 @dataclass(frozen=True)
-class Case:
-    """One carry to simulate: where it comes from, and the friction that it is pressed for."""
+class Slip:
+    """What the simulator says of one carry.
 
-    name: str
+    Attributes:
+        cell, candidate, friction: which one, and what it was pressed for.
+        pads: a key of `ALLOWED`.
+        duration, force: of the carry [s], and the largest planned normal force of pad 2 [N].
+        threshold: least multiple of the planned force that holds; NaN where there is none.
+        begins: when the box slips first under a force that is the same all along and a little
+            below what holds [s]; NaN where it does not.
+        planned: when the plan first asks for more than that [s].
+    """
+
+    cell: str
     candidate: str
-    timing: str
     friction: float
-    cell: Cell
-    carry: Carry
+    pads: str
+    duration: float
+    force: float
+    threshold: Figure
+    begins: Figure
+    planned: float
+
+    @property
+    def within(self) -> bool:
+        """Whether the threshold is as near one as it should be."""
+        return abs(self.threshold - 1.0) <= ALLOWED[self.pads]
+
+    @property
+    def in_place(self) -> bool:
+        """Whether the box slips first where the plan asks for most."""
+        return abs(self.begins - self.planned) <= SAME_PLACE
+
+    def __str__(self) -> str:
+        return (
+            f"{self.cell:9} {self.candidate:10} {self.friction:8.2f} {self.duration:8.3f} s "
+            f"{self.force:8.2f} N {self.threshold:9.4f} {self.begins:10.3f} s {self.planned:7.3f} s"
+        )
+
+
+@dataclass(frozen=True)
+class Slips:
+    """The file of all carries so far, in order, and the seed that they are drawn with."""
+
+    seed: int
+    found: tuple[Slip, ...]
 
 
 def thresholds(options: argparse.Namespace) -> int:
-    """Print the threshold of every carry that the options ask for; returns the exit code."""
-    settings = SimulationSettings(
-        tilt_stiffness=TILT_STIFFNESS if options.pads == "driven" else None
-    )
-    found: list[float] = []
-    away_in_time: list[float] = []
-    rng = np.random.default_rng(options.seed)
-    print("cell      candidate   timing   friction  force [N]  threshold  first slip [s]  planned")
-    with TemporaryDirectory() as folder:
-        for case in islice(
-            _cases(options.files, Path(folder), rng), options.skip, options.skip + options.carries
-        ):
-            factor, begins, planned = _threshold(case, settings)
-            found.append(factor)
-            away_in_time.append(abs(begins - planned))
-            print(
-                f"{case.name:9} {case.candidate:11} {case.timing:8} {case.friction:8.2f}  "
-                f"{case.carry.peak_normal_force.max():9.2f}  {factor:9.4f}  {begins:14.3f}  "
-                f"{planned:7.3f}",
-                flush=True,
+    """Print and store the threshold of every carry that is asked for; returns the exit code."""
+    path, done = options.output, Slips(options.seed, ())
+    if path.exists():
+        done = read_record(Slips, path, "delete it to begin anew")
+        if done.seed != options.seed:
+            raise WitnessError(
+                f"{path} was begun with seed {done.seed}; give that one or a new file"
             )
-    away = np.abs(np.array(found) - 1.0)
-    print(
-        f"{len(found)} carries: median {np.median(found):.4f}, from {min(found):.4f} to "
-        f"{max(found):.4f}; {int((away <= 0.03).sum())} within 3 % of 1; the first slip within "
-        f"0.1 s of the plan's in {int((np.array(away_in_time) <= 0.1).sum())}"
-    )
+    sources = [_Source(path, options.seed) for path in options.cells or usual_cells()]
+    print("cell      candidate  friction  duration      force  threshold  slips first  planned")
+    for slip in done.found:
+        print(slip)
+    for k in range(len(done.found), options.carries):
+        source = sources[k % len(sources)]
+        slip = slip_of(*source.case(k // len(sources)))
+        done = replace(done, found=(*done.found, slip))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, to_json(done))
+        print(slip, f"  {k + 1} of {options.carries}", flush=True)
+    print(summary(done.found))
     return 0
 
 
-def _threshold(case: Case, settings: SimulationSettings) -> tuple[float, float, float]:
-    """The least factor; when the box slips first under a force that is the same all along and a
-    little below; and when the plan asks for more than that."""
-    carry, witness = case.carry, Witness(case.carry.workcell, settings)
-    moments = planned_moments(case.cell, carry)
-    drive = drive_of(carry, settings, moments=moments)
+def usual_cells() -> list[Path]:
+    """The shipped cells whose drivable carries are planned for pads that press evenly."""
+    paths = sorted(WORKCELLS.glob("*.toml"))
+    return [path for path in paths if Cell.load(path).workcell.has_opposite_pads]
+
+
+def summary(found: Sequence[Slip]) -> str:
+    """How many carries are as they should be."""
+    lines = []
+    for pads, allowed in ALLOWED.items():
+        some = np.array([slip.threshold for slip in found if slip.pads == pads])
+        if len(some):
+            within = int((np.abs(some - 1.0) <= allowed).sum())
+            lines.append(
+                f"{len(some)} carries, {pads} pads: threshold from {np.nanmin(some):.4f} to "
+                f"{np.nanmax(some):.4f}, median {np.nanmedian(some):.4f}; {within} within "
+                f"{100.0 * allowed:g} % of 1"
+            )
+    in_place = sum(slip.in_place for slip in found)
+    lines.append(
+        f"{in_place} of {len(found)} slip first within {SAME_PLACE:g} s of where the plan asks for "
+        "most"
+    )
+    return "\n".join(lines)
+
+
+def slip_of(name: str, candidate: str, carry: Carry) -> Slip:
+    """Simulate one carry whose forces are planned, and see where it slips first."""
+    settings, needed = SimulationSettings(), carry.normal_force[:, 1]
+    witness, drive = Witness(carry.workcell, settings), drive_of(carry, settings)
+    simulate = partial(witness.simulate, drive)
+    factor = begins = float("nan")
     try:
-        factor = witness.threshold(drive, LOW, HIGH, BISECTIONS).factor
+        try:
+            factor = bisected(simulate, LOW, HIGH, BISECTIONS).factor
+        except WitnessError:
+            factor = bisected(simulate, *WIDER, MORE_BISECTIONS).factor
+        steady = replace(drive, press=np.full(len(drive.time), needed.max()))
+        begins = witness.simulate(steady, PRESSED_SHARE * factor).begins(settings.slip)
     except WitnessError:
-        factor = witness.threshold(drive, LOW, WIDER, MORE_BISECTIONS).factor
-    needed = carry.normal_force[:, 1]
-    steady = drive_of(carry, settings, np.full(len(carry), needed.max()), moments=moments)
-    slips = witness.simulate(steady, PRESSED_SHARE * factor)
-    planned = carry.time[np.flatnonzero(needed > PRESSED_SHARE * needed.max())[0]]
-    return factor, slips.begins(settings.slip), float(planned)
-
-
-def _cases(files: Sequence[str], folder: Path, rng: np.random.Generator) -> Iterator[Case]:
-    """Endless: hand-made trajectories with every timing and friction, then the files' and random
-    ones, which take the frictions in turn."""
-    shipped = Path(__file__).parents[1] / "workcells"
-    cells = {name: Cell.load(shipped / f"{name}.toml") for name in CELLS}
-    for name, cell in cells.items():
-        x = initial_decision(cell.workcell.task)
-        for friction in FRICTIONS:
-            yield from _timed(cell, (name, "hand-made"), x, (friction,) * len(TIMINGS))
-    for k, file in enumerate(files):
-        stored = read_trajectory(file)
-        cell = stored.open_cell(folder / str(k))
-        yield from _timed(cell, ("file", Path(file).parent.name[-11:]), stored.x, _turned(k))
-    for k in count():
-        for name, cell in cells.items():
-            yield from _timed(cell, (name, "random"), _feasible(cell, rng), _turned(k))
-
-
-def _turned(k: int) -> tuple[float, ...]:
-    """One friction per timing, others for the next trajectory."""
-    return tuple(FRICTIONS[(k + i) % len(FRICTIONS)] for i in range(len(TIMINGS)))
-
-
-def _timed(
-    cell: Cell, names: tuple[str, str], x: Array, frictions: tuple[float, ...]
-) -> Iterator[Case]:
-    """A trajectory with every timing that can be had, and one friction for each."""
-    for (timing, limits), friction in zip(TIMINGS.items(), frictions, strict=True):
-        timed = time_path(cell.timing_model, x, limits)
-        if timed.ok and timed.carry is not None:
-            yield Case(*names, timing, friction, cell, _pressed(cell, timed.carry, friction))
-
-
-def _feasible(cell: Cell, rng: np.random.Generator) -> Array:
-    """(n_var,) a feasible candidate drawn evenly from the bounds."""
-    while True:
-        x = rng.uniform(cell.lower, cell.upper, (DRAWN, cell.n_var))
-        feasible = np.flatnonzero(cell.evaluate(x).feasible)
-        if len(feasible):
-            found: Array = x[feasible[0]]
-            return found
-
-
-def _pressed(cell: Cell, carry: Carry, friction: float) -> Carry:
-    """The carry in a cell of another friction, with the forces planned for it."""
-    workcell = cell.workcell
-    first, second = (replace(contact, friction=friction) for contact in workcell.contacts)
-    load = cell.timing_model.uncertain_load(
-        carry, np.full(2, friction), workcell.payload.centre_of_mass
+        pass  # it is told as no number
+    rectangular = any(pad.half_sides is not None for pad in carry.workcell.pads)
+    return Slip(
+        cell=name,
+        candidate=candidate,
+        friction=carry.workcell.contacts[0].friction,
+        pads="rectangle" if rectangular else "disc",
+        duration=carry.duration,
+        force=float(needed.max()),
+        threshold=factor,
+        begins=begins if np.isfinite(begins) else float("nan"),
+        planned=float(carry.time[needed > PRESSED_SHARE * needed.max()][0]),
     )
-    return replace(
-        carry,
-        workcell=replace(workcell, contacts=(first, second)),
-        normal_force=load["normal_force"],
-    )
+
+
+class _Source:
+    """Carries of one cell; every one is the same whichever are asked for."""
+
+    def __init__(self, path: Path, seed: int) -> None:
+        self._drivable = cell = Cell.load(path).drivable()  # its files last as long as it
+        self._name, self._seed = path.stem, seed
+        if cell.workcell.task.allocation != "soft-finger":
+            task = replace(cell.workcell.task, allocation="soft-finger")
+            cell = Cell(replace(cell.workcell, task=task), cell.objective_names)
+        self._cell = cell
+        self._front: Array | None = None
+
+    def case(self, k: int) -> tuple[str, str, Carry]:
+        """Cell, candidate, and the carry with the forces planned for its friction."""
+        cell, kind = self._cell, KINDS[k % len(KINDS)]
+        model = cell.timing_model
+        while True:
+            x = self._candidate(kind, k)
+            timing = time_path(model, x, model.drive_limits(float(x[-1])))
+            if timing.ok and timing.carry is not None:
+                break
+            kind, k = "random", k + len(KINDS) * 10**6
+        friction = np.full(2, FRICTIONS[(k + k // len(FRICTIONS)) % len(FRICTIONS)])
+        payload, contacts = cell.workcell.payload, cell.workcell.contacts
+        load = model.uncertain_load(timing.carry, friction, payload.centre_of_mass)
+        rubs = tuple(replace(contact, friction=float(friction[0])) for contact in contacts)
+        workcell = replace(cell.workcell, contacts=(rubs[0], rubs[1]))
+        carry = replace(timing.carry, workcell=workcell, normal_force=load["normal_force"])
+        return self._name, kind, carry
+
+    def _candidate(self, kind: str, k: int) -> Array:
+        if kind == "hand-made":
+            return self._cell.initial
+        if kind == "random":
+            return self._random(np.random.default_rng([self._seed, k]))
+        if self._front is None:
+            rng = np.random.default_rng(self._seed)
+            self._front = search(self._cell, evaluations=SEARCHED, rng=rng).x
+        row = {"fastest": 0, "middle": len(self._front) // 2, "gentlest": -1}[kind]
+        return np.asarray(self._front[row])
+
+    def _random(self, rng: np.random.Generator) -> Array:
+        cell = self._cell
+        while True:
+            x = rng.uniform(cell.lower, cell.upper, (DRAWN, cell.n_var))
+            feasible = np.flatnonzero(cell.evaluate(x).feasible)
+            if len(feasible):
+                return np.asarray(x[feasible[0]])

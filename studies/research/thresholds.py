@@ -1,33 +1,35 @@
 """Slip thresholds of many carries in the simulator: `python -m studies.research.thresholds`.
 
-The least multiple of the planned normal forces with which the box does not slip in MuJoCo, and
-where it slips first, for hand-made, given and random feasible trajectories of both cells under
-several timings and frictions.
+The least multiple of the planned normal forces with which the box does not slip in MuJoCo between
+pads that press evenly, and when it slips first, for hand-made, searched and random feasible
+trajectories of the shipped cells under several frictions. Every carry is stored as it is done; the
+same command goes on from there.
 """
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 from studies.options import add, whole
 from studies.program import Parser, Program, later, run_program
 
 
 def _add_options(parser: Parser) -> None:
-    parser.add_argument("files", nargs="*", metavar="FILE", help="trajectory files, e.g. polished")
     parser.add_argument(
-        "--carries", type=whole(1, 10**6), default=40, help="how many, in turn of all kinds"
+        "cells", nargs="*", type=Path, metavar="WORKCELL", help="(default: the shipped ones)"
     )
     parser.add_argument(
-        "--skip", type=whole(0, 10**6), default=0, help="how many of these are done already"
+        "--carries", type=whole(1, 10**6), default=60, help="how many, of all cells in turn"
     )
-    parser.add_argument(
-        "--pads",
-        choices=("driven", "rigid"),
-        default="driven",
-        help="pads that tilt, driven by the planned moments; or pads that only keep their place",
+    add(
+        parser,
+        "--output",
+        default=Path("results/thresholds.json"),
+        metavar="FILE",
+        help="where they are stored (default: results/thresholds.json)",
     )
-    add(parser, "--seed", help="of the random candidates")
+    add(parser, "--seed", help="of the random candidates and of the searches")
 
 
 main = Program(

@@ -166,8 +166,7 @@ def test_force_control_takes_what_a_wrong_reference_adds() -> None:
         for control in CONTROLS
     }
     assert excess["impedance"] > 0.05
-    assert abs(excess["leader"]) < 0.01
-    assert 0.0 < excess["both"] < 0.5 * excess["impedance"]
+    assert max(abs(excess["leader"]), abs(excess["both"])) < 0.01
 
 
 def test_what_pushes_the_box_along_the_normal_moves_it_by_the_weak_springs_alone() -> None:
@@ -208,13 +207,21 @@ def test_tracking_errors_begin_at_zero_and_stay_small() -> None:
     np.testing.assert_allclose(np.gradient(off.q, time, axis=0)[1:-1], off.q_rate[1:-1], atol=1e-4)
 
 
-def test_a_carrys_references_are_the_planners_torques() -> None:
-    """The torques of the timing's compiled functions, and what pressing harder adds to them."""
+def test_a_carrys_references_are_the_planners_torques_but_for_moments() -> None:
+    """The torques of the timing's compiled functions without what the wrenches' moments take of
+    them, and what pressing harder adds."""
     cell = Cell(rack_cell())
     carry = time_path(cell.timing_model, cell.initial, TimingLimits()).carry
     assert carry is not None
     planned = carry_reference(cell, carry)
-    np.testing.assert_allclose(planned.effort[2:], carry.torque, atol=1e-9)
+    load = cell.timing_model.uncertain_load(carry, np.ones(2), np.zeros(3))
+    moments = np.stack([load["wrench_1"][:, 3:], load["wrench_2"][:, 3:]])
+    by_moment = cell.timing_model.wrench_torque(carry.q, carry.pose)[..., 3:]
+    each = (by_moment[:, :6], by_moment[:, 6:])
+    taken = [np.einsum("njk,nk->nj", part, own) for part, own in zip(each, moments, strict=True)]
+    assert np.abs(taken).max() > 0.1
+    fed = planned.effort[2:] + np.concatenate(taken, axis=1)
+    np.testing.assert_allclose(fed, carry.torque, atol=1e-9)
     np.testing.assert_allclose(planned.normal_force[2:], carry.normal_force, atol=1e-9)
     harder = carry_reference(cell, carry, carry.normal_force[:, 0] + 7.0, leader=1)
     assert harder.leader == 1
@@ -251,5 +258,5 @@ def test_misuse_is_told() -> None:
         job_reference(cell, reference.motion, np.zeros((3, 2)), reference.job)
     with pytest.raises(SettingsError, match="multiple of the time step"):
         ArmSettings(control_period=7e-4)
-    with pytest.raises(SettingsError, match="two time steps"):
+    with pytest.raises(SettingsError, match="time step"):
         ArmSettings(time_step=0.01)

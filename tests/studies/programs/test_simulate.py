@@ -58,6 +58,6 @@ def test_wrong_input_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "none.json" in capsys.readouterr().err
     path = stored(tmp_path, "")
     assert simulate.main([str(path), "--time-step", "0.1"]) == 2
-    assert "two time steps" in capsys.readouterr().err
+    assert "time step" in capsys.readouterr().err
     assert simulate.main([str(path), "--controller", "pads", "--film", "film.gif"]) == 2
     assert "another --controller" in capsys.readouterr().err
