@@ -1,10 +1,13 @@
-"""Short carries with forces in closed form, for the witness."""
+"""Short carries with forces in closed form, for the witness, and its word on longer ones."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from hybrid_opt.carry import ArmMotion, Carry
+from hybrid_opt.cell import Cell
+from hybrid_opt.witness.box import Witness, drive_of, planned_moments
+from hybrid_opt.witness.scene import SimulationSettings
 from studies.research.plain.motion import angular_rates
 from symbolic.array import Array
 from symbolic.records import Workcell
@@ -61,3 +64,13 @@ def least_forces(carry: Carry) -> Array:
     total = np.hypot(force[:, 0], force[:, 2]) / friction
     assert (np.abs(along) <= total).all()
     return np.column_stack([total + along, total - along]) / 2.0
+
+
+def assert_driven_pads_hold(cell: Cell, carry: Carry) -> None:
+    """Pads at their rims, turned by the planned moments, hold with 5 % more than the plan, and not
+    with as much less."""
+    settings = SimulationSettings(pads="driven")
+    witness = Witness(cell.workcell, settings)
+    drive = drive_of(carry, settings, moments=planned_moments(cell, carry))
+    assert witness.simulate(drive, 1.05).holds
+    assert not witness.simulate(drive, 0.95).holds
