@@ -50,13 +50,6 @@ def _add_options(parser: Parser) -> None:
         help="amplitude of each joint's error in the random cases, a sinusoid of 0.3 to 1.5 Hz",
     )
     parser.add_argument(
-        "--force-error",
-        type=number(0.0, 0.99),
-        default=0.05,
-        metavar="SHARE",
-        help="of the commanded normal force that is missing in the random cases",
-    )
-    parser.add_argument(
         "--stiffness",
         type=number(1e-3, 1e9),
         default=stated("hybrid_opt.witness.scene.ArmSettings.stiffness"),

@@ -362,7 +362,8 @@ class Witness:
 
 
 def workcell_of_case(workcell: Workcell, case: Array) -> Workcell:
-    """The workcell as it is in a case (15,), but for the disturbance."""
+    """The workcell as it is in a case (18,), see `symbolic.contact.worst_cases.CASE_SIZES`, but for
+    the disturbance and what the arms do."""
     payload = workcell.payload
     mass, centre = float(case[4]), case[5:8]
     # The inertia is known about the nominal centre of mass: Steiner's theorem takes it to the true.

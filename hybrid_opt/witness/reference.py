@@ -20,12 +20,11 @@ import pinocchio as pin
 from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
-from hybrid_opt.job.smooth import without_jumps
+from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.model import contact_torque
 from hybrid_opt.timing.records import JerkLimits, Timing
-from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.box import refuse_motion_at_ends, to_middles
 from hybrid_opt.witness.scene import ArmSettings
 from symbolic.array import Array
@@ -191,15 +190,21 @@ def carry_reference(
 
 
 def with_tracking_error(
-    reference: Reference, amplitude: float, rng: np.random.Generator
+    reference: Reference, amplitude: float, rng: np.random.Generator, opposed: float = 0.0
 ) -> Reference:
-    """References whose joints are off by a random sinusoid each, which begins at zero.
+    """References whose joints are off by a random sinusoid each, which begins at zero, of arms that
+    push against one another.
 
-    Frequencies are drawn from 0.3 to 1.5 Hz. What is fed forward stays.
+    Frequencies are drawn from 0.3 to 1.5 Hz. All else that is fed forward stays.
 
     Args:
         amplitude: of each joint's sinusoid [rad].
+        opposed: force of either arm along the first pad's face, in a random direction [N].
     """
+    workcell, turned = reference.workcell, rng.uniform(0.0, 2.0 * np.pi)
+    along = opposed * np.array([np.cos(turned), np.sin(turned), 0.0])
+    force = workcell.contacts[0].T_box_pad[:3, :3] @ along
+    pushed = _force_torque(workcell, reference.motion.q, (force, -force))
     motion = reference.motion
     joints = motion.q.shape[1]
     omega = 2.0 * np.pi * rng.uniform(0.3, 1.5, joints)
@@ -208,7 +213,7 @@ def with_tracking_error(
     off = amplitude * (np.sin(angle) - np.sin(phase)) / 2.0
     rate = amplitude * omega * np.cos(angle) / 2.0
     moved = replace(motion, q=motion.q + off, q_rate=motion.q_rate + rate)
-    return replace(reference, motion=moved)
+    return replace(reference, motion=moved, effort=reference.effort + pushed)
 
 
 def press_torque(workcell: Workcell, q: Array) -> Array:
@@ -221,12 +226,21 @@ def press_torque(workcell: Workcell, q: Array) -> Array:
         np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
         for contact in workcell.contacts
     ]
-    found = []
-    for i, values in enumerate(joints_of(workcell, q)):
-        contact, line = workcell.contacts[i], middles[1 - i] - middles[i]
-        pushed = line if not workcell.has_opposite_pads else contact.T_box_pad[:3, 2]
-        force = contact.T_box_pad[:3, :3].T @ (pushed / (contact.T_box_pad[:3, 2] @ pushed))
-        found.append(_press_torque(workcell.robots[i], contact, force, values))
+    forces = []
+    for i, contact in enumerate(workcell.contacts):
+        normal, line = contact.T_box_pad[:3, 2], middles[1 - i] - middles[i]
+        pushed = normal if workcell.has_opposite_pads else line
+        forces.append(pushed / (normal @ pushed))
+    return _force_torque(workcell, q, (forces[0], forces[1]))
+
+
+def _force_torque(workcell: Workcell, q: Array, forces: tuple[Array, Array]) -> Array:
+    """(n, all joints) torques of forces (3,) on the box, in its frame, one of each robot [N m]."""
+    arms = zip(workcell.robots, workcell.contacts, forces, joints_of(workcell, q), strict=True)
+    found = [
+        _arm_torque(robot, contact, contact.T_box_pad[:3, :3].T @ force, values)
+        for robot, contact, force, values in arms
+    ]
     return np.concatenate(found, axis=1)
 
 
@@ -241,7 +255,7 @@ def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
     return np.concatenate(found, axis=1)
 
 
-def _press_torque(robot: Robot, contact: Contact, pushed: Array, q: Array) -> Array:
+def _arm_torque(robot: Robot, contact: Contact, pushed: Array, q: Array) -> Array:
     """Joint torques of a force (3,) along the first pad's axes; several pads press alike."""
     T_flange_box = robot.T_flange_pad @ inverse(contact.T_box_pad)
     pads = [T_flange_box @ pad.T_box_pad for pad in contact.further]
@@ -380,7 +394,7 @@ def driven_carry(cell: Cell, x: Array) -> Carry:
     """
     model, workcell = cell.timing_model, cell.workcell
     if workcell.task.time_law == "optimal":
-        timing = time_path(model, x, model.drive_limits(float(x[-1])))
+        timing = driven_timing(model, x)
     else:
         timing = closest_to_reference_timing(model, x)
     return exported_carry(cell, timing)

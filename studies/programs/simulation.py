@@ -72,8 +72,11 @@ def simulate_arms(
     _tell(found.shown, carry)
     if found.squeeze.uncertainty is not None:
         _cases(cell, found.reference, settings, options)
-        rubs_less = workcell_of_case(workcell, worst_friction(workcell))
-        tell_least(CellWitness(rubs_less, settings).simulate(reference, control))
+        rubs_less = CellWitness(workcell_of_case(workcell, worst_friction(workcell)), settings)
+        tracked = 1.0 - workcell.uncertainty.tracking
+        worst = rubs_less.simulate(found.reference, control, tracked)
+        tell_worst(worst, tracked)
+        tell_least(rubs_less.simulate(reference, control))
     if options.film:
         _film(cell, found.shown, Path(options.film))
     return witness.text
@@ -97,21 +100,24 @@ def _cases(
     cell: Cell, pressed: Reference, settings: ArmSettings, options: argparse.Namespace
 ) -> None:
     """Random cases with tracking errors under the robust force."""
-    workcell, rng = cell.workcell, np.random.default_rng(options.seed)
+    workcell, rng, leader = cell.workcell, np.random.default_rng(options.seed), options.leader - 1
     control: Control = options.controller
-    slips = []
-    arrived = 0
-    for case in random_cases(workcell, workcell.uncertainty, options.runs, rng):
+    outcomes = []
+    for case in random_cases(workcell, workcell.uncertainty, options.runs, rng, leader):
         witness = CellWitness(workcell_of_case(workcell, case), settings, case[8:11])
-        told = with_tracking_error(pressed, options.tracking_error, rng)
-        outcome = witness.simulate(told, control, 1.0 - options.force_error)
-        arrived += outcome.arrives
-        slips.append(outcome.slip.max())
+        told = with_tracking_error(pressed, options.tracking_error, rng, float(case[17]))
+        outcomes.append(witness.simulate(told, control, tracked_share(case, leader)))
+    arrived = sum(outcome.arrives for outcome in outcomes)
+    slip = max((outcome.slip.max() for outcome in outcomes), default=0.0)
     print(
-        f"  {arrived} of {len(slips)} random cases arrive (seed {options.seed}, joints off by up "
-        f"to {options.tracking_error:g} rad, {100.0 * options.force_error:g} % of the force "
-        f"missing); slip up to {1e3 * max(slips):.3f} mm"
+        f"  {arrived} of {len(outcomes)} random cases arrive (seed {options.seed}, joints off by "
+        f"up to {options.tracking_error:g} rad); slip up to {1e3 * slip:.3f} mm"
     )
+
+
+def tracked_share(case: Array, leader: int) -> float:
+    """Share of the commanded force that a case leaves."""
+    return 1.0 - float(case[16 - leader])
 
 
 def _film(cell: Cell, outcome: ArmOutcome, path: Path) -> None:
@@ -153,20 +159,21 @@ def simulate_pads(
     forces, squeeze = commanded_forces(workcell, carry, SqueezeSettings(leader=leader))
     pressed = drive_of(carry, settings, forces[:, 1 - leader], leader, moments)
     rng = np.random.default_rng(options.seed)
-    cases = random_cases(workcell, workcell.uncertainty, options.runs, rng)
+    cases = random_cases(workcell, workcell.uncertainty, options.runs, rng, leader)
     held = sum(
         Witness(workcell_of_case(workcell, case), settings, case[8:11])
-        .simulate(pressed, 1.0 - options.force_error)
+        .simulate(pressed, tracked_share(case, leader))
         .holds
         for case in cases
     )
     print(
         f"  pressed up to {forces[:, 0].max():.2f} / {forces[:, 1].max():.2f} N, {squeeze}: {held} "
-        f"of {len(cases)} random cases hold (seed {options.seed}, "
-        f"{100.0 * options.force_error:g} % of the force missing)"
+        f"of {len(cases)} random cases hold (seed {options.seed})"
     )
-    rubs_less = workcell_of_case(workcell, worst_friction(workcell))
-    tell_least(Witness(rubs_less, settings).simulate(drive))
+    rubs_less = Witness(workcell_of_case(workcell, worst_friction(workcell)), settings)
+    tracked = 1.0 - workcell.uncertainty.tracking
+    tell_worst(rubs_less.simulate(pressed, tracked), tracked)
+    tell_least(rubs_less.simulate(drive))
 
 
 def _swept(step: float) -> tuple[float, float]:
@@ -176,6 +183,14 @@ def _swept(step: float) -> tuple[float, float]:
 
 def _tell_sweep(step: float, threshold: Threshold[Shown]) -> None:
     print(f"  with a time step of {step:g} s: {threshold.factor:.4f}")
+
+
+def tell_worst(outcome: Outcome, tracked: float) -> None:
+    """What becomes of a box where least friction and least force come together."""
+    print(
+        f"  with the set's worst friction and {100.0 * tracked:g} % of the force it "
+        f"{'holds' if outcome.holds else 'SLIPS'}: slip up to {1e3 * outcome.slip.max():.3f} mm"
+    )
 
 
 def tell_least(outcome: Outcome) -> None:
@@ -195,7 +210,7 @@ def threshold_text(threshold: Threshold[Shown], slip: float) -> str:
 
 
 def worst_friction(workcell: Workcell) -> Array:
-    """(15,) the nominal case with the set's worst friction."""
+    """(18,) the nominal case with the set's worst friction."""
     case = nominal_case(workcell)
     case[0:2] *= 1.0 - workcell.uncertainty.friction
     return case
