@@ -53,7 +53,7 @@ from symbolic.records.poses import box_rotation
 LOOKED_AT = 5e-3
 """Time between two looks at the box [s]."""
 
-LOW, HIGH, BISECTIONS = 0.9, 1.5, 8
+LOW, HIGH, BISECTIONS = 0.9, 2.0, 9
 """Factors between which a threshold is looked for, to about 0.2 %."""
 
 

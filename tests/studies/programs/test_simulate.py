@@ -10,6 +10,7 @@ from PIL import Image, ImageSequence
 from studies import simulate
 from studies.research import thresholds
 from tests.studies.programs.test_robust import TABLE, stored
+from tests.symbolic.cells import RACK
 
 pytest.importorskip("mujoco")
 
@@ -20,8 +21,9 @@ import mujoco
 def test_threshold_and_cases_of_a_stored_trajectory_without_arms(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """The paper's forces are the least of the pads that it assumes; what is commanded holds."""
     path = stored(tmp_path, TABLE)
-    arguments = [str(path), "--controller", "pads", "--timing", "fastest", "--runs", "2"]
+    arguments = [str(path), "--controller", "pads-driven", "--timing", "fastest", "--runs", "2"]
     assert simulate.main(arguments) == 0
     out = capsys.readouterr().out
     factor = float(out.split("holds from ")[1].split()[0])
@@ -37,20 +39,30 @@ def test_arms_carry_a_stored_trajectory(tmp_path: Path, capsys: pytest.CaptureFi
     assert simulate.main([*arguments, "--mjcf", str(cell)]) == 0
     out = capsys.readouterr().out
     factor = float(out.split("holds from ")[1].split()[0])
-    assert 1.0 < factor < 1.1
+    assert 1.1 < factor < 1.5, "the paper's forces do not hold pads that press evenly"
     assert "the box arrives" in out
     assert "2 of 2 random cases arrive" in out
+    assert "% of the force it holds" in out
     assert "least forces with the set's worst friction: slip" in out
     assert len(list(ImageSequence.Iterator(Image.open(film)))) > 20
     assert mujoco.MjModel.from_xml_path(str(cell)).nv == 18
 
 
 @pytest.mark.slow
-def test_thresholds_of_many_carries(capsys: pytest.CaptureFixture[str]) -> None:
-    assert thresholds.main(["--carries", "1"]) == 0
+def test_thresholds_of_many_carries_go_on_from_what_is_stored(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(RACK), "--output", str(tmp_path / "found.json"), "--carries"]
+    assert thresholds.main([*arguments, "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert float(lines[1].split()[5]) == pytest.approx(1.0, abs=0.03)
-    assert lines[-1].startswith("1 carries: median ")
+    assert float(lines[1].split()[7]) == pytest.approx(1.0, abs=0.03)
+    assert lines[1].endswith("1 of 1")
+    assert "1 carries, disc pads: threshold from " in lines[2]
+    assert "1 of 1 slip first within 0.1 s" in lines[3]
+    assert thresholds.main([*arguments, "1"]) == 0
+    assert capsys.readouterr().out.splitlines()[1] == lines[1].removesuffix("  1 of 1").rstrip()
+    assert thresholds.main([*arguments, "2", "--seed", "2"]) == 2
+    assert "has seed 1" in capsys.readouterr().err
 
 
 def test_wrong_input_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
