@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
+from hybrid_opt import recommend, search
+from hybrid_opt.cell import Cell
+from hybrid_opt.store.trajectory_file import write_trajectory
+from hybrid_opt.witness.reference import CONTROLS
 from studies import simulate
 from studies.research import thresholds
 from tests.studies.programs.test_robust import TABLE, stored
@@ -63,6 +68,29 @@ def test_thresholds_of_many_carries_go_on_from_what_is_stored(
     assert capsys.readouterr().out.splitlines()[1] == lines[1].removesuffix("  1 of 1").rstrip()
     assert thresholds.main([*arguments, "2", "--seed", "2"]) == 2
     assert "has seed 1" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def recommended(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The rack's carry to run, of a small search."""
+    cell = Cell.load(RACK).drivable()
+    front = search(cell, evaluations=300, rng=np.random.default_rng(1))
+    path = tmp_path_factory.mktemp("rack") / "recommended.json"
+    write_trajectory(path, cell.workcell, recommend(cell, front).x, {}, {"algorithm": "nsga2"})
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("controller", [*CONTROLS, "pads"])
+def test_the_recommended_carry_is_held_over_the_whole_uncertainty(
+    recommended: Path, controller: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Pads that press evenly, no moments commanded, the forces of its job."""
+    assert simulate.main([str(recommended), "--controller", controller, "--runs", "20"]) == 0
+    out = capsys.readouterr().out
+    assert "20 of 20 random cases" in out
+    assert float(out.split("it holds: slip up to ")[1].split()[0]) < 0.5
+    assert "least forces with the set's worst friction: slip" in out
 
 
 def test_wrong_input_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
