@@ -209,17 +209,13 @@ def planned_moments(cell: Cell, carry: Carry) -> Array:
     )
     friction = np.array([contact.friction for contact in workcell.contacts])
     load = cell.timing_model.uncertain_load(known, friction, workcell.payload.centre_of_mass)
-    wrenches = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
-    arms = to_middles(workcell, known.pose)
-    return np.asarray(wrenches[..., 3:] - np.cross(arms, wrenches[..., :3]))
-
-
-def to_middles(workcell: Workcell, pose: Array) -> Array:
-    """(n, 2, 3) from the place of each robot's first pad to the middle of its pads, at box poses
-    (n, 6), world frame [m]."""
-    rotation = box_rotation(workcell.task.orientation, pose)
-    in_box = [contact.T_box_pad[:3, :3] @ tilt_centre(contact) for contact in workcell.contacts]
-    return np.stack([rotation @ arm for arm in in_box], axis=1)
+    rotation = box_rotation(workcell.task.orientation, known.pose)
+    moments = []
+    for i, contact in enumerate(workcell.contacts):
+        wrench = load[f"wrench_{i + 1}"]
+        arm = rotation @ contact.T_box_pad[:3, :3] @ tilt_centre(contact)
+        moments.append(wrench[:, 3:] - np.cross(arm, wrench[:, :3]))
+    return np.stack(moments, axis=1)
 
 
 def drive_of(
@@ -261,8 +257,7 @@ def drive_of(
     R_box_pad = slider.T_box_pad[:3, :3]
     arm = rotation @ (slider.T_box_pad[:3, 3] + R_box_pad @ tilt_centre(slider))
     at_pad = acceleration + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
-    in_box = (np.einsum("nji,nj->ni", rotation, values) for values in (omega, alpha))
-    spin, spin_rate = in_box
+    spin, spin_rate = (np.einsum("nji,nj->ni", rotation, values) for values in (omega, alpha))
     tilt = np.zeros((steps, 2, 2))
     for i, contact in enumerate(carry.workcell.contacts if moments is not None else ()):
         assert moments is not None

@@ -23,14 +23,13 @@ from hybrid_opt.errors import WitnessError
 from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.analysis import closest_to_reference_timing
-from hybrid_opt.timing.model import contact_torque
 from hybrid_opt.timing.records import JerkLimits, Timing
-from hybrid_opt.witness.box import refuse_motion_at_ends, to_middles
+from hybrid_opt.witness.box import refuse_motion_at_ends
 from hybrid_opt.witness.scene import ArmSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.records import Contact, Robot, Workcell
-from symbolic.records.poses import inverse
+from symbolic.records import Workcell
+from symbolic.records.poses import box_rotation, inverse
 from symbolic.robot.model import build_robot_model
 
 SETTLE = 0.3
@@ -166,11 +165,11 @@ def carry_reference(
     known = replace(carry, pose=pose, rate=rate, second_rate=second)
     friction = np.array([contact.friction for contact in workcell.contacts])
     load = model.uncertain_load(known, friction, workcell.payload.centre_of_mass)
-    arms, pushed = to_middles(workcell, pose), {}
-    for i, name in enumerate(("wrench_1", "wrench_2")):
-        force = load[name][:, :3]
-        pushed[name] = np.column_stack([force, np.cross(arms[:, i], force)])
-    torque = contact_torque(workcell, model.wrench_torque(motion.q, pose), pushed)
+    rotation = box_rotation(workcell.task.orientation, pose)
+    one, two = (
+        np.einsum("nji,nj->ni", rotation, load[name][:, :3]) for name in ("wrench_1", "wrench_2")
+    )
+    torque = _force_torque(workcell, motion.q, (one, two))
     # At rest before the carry the pads press as they will have to when it begins.
     extra = np.concatenate([[extra[0]] * 2, extra])
     starting = (carry.normal_force[0] - load["normal_force"][0]).max()
@@ -235,12 +234,22 @@ def press_torque(workcell: Workcell, q: Array) -> Array:
 
 
 def _force_torque(workcell: Workcell, q: Array, forces: tuple[Array, Array]) -> Array:
-    """(n, all joints) torques of forces (3,) on the box, in its frame, one of each robot [N m]."""
-    arms = zip(workcell.robots, workcell.contacts, forces, joints_of(workcell, q), strict=True)
-    found = [
-        _arm_torque(robot, contact, contact.T_box_pad[:3, :3].T @ force, values)
-        for robot, contact, force, values in arms
-    ]
+    """(n, all joints) torques of forces (3,) or (n, 3) on the box, in its frame, one of each robot
+    in the middle of its pads [N m]."""
+    found = []
+    parts = zip(workcell.robots, workcell.contacts, forces, joints_of(workcell, q), strict=True)
+    for robot, contact, force, values in parts:
+        T_flange_box = robot.T_flange_pad @ inverse(contact.T_box_pad)
+        pads = [T_flange_box @ pad.T_box_pad for pad in contact.further]
+        middle = np.mean([robot.T_flange_pad, *pads], axis=0)[:3, 3]
+        pushed = np.broadcast_to(force @ T_flange_box[:3, :3].T, (len(values), 3))
+        wrench = np.column_stack([pushed, np.cross(middle, pushed)])
+        arm = build_robot_model(robot)
+        data, torque = arm.model.createData(), np.empty_like(values)
+        for k, row in enumerate(values):
+            J = pin.computeFrameJacobian(arm.model, data, row, arm.flange_id, pin.LOCAL)
+            torque[k] = J.T @ wrench[k]
+        found.append(torque)
     return np.concatenate(found, axis=1)
 
 
@@ -253,21 +262,6 @@ def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
         data = model.createData()
         found.append(np.array([pin.rnea(model, data, *row) for row in zip(*rows, strict=True)]))
     return np.concatenate(found, axis=1)
-
-
-def _arm_torque(robot: Robot, contact: Contact, pushed: Array, q: Array) -> Array:
-    """Joint torques of a force (3,) along the first pad's axes; several pads press alike."""
-    T_flange_box = robot.T_flange_pad @ inverse(contact.T_box_pad)
-    pads = [T_flange_box @ pad.T_box_pad for pad in contact.further]
-    places = np.mean([robot.T_flange_pad, *pads], axis=0)
-    arm = build_robot_model(robot)
-    data, flange = arm.model.createData(), arm.flange_id
-    torque = np.empty_like(q)
-    for k, row in enumerate(q):
-        J = pin.computeFrameJacobian(arm.model, data, row, flange, pin.LOCAL)
-        force = robot.T_flange_pad[:3, :3] @ pushed
-        torque[k] = J[:3].T @ force + J[3:].T @ np.cross(places[:3, 3], force)
-    return torque
 
 
 def _counts(workcell: Workcell) -> list[int]:
