@@ -24,7 +24,6 @@ from hybrid_opt.bundles.programs.carry_job import Job
 from hybrid_opt.timing import TimingLimits, time_path
 from hybrid_opt.witness.arms import ArmOutcome, CellWitness
 from hybrid_opt.witness.reference import BoxJob, JointMotion, Reference, job_reference
-from hybrid_opt.witness.scene import ArmSettings
 from symbolic.array import Array
 from tests.hybrid_opt.bundles import test_egm
 from tests.hybrid_opt.bundles.bundles import contents
@@ -61,7 +60,7 @@ def job(force: float | None = None) -> Job:
 @cache
 def witness() -> CellWitness:
     """Pads that press evenly, as the drivable cell's model has them."""
-    return CellWitness(rack().workcell, ArmSettings(pads="even"))
+    return CellWitness(rack().workcell)
 
 
 def reference(
