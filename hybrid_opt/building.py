@@ -91,7 +91,7 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     compiled, workcell, cache = cell.compiled, cell.workcell, cell.compiled.cache
     polished = polish and workcell.has_facing_pads
     if _driven(cell):
-        polished = polished and is_polishable(workcell.task)
+        polished = polished and is_polishable(workcell)
     yield lambda: cell.evaluator
     if polished:
         yield lambda: cell.polish_functions

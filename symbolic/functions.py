@@ -199,7 +199,7 @@ def sample_sizes(workcell: Workcell) -> dict[str, int]:
 def forces_come_last(workcell: Workcell) -> bool:
     """Whether a candidate's forces are found after all else is known of it, where that is free of
     violations: a program solves for them, and then nothing but objectives depends on them."""
-    return workcell.task.allocation == "joint"
+    return not workcell.has_closed_form
 
 
 def force_sizes(workcell: Workcell) -> dict[str, int]:
@@ -417,8 +417,8 @@ def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
 
     path_motion: see `symbolic.path_motion`, at that many samples. load, uncertain_load: see
     `symbolic.contact.load`. arm_i per arm i = 1, 2: see
-    `symbolic.path_motion.arm_derivative_function`. path_force, where the normal forces have a
-    closed form: see `symbolic.limits.path_force_function`.
+    `symbolic.path_motion.arm_derivative_function`. path_force, where the normal forces have slopes:
+    see `symbolic.limits.path_force_function`.
     """
     workcell = model.workcell
     functions = {
@@ -426,7 +426,7 @@ def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
         "load": load_function(workcell),
         "uncertain_load": uncertain_load_function(workcell),
     }
-    if workcell.task.allocation != "joint":
+    if workcell.has_force_slopes:
         functions["path_force"] = path_force_function(workcell)
     for i, (robot, robot_model, contact) in enumerate(
         zip(workcell.robots, model.robots, workcell.contacts, strict=True), start=1

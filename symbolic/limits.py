@@ -7,14 +7,17 @@ a sample is a function of (u'', u'^2) whose coefficients lie packed in one vecto
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.closed_form import Asked, HeldLoad, held_by
-from symbolic.contact.load import frictions
+from symbolic.contact.grasp import Grasp
+from symbolic.contact.load import frictions, robot_wrenches
 from symbolic.contact.soft_finger import Detached
+from symbolic.contact.soft_grasp import SoftGrasp
 from symbolic.expression import mx_given, number, of, sx_given
 from symbolic.path.spline import path_basis, waypoint_matrix
 from symbolic.path_motion import (
@@ -31,6 +34,10 @@ from symbolic.robot.arm import TRACK_OUTPUTS, follow_function
 
 VERDICTS = ("ik_residual", "lost", "limit_margin", "manipulability")
 """What `symbolic.robot.arm.TRACK_OUTPUTS` says of an arm beside its joints."""
+
+WEIGHT = 1e-6
+"""Of the barriers where a program finds the forces (`symbolic.contact.soft_grasp`), which are above
+the least ones by less than what timings are exact to."""
 
 SPEEDS_OF_BOX = 4
 """Payload, payload turning, reference, reference turning."""
@@ -214,25 +221,59 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
     Both take the force (9,) and moment (6,) blocks of `LimitLayout` as one input, then u'' and
     u'^2. `limit_forces` gives (2,) [N]; `limit_force_slopes` the same and its derivatives (2,) by
-    u'' and by u'^2.
+    u'' and by u'^2. Where a program finds the forces, they are those on its central path
+    (`symbolic.contact.soft_grasp`).
     """
     sizes = limit_layout(workcell).sizes
+    names = ("limit_forces", "limit_force_slopes")
+    if not workcell.has_closed_form:
+        inputs = [ca.MX.sym("asked", sizes["force"] + sizes["moment"]), *map(ca.MX.sym, "aw")]
+        load, by_timing = _load_function(workcell)(*inputs)
+        soft = _on_central_path(workcell)
+        normal, slope, _ = soft.first()(load)
+        slopes = ca.horzsplit(ca.mtimes(slope.T, by_timing))
+        alone = ca.mtimes(soft.normals, soft.solved(load))
+        return (
+            ca.Function(names[0], inputs, [ca.densify(alone)]),
+            ca.Function(names[1], inputs, [normal, *slopes]),
+        )
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment")}
     a, w = ca.SX.sym("a"), ca.SX.sym("w")
     detached: Detached = []
     value = _held(workcell, blocks, a, w, detached).normal
-    names = ("limit_forces", "limit_force_slopes")
     inputs = [ca.vertcat(*blocks.values()), a, w, *sx_given(workcell.payload).values()]
     return _with_slopes(names, value, inputs, detached)
+
+
+def _on_central_path(workcell: Workcell) -> SoftGrasp:
+    friction = np.array([contact.friction for contact in workcell.contacts])
+    return SoftGrasp(Grasp(workcell), friction, WEIGHT)
+
+
+def _load_function(workcell: Workcell) -> ca.Function:
+    """Force and moment blocks of `LimitLayout`, u'' and u'^2 to the load (6,) about the box frame's
+    origin, box axes, and its derivatives (6, 2) by u'' and u'^2."""
+    size = limit_layout(workcell).sizes["force"]
+    axes, centre = ca.DM(workcell.contacts[0].T_box_pad[:3, :3]), workcell.payload.centre_of_mass
+    asked = ca.SX.sym("asked", size + limit_layout(workcell).sizes["moment"])
+    timing = ca.SX.sym("timing", 2)
+    factors = ca.vertcat(timing, 1.0)
+    force = ca.mtimes(axes, ca.mtimes(ca.reshape(asked[:size], 3, 3), factors))
+    about = ca.mtimes(axes, ca.mtimes(ca.reshape(asked[size:], 3, 2), timing))
+    load = ca.vertcat(force, about + ca.cross(ca.SX(ca.DM(centre)), force))
+    outputs = [load, ca.densify(ca.jacobian(load, timing))]
+    return ca.Function("load", [asked, timing[0], timing[1]], ca.cse(outputs))
 
 
 def path_force_function(workcell: Workcell) -> ca.Function:
     """Box pose and its derivatives by u (6,), u'' and u'^2 to normal_force (2,) [N] and slope
     (2, 2), of each force by u'' and by u'^2."""
-    path = [ca.SX.sym(name, 6) for name in ("pose", "first", "second")]
-    a, w = ca.SX.sym("a"), ca.SX.sym("w")
-    given = sx_given(workcell.payload)
-    box = dict(zip(BOX_OUTPUTS, box_function(workcell)(*path, *given.values()), strict=True))
+    closed = workcell.has_closed_form
+    kind, given = (ca.SX, sx_given) if closed else (ca.MX, mx_given)
+    numbers: dict[str, Any] = dict(given(workcell.payload))
+    path = [kind.sym(name, 6) for name in ("pose", "first", "second")]
+    a, w = kind.sym("a"), kind.sym("w")
+    box = dict(zip(BOX_OUTPUTS, box_function(workcell)(*path, *numbers.values()), strict=True))
     rotation = ca.reshape(box["rotation"], 3, 3).T
     axes = ca.mtimes(rotation, number(workcell.contacts[0].T_box_pad[:3, :3]))
     weight = ca.DM(GRAVITY) * workcell.payload.mass
@@ -241,10 +282,12 @@ def path_force_function(workcell: Workcell) -> ca.Function:
         *(box["moment_by_acceleration"], box["moment_by_speed"]),
     )
     blocks = ca.vertcat(*[ca.mtimes(axes.T, part) for part in asked])
-    force, by_a, by_w = force_functions(workcell)[1](blocks, a, w, *given.values())
-    outputs = ca.cse([force, ca.vertcat(by_a.T, by_w.T)])
-    inputs, names = [*path, a, w, *given.values()], ["pose", "first", "second", "a", "w", *given]
-    return ca.Function("path_force", inputs, outputs, names, ["normal_force", "slope"])
+    force, by_a, by_w = force_functions(workcell)[1](blocks, a, w, *numbers.values())
+    outputs = [force, ca.vertcat(by_a.T, by_w.T)]
+    inputs = [*path, a, w, *numbers.values()]
+    names = ["pose", "first", "second", "a", "w", *numbers]
+    results = ca.cse(outputs) if closed else outputs
+    return ca.Function("path_force", inputs, results, names, ["normal_force", "slope"])
 
 
 def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
@@ -252,10 +295,13 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
     Both take force (9,), moment (6,), torque and wrench blocks of `LimitLayout` as one input, then
     u'' and u'^2. `limit_ratios` gives `contact_limits`' ratios; `limit_slopes` gives the same and
-    their derivatives (joints + 2,) by u'' and by u'^2.
+    their derivatives (joints + 2,) by u'' and by u'^2. Where a program finds the forces, shifts of
+    the pressure are no limit and count as none.
     """
     sizes = limit_layout(workcell).sizes
     names = ("force", "moment", "torque", "wrench")
+    if not workcell.has_closed_form:
+        return _program_ratios(workcell)
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in names}
     a, w = ca.SX.sym("a"), ca.SX.sym("w")
     detached: Detached = []
@@ -301,6 +347,37 @@ def contact_limits(
         for moved, contact in zip((held.shift_1, held.shift_2), workcell.contacts, strict=True)
     ]
     return held.normal, ca.vertcat(*ratios)
+
+
+def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
+    """See `ratio_functions`."""
+    layout = limit_layout(workcell)
+    sizes, joints = layout.sizes, layout.joints
+    names = ("force", "moment", "torque", "wrench")
+    ends = np.cumsum([0, sizes["force"] + sizes["moment"], sizes["torque"], sizes["wrench"]])
+    inputs = [ca.MX.sym("blocks", sum(sizes[name] for name in names)), *map(ca.MX.sym, "aw")]
+    asked, torque, wrench = ca.vertsplit(inputs[0], ends.tolist())
+    own, by_wrench = ca.reshape(torque, joints, 3), ca.reshape(wrench, 6, joints).T
+    # Each arm's joints feel its own wrench.
+    first, to_robots = len(workcell.robots[0].velocity_max), robot_wrenches(workcell)
+    felt = [ca.sparsify(ca.DM(part)) for part in (to_robots[:6], to_robots[6:])]
+    load, by_timing = _load_function(workcell)(asked, *inputs[1:])
+    soft, none = _on_central_path(workcell), ca.DM.zeros(2, 1)
+
+    def on_joints(held: ca.MX) -> ca.MX:
+        each = (by_wrench[:first, :], by_wrench[first:, :])
+        turned = [ca.mtimes(by, ca.mtimes(to, held)) for by, to in zip(each, felt, strict=True)]
+        return ca.vertcat(*turned)
+
+    ratios = ca.mtimes(own, ca.vertcat(*inputs[1:], 1.0))
+    held, by_load = soft.wrenches(slopes=True)(load)
+    slopes = own[:, :2] + on_joints(ca.mtimes(by_load, by_timing))
+    alone = soft.wrenches(slopes=False)(load)
+    whole = [ratios + on_joints(held), *ca.horzsplit(slopes)]
+    return (
+        ca.Function("limit_ratios", inputs, [ca.vertcat(ratios + on_joints(alone), none)]),
+        ca.Function("limit_slopes", inputs, [ca.vertcat(value, none) for value in whole]),
+    )
 
 
 def _with_slopes(

@@ -252,7 +252,7 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
     pairs = zip(cell.robots, cell.contacts, strict=True)
     first, second = (_robot(take, i, *pair) for i, pair in enumerate(pairs))
     # A squeeze to start from is looked for with the contacts' numbers themselves.
-    searched = cell.task.allocation == "joint" and not cell.has_facing_pads
+    searched = cell.has_force_slopes and not cell.has_closed_form
     payload: Any = replace(cell.payload, size=np.zeros(3), shape=None, jerk_max=None)
     contacts: Any = cell.contacts
     task: Any = replace(

@@ -13,11 +13,17 @@ import numpy as np
 from hybrid_opt.job.motions import PEAK_RATE, SAMPLES, TICK, at_even_steps, rise
 from hybrid_opt.job.records import Force, PhaseMotion, contact_effort
 from hybrid_opt.robust.force import BoxMotion
-from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, pressed_beyond
+from hybrid_opt.robust.squeeze import (
+    Squeeze,
+    SqueezeSettings,
+    pressed_beyond,
+    pressed_together,
+)
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array
-from symbolic.errors import SettingsError
+from symbolic.contact.grasp import Grasp
+from symbolic.contact.load import robot_wrenches
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
@@ -38,14 +44,8 @@ def holding(
     about.
 
     Raises:
-        SettingsError: the uncertainty leaves no friction or patch, or the contacts are not two pads
-            with opposite normals.
+        SettingsError: the uncertainty leaves no friction or patch.
     """
-    if not model.workcell.has_opposite_pads:
-        raise SettingsError(
-            "a job presses with two pads whose normals are opposite; carries with other pads can "
-            "be searched, timed and simulated"
-        )
     ends = np.cumsum([0.0, *(motion.duration for motion in motions)])
     time = np.concatenate([m.time + at for m, at in zip(motions, ends[:-1], strict=True)])
     box = BoxMotion(
@@ -57,8 +57,8 @@ def holding(
     load = model.load(box.pose, box.rate, box.second_rate)
     least, wrench = load["normal_force"], np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
     extra, squeeze = pressed_beyond(model.workcell, settings, time, box, least)
-    normal = least + extra[:, None]
-    wrench = wrench + extra[:, None, None] * unit_squeeze(model.workcell, box.pose)
+    normal = least + np.multiply.outer(extra, pressed_together(model.workcell, squeeze.leader))
+    wrench = wrench + extra[:, None, None] * unit_squeeze(model.workcell, box.pose, squeeze.leader)
     cuts = np.cumsum([len(motion.time) for motion in motions])[:-1]
     parts = zip(*(np.split(values, cuts) for values in (normal, least, wrench)), strict=True)
     return [Force(*part) for part in parts], squeeze
@@ -89,19 +89,27 @@ def without_force(motion: PhaseMotion) -> Force:
     return Force(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 6)))
 
 
-def unit_squeeze(workcell: Workcell, pose: Array) -> Array:
-    """(n, 2, 6) wrenches about the nominal contact points of 1 N that either pad presses more.
+def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
+    """(n, 2, 6) wrenches about the nominal contact points of 1 N that is commanded beyond the plan.
 
-    Both forces act on one line, midway between the nominal points, and balance one another.
+    Of pads with opposite normals both forces act on one line, midway between the nominal points,
+    and balance one another. Of others it is an internal squeeze within all friction cones.
 
     Args:
         pose: (n, 6) of the box [m, rad].
+        leader: index of the arm that is not commanded.
     """
+    turned = box_rotation(workcell.task.orientation, pose)
+    if not workcell.has_opposite_pads:
+        grasp = Grasp(workcell)
+        parts = robot_wrenches(workcell) @ grasp.squeeze_wrenches().ravel()
+        axes = workcell.contacts[0].T_box_pad[:3, :3]
+        wrenches = parts.reshape(2, 2, 3) @ axes.T / grasp.squeeze_normals()[1 - leader]
+        return np.asarray(np.einsum("nij,abj->nabi", turned, wrenches).reshape(len(pose), 2, 6))
     first, second = (contact.T_box_pad for contact in workcell.contacts)
     normal = first[:3, 2]
     apart = second[:3, 3] - first[:3, 3]
     beside = (apart - (apart @ normal) * normal) / 2.0
-    turned = box_rotation(workcell.task.orientation, pose)
     wrenches = np.array(
         [
             np.concatenate([sign * normal, np.cross(sign * beside, sign * normal)])

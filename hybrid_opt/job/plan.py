@@ -39,6 +39,7 @@ from hybrid_opt.static_hold import kept_per_workcell
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array
+from symbolic.contact.force_closure import presses_evenly
 from symbolic.errors import SettingsError
 from symbolic.records import Handling, Workcell
 from symbolic.records.task import extended_waypoints
@@ -123,11 +124,14 @@ class JobModel:
 
         Raises:
             SettingsError: the timing failed, or the squeeze is not possible.
-            JobError: the pads do not face one another, an arm does not reach a place, something
-                collides, or a limit is exceeded.
+            JobError: pads that do not face one another choose their pressure, an arm does not reach
+                a place, something collides, or a limit is exceeded.
         """
-        if not self.workcell.has_facing_pads:
-            raise JobError("whole jobs are those of two round pads that face one another")
+        if not (self.workcell.has_facing_pads or presses_evenly(self.workcell)):
+            raise JobError(
+                "whole jobs are those of pads that press evenly (task.allocation = 'soft-finger'), "
+                "or of two round pads that face one another"
+            )
         carry = timing.carry
         if carry is None or not timing.ok:
             raise SettingsError(

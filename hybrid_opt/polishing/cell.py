@@ -135,7 +135,7 @@ def quantities_of(workcell: Workcell) -> tuple[Quantity, ...]:
     one another nothing is in closed form."""
     if workcell.task.time_law == "optimal":
         return ()
-    if workcell.task.allocation != "joint":
+    if workcell.has_closed_form:
         return ("force", "pressure") if workcell.task.allocation == "paper" else ("force",)
     return ("force", "load") if workcell.has_facing_pads else ("load",)
 

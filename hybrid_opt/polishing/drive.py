@@ -44,7 +44,8 @@ from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.drive import Driver
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.records.task import Task, waypoints_of
+from symbolic.records import Workcell
+from symbolic.records.task import waypoints_of
 
 FIRST_RADIUS, LEAST_RADIUS = 0.3, 1e-4
 """Of the box of trust, in halves of the ranges of the waypoints; below the least a point is
@@ -85,9 +86,9 @@ STILL = 1e-3
 """The least force limit is this share above the force that holds the box at rest."""
 
 
-def is_polishable(task: Task) -> bool:
-    """Whether drivable carries of a task can be polished: those whose forces have a closed form."""
-    return task.allocation != "joint"
+def is_polishable(workcell: Workcell) -> bool:
+    """Whether drivable carries of a cell can be polished: those whose forces have a closed form."""
+    return workcell.has_closed_form
 
 
 @dataclass(frozen=True)
@@ -200,13 +201,13 @@ class DriveWay(Way[DriveReached, DriveStep]):
         """Prepare programs.
 
         Raises:
-            SettingsError: the time law is not 'optimal', or forces are allocated jointly.
+            SettingsError: the time law is not 'optimal', or forces have no closed form.
         """
         driver, task = cell.evaluator.driver, cell.task
-        if driver is None or not is_polishable(task):
+        if driver is None or not is_polishable(cell.workcell):
             raise SettingsError(
                 "the polish of drivable carries needs the time law 'optimal' and the allocation "
-                "'soft-finger' or 'paper': switch the polish off"
+                "'paper', or 'soft-finger' with two pads of opposite normals: switch the polish off"
             )
         super().__init__(cell, ActiveSet(cell), CarryReader(cell))
         self.driver, self.settings, self._n = driver, settings, task.n_path

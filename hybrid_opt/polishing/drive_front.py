@@ -321,8 +321,10 @@ class DriveRun(PolishRun[DriveAttempt]):
         rows = [k for k in self._archive.rows() if self._archive.polished[k]]
         if len(rows) < 2:
             rows = self._archive.rows()
-        # By shares: a second matters less to a slow carry than to a fast one.
-        values = np.log([self._archive.objectives[k] for k in rows])
+        # By speed and by shares of force: a second matters less to a slow carry than to a fast one.
+        values = np.array([self._archive.objectives[k] for k in rows])
+        values[:, 1 - self._by_force] **= -1.0
+        values[:, self._by_force] = np.log(values[:, self._by_force])
         values /= np.maximum(np.ptp(values, axis=0), LEAST_SPAN)
         areas = np.abs(np.prod(np.diff(values, axis=0), axis=1))
         for gap in np.argsort(-areas, kind="stable").tolist():

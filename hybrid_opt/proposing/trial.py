@@ -94,7 +94,7 @@ class Trial:
         }
         self.evaluator = CandidateEvaluator(self.workcell, functions=functions)
         # Forces that a solver finds take most of a candidate's time.
-        self._solved = self.workcell.task.allocation == "joint"
+        self._solved = not self.workcell.has_closed_form
         self._motion = InterpretedFunction(dense(motion_function(model))) if self._solved else None
 
     @property

@@ -252,8 +252,8 @@ def _job(cell: Cell, timing: Timing) -> tuple[Array, Squeeze, Job | None, list[s
         doubts.append("the cell states that nothing is uncertain: state what may be off")
     if not squeeze.even_pads:
         doubts.append(
-            "the squeeze holds pads that choose their pressure; what pads that press evenly need "
-            "is known for two pads with opposite normals only"
+            "the squeeze holds pads that choose their pressure; pressing evenly, they do not close "
+            "their grasp: turn them towards one another, or raise the friction"
         )
     allowed = cell.workcell.task.reference_force
     if (peak > allowed * (1.0 + BETTER)).any():

@@ -11,11 +11,13 @@ Which are worst follows from the least squeeze that a case asks for:
 - a disc of radius r - e about the nominal pad lies within every disc of radius r displaced by at
   most e, so that a patch smaller by e stands for all displaced ones. This one is sufficient, not
   exact. A rectangle shrinks in proportion, so that its shorter side shrinks by e;
-- soft fingers press about their displaced places. Displaced alike by e, both leave the centre of
-  mass as much beside them. Displaced apart, they turn the squeeze into a moment, which a difference
-  of their tangential forces of up to 2 e N / L each carries, L being their distance: a coefficient
-  of friction that is lower by 2 e / L stands for it. Both at once are sufficient, not exact. What
-  the arms' places are off one another adds to 2 e;
+- pads that press evenly press about their displaced places. Two with opposite normals, displaced
+  alike by e, leave the centre of mass as much beside them. Displaced apart, they turn the squeeze
+  into a moment, which a difference of their tangential forces of up to 2 e N / L each carries, L
+  being their distance: a coefficient of friction that is lower by 2 e / L stands for it. Both at
+  once are sufficient, not exact. What the arms' places are off one another adds to 2 e. Of pads
+  anywhere the corners of squares about the discs of displacements are taken; that nothing between
+  them is worse is true to first order in e, and what random cases check;
 - a pad that is tilted by t against its face presses along its own axis: the cone about that axis
   which lies within the face's own has the coefficient tan(atan mu - t), exact in the worst
   direction;
@@ -76,21 +78,31 @@ def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -
     case[16 - leader] = uncertainty.tracking
     case[17] = uncertainty.opposed_force
     centre = uncertainty.centre_of_mass
-    if workcell.task.allocation == "soft-finger":
+    places = [np.zeros(4)]
+    if workcell.task.allocation == "soft-finger" and not workcell.has_closed_form:
+        off += uncertainty.apart / 2.0
+        places = [off * np.array(signs) for signs in product((-1.0, 1.0), repeat=4 * (off > 0.0))]
+    elif workcell.task.allocation == "soft-finger":
         normal = workcell.contacts[0].T_box_pad[:3, 2]
         centre = centre + off * np.sqrt(np.maximum(1.0 - normal**2, 0.0))
     else:
         case[2:4] *= patches_left(workcell, uncertainty)
     ranges = np.concatenate([centre, uncertainty.disturbance])
     corners = product(*[(-width, width) if width > 0.0 else (0.0,) for width in ranges])
-    return np.array([case + np.concatenate([np.zeros(5), at, np.zeros(7)]) for at in corners])
+    return np.array(
+        [
+            case + np.concatenate([np.zeros(5), at, place, np.zeros(3)])
+            for at in corners
+            for place in places
+        ]
+    )
 
 
 def least_friction(workcell: Workcell, uncertainty: Uncertainty) -> Array:
     """(2,) coefficients of friction that stand for the worst of a set, zero or less for none."""
     friction = np.array([contact.friction for contact in workcell.contacts])
     left = np.tan(np.arctan(friction * (1.0 - uncertainty.friction)) - uncertainty.turned)
-    if workcell.task.allocation == "soft-finger":
+    if workcell.task.allocation == "soft-finger" and workcell.has_closed_form:
         first, second = (contact.T_box_pad for contact in workcell.contacts)
         length = abs(float((first[:3, 3] - second[:3, 3]) @ first[:3, 2]))
         left -= (2.0 * uncertainty.pad_position + uncertainty.apart) / length

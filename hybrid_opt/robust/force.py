@@ -26,6 +26,8 @@ from hybrid_opt.robust.cases import (
 )
 from hybrid_opt.static_hold import kept_per_workcell
 from symbolic.array import Array
+from symbolic.contact.force_closure import has_force_closure
+from symbolic.contact.worst_cases import least_distance
 from symbolic.errors import SettingsError
 from symbolic.read.checks import PATCH_OVERLAP, pads_beside
 from symbolic.records import Uncertainty, Workcell
@@ -34,6 +36,10 @@ BATCH = 100_000
 """Samples that are evaluated at once."""
 
 BISECTIONS = 30
+DISPLACED = 0.2
+"""Displacement of pads that press evenly, over the least distance of two pads of different robots,
+up to which forces are looked for."""
+
 LARGEST_FACTOR = 20.0
 """The largest multiple of a set that is looked for."""
 
@@ -145,9 +151,10 @@ class RobustModel:
             found[start : start + step] = forces.reshape(len(some), n, 2)
         return found
 
-    def nominal(self, motion: HeldMotion) -> Array:
-        """(n, 2) least normal forces of the cell as it is described [N]."""
-        return np.asarray(self.least_squeeze(motion, nominal_case(self.workcell)[None])[0])
+    def nominal(self, motion: HeldMotion, leader: int = 0) -> Array:
+        """(n, 2) least normal forces of the cell as it is described [N], see `least_squeeze`."""
+        case = nominal_case(self.workcell)[None]
+        return np.asarray(self.least_squeeze(motion, case, leader)[0])
 
     def hold(
         self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
@@ -307,7 +314,10 @@ def _leaves_something(workcell: Workcell, uncertainty: Uncertainty) -> bool:
     """Whether friction, patches, mass and force are left in the worst case."""
     shares = [1.0 - uncertainty.mass, 1.0 - uncertainty.tracking]
     left = [*least_friction(workcell, uncertainty), *shares]
-    if workcell.task.allocation != "soft-finger":
+    if not workcell.has_closed_form and workcell.task.allocation == "soft-finger":
+        off = uncertainty.pad_position + uncertainty.apart / 2.0
+        left.append(DISPLACED * least_distance(workcell) - off)
+    elif workcell.task.allocation != "soft-finger":
         patches = patches_left(workcell, uncertainty)
         left += [*patches]
         if workcell.has_facing_pads:
@@ -326,13 +336,18 @@ def _soft_model(workcell: Workcell) -> RobustModel:
 
 
 soft_model = kept_per_workcell(_soft_model)
-"""The model of a workcell whose pads press evenly, whatever its own allocation: two pads with
-opposite normals."""
+"""The model of a workcell whose pads press evenly, whatever its own allocation."""
 
 
 def pressing_model(workcell: Workcell) -> RobustModel:
     """The model of what is commanded: of pads that press evenly where that is known of them."""
-    return (soft_model if workcell.has_opposite_pads else robust_model)(workcell)
+    return (soft_model if closes_evenly(workcell) else robust_model)(workcell)
+
+
+def closes_evenly(workcell: Workcell) -> bool:
+    """Whether pads that press evenly hold a workcell's payload whatever the motion asks."""
+    task = replace(workcell.task, allocation="soft-finger")
+    return workcell.has_opposite_pads or has_force_closure(replace(workcell, task=task))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 With N_1 - N_2 fixed by the motion, the force of one arm decides both: the leading arm keeps its
 place and feels what follows, the other is force-controlled (`hybrid_opt.robust`). Force
-beyond the plan presses both pads against one another and moves nothing.
+beyond the plan presses both pads against one another and moves nothing. Of pads without opposite
+normals an internal squeeze within all friction cones does.
 
 The plan may assume pads that choose their pressure. What is commanded always holds pads that press
 evenly as well (`hybrid_opt.robust.force.soft_model`), in every case of the cell's set: one number
@@ -18,8 +19,15 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.robust.force import HeldMotion, pressing_model, soft_model
+from hybrid_opt.robust.force import (
+    BoxMotion,
+    HeldMotion,
+    closes_evenly,
+    pressing_model,
+    soft_model,
+)
 from symbolic.array import Array
+from symbolic.contact.grasp import Grasp
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
 
@@ -98,8 +106,8 @@ class Squeeze:
         factor: commanded squeeze over the least that holds, None where the forces are robust ones.
         uncertainty: the set that the forces hold for, None where a factor was taken.
         smoothing: half the width of the time window of the smoothing [s].
-        even_pads: whether the forces hold pads that press evenly; known for two pads with opposite
-            normals.
+        even_pads: whether the forces hold pads that press evenly, which may not close a grasp that
+            pads close that choose their pressure.
         parts: of the largest force that is commanded, the least that holds first; they add up to
             it.
     """
@@ -134,10 +142,11 @@ class Squeeze:
 def pressed_beyond(
     workcell: Workcell, settings: SqueezeSettings, time: Array, motion: HeldMotion, least: Array
 ) -> tuple[Array, Squeeze]:
-    """(n,) what both robots press with beyond the planned normal forces [N], and how it came about.
+    """(n,) what the commanded robot presses with beyond the planned normal force [N], the other one
+    in the proportion of `pressed_together`, and how it came about.
 
     Smooth where the planned forces are; with it neither robot ever presses less than the plan, or
-    than what holds pads that press evenly, in every case of the set, asks for.
+    than what holds pads that press evenly, moving or stopped, in every case of the set, asks for.
 
     Args:
         time: (n,) of the samples, not decreasing [s].
@@ -147,13 +156,15 @@ def pressed_beyond(
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
     """
-    leader, even = settings.leader, workcell.has_opposite_pads
+    leader, even = settings.leader, closes_evenly(workcell)
     planned, doubt = least[:, 1 - leader], workcell.uncertainty
+    still = BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
     if settings.factor is None:
         model = pressing_model(workcell)
 
         def needed_for(names: tuple[str, ...]) -> Array:
-            return np.maximum(planned, model.hold(motion, doubt.only(names), leader)[0])
+            held = [model.hold(box, doubt.only(names), leader)[0] for box in (motion, still)]
+            return np.maximum(planned, np.maximum(*held))
 
         names: tuple[str, ...] = ()
         needed = needed_for(names)
@@ -165,10 +176,13 @@ def pressed_beyond(
                 parts.append(Part(name, float(needed.max()) - before))
                 before = float(needed.max())
     else:
+        stopped = np.zeros(len(planned))
         if even:
-            least = np.maximum(least, soft_model(workcell).nominal(motion))
+            least = np.maximum(least, soft_model(workcell).nominal(motion, leader))
+            stopped = soft_model(workcell).nominal(still, leader)[:, 1 - leader]
         held = least[:, 1 - leader]
-        needed = held + (settings.factor - 1.0) * least.mean(axis=1)
+        own = least.mean(axis=1) if workcell.has_opposite_pads else held
+        needed = np.maximum(held + (settings.factor - 1.0) * own, stopped)
         parts = [Part("least force", float(held.max()))]
         parts.append(Part("factor", float(needed.max() - held.max())))
     squeeze = Squeeze(
@@ -180,6 +194,15 @@ def pressed_beyond(
         tuple(parts),
     )
     return smooth_above(time, needed, settings.smoothing) - planned, squeeze
+
+
+def pressed_together(workcell: Workcell, leader: int) -> Array:
+    """(2,) what both robots press with for each newton that is commanded beyond the plan: an
+    internal squeeze of their pads."""
+    if workcell.has_opposite_pads:
+        return np.ones(2)
+    normals = Grasp(workcell).squeeze_normals()
+    return np.asarray(normals / normals[1 - leader])
 
 
 def commanded_forces(
@@ -194,7 +217,8 @@ def commanded_forces(
         SettingsError: the cell's uncertainty leaves no friction or patch.
     """
     extra, squeeze = pressed_beyond(workcell, settings, carry.time, carry, carry.normal_force)
-    return carry.normal_force + extra[:, None], squeeze
+    together = pressed_together(workcell, settings.leader)
+    return carry.normal_force + np.multiply.outer(extra, together), squeeze
 
 
 def smooth_above(time: Array, values: Array, width: float) -> Array:

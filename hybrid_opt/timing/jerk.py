@@ -26,6 +26,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from hybrid_opt.carry import Carry
+from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.timing.jerk_program import Point
 from hybrid_opt.timing.jerk_step import convex_step
 from hybrid_opt.timing.model import TimingModel
@@ -42,7 +43,6 @@ from hybrid_opt.timing.records import (
 from hybrid_opt.timing.solve import LEAST_SPEED, time_path
 from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_ratios, limit_use, worst
 from symbolic.array import Array
-from symbolic.errors import SettingsError
 
 PIECES = 60
 """Pieces of the spline of squared speeds."""
@@ -60,6 +60,9 @@ SETTLED = 1e-4
 TIGHTENED = 4
 """Times that a timing is found anew with less of the limits where they were exceeded."""
 
+SLOWEST = 0.5
+"""Factor on the speeds below which a timing cannot be mended by slowing it down."""
+
 FIRST_USE = 0.5
 """Largest use of a limit by the slow start that the rounds begin with."""
 
@@ -73,14 +76,8 @@ def time_with_jerk(
         x: (n_var,) decision vector.
 
     Raises:
-        SettingsError: x does not fit the workcell, or the force is limited of pads that are not
-            two round ones facing one another.
+        SettingsError: x does not fit the workcell, or limited robust forces have no slopes.
     """
-    if limits.force is not None and not model.workcell.has_facing_pads:
-        raise SettingsError(
-            "jerk limits beside a force limit need two round pads that face one another: leave "
-            "one of the limits out"
-        )
     motion = model.path_motion(x)
     fastest = time_path(model, x, limits, motion)
     if path_failure(model, motion) is not None or not fastest.ok:
@@ -91,11 +88,11 @@ def time_with_jerk(
 
 def drive_with_jerk(model: TimingModel, x: Array) -> JerkTiming | None:
     """A drivable carry x (n_var,) within its own force limit and the cell's limits on jerk; None
-    where the cell limits no jerk, and where its pads are not two round ones facing one another."""
-    limits = JerkLimits.of(model.workcell)
-    if limits is None or not model.workcell.has_facing_pads:
+    where the cell limits no jerk, and where limited robust forces have no slopes."""
+    jerk, limits = JerkLimits.of(model.workcell), model.drive_limits(float(x[-1]))
+    if jerk is None or (limits.robust and not is_squeezed(model.workcell)):
         return None
-    return time_with_jerk(model, x, model.drive_limits(float(x[-1])), limits)
+    return time_with_jerk(model, x, limits, jerk)
 
 
 class _Problem:
@@ -135,7 +132,9 @@ class _Problem:
                 break
             keep = self._coarse.keep / np.where(excess > 1.0, excess, 1.0)
             self._coarse = replace(self._coarse, keep=keep)
-            c, more = self._settled(self._factor(c) ** 2 * c)
+            factor = self._factor(c)
+            # Slower is not better where standing still needs more force than the limit.
+            c, more = self._settled(factor**2 * c if factor > SLOWEST else c)
             rounds += more
         return replace(self._judged(c), rounds=rounds)
 
@@ -163,17 +162,21 @@ class _Problem:
         return np.asarray(np.maximum(np.append(use[0], between), np.append(between, use[-1])))
 
     def _slow(self, c: Array) -> float:
-        """Factor on the squared speeds at which everything is used little, as at rest."""
+        """Factor on the squared speeds at which everything is used little, as at rest; normal
+        forces beyond their limit at rest are left to the rounds."""
+        limits = self._limits
+        if max(self._uses(0.0 * c, limits)) >= 1.0:
+            limits = replace(limits, force=None)
         factor = 1.0
-        rest = max(self._uses(0.0 * c))
+        rest = max(self._uses(0.0 * c, limits))
         allowed = rest + FIRST_USE * (1.0 - rest)
-        while max(self._uses(factor * c)) > allowed:
+        while max(self._uses(factor * c, limits)) > allowed:
             factor *= 0.5
         return factor
 
-    def _uses(self, c: Array) -> tuple[float, float, float]:
-        """Largest use of the timing's limits, joint jerk and payload jerk at the coarse points."""
-        return self._judge(self._coarse, c)[1:]
+    def _uses(self, c: Array, limits: TimingLimits) -> tuple[float, float, float]:
+        """Largest use of limits, joint jerk and payload jerk at the coarse points."""
+        return self._judge(self._coarse, c, limits)[1:]
 
     def _carry(self, at: Point, c: Array) -> Carry:
         return self._model.carry(at.motion, at.time(c), at.speed(c), at.acceleration(c))
@@ -184,9 +187,12 @@ class _Problem:
         of_joints = (np.abs(joint) / self._jerk.joints).max(axis=1)
         return of_joints, np.linalg.norm(box, axis=1) / self._jerk.payload
 
-    def _judge(self, at: Point, c: Array) -> tuple[Timing, float, float, float]:
+    def _judge(
+        self, at: Point, c: Array, limits: TimingLimits | None = None
+    ) -> tuple[Timing, float, float, float]:
         carry = self._carry(at, c)
-        use = limit_use(carry, self._model.workcell, self._limits, self._model.joint_names)
+        limits = limits or self._limits
+        use = limit_use(carry, self._model.workcell, limits, self._model.joint_names)
         joint, box = (float(jerk.max()) for jerk in self._jerks(at, c))
         excess = worst(use)
         reason = f"{carry.duration:.3f} s; most used: {excess.place}"

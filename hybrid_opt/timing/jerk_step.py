@@ -17,6 +17,9 @@ LEAST_SHARE = 0.05
 """Least share of its last value that a coefficient keeps."""
 
 
+MENDED = 1.001
+"""Excess of a normal force that is left as it is."""
+
 NEAR = 0.6
 """Torques and shifts that stay below this share of their limit get no rows."""
 
@@ -27,7 +30,7 @@ def convex_step(
     """Better coefficients than c (k,), which satisfy all limits at the points; None without any."""
     rows = Rows(len(c))
     _motion_rows(model, at, limits, rows)
-    _force_rows(model, at, c, limits, rows)
+    to_mend = _force_rows(model, at, c, limits, rows)
     _ratio_rows(model, at, c, limits, rows)
     _jerk_rows(at, c, jerk, rows)
     rows.below(-np.ones((len(c), 1)), -LEAST_SHARE * c, np.arange(len(c)))
@@ -36,9 +39,9 @@ def convex_step(
     if answer is None:
         return None
     # The quadratic model promises too much far away: c and the answer are both allowed, and so is
-    # everything between them.
+    # everything between them, unless there is something to mend in c.
     share = 1.0
-    while at.duration(c + share * (answer - c)) > at.duration(c) and share > 1e-3:
+    while not to_mend and at.duration(c + share * (answer - c)) > at.duration(c) and share > 1e-3:
         share *= 0.5
     return np.asarray(c + share * (answer - c))
 
@@ -66,32 +69,40 @@ def _motion_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows
         rows.within(A / most, np.zeros((len(at.s), 3)), none, keep, first_basis)
 
 
-def _force_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, rows: Rows) -> None:
+def _force_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, rows: Rows) -> bool:
     """Normal forces below the limit, planned and robust ones, linearised at c: they are convex in
-    (u'', u'^2)."""
+    (u'', u'^2). Whether c exceeds what may not stay as it is for a round."""
     if limits.force is None:
-        return
+        return False
     workcell, m = model.workcell, at.motion
     a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
-    forces = []
-    if workcell.task.allocation != "joint":
-        forces.append(model.path_force(m, a, w))
+    slopes = workcell.has_force_slopes
+    forces = [model.path_force(m, a, w)] if slopes else []
     if limits.robust:
         path = (m.pose[:, :6], m.pose_first[:, :6], m.pose_second[:, :6])
         force, slope = robust_path(workcell).at(PathPoints(*path, a, w))
         forces.append((force, slope[:, :, BY_TIMING]))
     along = np.stack([at.acceleration_by, at.squared_by], axis=1)[:, None]
+    # Tangents of what is convex leave a way wherever there is one, however far from it c is. Where
+    # slowing down cannot mend what rounds leave out, they have to.
+    standing = model.path_force(m, 0.0 * a, 0.0 * w)[0] if slopes else np.zeros(1)
+    still = bool((standing > limits.force).any())
     for force, slope in forces:
         by = ((slope / limits.force)[..., None] * along).sum(axis=2)
-        _linearised(at, c, force / limits.force, by, rows)
+        _linearised(at, c, force / limits.force, by, rows, strict=still)
+    return still and max(float(force.max()) for force, _ in forces) > MENDED * limits.force
 
 
-def _linearised(at: Point, c: Array, value: Array, by: Array, rows: Rows) -> None:
+def _linearised(
+    at: Point, c: Array, value: Array, by: Array, rows: Rows, strict: bool = False
+) -> None:
     """Values (n, m) at c over their limits, with derivatives (n, m, k), below one.
 
-    What is exceeded between rounds, by what the last one left out, may stay as it is for one.
+    What is exceeded between rounds, by what the last one left out, may stay as it is for one,
+    unless they are `strict`.
     """
-    bound = np.maximum(at.keep[:, None], value) - value + by @ c
+    keep = at.keep[:, None]
+    bound = (keep if strict else np.maximum(keep, value)) - value + by @ c
     A = at.local(by)
     first = np.repeat(at.first_basis, by.shape[1])
     rows.below(A.reshape(-1, A.shape[2]), bound.reshape(-1), first)

@@ -121,7 +121,7 @@ class TimingModel:
 
     def path_force(self, motion: PathMotion, a: Array, w: Array) -> tuple[Array, Array]:
         """Normal forces (n, 2) [N] under u'' = a and u'^2 = w (n,), and their slopes (n, 2, 2) by
-        these; of allocations with a closed form."""
+        these, where the cell `has_force_slopes`."""
         path = (motion.pose, motion.pose_first, motion.pose_second)
         found = self._functions["path_force"].batch(*path, a, w)
         return found["normal_force"], found["slope"]

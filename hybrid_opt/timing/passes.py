@@ -9,6 +9,7 @@ from codegen.cache import source_digest
 from codegen.function import NumericFunction, Signature
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.records import TimingStatus
+from hybrid_opt.timing.use import STANDING
 from symbolic.records import Workcell
 
 KINDS = (
@@ -38,7 +39,7 @@ OUTCOMES = (
 def passes_function(
     compiled: CompiledCell, intervals: int, cuts: int = 0
 ) -> NumericFunction | None:
-    """The timing of one path from its limits; None where the contact forces are allocated jointly.
+    """The timing of one path from its limits; None where these do not tell the contact wrenches.
 
     Inputs: samples (2 intervals + 1, `LimitLayout.size`), both ends and the middle of
     every interval; options (4,): largest normal force [N],
@@ -57,9 +58,9 @@ def passes_function(
         cuts: lines at every sample that the caller gives.
     """
     workcell, cache = compiled.workcell, compiled.cache
-    if workcell.task.allocation == "joint":
-        return None  # the passes know normal forces in closed form, and no others
-    details = (str(intervals), str(cuts), source_digest(__name__), _passes_c())
+    if workcell.has_opposite_pads and not workcell.has_closed_form:
+        return None  # among wrenches of the same effort the load function keeps the paper's
+    details = (str(intervals), str(cuts), str(STANDING), source_digest(__name__), _passes_c())
     key = compiled.key("path timing", *details, bodies=False)
     made = load_or_compile(key, lambda: _source(compiled.symbols.workcell, intervals, cuts), cache)
     return compiled.bound(made)
@@ -76,13 +77,19 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
     from symbolic.limits import force_functions, limit_layout, ratio_functions
 
     layout = limit_layout(workcell)
+    helpers = (*force_functions(workcell), *ratio_functions(workcell))
+    rooms = [(f.sz_arg(), f.sz_res(), f.sz_iw(), f.sz_w()) for f in helpers]
+    # The numbers of what is held come fourth, where a function takes them.
+    most = (max(4, *sizes) for sizes in zip(*rooms, strict=True))
     constants = {
+        **dict(zip(("ROOM_ARG", "ROOM_RES", "ROOM_IW", "ROOM_W"), most, strict=True)),
         "INTERVALS": intervals,
         "JOINTS": layout.joints,
         "SIZE": layout.size,
         "RATIOS": layout.joints + 2,
         "CUTS": cuts,
         "HELD": 3 if cuts else 2,
+        "STANDING": 1.0 if cuts else STANDING,
         **{f"AT_{name.upper()}": place for name, place in layout.offsets.items()},
     }
     held = sx_given(workcell.payload)
@@ -103,6 +110,4 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
         ),
         ((), (), (), (2,), (len(KINDS), 3), (intervals + 1,), (), ()),
     )
-    return signature, handwritten_source(
-        signature, text, (*force_functions(workcell), *ratio_functions(workcell))
-    )
+    return signature, handwritten_source(signature, text, helpers)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.robust.path_force import robust_path
 from hybrid_opt.timing.model import TimingModel, joint_names
 from hybrid_opt.timing.passes import KINDS, OUTCOMES, passes_function
@@ -78,7 +79,8 @@ class PathTiming:
 
 class PathTimer:
     """Times paths of one workcell. Where it has no compiled passes it asks `time_path`, which is
-    slow: with the joint allocation of the contact forces.
+    slow: with the joint allocation of two opposite pads, and within robust forces of pads whose
+    forces are no squeeze (`hybrid_opt.robust.cases.is_squeezed`).
 
     Attributes:
         workcell: the cell.
@@ -129,7 +131,8 @@ class PathTimer:
         self._path, self._limits = functions["path"], functions["sample_limits"]
         self._passes = passes_function(compiled, intervals)
         # Made here: the cell's files may be gone when the first path is timed.
-        self._model = TimingModel(compiled, intervals) if self._passes is None else None
+        knows_all = self._passes is not None and is_squeezed(workcell)
+        self._model = None if knows_all else TimingModel(compiled, intervals)
 
     @property
     def compiled(self) -> bool:
@@ -188,13 +191,13 @@ class PathTimer:
         they are given."""
         found = list(self.failures(paths) if failures is None else failures)
         rows = [row for row, failure in enumerate(found) if failure is None]
-        if self._model is not None:
-            for row in rows:
-                found[row] = from_time_path(self._model, x[row], limits[row])
-            return [timing for timing in found if timing is not None]
         for robust in (False, True):
             some = [row for row in rows if limits[row].robust is robust]
             if not some:
+                continue
+            if self._model is not None and (robust or self._passes is None):
+                for row in some:
+                    found[row] = from_time_path(self._model, x[row], limits[row])
                 continue
             options = np.array([_options(limits[row]) for row in some])
             drive = self._robustly_driven if robust else self._driven

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
 from hybrid_opt.timing import rows as rows_of
@@ -79,11 +80,11 @@ class PointLimits:
 
     def _convex_forces(self, a: Array, w: Array) -> list[tuple[Array, Array]]:
         """Limited normal forces (n, 2) that are convex in (u'', u'^2) and their slopes (n, 2, 2):
-        planned ones in closed form, and robust ones."""
+        planned ones, and robust ones where their slopes are known."""
         if self._limits.force is None:
             return []
-        closed = self._model.workcell.task.allocation != "joint"
-        found = [self._model.path_force(self.points, a, w)] if closed else []
+        slopes = self._model.workcell.has_force_slopes
+        found = [self._model.path_force(self.points, a, w)] if slopes else []
         robust = self._robust(a, w)
         return found if robust is None else [*found, robust]
 
@@ -95,7 +96,7 @@ class PointLimits:
     def _robust(self, a: Array, w: Array) -> tuple[Array, Array] | None:
         """Robust forces (n, 2) and their slopes (n, 2, 2) by (u'', u'^2), where these are limited
         and convex."""
-        if not (self._limits.robust and self._model.workcell.has_facing_pads):
+        if not (self._limits.robust and is_squeezed(self._model.workcell)):
             return None
         p = self.points
         path = (p.pose[:, :6], p.pose_first[:, :6], p.pose_second[:, :6])
@@ -134,7 +135,8 @@ class PointLimits:
         columns: list[Array] = []
         p, workcell = self.points, self._model.workcell
         pressure = limits_pressure(workcell, self._limits)
-        force = self._limits.force if workcell.task.allocation == "joint" else None
+        robust = self._limits.robust and not is_squeezed(workcell)
+        force = self._limits.force if robust or not workcell.has_force_slopes else None
         if not (self._limits.torque or pressure or force):
             return np.zeros((len(a), 0))
         load = self._model.drive(p, np.sqrt(w), a)
@@ -146,14 +148,12 @@ class PointLimits:
             radius = np.array([contact.patch_radius for contact in workcell.contacts])
             columns.append(load["pressure_shift"] / radius)
         if force:
-            needed = load["normal_force"]
-            if self._limits.robust and not workcell.has_facing_pads:
-                needed = np.maximum(needed, self._robust_anywhere(a, w))
+            needed = self._robust_anywhere(a, w) if robust else load["normal_force"]
             columns.append(needed / force)
         return np.concatenate(columns, axis=1)
 
     def _robust_anywhere(self, a: Array, w: Array) -> Array:
-        """(n, 2) robust forces, also of pads that do not face one another."""
+        """(n, 2) robust forces of pads that are not squeezed (`is_squeezed`)."""
         p, workcell = self.points, self._model.workcell
         path = (p.pose[:, :6], p.pose_first[:, :6], p.pose_second[:, :6])
         motion = BoxMotion(*PathPoints(*path, a, w).motion)

@@ -17,7 +17,10 @@ from hybrid_opt.timing.model import TimingModel, contact_torque
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.use import limits_pressure
 from symbolic.array import Array
+from symbolic.contact.elastic import free_shift, pressure_shifts
+from symbolic.contact.force_closure import presses_evenly
 from symbolic.records import Workcell
+from symbolic.records.poses import box_rotation
 
 KILOGRAM_FORCE = 9.80665
 """[N] per kgf."""
@@ -101,7 +104,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
 
     The forces are allocated anew for the changed values (the robots squeeze as hard as it takes);
     the carry fails when a normal force exceeds its reference force, a centre of pressure leaves
-    its patch, or a joint torque exceeds its maximum. Motion and timing stay as they are.
+    its patch, or a joint torque exceeds its maximum. Motion and timing stay as they are. Pads that
+    press evenly have a margin until a rim lifts off in place of one of the patch.
     """
     judge = _Judge(model, carry)
     names = [robot.name for robot in model.workcell.robots]
@@ -111,7 +115,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         _friction_margin(judge, f"friction of {names[1]}", np.array([0.0, 1.0])),
     ]
     margins += [_centre_margin(judge, axis, sign) for axis in range(3) for sign in (1.0, -1.0)]
-    return (*margins, *_patch_margins(carry, model.workcell))
+    return (*margins, *_patch_margins(carry, model.workcell), *_even_margins(model, carry))
 
 
 class _Judge:
@@ -186,6 +190,29 @@ def _patch_margins(carry: Carry, workcell: Workcell) -> list[Margin]:
             workcell.robots, workcell.contacts, carry.peak_pressure_shift, strict=True
         )
     ]
+
+
+def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
+    """The shift of the pressure that has to be free before an elastic pad lifts off at a rim is the
+    largest one of the carry."""
+    workcell = model.workcell
+    if not presses_evenly(workcell):
+        return []
+    load = model.load(carry.pose, carry.rate, carry.second_rate)
+    turned = box_rotation(workcell.task.orientation, carry.pose)
+    about = np.zeros((len(carry), 6))
+    for i, contact in enumerate(workcell.contacts):
+        parts = load[f"wrench_{i + 1}"].reshape(-1, 2, 3)
+        force, moment = np.einsum("nji,nkj->kni", turned, parts)
+        lever = np.cross(contact.T_box_pad[:3, 3], force)
+        about += np.hstack([force, moment + lever])
+    largest = pressure_shifts(workcell, about, load["normal_force"]).max(axis=0)
+    found = []
+    for robot, contact, share in zip(workcell.robots, workcell.contacts, largest, strict=True):
+        room = free_shift(contact)
+        name = f"room for the pressure of {robot.name}"
+        found.append(Margin(name, "m", room, room * float(share), "pad lifts off"))
+    return found
 
 
 def _last_holding(failure: Callable[[float], str], end: float) -> tuple[float, str]:

@@ -24,7 +24,14 @@ from hybrid_opt.timing.point_limits import POINT_TOLERANCE, PointLimits
 from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.refined import refined_carry
 from hybrid_opt.timing.rows import INTERVAL_ENDS, PointRows
-from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_ratios, limit_use, worst
+from hybrid_opt.timing.use import (
+    RECOMPUTED_TOLERANCE,
+    STANDING,
+    limit_ratios,
+    limit_use,
+    use_of,
+    worst,
+)
 from symbolic.array import Array
 
 MAX_ITERATIONS = 25
@@ -72,19 +79,30 @@ def time_path(
     """
     begin = time.perf_counter()
     motion = model.path_motion(x) if motion is None else motion
-    timing = path_failure(model, motion) or _failure_at_rest(model, motion, limits)
+    standing = 1.0 if limits.robust else STANDING
+    timing = path_failure(model, motion) or _failure_at_rest(model, motion, limits, standing)
     if timing is None:
         timing = _Problem(model, motion, limits).solve()
+        if timing.status is TimingStatus.SOLVER_FAILED:
+            timing = _failure_at_rest(model, motion, limits) or timing
     seconds = time.perf_counter() - begin
     return replace(timing, seconds=seconds, limits=limits)
 
 
-def _failure_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing | None:
-    """A limit that is exceeded even standing still: then no timing exists.
+def _failure_at_rest(
+    model: TimingModel, motion: PathMotion, limits: TimingLimits, standing: float = 1.0
+) -> Timing | None:
+    """A limit that is exceeded even standing still, of normal forces between the ends `standing`
+    times it: then the path is not to be driven.
 
-    Otherwise one exists: slow enough, every quantity is as close to its value at rest as wanted.
+    Where none is exceeded a timing exists: slow enough, every quantity is as close to its value at
+    rest as wanted.
     """
-    use = limit_use(model.still(motion), model.workcell, limits, model.joint_names)
+    carry = model.still(motion)
+    ratios = limit_ratios(carry, model.workcell, limits)
+    if "normal force" in ratios:
+        ratios["normal force"][1:-1] /= standing
+    use = use_of(ratios, carry, model.joint_names)
     excess = worst(use)
     if excess.ratio < 1.0 - 1e-6:
         return None

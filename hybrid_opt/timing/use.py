@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from hybrid_opt.carry import Carry
+from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.records import Excess, Place, TimingLimits
@@ -31,6 +32,10 @@ SPREAD = 20
 
 AT_A_TIME = 2000
 """Samples of a carry whose cases are held in memory together."""
+
+STANDING = 1.3
+"""Normal force that standing still may need anywhere between a carry's ends, over its force limit:
+what a job presses with holds the box wherever it stops. Robust forces hold it within the limit."""
 
 FORCE_FLOOR = 1e-9
 """A contact with less normal force than this carries nothing [N]."""
@@ -85,7 +90,7 @@ def limited_force(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Arr
 def _near_limit(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array:
     """As `limited_force`; robust ones that are below `NEAR` of the limit, and below the largest of
     the carry, may be told as the planned ones: to see that takes a fraction of the time."""
-    if not limits.robust or limits.force is None or not workcell.has_facing_pads:
+    if not limits.robust or limits.force is None or not is_squeezed(workcell):
         return limited_force(carry, workcell, limits)
     n = len(carry)
     points = PathPoints(carry.pose, carry.rate, carry.second_rate, np.zeros(n), np.ones(n))

@@ -130,11 +130,12 @@ def run_study(
         progress.note("the polish of robust forces knows two round pads that face one another: off")
         study = replace(study, polish=None)
     polish = study.polish if alone else study.drivable_polish
-    if polish is not None and not is_polishable(cell.task):
+    driven = Cell(cell).drivable().workcell if study.drivable and not alone else cell
+    if polish is not None and not is_polishable(driven):
         progress.note(
-            "the drivable carries of this cell are not polished, only searched: its task says "
-            f'allocation = "{cell.task.allocation}", and the polish of time and force knows '
-            'the allocations "soft-finger" and "paper" alone'
+            "the drivable carries of this cell are not polished, only searched: the polish of time "
+            'and force knows the allocation "paper", and "soft-finger" with two pads of opposite '
+            f'normals; here it is "{driven.task.allocation}"'
         )
         study = replace(study, drivable_polish=None, polish=None if alone else study.polish)
     with open_folder(settings, execution, cell) as folder:

@@ -7,22 +7,21 @@ The method is primal-dual with a predictor and a corrector (Mehrotra, SIAM J. Op
 step aims at the central path's place of a smaller weight, to second order by what a first step
 to weight zero leaves out. It starts within the cones, the load balanced, and takes some six steps;
 at most `STEPS`, each of which is passed over once the weight is small enough, so that the whole is
-one expression and compiles. The wrench of the last contact is what the others leave, so that
-6 (k - 1) components are free. Starts from a neighbouring sample's solution take more steps where
-several candidates run in lanes, and some never arrive.
+one expression and compiles. Six components of the wrenches are what the others leave. Starts from a
+neighbouring sample's solution take more steps where several candidates run in lanes, and some never
+arrive.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
 from itertools import accumulate
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.patches import Elimination, Patch, Step, least
 
 FINAL_WEIGHT = 1e-8
@@ -55,6 +54,9 @@ PROGRAMS = 16
 """How many programs' functions are kept."""
 
 
+AnyExpression = TypeVar("AnyExpression", ca.SX, ca.MX)
+
+
 class Program(Protocol):
     """What a set of contacts has to balance, and at what cost.
 
@@ -70,8 +72,11 @@ class Program(Protocol):
     def cell_sizes(self) -> tuple[tuple[str, int], ...]:
         """Names and sizes of the inputs."""
 
-    def left(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """(6,) of the last contact: what the others leave; affine."""
+    def free(self, wrenches: list[ca.SX]) -> ca.SX:
+        """The components that are free."""
+
+    def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
+        """All wrenches from these: six other components are what they leave; affine."""
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """What is minimised: a sum over the contacts, each convex and at most quadratic."""
@@ -85,7 +90,7 @@ class Program(Protocol):
 
 
 def least_effort(program: Program, *cell: ca.MX) -> ca.MX:
-    """Scaled wrenches (6 k,) of least effort, in the order of the program's patches.
+    """Scaled wrenches of least effort side by side, in the order of the program's patches.
 
     Where derivatives are wanted: `differentiable_least_effort`.
     """
@@ -179,7 +184,7 @@ def _barrier_step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Fu
     alone; where it has arrived there, its derivatives by the cell are those of the central path."""
     iterate, cell = iterate_and_cell(program)
     owns = ca.vertsplit(iterate, ends_of(program))
-    wrenches = [own[:WRENCH_SIZE] for own in owns]
+    wrenches = wrenches_of(program, owns)
     weight = final_weight * efforts(program, wrenches, cell)[0]
     patches = zip(program.patches, owns, strict=True)
     barriers = [patch.barrier(own, weight) for patch, own in patches]
@@ -211,7 +216,7 @@ def _centred_at(
     program: Program, states: list[ca.SX], share: ca.SX | float, cell: list[ca.SX]
 ) -> ca.SX:
     """The iterate whose X S is a weight, given over the effort per degree."""
-    effort = program.effort([own[:WRENCH_SIZE] for own in states], cell)
+    effort = program.effort(wrenches_of(program, states), cell)
     weight = effort * (share / degree_of(program))
     pairs = zip(program.patches, states, strict=True)
     return ca.vertcat(*[patch.centred(own, weight) for patch, own in pairs])
@@ -260,7 +265,7 @@ def _newton_step(program: Program, share: float) -> ca.Function:
 
 
 def _wrenches(program: Program, iterate: ca.MX) -> ca.MX:
-    return ca.vertcat(*[own[:WRENCH_SIZE] for own in ca.vertsplit(iterate, ends_of(program))])
+    return ca.vertcat(*wrenches_of(program, ca.vertsplit(iterate, ends_of(program))))
 
 
 # --- Newton's equations ---
@@ -279,17 +284,18 @@ class Equations:
         """Factors.
 
         Args:
-            local: of each patch its wrench (6,) and stiffness (6, 6).
+            local: of each patch its wrench (m,) and stiffness (m, m).
         """
         wrenches = [wrench for wrench, _ in local]
         self.effort, self._slopes, curvatures = efforts(program, wrenches, cell)
         stiff = [curve + own for curve, (_, own) in zip(curvatures, local, strict=True)]
-        symbols = wrench_symbols(len(local) - 1)
-        passed = ca.vertcat(*symbols)
-        self._change = ca.jacobian(program.left(symbols, cell), passed)
-        self._missing = program.left(wrenches[:-1], cell) - wrenches[-1]
-        self._last = stiff[-1]
-        whole = ca.diagcat(*stiff[:-1]) + ca.mtimes([self._change.T, self._last, self._change])
+        at, own = program.free(wrenches), ca.vertcat(*wrenches)
+        free = ca.SX.sym("free", at.shape[0])
+        # What the free components make of all of them.
+        self._by_free = ca.jacobian(ca.vertcat(*program.balanced(free, cell)), free)
+        self._missing = ca.vertcat(*program.balanced(at, cell)) - own
+        self._stiff, self._ends = ca.diagcat(*stiff), [0, *accumulate(w.shape[0] for w in wrenches)]
+        whole = ca.mtimes([self._by_free.T, self._stiff, self._by_free])
         size = range(whole.shape[0])
         self._system = Elimination([[whole[i, j] for j in size] for i in size], len(size))
 
@@ -300,20 +306,23 @@ class Equations:
         return sum(ca.dot(pull - slope, change) for pull, slope, change in terms)
 
     def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
-        """(6,) of every wrench, where the patches' multipliers pull so (6,)."""
-        right = [pull - slope for pull, slope in zip(pulls, self._slopes, strict=True)]
-        on_last = right[-1] - ca.mtimes(self._last, self._missing)
-        pulled = ca.vertcat(*right[:-1]) + ca.mtimes(self._change.T, on_last)
-        reduced = self._system.reduced(ca.vertsplit(pulled))
+        """Of every wrench (m,), where the patches' multipliers pull so (m,)."""
+        right = (
+            ca.vertcat(*pulls) - ca.vertcat(*self._slopes) - ca.mtimes(self._stiff, self._missing)
+        )
+        reduced = self._system.reduced(ca.vertsplit(ca.mtimes(self._by_free.T, right)))
         free = ca.vertcat(*self._system.first(reduced, []))
-        return [*ca.vertsplit(free, WRENCH_SIZE), self._missing + ca.mtimes(self._change, free)]
+        found: list[ca.SX] = ca.vertsplit(
+            self._missing + ca.mtimes(self._by_free, free), self._ends
+        )
+        return found
 
 
 def efforts(
     program: Program, wrenches: list[ca.SX], cell: list[ca.SX]
 ) -> tuple[ca.SX, list[ca.SX], list[ca.SX]]:
-    """The effort at wrenches, its slopes (6,) and curvatures (6, 6) by each of them."""
-    symbols = wrench_symbols(len(wrenches))
+    """The effort at wrenches, its slopes (m,) and curvatures (m, m) by each of them."""
+    symbols = [ca.SX.sym(f"w_{i}", wrench.shape[0]) for i, wrench in enumerate(wrenches)]
     effort = program.effort(symbols, cell)
     slopes = [ca.gradient(effort, w) for w in symbols]
     curvatures = [ca.hessian(effort, w)[0] for w in symbols]
@@ -328,9 +337,9 @@ def iterate_and_cell(program: Program) -> tuple[ca.SX, list[ca.SX]]:
     return ca.SX.sym("iterate", ends_of(program)[-1]), cell
 
 
-def wrench_symbols(count: int) -> list[ca.SX]:
-    """Symbols (6,) of so many wrenches."""
-    return [ca.SX.sym(f"w_{i}", WRENCH_SIZE) for i in range(count)]
+def wrenches_of(program: Program, owns: list[AnyExpression]) -> list[AnyExpression]:
+    """The wrenches with which the patches' states or iterates begin."""
+    return [own[: patch.wrench_size] for patch, own in zip(program.patches, owns, strict=True)]
 
 
 def degree_of(program: Program) -> float:

@@ -7,6 +7,8 @@ Scaled wrenches of a contact, in its pad's axes, z into the payload: N, T / mu, 
 M / (mu r) with the normal force N, the tangential force T (2,), the centre of pressure d (2,), the
 moment M about the normal through the patch's centre, and r the patch's radius or half diagonal.
 A patch's state begins with it; see `corner_modes` for what follows where the patch is rectangular.
+A patch that presses evenly has no moment but that about its normal; its state is N, T / mu and
+M / (mu r).
 """
 
 from __future__ import annotations
@@ -14,9 +16,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.contact.soft_finger import SoftPatch, torsion_capacity
 from symbolic.records import Contact, Workcell
 from symbolic.records.poses import skew
 
@@ -24,8 +28,14 @@ WRENCH_SIZE = 6
 POINT_SIZE, STATE_SIZE = 3, 12
 """Of a corner's force, and of a rectangular patch's state."""
 
+EVEN = (0, 1, 2, 5)
+"""Entries of a wrench that a patch under even pressure can bear: its state."""
+
 RIM_POINTS, DIRECTIONS = 12, 24
 """Points on a round patch's rim and directions of friction that stand for its cone."""
+
+TORSIONS = 4
+"""Shares of friction in every direction that stand for the cone under even pressure."""
 
 NEWTON_STEPS = 100
 BALANCED = 1e-6
@@ -53,39 +63,51 @@ class Squeeze:
     least_share: float
 
 
-def closing_squeeze(contacts: Sequence[Contact]) -> Squeeze | None:
+def closing_squeeze(contacts: Sequence[Contact], even: bool = False) -> Squeeze | None:
     """A squeeze that holds with as little as half the friction (on a logarithmic scale) between
-    the nominal and the least; None where the grasp is not closed with `SPARE_FRICTION`."""
-    if _balanced_states(contacts, SPARE_FRICTION) is None:
+    the nominal and the least; None where the grasp is not closed with `SPARE_FRICTION`.
+
+    Args:
+        contacts: all pads.
+        even: whether they press evenly.
+    """
+    if _balanced_states(contacts, SPARE_FRICTION, even) is None:
         return None
     low, high = LEAST_SHARE, SPARE_FRICTION
-    if _balanced_states(contacts, low) is not None:
+    if _balanced_states(contacts, low, even) is not None:
         high = low
     else:
         for _ in range(BISECTIONS):
             middle = float(np.sqrt(low * high))
-            if _balanced_states(contacts, middle) is None:
+            if _balanced_states(contacts, middle, even) is None:
                 low = middle
             else:
                 high = middle
-    states = _balanced_states(contacts, float(np.sqrt(high * SPARE_FRICTION)))
+    states = _balanced_states(contacts, float(np.sqrt(high * SPARE_FRICTION)), even)
     assert states is not None
     return Squeeze(states, high)
 
 
 def has_force_closure(workcell: Workcell) -> bool:
     """Whether a workcell's pads hold its payload whatever the motion asks."""
-    return _balanced_states(workcell.pads, SPARE_FRICTION) is not None
+    return _balanced_states(workcell.pads, SPARE_FRICTION, presses_evenly(workcell)) is not None
 
 
-def _balanced_states(contacts: Sequence[Contact], share: float) -> tuple[Array, ...] | None:
+def presses_evenly(workcell: Workcell) -> bool:
+    """Whether a workcell's pads are taken to press evenly."""
+    return workcell.task.allocation == "soft-finger"
+
+
+def _balanced_states(
+    contacts: Sequence[Contact], share: float, even: bool
+) -> tuple[Array, ...] | None:
     """States within the cones at a share of the friction, whose wrenches cancel.
 
     They are weighted sums of points on the cones' boundaries, all weights positive.
     """
-    generators = [_generators(contact) for contact in contacts]
+    generators = [_generators(contact, even) for contact in contacts]
     lessened = [_with_friction(rows, share) for rows in generators]
-    maps = [state_to_box(contact) for contact in contacts]
+    maps = [state_to_box(contact, even) for contact in contacts]
     columns = np.vstack([rows @ A.T for rows, A in zip(lessened, maps, strict=True)])
     weights = _weights(columns / np.abs(columns).max(axis=0))
     if weights is None:
@@ -119,7 +141,7 @@ def _weights(columns: Array) -> Array | None:
     return None
 
 
-def state_to_box(contact: Contact) -> Array:
+def state_to_box(contact: Contact, even: bool = False) -> Array:
     """(6, n) from a patch's state to force and moment about the box frame's origin, box axes."""
     R, p = contact.T_box_pad[:3, :3], contact.T_box_pad[:3, 3]
     mu, r = contact.friction, contact.patch_radius
@@ -128,6 +150,8 @@ def state_to_box(contact: Contact) -> Array:
     # A normal force N n at d turns about d x n = (d_y, -d_x).
     local[[3, 4, 5], [4, 3, 5]] = r, -r, mu * r
     in_box = np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
+    if even:
+        return np.asarray(in_box @ local[:, list(EVEN)])
     size = WRENCH_SIZE if contact.half_sides is None else STATE_SIZE
     return np.asarray(in_box @ local @ np.eye(WRENCH_SIZE, size))
 
@@ -161,13 +185,15 @@ def corner_modes(half_sides: tuple[float, float]) -> Array:
 
 def tangential(state_size: int) -> list[int]:
     """Which entries of a state friction carries."""
+    if state_size == len(EVEN):
+        return [1, 2, 3]
     return [k for k in (1, 2, 5, 7, 8, 9, 10, 11) if k < state_size]
 
 
 def size_powers(state_size: int) -> tuple[int, ...]:
     """With which power of a patch's size over another's a state's entries shrink, if the forces at
     its corners are shared among those of the other: once for each axis along which they vary."""
-    return (0, 0, 0, 1, 1, 1, 2, 1, 2, 1, 2, 1)[:state_size]
+    return (0, 0, 0, 1, 1, 1, 2, 1, 2, 1, 2, 1)[:state_size]  # (0, 0, 0, 1) of `EVEN`
 
 
 def _with_friction(states: Array, share: float) -> Array:
@@ -176,11 +202,30 @@ def _with_friction(states: Array, share: float) -> Array:
     return lessened
 
 
-def _generators(contact: Contact) -> Array:
+def scaled_patch(contact: Contact) -> SoftPatch:
+    """A contact's patch under even pressure in its own axes, its lengths over its radius."""
+    own = SoftPatch.of(contact, contact.T_box_pad[:3, :3])
+    return SoftPatch(own.twist / contact.patch_radius, own.spread / contact.patch_radius)
+
+
+def _even_generators(contact: Contact) -> Array:
+    patch, rows = scaled_patch(contact), []
+    for angle in 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
+        for share in np.linspace(0.0, 1.0, TORSIONS + 1)[:-1]:
+            tangent = share * np.array([np.cos(angle), np.sin(angle)])
+            grip = ca.DM(np.sqrt(1.0 - share**2))
+            torsion = float(torsion_capacity(grip, ca.DM(tangent), patch)[0])
+            rows += [[1.0, *tangent, sign * torsion] for sign in (1.0, -1.0)]
+    return np.array(rows)
+
+
+def _generators(contact: Contact, even: bool) -> Array:
     """(n, state size) states on the boundary of a patch's cone that span it, each with N = 1."""
     around = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     friction = np.column_stack([np.cos(around), np.sin(around)])
     ones = np.ones((DIRECTIONS, 1))
+    if even:
+        return _even_generators(contact)
     if contact.half_sides is not None:
         at_corners = np.kron(np.eye(4), np.hstack([ones, friction]))
         return np.asarray(np.linalg.solve(corner_modes(contact.half_sides), at_corners.T).T)

@@ -16,10 +16,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import accumulate
 from typing import Literal
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import qr
 
 from symbolic.array import Array
 from symbolic.contact.central_path import (
@@ -28,9 +30,13 @@ from symbolic.contact.central_path import (
     differentiable_least_effort,
     least_effort,
 )
+from symbolic.contact.even_patch import EvenPatch
 from symbolic.contact.force_closure import (
+    EVEN,
     WRENCH_SIZE,
     closing_squeeze,
+    presses_evenly,
+    scaled_patch,
     size_powers,
     state_to_box,
     tangential,
@@ -72,6 +78,9 @@ MOMENT_ARM = 0.1
 """Of moments in the load's scale [m]: about half a payload, so that they count like forces."""
 
 
+SIZES = ("friction", "reach")
+"""Inputs after the load that scale states; others may follow."""
+
 WHOLE = ca.SX.ones(2)
 """Patches of their own size."""
 
@@ -91,39 +100,67 @@ class Grasp:
         Raises:
             SettingsError: no squeeze holds the payload whatever is asked.
         """
-        pads = workcell.pads
-        squeeze = closing_squeeze(pads)
+        pads, even = workcell.pads, presses_evenly(workcell)
+        squeeze = closing_squeeze(pads, even)
         if squeeze is None:
             raise SettingsError(
                 "the pads do not close their grasp: no internal squeeze lies within their friction "
                 "cones; raise the friction or turn them towards one another"
             )
         self.robots = workcell.pad_robots
-        self.patches = tuple(_patch(pad) for pad in pads)
+        self.patches = tuple(_patch(pad, even) for pad in pads)
         self.cell_sizes: tuple[tuple[str, int], ...] = (("load", LOAD_SIZE), ("friction", 2))
         self.nominal: tuple[list[float], ...] = ([c.friction for c in workcell.contacts],)
         self._load_at_rest = _load_at_rest(workcell)
         self._pads = pads
         self._squeeze = squeeze.states
         # The least states that balance a load, whether they lie within the cones or not.
-        spread = np.linalg.pinv(np.hstack([state_to_box(pad) for pad in pads]))
+        spread = np.linalg.pinv(np.hstack([state_to_box(pad, even) for pad in pads]))
         ends = np.cumsum([len(state) for state in squeeze.states])[:-1]
         self._spread = tuple(np.split(spread, ends))
-        in_units = [
-            state_to_box(replace(pad, friction=1.0, patch_radius=1.0, half_sides=None))
-            for pad in pads
-        ]
-        to_last = np.asarray(np.linalg.inv(in_units[-1]), dtype=float)
-        self._load_to_last = _sparse(to_last)
-        self._pads_to_last = [_sparse(to_last @ matrix) for matrix in in_units[:-1]]
+        in_units = np.hstack(
+            [
+                state_to_box(replace(pad, friction=1.0, patch_radius=1.0, half_sides=None), even)
+                for pad in pads
+            ]
+        )
+        # Which six components are what the others leave: all of the last pad's, or those that the
+        # load reaches best.
+        n = in_units.shape[1]
+        whole = np.hstack([state_to_box(pad, even) for pad in pads])
+        self._left = (
+            np.sort(qr(whole, pivoting=True)[2][:LOAD_SIZE]) if even else np.arange(n - 6, n)
+        )
+        self._free = np.setdiff1d(np.arange(n), self._left)
+        to_left = np.asarray(np.linalg.inv(in_units[:, self._left]), dtype=float)
+        self._load_to_left = _sparse(to_left)
+        self._free_to_left = _sparse(to_left @ in_units[:, self._free])
 
-    def left(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+    @property
+    def free_size(self) -> int:
+        """Components of the wrenches that are free."""
+        return len(self._free)
+
+    def free(self, wrenches: list[ca.SX]) -> ca.SX:
+        """See `symbolic.contact.central_path.Program`."""
+        return ca.vertcat(*wrenches)[self._free.tolist()]
+
+    def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
         """See `symbolic.contact.central_path.Program`."""
         load, *sizes = cell
-        rest = ca.mtimes(self._load_to_last, load)
-        for i, (wrench, to_last) in enumerate(zip(wrenches, self._pads_to_last, strict=True)):
-            rest -= ca.mtimes(to_last, self.units(i, *sizes) * wrench)
-        return rest * reciprocal(self.units(len(self.patches) - 1, *sizes))
+        return self._left_by(load, free, sizes)
+
+    def _left_by(self, load: ca.SX, free: ca.SX, sizes: list[ca.SX]) -> list[ca.SX]:
+        """All wrenches that balance a load, from their free components."""
+        units = ca.vertcat(*[self.units(i, *sizes) for i in range(len(self.patches))])
+        given = ca.mtimes(self._free_to_left, units[self._free.tolist()] * free)
+        left = ca.mtimes(self._load_to_left, load) - given
+        whole = ca.SX(units.shape[0], 1)
+        whole[self._free.tolist()] = free
+        whole[self._left.tolist()] = left * reciprocal(units[self._left.tolist()])
+        ends = [0, *accumulate(patch.wrench_size for patch in self.patches)]
+        wrenches: list[ca.SX] = ca.vertsplit(whole, ends)
+        return wrenches
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """Half the sum of all squared forces."""
@@ -135,7 +172,7 @@ class Grasp:
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
         """For loads like that at rest what to first order lies on their central path, else the
         least states that balance them; and as much of the squeeze as takes that into the cones."""
-        load, *sizes = cell
+        load, *sizes = cell[: 1 + len(SIZES)]
         given, rest = self.squeezed(*sizes), ca.DM(self._load_at_rest)
         states, slopes = self._at_rest
         times = ca.fmax(ca.dot(rest, load) / ca.sumsqr(rest), 0.0)
@@ -146,7 +183,7 @@ class Grasp:
         stays = ca.logic_and(least(inside) > 0.0, least(taken) > -REST_SHARE)
         part = [move + REST_SHARE * s for s, move in zip(near, moves, strict=True)]
         press = ca.if_else(stays, START_FLOOR, self._pressed(given, part))
-        asked, alike = self.asked(*cell), press < ALIKE
+        asked, alike = self.asked(load, *sizes), press < ALIKE
         press = ca.if_else(alike, press, self._pressed(given, asked))
         pairs = zip(near, moves, asked, strict=True)
         chosen = [ca.if_else(alike, s + move, a) for s, move, a in pairs]
@@ -163,7 +200,8 @@ class Grasp:
         """States (n,) on the central path under `_load_at_rest`, and their slopes (n, 6) by it."""
         inputs = [self._load_at_rest, *[np.array(value) for value in self.nominal]]
         cell = [ca.SX(ca.DM(value)) for value in inputs]
-        asked, given = self.asked(*cell), self.squeezed(*cell[1:])
+        load, *sizes = cell[: 1 + len(SIZES)]
+        asked, given = self.asked(load, *sizes), self.squeezed(*sizes)
         press = self._pressed(given, asked)
         pairs = zip(asked, given, strict=True)
         states = [np.array(ca.evalf(a + press * s)).ravel() for a, s in pairs]
@@ -191,10 +229,21 @@ class Grasp:
         normals = np.array([state[0] for state in self._squeeze])
         return np.bincount(np.array(self.robots), normals, 2).astype(float)
 
+    def squeeze_wrenches(self) -> Array:
+        """(k, 6) of all pads in the squeeze, see `grasp_wrenches`."""
+        friction, states = ca.SX(ca.DM(self.nominal[0])), self._squeeze
+        sizes = [patch.wrench_size for patch in self.patches]
+        parts = [
+            whole_wrench(self.units(i, friction) * ca.SX(ca.DM(state[:size])))
+            for i, (state, size) in enumerate(zip(states, sizes, strict=True))
+        ]
+        return np.array(ca.evalf(ca.horzcat(*parts))).T
+
     def units(self, i: int, friction: ca.SX, reach: ca.SX = WHOLE) -> ca.SX:
-        """(6,) what the entries of pad i's scaled wrench are multiples of."""
+        """(m,) what the entries of pad i's scaled wrench are multiples of."""
         robot = self.robots[i]
-        return _units(friction[robot], reach[robot] * self._pads[i].patch_radius)
+        units = _units(friction[robot], reach[robot] * self._pads[i].patch_radius)
+        return units[list(EVEN)] if self.patches[i].wrench_size == len(EVEN) else units
 
     def _at(self, states: list[ca.SX], friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
         """States at the nominal friction and size with what they carry, at others: each corner's
@@ -230,15 +279,26 @@ def grasp_wrenches(
 
 
 def _in_newtons(grasp: Grasp) -> ca.Function:
-    n = len(grasp.patches)
-    found, size, friction = ca.SX.sym("w", WRENCH_SIZE * n), ca.SX.sym("s"), ca.SX.sym("mu", 2)
-    units = ca.vertcat(*[grasp.units(i, friction) for i in range(n)])
+    ends = [0, *accumulate(patch.wrench_size for patch in grasp.patches)]
+    found, size, friction = ca.SX.sym("w", ends[-1]), ca.SX.sym("s"), ca.SX.sym("mu", 2)
+    wrenches = [
+        whole_wrench(grasp.units(i, friction) * own)
+        for i, own in enumerate(ca.vertsplit(found, ends))
+    ]
     squeezed = zip(grasp.patches, grasp.squeezed(friction), strict=True)
     closes = least([patch.slack(state) for patch, state in squeezed]) > 0.0
-    beyond = ca.repmat(ca.DM([BEYOND, 0, 0, 0, 0, 0]), n, 1)
-    return ca.Function(
-        "in_newtons", [found, size, friction], [size * ca.if_else(closes, units * found, beyond)]
-    )
+    beyond = ca.repmat(ca.DM([BEYOND, 0, 0, 0, 0, 0]), len(wrenches), 1)
+    held = size * ca.if_else(closes, ca.vertcat(*wrenches), beyond)
+    return ca.Function("in_newtons", [found, size, friction], [held])
+
+
+def whole_wrench(wrench: ca.SX) -> ca.SX:
+    """All six entries of a pad's wrench (m,)."""
+    if wrench.shape[0] == WRENCH_SIZE:
+        return wrench
+    whole = ca.SX(WRENCH_SIZE, wrench.shape[1])
+    whole[list(EVEN), :] = wrench
+    return ca.densify(whole)
 
 
 def _load_at_rest(workcell: Workcell) -> Array:
@@ -251,7 +311,9 @@ def _load_at_rest(workcell: Workcell) -> Array:
     return np.asarray(load / np.hypot(np.linalg.norm(force), np.linalg.norm(moment) / MOMENT_ARM))
 
 
-def _patch(contact: Contact) -> Patch:
+def _patch(contact: Contact, even: bool) -> Patch:
+    if even:
+        return EvenPatch(scaled_patch(contact))
     return RoundPatch() if contact.half_sides is None else RectangularPatch(*contact.half_sides)
 
 
@@ -345,20 +407,25 @@ class OppositePads:
     patches: tuple[Patch, ...] = (RoundPatch(), RoundPatch())
     cell_sizes: tuple[tuple[str, int], ...] = CELL_SIZES
 
-    def left(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
+    def free(self, wrenches: list[ca.SX]) -> ca.SX:
+        """That of contact 1."""
+        return wrenches[0]
+
+    def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
         """What contact 1 leaves to contact 2, its normal force along -n."""
-        (wrench,), (balance, friction, radius) = wrenches, cell
+        wrench, (balance, friction, radius) = free, cell
         tangent, moment = friction[0] * wrench[1:3], radius[0] * wrench[3:5]
         # Moments about pad 2: (p_1 - p_2) x f_1 and the contacts' own make up what is required.
         moment_2 = moment - balance[8] * tangent + wrench[0] * balance[6:8] - balance[3:5]
         about_n = balance[5] - cross_2(balance[6:8], tangent) - friction[0] * radius[0] * wrench[5]
         over_mu, over_r = reciprocal(friction[1]), reciprocal(radius[1])
-        return ca.vertcat(
+        left = ca.vertcat(
             wrench[0] - balance[0],
             (balance[1:3] - tangent) * over_mu,
             moment_2 * over_r,
             about_n * (over_mu * over_r),
         )
+        return [wrench, left]
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """Half the sum of the squared forces, or the sum of the normal ones."""
@@ -426,7 +493,7 @@ def _shared(cell: list[ca.SX], tangent: ca.SX, n_1: ca.SX) -> list[ca.SX]:
         (tilt - n_1 * balance[6:8]) / ca.sum1(radius),
         about_n / ca.sum1(friction * radius),
     )
-    return [first, OppositePads("effort").left([first], cell)]
+    return OppositePads("effort").balanced(first, cell)
 
 
 def _length(vector: ca.SX) -> ca.SX:

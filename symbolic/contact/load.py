@@ -1,16 +1,19 @@
 """What one sample of the box motion asks of the two contacts, as one CasADi function.
 
-Joins rotation, force allocation and centre of pressure (paper Section 4.4). The allocations `paper`
-and `soft-finger` have closed forms (`symbolic.contact.closed_form`). With `joint` the paper's
-result is kept wherever its shifts stay within the patches and leave no moment, and
-`symbolic.contact.grasp` takes over where not. For pads that do not face one another, or more than
-two, the paper has no result: `symbolic.contact.grasp` alone answers.
+Joins rotation, force allocation and centre of pressure (paper Section 4.4). The allocation `paper`,
+and `soft-finger` on two pads with opposite normals, have closed forms
+(`symbolic.contact.closed_form`). With `joint` the paper's result is kept wherever its shifts stay
+within the patches and leave no moment, and `symbolic.contact.grasp` takes over where not. For pads
+that do not face one another, or more than two, the paper has no result: `symbolic.contact.grasp`
+alone answers, for both other allocations.
 """
 
 from __future__ import annotations
 
 import casadi as ca
+import numpy as np
 
+from symbolic.array import Array
 from symbolic.contact.closed_form import Asked, held_by
 from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp, balance_of, facing_wrenches, grasp_wrenches
@@ -18,6 +21,7 @@ from symbolic.contact.paper import required_force, required_moment
 from symbolic.expression import Expression, as_mx, mx_given, number, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.records import Allocation, Workcell
+from symbolic.records.poses import skew
 
 LOAD_OUTPUTS = (
     "angular_velocity",
@@ -67,13 +71,13 @@ def load_function(workcell: Workcell) -> ca.Function:
     Inputs: pose, rate, second_rate (6,) as in `symbolic.path.time_law.TimedPath`.
     Outputs: see `LOAD_OUTPUTS`.
     """
-    is_joint = workcell.task.allocation == "joint"
-    kind, payload = ca.MX if is_joint else ca.SX, workcell.payload
+    closed, payload = workcell.has_closed_form, workcell.payload
+    kind = ca.SX if closed else ca.MX
     names = ["pose", "rate", "second_rate"]
     motion = [kind.sym(name, 6) for name in names]
     own = [frictions(workcell), ca.SX(number(payload.centre_of_mass))]
     given: dict[str, ca.SX | ca.MX] = sx_given(payload)
-    if is_joint:
+    if not closed:
         handed = mx_given(payload)
         own = [as_mx(value, given, handed) for value in own]
         given = handed
@@ -107,7 +111,7 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
     Inputs: pose, rate, second_rate (6,); friction (2,) coefficients of the contacts;
     centre_of_mass (3,) in the box frame [m]. Outputs: see `LOAD_OUTPUTS`.
     """
-    if workcell.task.allocation != "joint":
+    if workcell.has_closed_form:
         return closed_load_function(workcell, workcell.task.allocation)
     if workcell.has_opposite_pads:
         return _joint_load_function(workcell)
@@ -319,6 +323,25 @@ def box_load_function(workcell: Workcell) -> ca.Function:
     in_box = ca.mtimes(to_box, force)
     about = ca.mtimes(to_box, moment) + ca.cross(centre_of_mass, in_box)
     return ca.Function("box_load", inputs, [ca.vertcat(in_box, about)])
+
+
+def robot_wrenches(workcell: Workcell) -> Array:
+    """(12, 6 k) from all pads' wrenches, see `symbolic.contact.grasp.grasp_wrenches`, to force and
+    moment of both robots about their nominal contact points, along the axes of contact 1."""
+    axes, columns = workcell.contacts[0].T_box_pad[:3, :3], []
+    for pad, robot in zip(workcell.pads, workcell.pad_robots, strict=True):
+        force, moment = np.zeros((2, 3, WRENCH_SIZE))
+        force[[0, 1, 2], [1, 2, 0]] = 1.0
+        # A normal force N n at d turns about d x n = (d_y, -d_x).
+        moment[[0, 1, 2], [4, 3, 5]] = 1.0, -1.0, 1.0
+        beside = pad.T_box_pad[:3, 3] - workcell.contacts[robot].T_box_pad[:3, 3]
+        to_axes = axes.T @ pad.T_box_pad[:3, :3]
+        force = to_axes @ force
+        moment = to_axes @ moment + skew(axes.T @ beside) @ force
+        own = np.zeros((2, 2 * 3, WRENCH_SIZE))
+        own[robot] = np.vstack([force, moment])
+        columns.append(own.reshape(-1, WRENCH_SIZE))
+    return np.hstack(columns)
 
 
 def grasp_world_function(workcell: Workcell) -> ca.Function:

@@ -31,6 +31,10 @@ class Patch(Protocol):
     """A kind of patch."""
 
     @property
+    def wrench_size(self) -> int:
+        """Entries m of a scaled wrench: all six, or those that the patch can bear."""
+
+    @property
     def iterate_size(self) -> int:
         """Entries of an iterate: state, then multipliers."""
 
@@ -69,8 +73,8 @@ class LocalPatch(Protocol):
     """A patch at an iterate.
 
     Attributes:
-        wrench: (6,) scaled.
-        stiffness: (6, 6) what the multipliers give less for a change of the wrench, the rest of the
+        wrench: (m,) scaled.
+        stiffness: (m, m) what the multipliers give less for a change of the wrench, the rest of the
             state moving as is best.
         gap: pairing of X with S.
     """
@@ -88,9 +92,9 @@ class BarrierPatch:
     """The barrier that keeps a patch's state within the cone, over its wrench.
 
     Attributes:
-        stiffness: (6, 6) curvature.
-        pull: (6,) downhill.
-        step: that changes the wrench by (6,) and leaves the multipliers.
+        stiffness: (m, m) curvature.
+        pull: (m,) downhill.
+        step: that changes the wrench by (m,) and leaves the multipliers.
     """
 
     stiffness: ca.SX
@@ -110,13 +114,13 @@ class Aim(Protocol):
     """A weight and a correction that a step is to lead to.
 
     Attributes:
-        pull: (6,) what the multipliers give to the wrench where that does not change.
+        pull: (m,) what the multipliers give to the wrench where that does not change.
     """
 
     pull: ca.SX
 
     def step(self, change: ca.SX) -> Step:
-        """The step that changes the wrench by `change` (6,)."""
+        """The step that changes the wrench by `change` (m,)."""
 
 
 class Step(Protocol):

@@ -39,6 +39,7 @@ class RectangularPatch:
 
     half_x: float
     half_y: float
+    wrench_size: int = WRENCH_SIZE
     iterate_size: int = 2 * STATE_SIZE
     state_size: int = STATE_SIZE
     correction_size: int = STATE_SIZE

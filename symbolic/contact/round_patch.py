@@ -205,6 +205,7 @@ LEAST_SPREAD = 1e-60
 class RoundPatch:
     """A disc."""
 
+    wrench_size: int = WRENCH_SIZE
     iterate_size: int = FREE_SIZE + MULTIPLIER_SIZE
     state_size: int = WRENCH_SIZE
     correction_size: int = HERMITIAN_SIZE

@@ -24,9 +24,8 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.contact.central_path import centred
-from symbolic.contact.force_closure import WRENCH_SIZE
-from symbolic.contact.grasp import LOAD_SIZE, MOMENT_ARM, SCALE_FLOOR, Grasp
+from symbolic.contact.central_path import centred, wrenches_of
+from symbolic.contact.grasp import LOAD_SIZE, MOMENT_ARM, SCALE_FLOOR, Grasp, whole_wrench
 from symbolic.contact.patches import Elimination, Patch
 
 POLISH_STEPS = 2
@@ -63,6 +62,12 @@ class SoftGrasp:
         """load (6,), see `symbolic.contact.grasp.grasp_wrenches`, to normal (2,) forces of the
         robots [N], slope (6, 2), their gradients, and state (size,)."""
         load = ca.MX.sym("load", LOAD_SIZE)
+        state = self.solved(load)
+        outputs = [*self._slopes()(state), state]
+        return ca.Function("held_first", [load], outputs, ["load"], ["normal", "slope", "state"])
+
+    def solved(self, load: ca.MX) -> ca.MX:
+        """The state (size,) that holds a load (6,)."""
         scale = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
         iterate = centred(self.grasp, self.weight)(load / scale, self._friction)
         held, at = [], 0
@@ -73,8 +78,21 @@ class SoftGrasp:
         step = self._newton()
         for _ in range(POLISH_STEPS):
             state = step(state)
-        outputs = [*self._slopes()(state), state]
-        return ca.Function("held_first", [load], outputs, ["load"], ["normal", "slope", "state"])
+        return state
+
+    def wrenches(self, slopes: bool) -> ca.Function:
+        """load (6,) to wrenches (6 k,) of all pads, see `symbolic.contact.grasp.grasp_wrenches`,
+        and where asked for, to by_load (6 k, 6)."""
+        load, state = ca.MX.sym("load", LOAD_SIZE), ca.SX.sym("state", self.size)
+        own = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
+        friction = ca.SX(self._friction)
+        units = [self.grasp.units(i, friction) * wrench for i, wrench in enumerate(own)]
+        outputs = [ca.vertcat(*map(whole_wrench, units))]
+        if slopes:
+            by_state = ca.jacobian(outputs[0], state)
+            outputs.append(ca.mtimes(by_state, _Local(self, state).by_load()))
+        whole = ca.Function("whole", [state], ca.cse([ca.densify(value) for value in outputs]))
+        return ca.Function("held_wrenches", [load], whole.call([self.solved(load)]))
 
     def second(self) -> ca.Function:
         """state (size,) and weight (2,) to curvature (6, 6), the weighted second derivatives of the
@@ -108,20 +126,20 @@ class SoftGrasp:
 
     def effort(self, state: ca.SX) -> ca.SX:
         """Half the sum of all squared forces."""
-        wrenches = [own[:WRENCH_SIZE] for own in ca.vertsplit(state, self.ends)]
+        wrenches = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
         return self.grasp.effort(wrenches, [ca.SX(LOAD_SIZE, 1), ca.SX(self._friction)])
 
     def _states(self) -> tuple[ca.DM, ca.DM]:
         """Y (n, free) and W (n, 6). What is free: whatever leaves the wrenches as they are, then
-        all wrenches but the last, which is what the others leave."""
+        the wrenches' components that are free."""
         patches = self.grasp.patches
-        inner = [ca.SX.sym(f"inner_{i}", p.state_size - WRENCH_SIZE) for i, p in enumerate(patches)]
-        wrenches = [ca.SX.sym(f"wrench_{i}", WRENCH_SIZE) for i in range(len(patches) - 1)]
-        load = ca.SX.sym("load", LOAD_SIZE)
-        last = self.grasp.left(wrenches, [load, ca.SX(self._friction)])
-        pairs = zip([*wrenches, last], inner, strict=True)
-        state = ca.vertcat(*[part for pair in pairs for part in pair])
-        free = ca.vertcat(*inner, *wrenches)
+        inner = [
+            ca.SX.sym(f"inner_{i}", p.state_size - p.wrench_size) for i, p in enumerate(patches)
+        ]
+        load, wrenches = ca.SX.sym("load", LOAD_SIZE), ca.SX.sym("free", self.grasp.free_size)
+        whole = self.grasp.balanced(wrenches, [load, ca.SX(self._friction)])
+        state = ca.vertcat(*[part for pair in zip(whole, inner, strict=True) for part in pair])
+        free = ca.vertcat(*inner, wrenches)
         by = [ca.jacobian(state, symbols) for symbols in (free, load)]
         found = ca.Function("by", [], [ca.sparsify(ca.evalf(matrix)) for matrix in by])
         free_part, loaded = found.call([])

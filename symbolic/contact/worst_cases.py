@@ -12,8 +12,8 @@ that presses this robot's pads harder, so that with more than its least force th
 well.
 
 A displaced pad that chooses its pressure counts as a smaller one that lies within it: a disc
-shrinks by the displacement, a rectangle in proportion, so that its shorter side does. A soft finger
-presses about its displaced place.
+shrinks by the displacement, a rectangle in proportion, so that its shorter side does. A pad that
+presses evenly presses about its displaced place.
 
 What is commanded is more: a share of it may be missing, and the arms may work against one another.
 With N a pad's least normal force, e the missing share and T the opposed tangential force, it is
@@ -25,12 +25,14 @@ does.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import accumulate
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from symbolic.contact.central_path import least_effort
-from symbolic.contact.force_closure import WRENCH_SIZE, has_force_closure
+from symbolic.contact.force_closure import WRENCH_SIZE, has_force_closure, presses_evenly
 from symbolic.contact.grasp import (
     BEYOND,
     LOAD_SIZE,
@@ -150,7 +152,7 @@ def case_slack_function(workcell: Workcell) -> ca.Function:
     given = sx_given(workcell.payload)
     balance = _balance_function(workcell)(*motion, case, *given.values())
     n_1 = force + arm * balance[0]
-    if workcell.task.allocation == "soft-finger":
+    if presses_evenly(workcell):
         slack = [n_1 - _least_squeeze(workcell, motion, case, given)[0]]
     else:
         *_, tracking, _ = case_parts(case)
@@ -163,7 +165,7 @@ def case_slack_function(workcell: Workcell) -> ca.Function:
 
 def _kind(workcell: Workcell) -> Any:
     """The kind of expressions that a cell's least squeeze is made of, SX or MX."""
-    return ca.SX if workcell.task.allocation == "soft-finger" else ca.MX
+    return ca.SX if presses_evenly(workcell) else ca.MX
 
 
 def _given(workcell: Workcell) -> dict[str, Any]:
@@ -184,7 +186,7 @@ def _least_squeeze(
     """(2,) N_1 and N_2 to command [N]: of soft fingers where the cell has these, else of pads that
     choose their pressure, see `symbolic.contact.grasp.facing_wrenches`."""
     friction, radius, *_ = case_parts(case)
-    if workcell.task.allocation != "soft-finger":
+    if not presses_evenly(workcell):
         balance = _balance_function(workcell)(*motion, case, *given.values())
         wrenches = facing_wrenches(balance, friction, radius, "squeeze", differentiable)
         return _to_command(wrenches[::WRENCH_SIZE], case)
@@ -302,7 +304,8 @@ def case_grasp_function(workcell: Workcell, commanded: int) -> ca.Function:
     friction, *_, tracking, internal = case_parts(case)
     squeeze, sizes = GraspSqueeze(workcell, commanded), _sizes(workcell, case)
     load = _origin_load_function(workcell)(*motion, case)
-    force = commanded_forces(squeeze, load, friction, sizes)
+    *_, displacement, _, _ = case_parts(case)
+    force = commanded_forces(squeeze, load, friction, sizes, displacement)
     needed = force[commanded] + internal * _against_internal(squeeze)(friction, sizes)
     more = needed / (1.0 - tracking[commanded]) - force[commanded]
     normals = squeeze.squeeze_normals()
@@ -321,7 +324,8 @@ def case_grasp_slack_function(workcell: Workcell, commanded: int) -> ca.Function
     load = _origin_load_function(workcell)(*motion, case)
     left = (1.0 - tracking[commanded]) * force
     left -= internal * _against_internal(squeeze)(friction, sizes)
-    slack = commanded_slack(squeeze, load, friction, sizes, left)
+    *_, displacement, _, _ = case_parts(case)
+    slack = commanded_slack(squeeze, load, friction, sizes, displacement, left)
     names = ["pose", "rate", "second_rate", "case", "force"]
     inputs = [*motion, case, force]
     return ca.Function("case_grasp_slack", inputs, ca.cse([slack]), names, ["slack"])
@@ -336,10 +340,21 @@ def least_reaches(workcell: Workcell) -> tuple[float, float]:
     return first, second
 
 
+def least_distance(workcell: Workcell) -> float:
+    """Of two pads of different robots [m]."""
+    places = [
+        np.array([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)])
+        for contact in workcell.contacts
+    ]
+    return float(np.linalg.norm(places[0][:, None] - places[1], axis=2).min())
+
+
 def _sizes(workcell: Workcell, case: ca.SX | ca.MX) -> ca.SX | ca.MX:
-    """(2,) of the robots' patches over the cell's own."""
+    """(2,) of the robots' patches over the cell's own, less what displacements take off."""
     _, radius, *_, displacement, _, _ = case_parts(case)
     own = ca.DM([contact.patch_radius for contact in workcell.contacts])
+    if presses_evenly(workcell):
+        return radius / own
     lengths = [ca.norm_2(displacement[2 * i : 2 * i + 2]) for i in (0, 1)]
     return radius / own - ca.vertcat(*lengths) / ca.DM(least_reaches(workcell))
 
@@ -353,8 +368,15 @@ def _origin_load_function(workcell: Workcell) -> ca.Function:
     return ca.Function("origin_load", inputs, ca.cse([ca.vertcat(force, about)]))
 
 
+DISPLACED = 6
+"""Repetitions by which what displaced forces turn about is found: each takes the error to its
+displacement over the pads' distances."""
+
 REACHES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 """Sizes of the patches, as shares, at which a squeeze to start from is looked for."""
+
+ROUNDING = 1e-6
+"""Of the commanded force, which balancing displaced forces may change."""
 
 OTHER_WEIGHT = 1e-3
 """Weight of the other robot's normal force, which alone may be anything: what it adds to the
@@ -363,7 +385,8 @@ commanded force makes that a little more than the least."""
 
 class GraspSqueeze(Grasp):
     """Least normal force of one robot, plus a little of the other's; see `OTHER_WEIGHT`. Inputs are
-    load, coefficients and sizes of the patches over the cell's own, (2,) by robot.
+    load, coefficients and sizes of the patches over the cell's own, (2,) by robot, and where pads
+    press evenly, their displacements (4,), the same for all pads of a robot, along their tangents.
 
     Attributes:
         commanded: index of the robot whose force is commanded.
@@ -383,6 +406,31 @@ class GraspSqueeze(Grasp):
         self.commanded = commanded
         self.cell_sizes = (("load", LOAD_SIZE), ("friction", 2), ("reach", 2))
         self.nominal = (*self.nominal, [1.0, 1.0])
+        self.is_even = presses_evenly(workcell)
+        if self.is_even:
+            self.cell_sizes += (("displacement", 4),)
+            self.nominal += ([0.0] * 4,)
+
+    def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
+        """See `symbolic.contact.central_path.Program`."""
+        load, friction, reach, *displaced = cell
+        wrenches = self._left_by(load, free, [friction, reach])
+        for _ in range(DISPLACED if displaced else 0):
+            turned = self._turned(wrenches, displaced[0], [friction, reach])
+            wrenches = self._left_by(
+                load - ca.vertcat(ca.SX.zeros(3), turned), free, [friction, reach]
+            )
+        return wrenches
+
+    def _turned(self, wrenches: list[ca.SX], displacement: ca.SX, sizes: list[ca.SX]) -> ca.SX:
+        """Moment (3,) of scaled wrenches' forces about where they would act."""
+        total = ca.SX.zeros(3)
+        for i, (pad, robot, own) in enumerate(zip(self._pads, self.robots, wrenches, strict=True)):
+            normal, *tangent = ca.vertsplit((self.units(i, *sizes) * own)[:3])
+            moved = ca.vertcat(displacement[2 * robot : 2 * robot + 2], 0.0)
+            force = ca.vertcat(*tangent, normal)
+            total += ca.mtimes(ca.DM(pad.T_box_pad[:3, :3]), ca.cross(moved, force))
+        return total
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """See `symbolic.contact.central_path.Program`."""
@@ -392,7 +440,9 @@ class GraspSqueeze(Grasp):
         return total
 
 
-def commanded_forces(squeeze: GraspSqueeze, load: ca.MX, friction: ca.MX, share: ca.MX) -> ca.MX:
+def commanded_forces(
+    squeeze: GraspSqueeze, load: ca.MX, friction: ca.MX, share: ca.MX, displacement: ca.MX
+) -> ca.MX:
     """(2,) normal forces of the robots [N]: what is commanded, a convex function of the load, and
     what the other one then presses with. Beyond any limit where the grasp does not close.
 
@@ -400,15 +450,22 @@ def commanded_forces(squeeze: GraspSqueeze, load: ca.MX, friction: ca.MX, share:
         load: (6,) force and moment about the box frame's origin, along the box's axes.
         friction: (2,) Coulomb coefficients of the robots' pads.
         share: (2,) sizes of their patches over the cell's own.
+        displacement: (4,) of pads that press evenly [m].
     """
     size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
     reach = share / squeeze.reach
-    found = least_effort(squeeze, load / size, friction, reach)
+    displaced = [displacement] if squeeze.is_even else []
+    found = least_effort(squeeze, load / size, friction, reach, *displaced)
     return _in_newtons(squeeze)(found, size, friction, reach)
 
 
 def commanded_slack(
-    squeeze: GraspSqueeze, load: ca.SX, friction: ca.SX, share: ca.SX, force: ca.SX
+    squeeze: GraspSqueeze,
+    load: ca.SX,
+    friction: ca.SX,
+    share: ca.SX,
+    displacement: ca.SX,
+    force: ca.SX,
 ) -> ca.SX:
     """Positive where the least wrenches that balance a load, and as much of the squeeze as makes
     the commanded force (arguments as in `commanded_forces`), lie within all cones."""
@@ -417,8 +474,13 @@ def commanded_slack(
     own = [k for k, robot in enumerate(squeeze.robots) if robot == squeeze.commanded]
     pressed = (force - sum(asked[k][0] for k in own)) / sum(given[k][0] for k in own)
     held = [a + pressed * g for a, g in zip(asked, given, strict=True)]
+    enough = pressed
+    if squeeze.is_even:
+        cell = [load, friction, reach, displacement]
+        held = squeeze.balanced(squeeze.free(held), cell)
+        enough = ca.fmin(pressed, (1.0 + ROUNDING) * force - sum(held[k][0] for k in own))
     slack = [patch.slack(state) for patch, state in zip(squeeze.patches, held, strict=True)]
-    return ca.fmin(least(slack), pressed)
+    return ca.fmin(least(slack), enough)
 
 
 def _against_internal(squeeze: GraspSqueeze) -> ca.Function:
@@ -427,9 +489,9 @@ def _against_internal(squeeze: GraspSqueeze) -> ca.Function:
     it."""
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
     given = squeeze.squeezed(friction, share / squeeze.reach)
-    robots = enumerate(squeeze.robots)
+    robots, turning = enumerate(squeeze.robots), 3 if squeeze.is_even else 5
     left = [
-        friction[r] * (given[k][0] - ca.norm_2(given[k][1:3]) - ca.fabs(given[k][5]))
+        friction[r] * (given[k][0] - ca.norm_2(given[k][1:3]) - ca.fabs(given[k][turning]))
         for k, r in robots
     ]
     pressed = float(squeeze.squeeze_normals()[squeeze.commanded])
@@ -454,11 +516,11 @@ def smaller_patches(workcell: Workcell, share: float) -> Workcell:
 
 
 def _in_newtons(squeeze: GraspSqueeze) -> ca.Function:
-    n = len(squeeze.patches)
-    found, size = ca.SX.sym("w", WRENCH_SIZE * n), ca.SX.sym("s")
+    ends = [0, *accumulate(patch.wrench_size for patch in squeeze.patches)]
+    found, size = ca.SX.sym("w", ends[-1]), ca.SX.sym("s")
     friction, reach = ca.SX.sym("mu", 2), ca.SX.sym("reach", 2)
     force = [ca.SX(0.0), ca.SX(0.0)]
-    for own, robot in zip(ca.vertsplit(found, WRENCH_SIZE), squeeze.robots, strict=True):
+    for own, robot in zip(ca.vertsplit(found, ends), squeeze.robots, strict=True):
         force[robot] += own[0]
     force[squeeze.commanded] += OTHER_WEIGHT * force[1 - squeeze.commanded]
     squeezed = zip(squeeze.patches, squeeze.squeezed(friction, reach), strict=True)

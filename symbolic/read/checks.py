@@ -64,10 +64,10 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
     if not problems.clean("contacts", *SHAPE_KEYS):
         return
     allocation = workcell.task.allocation
-    if allocation == "soft-finger":
+    if allocation == "soft-finger" and workcell.has_opposite_pads:
         if problems.clean("task.allocation"):
             _check_soft_fingers(workcell, problems)
-    elif workcell.has_facing_pads:
+    elif allocation != "soft-finger" and workcell.has_facing_pads:
         if allocation == "joint" and problems.clean("task.allocation"):
             _check_overlap(workcell, problems)
     elif allocation == "paper":
@@ -86,13 +86,6 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
 def _check_soft_fingers(workcell: Workcell, problems: Problems) -> None:
     """Soft fingers carry any moment by pressing harder where the line between them lies well within
     their friction cones."""
-    if not workcell.has_opposite_pads:
-        problems.add(
-            "contacts[1].xyz",
-            "is not opposite contacts[0]; task.allocation = 'soft-finger' allows two pads with "
-            "opposite normals: 'joint' takes any",
-        )
-        return
     beside, friction = pads_beside(workcell), min(c.friction for c in workcell.contacts)
     first, second = (contact.T_box_pad for contact in workcell.contacts)
     apart = abs(float((first[:3, 3] - second[:3, 3]) @ first[:3, 2]))
@@ -108,7 +101,7 @@ def _check_soft_fingers(workcell: Workcell, problems: Problems) -> None:
 
 def _paper_problem(workcell: Workcell) -> str:
     """Why the paper's allocation has no forces for a cell's pads."""
-    hint = "task.allocation = 'joint' takes any"
+    hint = "task.allocation = 'soft-finger' and 'joint' take any"
     first, second = (contact.T_box_pad[:3, 2] for contact in workcell.contacts)
     if any(contact.further for contact in workcell.contacts):
         return f"belongs to more than two pads; allowed are two: {hint}"

@@ -541,7 +541,7 @@ class Workcell:
     @property
     def has_facing_pads(self) -> bool:
         """Whether two round pads with opposite normals hold the payload: what the paper's
-        allocation and all closed forms are for."""
+        allocation is for."""
         return self.has_opposite_pads and not any(c.half_sides for c in self.contacts)
 
     @property
@@ -557,6 +557,19 @@ class Workcell:
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
         normal, apart = self.contacts[0].T_box_pad[:3, 2], first - second
         return bool(np.linalg.norm(apart - (apart @ normal) * normal) > BESIDE)
+
+    @property
+    def has_closed_form(self) -> bool:
+        """Whether the contact forces have a closed form: the paper's, and those of soft fingers on
+        two pads with opposite normals. All others are found by a program."""
+        allocation = self.task.allocation
+        return allocation == "paper" or (allocation == "soft-finger" and self.has_opposite_pads)
+
+    @property
+    def has_force_slopes(self) -> bool:
+        """Whether the normal forces have slopes: in closed form, or by the program of pads
+        anywhere. That of two facing pads that choose their pressure has none."""
+        return self.has_closed_form or not self.has_facing_pads
 
     @property
     def pads(self) -> tuple[Contact, ...]:

@@ -145,9 +145,8 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Fun
 
 
 def held_functions(workcell: Workcell) -> dict[str, ca.Function]:
-    """Normal forces as smooth convex functions of a sample's load: today those of the joint
-    allocation, see `symbolic.contact.soft_grasp.SoftGrasp.first` and `second`. Another contact
-    model without a closed form is plugged in here:
+    """Normal forces as smooth convex functions of a sample's load where they have no closed form,
+    see `symbolic.contact.soft_grasp.SoftGrasp.first` and `second`:
 
     first: load (6,) -> normal (2,) [N], slope (6, 2), state (n,), whatever the second takes.
     second: state, weight (2,) -> curvature (6, 6), the Hessian of weight . normal by the load.

@@ -129,7 +129,7 @@ class Forces(Kind[ForceRow]):
         self._ends = {0, 1, last - 1, last}
         self._every = set(range(0, last, self.grid.samples(FORCE_STRIDE)))
         self._ties = set(range(0, last + 1, self.grid.samples(TIE_STRIDE)))
-        self._joint = cell.task.allocation == "joint" and cell.robust is None
+        self._joint = cell.robust is None and not cell.workcell.has_closed_form
         self._facing = cell.workcell.has_facing_pads
 
     def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[ForceRow]:

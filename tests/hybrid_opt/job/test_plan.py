@@ -226,6 +226,7 @@ def test_what_presses_too_hard_is_refused() -> None:
 
 def test_pads_that_do_not_face_one_another_have_no_job(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(type(rack().workcell), "has_facing_pads", False)
+    monkeypatch.setattr("hybrid_opt.job.plan.presses_evenly", lambda cell: False)
     with pytest.raises(JobError, match="face one another"):
         rack_jobs().plan(rack_timing())
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hybrid_opt.robust.cases import random_cases
-from hybrid_opt.robust.force import BoxMotion, soft_model
+from hybrid_opt.robust.force import BoxMotion, closes_evenly, soft_model
 from hybrid_opt.robust.squeeze import SqueezeSettings, pressed_beyond
 from symbolic.read.cell import load
 from symbolic.records import Uncertainty, Workcell
@@ -57,8 +59,11 @@ def test_what_is_commanded_holds_even_pads(rack: Workcell, settings: SqueezeSett
     assert "press evenly" in str(squeeze)
 
 
-def test_other_pads_are_told() -> None:
+def test_pads_that_only_choosing_their_pressure_would_close_are_told() -> None:
     cell, still = load(RACK.with_name("corner.toml")), BoxMotion(*[np.zeros((2, 6))] * 3)
+    slippery = [replace(contact, friction=0.9) for contact in cell.contacts]
+    assert closes_evenly(cell)
+    assert not closes_evenly(replace(cell, contacts=(slippery[0], slippery[1])))
     time = np.array([0.0, 1.0])
     _, squeeze = pressed_beyond(cell, SqueezeSettings(), time, still, np.zeros((2, 2)))
-    assert "choose their pressure" in str(squeeze)
+    assert "press evenly" in str(squeeze)

@@ -10,7 +10,7 @@ import pytest
 
 from hybrid_opt.robust.force import BoxMotion, RobustModel
 from symbolic.read.cell import load
-from symbolic.records import Uncertainty
+from symbolic.records import Allocation, Uncertainty
 from tests.hybrid_opt.robust.test_force import at_rest
 from tests.symbolic.cells import ROOT
 
@@ -19,9 +19,21 @@ NAMES = ("drum", "fork", "corner")
 
 
 @cache
-def model(name: str) -> RobustModel:
+def model(name: str, allocation: Allocation = "joint") -> RobustModel:
     cell = load(ROOT / "studies" / "workcells" / f"{name}.toml")
-    return RobustModel(replace(cell, uncertainty=SET))
+    task = replace(cell.task, allocation=allocation)
+    return RobustModel(replace(cell, uncertainty=SET, task=task))
+
+
+def test_pads_that_press_evenly_hold_displaced_too() -> None:
+    """And need more than pads that choose their pressure."""
+    even, moved = model("drum", "soft-finger"), motion("drum")
+    force = even.robust_force(moved)
+    assert (force.commanded > force.nominal[:, 1]).all()
+    assert (force.nominal[:, 1] > model("drum").robust_force(moved).nominal[:, 1]).all()
+    assert even.check(moved, force, 200, np.random.default_rng(1)).holds
+    weaker = replace(force, commanded=0.85 * force.commanded)
+    assert not even.check(moved, weaker, 200, np.random.default_rng(1)).holds
 
 
 def motion(name: str) -> BoxMotion:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,29 @@ def test_at_rest_both_pads_hold_half_of_the_crate() -> None:
         normal = contact.T_box_pad[:3, 2]
         along = normal @ force
         assert np.linalg.norm(force - along * normal) <= contact.friction * along
+
+
+def test_soft_fingers_need_more_but_hold_it_as_well() -> None:
+    workcell = load(CORNER)
+    even = replace(workcell, task=replace(workcell.task, allocation="soft-finger"))
+    still = np.zeros(6)
+    least, found = (call(load_function(cell), still, still, still) for cell in (workcell, even))
+    assert (found["normal_force"] >= least["normal_force"] * (1.0 - 1e-4)).all()
+    np.testing.assert_allclose(found["pressure_shift"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(found["moment_residual"], 0.0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_compiled_passes_agree_with_the_independent_timing() -> None:
+    """Where a program finds the contact forces, within a force limit that decides."""
+    cell = shipped("corner").drivable()
+    path, limits = cell.initial[: cell.workcell.task.n_path], TimingLimits(force=30.0)
+    assert cell.path_timer.compiled
+    found = cell.path_timer.time(path, limits)
+    other = time_path(cell.timing_model, path, limits)
+    assert found.ok
+    assert found.duration == pytest.approx(other.duration, rel=5e-3)
+    assert found.peak_force.max() == pytest.approx(30.0, rel=2e-3)
 
 
 @pytest.mark.slow

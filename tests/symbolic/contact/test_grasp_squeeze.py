@@ -22,7 +22,7 @@ from tests.symbolic.contact.test_grasp import KINDS, friction_of
 
 def function_of(cell: Workcell, commanded: int) -> ca.Function:
     load, friction, share = ca.MX.sym("load", 6), ca.MX.sym("friction", 2), ca.MX.sym("share", 2)
-    force = commanded_forces(GraspSqueeze(cell, commanded), load, friction, share)
+    force = commanded_forces(GraspSqueeze(cell, commanded), load, friction, share, ca.MX.zeros(4))
     return ca.Function("commanded", [load, friction, share], [force])
 
 
@@ -47,7 +47,9 @@ def test_agrees_with_clarabel(kinds: tuple[str, ...], share: float) -> None:
             load = random_load(rng)
             found = np.array(function(load, friction_of(cell), [share, share])).ravel()
             expected = weights @ least_wrenches(small.pads, load, weights)[:, 2]
-            assert found[commanded] == pytest.approx(expected, rel=2e-5)
+            # Next to nothing may have to be commanded.
+            rounding = 2e-6 * float(np.linalg.norm(load[:3]))
+            assert found[commanded] == pytest.approx(expected, rel=2e-5, abs=rounding)
             assert found[1 - commanded] > 0.0
 
 
@@ -59,7 +61,7 @@ def test_what_the_quick_look_holds_needs_no_more() -> None:
         function, squeeze = function_of(cell, 1), GraspSqueeze(cell, 1)
         load, friction, share = (ca.SX.sym(n, k) for n, k in (("l", 6), ("mu", 2), ("s", 2)))
         force = ca.SX.sym("force")
-        slack = commanded_slack(squeeze, load, friction, share, force)
+        slack = commanded_slack(squeeze, load, friction, share, ca.SX.zeros(4), force)
         look = ca.Function("look", [load, friction, share, force], [slack])
         for _ in range(10):
             asked, known = random_load(rng), (friction_of(cell), [0.9, 0.9])

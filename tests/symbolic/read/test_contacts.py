@@ -140,7 +140,7 @@ def test_a_mesh(tmp_path: Path) -> None:
         (
             {"contacts": [contact(xyz=[0.15, 0, 0]), OPPOSITE], "task": {"allocation": "paper"}},
             "contacts[1].xyz",
-            "task.allocation = 'joint' takes any",
+            "task.allocation = 'soft-finger' and 'joint' take any",
         ),
         (
             {

@@ -1,0 +1,226 @@
+"""Pads anywhere under even pressure against clarabel on fine grids, against the closed form of two
+opposite pads, statics by hand, laws and differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import clarabel
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import sparse
+from scipy.spatial.transform import Rotation
+
+from symbolic.array import Array
+from symbolic.contact.even_patch import EvenPatch
+from symbolic.contact.force_closure import scaled_patch
+from symbolic.contact.grasp import Grasp, grasp_wrenches
+from symbolic.contact.soft_finger import SoftPatch, least_soft_squeeze
+from symbolic.contact.soft_grasp import SoftGrasp
+from symbolic.records import Contact, Workcell
+from tests.symbolic.cells import hand_cell, with_task
+from tests.symbolic.contact.grasp_oracle import in_box, random_grasp, random_load, turned
+
+KINDS = (
+    ("round", "round"),
+    ("round", "rectangle"),
+    ("round", "round", "round"),
+    ("rectangle",) * 4,
+)
+
+
+def even_cell() -> Workcell:
+    return with_task(hand_cell(), allocation="soft-finger")
+
+
+def function_of(cell: Workcell) -> ca.Function:
+    load, friction = ca.MX.sym("load", 6), ca.MX.sym("friction", 2)
+    found = grasp_wrenches(Grasp(cell), load, friction)
+    return ca.Function("grasp", [load, friction], [found])
+
+
+def wrenches(cell: Workcell, load: Array, function: ca.Function | None = None) -> Array:
+    """(k, 6) force and moment about the pads' centres, in their axes."""
+    friction = [contact.friction for contact in cell.contacts]
+    found = np.array((function or function_of(cell))(load, friction)).reshape(-1, 6)
+    n, t_x, t_y, q_x, q_y, m = found.T
+    return np.column_stack([t_x, t_y, n, q_y, -q_x, m])
+
+
+def effort(found: Array) -> float:
+    return float(np.sum(found[:, :3] ** 2))
+
+
+def points_of(pad: Contact) -> tuple[Array, Array]:
+    """(m, 2) points of a patch and the shares (m,) of the area that they stand for."""
+    if pad.half_sides is not None:
+        along = (np.arange(16) + 0.5) / 8 - 1.0
+        points = np.array(np.meshgrid(*[half * along for half in pad.half_sides]))
+        return points.reshape(2, -1).T, np.full(256, 1.0 / 256)
+    r, angle = np.meshgrid((np.arange(10) + 0.5) / 10, (np.arange(24) + 0.5) * 2.0 * np.pi / 24)
+    at = np.stack([r * np.cos(angle), r * np.sin(angle)], axis=-1)
+    return pad.patch_radius * at.reshape(-1, 2), r.ravel() / r.sum()
+
+
+def least_on_grids(pads: tuple[Contact, ...], load: Array) -> Array:
+    """(k, 6) as `wrenches`, of the least effort with friction at every point of a grid and pressure
+    that is the same all over each patch."""
+    size = float(np.linalg.norm(load[:3]) + 10.0 * np.linalg.norm(load[3:]))
+    maps, cones, ends = [], [], [0]
+    for pad in pads:
+        points, share = points_of(pad)
+        # Normal force, then the tangential force at every point over the normal force's share.
+        own = np.zeros((6, 1 + 2 * len(points)))
+        own[2, 0] = 1.0
+        for k, (point, part) in enumerate(zip(points, share, strict=True)):
+            at = 1 + 2 * k
+            own[0, at] = own[1, at + 1] = part
+            own[5, at : at + 2] = part * np.array([-point[1], point[0]])
+        maps.append(own)
+        cone = np.zeros((3 * len(points), own.shape[1]))
+        for k in range(len(points)):
+            cone[3 * k, 0] = pad.friction
+            cone[3 * k + 1 : 3 * k + 3, 1 + 2 * k : 3 + 2 * k] = np.eye(2)
+        cones.append(cone)
+        ends.append(ends[-1] + own.shape[1])
+    # The pads' wrenches are unknowns of their own: the effort is theirs.
+    k, whole = 6 * len(pads), sparse.block_diag(maps)
+    balance = np.hstack([in_box(pad) for pad in pads])
+    count = sum(len(cone) for cone in cones)
+    rows = [
+        [sparse.csc_matrix(balance), None],
+        [sparse.eye(k), -whole],
+        [None, -sparse.block_diag(cones)],
+    ]
+    options = clarabel.DefaultSettings()
+    options.verbose = False
+    solution = clarabel.DefaultSolver(
+        sparse.diags([*np.tile([1.0, 1, 1, 0, 0, 0], len(pads)), *np.zeros(ends[-1])]).tocsc(),
+        np.zeros(k + ends[-1]),
+        sparse.bmat(rows).tocsc(),
+        np.concatenate([load / size, np.zeros(k + count)]),
+        [clarabel.ZeroConeT(6 + k), *[clarabel.SecondOrderConeT(3)] * (count // 3)],
+        options,
+    ).solve()
+    assert str(solution.status) in ("Solved", "AlmostSolved"), solution.status
+    return size * np.array(solution.x)[:k].reshape(-1, 6)
+
+
+@pytest.mark.parametrize("kinds", KINDS)
+def test_the_least_effort_is_that_of_grids_of_points(kinds: tuple[str, ...]) -> None:
+    """Within what (1) of `soft_finger` is from the exact limit surface: rectangles of up to 12 to 1
+    are among them."""
+    rng = np.random.default_rng(4)
+    for _ in range(2):
+        cell = random_grasp(rng, even_cell(), kinds)
+        load = random_load(rng)
+        found, expected = wrenches(cell, load), least_on_grids(cell.pads, load)
+        balance = sum(in_box(p) @ w for p, w in zip(cell.pads, found, strict=True))
+        np.testing.assert_allclose(balance, load, atol=1e-9 * np.sqrt(effort(found)))
+        ratio = np.sqrt(effort(found) / effort(expected))
+        least, most = (0.985, 1.04) if "rectangle" in kinds else (0.99, 1.01)
+        assert least < ratio < most, ratio
+
+
+def test_two_opposite_pads_press_as_in_closed_form() -> None:
+    """Also unequal ones of different shapes, with the load off the line between them."""
+    rng = np.random.default_rng(8)
+    first, second = even_cell().contacts
+    pads = (
+        replace(first, friction=0.7, patch_radius=0.03),
+        replace(second, friction=0.9, patch_radius=0.05, half_sides=(0.04, 0.03)),
+    )
+    cell = replace(even_cell(), contacts=pads)
+    function, axes = function_of(cell), first.T_box_pad[:3, :3]
+    arms = [ca.DM(axes.T @ pad.T_box_pad[:3, 3]) for pad in pads]
+    patches = [SoftPatch.of(pad, axes) for pad in pads]
+    for _ in range(8):
+        load = random_load(rng) * [1, 1, 1, 0.3, 0.3, 0.3]
+        force, moment = (ca.SX(ca.DM(axes.T @ part)) for part in (load[:3], load[3:]))
+        found = least_soft_squeeze(
+            force, moment, (arms[0], arms[1]), ca.SX([0.7, 0.9]), (patches[0], patches[1])
+        )
+        expected = np.array(ca.evalf(found.normal)).ravel()
+        np.testing.assert_allclose(wrenches(cell, load, function)[:, 2], expected, rtol=1e-5)
+
+
+def test_a_block_on_a_wedge_of_pads_is_held_as_statics_say() -> None:
+    """Two pads whose normals stand at 90 degrees below a block need no friction: each bears its
+    share of the weight over the root of two. Lifted instead, by pads on adjacent faces, each
+    tangential force is at most friction times the normal one."""
+    z = 2**-0.5
+    places = ((-0.1, 0.0, -0.1), (0.1, 0.0, -0.1), (0.0, 0.0, 0.1))
+    normals = ((z, 0.0, z), (-z, 0.0, z), (0.0, 0.0, -1.0))
+    pads = []
+    for place, normal in zip(places, normals, strict=True):
+        T = np.eye(4)
+        across = np.array([0.0, 1.0, 0.0])
+        T[:3, :3] = np.column_stack([across, np.cross(normal, across), normal])
+        T[:3, 3] = place
+        pads.append(Contact(T, 0.5, 0.02))
+    cell = replace(even_cell(), contacts=(replace(pads[0], further=(pads[1],)), pads[2]))
+    found = wrenches(cell, np.array([0.0, 0.0, 80.0, 0.0, 0.0, 0.0]))
+    # The least sum of squares lets friction help: no pad on top, both forces upright at 26.6
+    # degrees from their normals at most.
+    share = 40.0 * np.cos(np.arctan(0.5)) / np.cos(np.pi / 4 - np.arctan(0.5))
+    np.testing.assert_allclose(found[:2, 2], share, rtol=1e-4)
+    assert found[2, 2] < 1e-3
+
+
+@given(seed=st.integers(0, 2**31), kinds=st.sampled_from(KINDS[:3]))
+@settings(max_examples=6, deadline=None)
+def test_turning_all_turns_the_forces(seed: int, kinds: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(seed)
+    cell, load = random_grasp(rng, even_cell(), kinds), random_load(rng)
+    rotation = Rotation.random(random_state=seed)
+    first, last = cell.contacts
+    moved = replace(
+        turned(first, rotation), further=tuple(turned(p, rotation) for p in first.further)
+    )
+    other = replace(cell, contacts=(moved, turned(last, rotation)))
+    there = wrenches(other, np.concatenate([rotation.apply(load[:3]), rotation.apply(load[3:])]))
+    here = wrenches(cell, load)
+    np.testing.assert_allclose(there[:, :3], here[:, :3], atol=1e-4 * np.sqrt(effort(here)))
+
+
+@pytest.mark.parametrize("kinds", KINDS[:3])
+def test_forces_on_the_central_path_have_exact_slopes(kinds: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(9)
+    cell, load = random_grasp(rng, even_cell(), kinds), random_load(rng)
+    soft = SoftGrasp(Grasp(cell), np.array([c.friction for c in cell.contacts]), 1e-4)
+    first, second = soft.first(), soft.second()
+    normal, slope, state = (np.array(value) for value in first(load))
+    least = np.bincount(cell.pad_robots, wrenches(cell, load)[:, 2])
+    np.testing.assert_allclose(normal.ravel(), least, rtol=5e-3)
+    weight, step = np.array([1.0, -0.4]), 1e-3
+    curvature = np.array(second(state, weight))
+    for k, moved in enumerate(step * np.eye(6) * [1, 1, 1, 0.1, 0.1, 0.1]):
+        ends = [first(load + sign * moved) for sign in (1.0, -1.0)]
+        size = 2.0 * moved[k]
+        by = np.array(ends[0][0] - ends[1][0]).ravel() / size
+        np.testing.assert_allclose(by, slope[k], atol=1e-4 * np.abs(slope).max())
+        bent = np.array(ends[0][1] - ends[1][1]) @ weight / size
+        np.testing.assert_allclose(bent, curvature[k], atol=1e-3 * np.abs(curvature).max())
+
+
+@pytest.mark.parametrize("kind", ["round", "rectangle"])
+def test_a_step_that_counts_as_allowed_stays_within_the_cone(kind: str) -> None:
+    rng = np.random.default_rng(3)
+    pad = random_grasp(rng, even_cell(), (kind, kind)).pads[0]
+    patch = EvenPatch(scaled_patch(pad))
+    state, change = ca.SX.sym("s", 4), ca.SX.sym("d", 4)
+    look = ca.Function("l", [state, change], [patch.slack(state), patch.lowest(state, change)])
+    least = []
+    for _ in range(200):
+        at = np.array([1.0, *0.6 * rng.uniform(-1, 1, 2), 0.3 * rng.uniform(-1, 1)])
+        d = rng.normal(size=4)
+        inside, lowest = (float(value) for value in look(at, d))
+        if inside <= 0.0:
+            continue
+        length = min(-1.0 / lowest, 1e3)
+        assert float(look(at + (1.0 - 1e-9) * length * d, d)[0]) >= -1e-9
+        least.append(float(look(at + 1.05 * length * d, d)[0]))
+    assert np.mean(np.array(least) <= 0.0) > 0.95
