@@ -359,7 +359,7 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     asked, torque, wrench = ca.vertsplit(inputs[0], ends.tolist())
     own, by_wrench = ca.reshape(torque, joints, 3), ca.reshape(wrench, 6, joints).T
     # Each arm's joints feel its own wrench.
-    first, to_robots = len(workcell.robots[0].velocity_max), robot_wrenches(workcell)
+    first, to_robots = workcell.robots[0].velocity_max.shape[0], robot_wrenches(workcell)
     felt = [ca.sparsify(ca.DM(part)) for part in (to_robots[:6], to_robots[6:])]
     load, by_timing = _load_function(workcell)(asked, *inputs[1:])
     soft, none = _on_central_path(workcell), ca.DM.zeros(2, 1)

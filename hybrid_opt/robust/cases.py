@@ -81,7 +81,8 @@ def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -
     places = [np.zeros(4)]
     if workcell.task.allocation == "soft-finger" and not workcell.has_closed_form:
         off += uncertainty.apart / 2.0
-        places = [off * np.array(signs) for signs in product((-1.0, 1.0), repeat=4 * (off > 0.0))]
+        signs = product((-1.0, 1.0) if off > 0.0 else (0.0,), repeat=4)
+        places = [off * np.array(at) for at in signs]
     elif workcell.task.allocation == "soft-finger":
         normal = workcell.contacts[0].T_box_pad[:3, 2]
         centre = centre + off * np.sqrt(np.maximum(1.0 - normal**2, 0.0))
