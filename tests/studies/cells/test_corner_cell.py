@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_opt.timing import TimingLimits
+from hybrid_opt.timing import TimingLimits, TimingModel
 from hybrid_opt.timing.solve import time_path
 from symbolic.contact.load import load_function
 from symbolic.read.cell import load
@@ -52,7 +52,7 @@ def test_compiled_passes_agree_with_the_independent_timing() -> None:
     path, limits = cell.initial[: cell.workcell.task.n_path], TimingLimits(force=30.0)
     assert cell.path_timer.compiled
     found = cell.path_timer.time(path, limits)
-    other = time_path(cell.timing_model, path, limits)
+    other = time_path(TimingModel(cell.compiled, cell.path_timer.intervals), path, limits)
     assert found.ok
     assert found.duration == pytest.approx(other.duration, rel=5e-3)
     assert found.peak_force.max() == pytest.approx(30.0, rel=2e-3)
