@@ -28,7 +28,7 @@ Which are worst follows from the least squeeze that a case asks for:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 
 import numpy as np
@@ -166,8 +166,9 @@ class CaseForces:
                 held_function(workcell, function.__name__, function, cache, lanes=0)
                 for function in (case_squeeze_function, case_slack_function)
             ]
-            in_place = case_squeeze_function(workcell, displaced=False)
-            self._in_place = compile_function(in_place, cache, lanes=0)
+            in_place = partial(case_squeeze_function, displaced=False)
+            name = "undisplaced squeeze"
+            self._in_place = held_function(workcell, name, in_place, cache, lanes=0)
 
     def least(
         self,
