@@ -70,6 +70,20 @@ def test_a_changed_number_needs_no_compiler_and_is_what_its_file_says(
         assert told != [getattr(carry, part).tolist() for part in ("time", "normal_force", "pose")]
 
 
+def test_a_changed_drivable_cell_needs_no_compiler_either(monkeypatch: pytest.MonkeyPatch) -> None:
+    cell = ho.Cell.load(RACK).drivable()
+    held = cell.carry(cell.initial)
+
+    def refused(*_: Any, **__: Any) -> None:
+        raise AssertionError("a compiler was asked for")
+
+    monkeypatch.setattr(Compiler, "compile", refused)
+    new = cell.changed({"payload.mass": 8.0, "payload.acceleration_max": 4.0})
+    carry = new.carry(new.initial)
+    assert carry.peak_normal_force.max() < held.peak_normal_force.max()
+    assert carry.duration > 0.0
+
+
 def test_changing_back_gives_the_same_bits() -> None:
     cell = ho.Cell.load(RACK)
     there = cell.changed({"payload.mass": 3.0})
