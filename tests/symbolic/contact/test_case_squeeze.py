@@ -7,7 +7,7 @@ import pytest
 
 from studies.research.plain.load import GRAVITY
 from studies.research.plain.motion import angular_rates, rotation
-from symbolic.contact.worst_cases import case_squeeze_function
+from symbolic.contact.worst_cases import CASE_SIZE, case_squeeze_function
 from tests.symbolic.cells import call
 from tests.symbolic.contact.joint_oracle import Case, least_wrenches
 from tests.symbolic.contact.test_payload_load import random_cell, random_motion
@@ -40,6 +40,7 @@ def test_agrees_with_the_true_bodys_balance() -> None:
             Case(to_pad @ force, to_pad @ moment, arms, friction, radius), squeeze=True
         )
         case = np.concatenate([friction, radius, [mass], centre, disturbance, displaced.ravel()])
+        case = np.append(case, np.zeros(CASE_SIZE - len(case)))  # pads press as commanded
         found = call(case_squeeze_function(cell), pose, rate, second, case)["normal_force"]
         size = float(np.abs(expected[:, 2]).max())
         assert found == pytest.approx(expected[:, 2] * [1.0, -1.0], abs=1e-6 * size)
