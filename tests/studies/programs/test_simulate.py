@@ -67,7 +67,7 @@ def test_thresholds_of_many_carries_go_on_from_what_is_stored(
     assert thresholds.main([*arguments, "1"]) == 0
     assert capsys.readouterr().out.splitlines()[1] == lines[1].removesuffix("  1 of 1").rstrip()
     assert thresholds.main([*arguments, "2", "--seed", "2"]) == 2
-    assert "has seed 1" in capsys.readouterr().err
+    assert "begun with seed 1" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
