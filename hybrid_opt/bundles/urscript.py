@@ -287,10 +287,11 @@ def _phase(export: Export, arm: int, index: int, name: str) -> Iterator[str]:
     q, span = sampled.arm(arm, sampled.q), sampled.span(index)
     force = sampled.normal_force[:, arm]
     most = float(force[span].max())
+    every = math.ceil(FORCE_EVERY / float(np.diff(sampled.time).mean()) - 1e-9)
     yield f"  def {name}():"
     for k in range(span.start + 1, span.stop):
         # Until the next reference no less than is needed.
-        ahead = min(k + round(FORCE_EVERY / CYCLE), span.stop)
+        ahead = k + every + 3
         newton = float(force[k:ahead].max()) if name in HELD else float(force[k])
         yield f"    go({_list(q[k])}, {newton:.3f})"
         if name in HELD:
