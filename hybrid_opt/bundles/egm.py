@@ -43,8 +43,8 @@ CROSSOVER = 0.3
 LEAST_LAG = 0.01
 """Least lag that the force loop reckons with [s]."""
 
-MOST_WAY, PRESS_SPEED = 0.03, 0.05
-"""Of the pressing pad beyond its plan [m], [m/s]."""
+MOST_WAY, PRESS_SPEED = 1.5, 0.05
+"""Of the pressing pad beyond its plan: over what its largest force needs, and [m/s]."""
 
 MOST_SPEED_DEVIATION = 20.0
 """By which EGM may exceed the speed of its references [degrees/s]."""
@@ -67,6 +67,7 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
     """The stream's program, and what starts EGM in both tasks."""
     robots, follower = export.workcell.robots, export.follower
     lag = max(LEAST_LAG, robots[follower].driver.lag)
+    compliance = 2.0 / export.options.stiffness
     config = {
         "ports": list(PORTS),
         "lags": [robot.driver.lag for robot in robots],
@@ -74,8 +75,8 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
         "press": {
             "arm": follower,
             "gain": 2.0 * CROSSOVER / (export.options.stiffness * lag),
-            "compliance": 2.0 / export.options.stiffness,
-            "most": MOST_WAY,
+            "compliance": compliance,
+            "most": MOST_WAY * compliance * float(export.job.peak_normal_force[follower]),
             "speed": PRESS_SPEED,
         },
         "inward": inward(export.workcell, follower, export.sampled.arm(follower, export.sampled.q))
