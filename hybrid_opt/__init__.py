@@ -15,6 +15,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from hybrid_opt.shown import shown_by
+
 if TYPE_CHECKING:
     from hybrid_opt.branches import search_branches
     from hybrid_opt.bundles.bundle import export
@@ -111,6 +113,9 @@ _HOMES = {
     "time_path": "hybrid_opt.door",
     "time_with_jerk": "hybrid_opt.door",
 }
+
+
+shown_by(lambda room: import_module(f"hybrid_opt.display.{room}"))
 
 
 def __getattr__(name: str) -> Any:

@@ -9,7 +9,7 @@ from importlib.metadata import version
 from codegen.cache import Cache
 from codegen.compiler import find_compiler, interruptible
 from codegen.errors import CodegenError
-from hybrid_opt.campaign.progress import Progress
+from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.polishing.drive import is_polishable

@@ -10,21 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from codegen.function import NumericFunction
 from hybrid_opt.indicators.metrics import excess_above_static
-from hybrid_opt.shown import Shown, display
+from hybrid_opt.shown import Page, Shown, display
 from hybrid_opt.static_hold import payload_limit, static_hold
 from symbolic.array import Array
 from symbolic.path.spline import sample_basis
 from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
-
-if TYPE_CHECKING:
-    from hybrid_opt.display.view import CarryView
 
 OBJECTIVE = "objective_"
 """Before the name of an objective among a carry's figures."""
@@ -248,14 +244,14 @@ class Carry(Shown):
             figures |= {f"{name}_{i + 1}": float(values[i]) for name, values in per_robot.items()}
         return figures
 
-    def view(self, height: int = 480) -> CarryView:
+    def view(self, height: int = 480) -> Page:
         """The carry in three dimensions: shown in a notebook's cell, or saved as a page.
 
         Args:
             height: of the notebook's cell [px].
         """
-        shown: CarryView = display("view").CarryView(self, height)
-        return shown
+        page: Page = display("view").CarryView(self, height)
+        return page
 
 
 def joints_of(workcell: Workcell, values: Array) -> tuple[Array, Array]:

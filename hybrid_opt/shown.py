@@ -1,17 +1,31 @@
 """Objects that show themselves in a terminal and in a notebook.
 
-How they look is told in `hybrid_opt.display`, whose rooms know the objects. The objects know this
-module only, the one place that leads from them to their display, when they are shown.
+They know this module only, and not how they look: the front door (`hybrid_opt`) tells where the
+rooms are that do, which are imported when an object is shown.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+_rooms: list[Callable[[str], Any]] = []
+
+
+def shown_by(room: Callable[[str], Any]) -> None:
+    """Tell what gives the module of a name that shows objects: 'objects' as text and HTML, 'view'
+    in three dimensions."""
+    _rooms[:] = [room]
+
+
+def display(room: str) -> Any:
+    """The module of that name."""
+    return _rooms[0](room)
 
 
 class Shown:
-    """An object for which `hybrid_opt.display.objects` has a text and a page."""
+    """An object that has a text and a page."""
 
     def __repr__(self) -> str:
         return str(display("objects").text_of(self))
@@ -20,6 +34,13 @@ class Shown:
         return str(display("objects").html_of(self))
 
 
-def display(room: str) -> Any:
-    """A module of `hybrid_opt.display`, imported when it is needed first."""
-    return import_module(f"hybrid_opt.display.{room}")
+class Page(Protocol):
+    """A self-contained page, which a notebook shows in a cell."""
+
+    def page(self) -> str:
+        """Its text."""
+
+    def save(self, path: str | Path) -> None:
+        """Write it into a file."""
+
+    def _repr_html_(self) -> str: ...

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import casadi as ca
 import numpy as np
 
-from symbolic.array import Array
+from symbolic.array import Array, Pair
 from symbolic.contact.load import LOAD_OUTPUTS, closed_load_function, uncertain_load_function
 from symbolic.errors import WorkcellError
 from symbolic.records import Workcell
@@ -72,8 +72,8 @@ class StaticHold:
         payload_limit: payload at which a robot's whole force reaches its reference force [kg].
     """
 
-    normal_force: Array
-    contact_force: Array
+    normal_force: Pair
+    contact_force: Pair
     payload_limit: float
 
 

@@ -12,6 +12,14 @@ from typing import Any, TypeVar
 
 LARGEST_SEED = 2**63 - 1
 
+QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 2
+"""Evaluations and replicas of a small but complete study."""
+
+DRIVEN = "pads-driven"
+
+PADS = ("pads", DRIVEN)
+"""The witnesses without arms, beside the controllers of those with them."""
+
 Number = TypeVar("Number", int, float)
 
 

@@ -16,14 +16,18 @@ from hybrid_opt.polishing.settings import (
     quick_settings,
 )
 from hybrid_opt.work.processes import warm_up
-from studies.options import add, add_looks, add_wishes, stated
+from studies.options import (
+    QUICK_EVALUATIONS,
+    QUICK_REPLICAS,
+    add,
+    add_looks,
+    add_wishes,
+    stated,
+)
 from studies.program import Parser, Program, carry_out, run_program
 from symbolic.errors import SettingsError
 
 DESCRIPTION = "Search for the least-force carries of a dual-arm workcell."
-
-QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 2
-"""Evaluations and replicas of a small but complete study."""
 
 ALGORITHMS: tuple[str, ...] = stated("hybrid_opt.metaheuristics.registry.REGISTRY")
 

@@ -9,13 +9,8 @@ from __future__ import annotations
 
 import sys
 
-from studies.options import add, number, stated, whole
+from studies.options import PADS, add, number, stated, whole
 from studies.program import Parser, Program, later, run_program
-
-DRIVEN = "pads-driven"
-
-PADS = ("pads", DRIVEN)
-"""The witnesses without arms, beside the controllers of those with them."""
 
 
 def _add_options(parser: Parser) -> None:

@@ -2,10 +2,9 @@
 
 from hybrid_opt.campaign.execution import ExecutionSettings, executor_for
 from hybrid_opt.campaign.folder import CampaignFolder, open_folder
-from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.settings import CampaignSettings
-from hybrid_opt.campaign.stages import Stage, check_stages, run_stages
+from hybrid_opt.campaign.stages import Progress, Stage, check_stages, run_stages
 
 __all__ = [
     "CampaignFolder",

@@ -1,15 +1,25 @@
-"""A workcell as a value that goes to any process or machine, and resources made from it there."""
+"""Workcells as values that go to any process or machine, and resources made from them there."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TypeVar
 
-from symbolic.read.cell_files import CellFiles, cell_from_json, cell_to_json, unpack_cell
+from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.objectives import force_kind
+from hybrid_opt.job.plan import JobModel
+from symbolic.read.cell_files import (
+    CellFiles,
+    cell_from_json,
+    cell_to_json,
+    drivable_files,
+    unpack_cell,
+)
 from symbolic.records import Workcell
 
 Made = TypeVar("Made")
@@ -34,3 +44,53 @@ class PackedCell:
         """Result of a function of the workcell, whose files exist only as long as it runs."""
         with TemporaryDirectory() as folder:
             return of_workcell(unpack_cell(cell_from_json(json.loads(self.text)), Path(folder)))
+
+
+@dataclass(frozen=True)
+class ReadyCell:
+    """A cell with all loaded that judges, times and plans its carries.
+
+    Attributes:
+        cell: the cell.
+        jobs: plans its jobs; `jobs.timing` times its paths.
+    """
+
+    cell: Cell
+    jobs: JobModel
+
+    @classmethod
+    def of(cls, objectives: tuple[str, ...], workcell: Workcell) -> ReadyCell:
+        """Load what is loaded when it is first needed: the cell's files are there only now."""
+        cell = Cell(workcell, objectives)
+        cell.carry(cell.initial)
+        cell.timing_model.search_carry(cell.initial)
+        if workcell.task.time_law == "optimal" and cell.force_kind.robust:
+            cell.timing_model.search_timing(cell.initial)
+        return cls(cell, JobModel(cell.compiled, cell.timing_model))
+
+
+@dataclass(frozen=True)
+class CellsSource:
+    """Makes the cells of a study ready for work, in any process.
+
+    Attributes:
+        cells: each with its objectives; the last one is the cell that robots drive.
+    """
+
+    cells: tuple[tuple[PackedCell, tuple[str, ...]], ...]
+
+    @classmethod
+    def of(cls, files: CellFiles, objectives: tuple[str, ...], driven: bool) -> CellsSource:
+        """An experiment's own cell, and the drivable variant of it, whose contact model may differ.
+
+        Args:
+            driven: whether robots drive the experiment's own cell.
+        """
+        own = (PackedCell.of(files), objectives)
+        if driven:
+            return cls((own,))
+        return cls((own, (PackedCell.of(drivable_files(files)), force_kind(objectives).drivable)))
+
+    def __call__(self) -> tuple[ReadyCell, ...]:
+        """Load the compiled functions, or build them where they are missing."""
+        return tuple(cell.make(partial(ReadyCell.of, names)) for cell, names in self.cells)

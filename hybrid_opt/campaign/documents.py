@@ -1,20 +1,17 @@
-"""The small files of a results folder as records. docs/results.md describes them."""
+"""The small files of a results folder as records, and where they lie (docs/results.md)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from hybrid_opt.campaign.settings import FirstGeneration
 from hybrid_opt.metaheuristics.problem import ConstraintHandling
-from hybrid_opt.store.json_records import Figure, Range, Shape
-from symbolic.array import Array
+from symbolic.array import Count, Range
 
-Count = Annotated[int, Range(0, 10**12)]
 Seconds = Annotated[float, Range(0.0, 1e12)]
-Pair = Annotated[Array, Shape((2,))]
-"""One number per robot."""
 
 StageStatus = Literal["running", "done", "outdated"]
 
@@ -90,55 +87,50 @@ class StageMark:
     seconds: Seconds
 
 
-@dataclass(frozen=True)
-class FrontPoint:
-    """A point of a polished front.
+CONFIGURATION = "configuration.json"
+SUMMARY = "summary.json"
+BRANCHES = "branches.json"
+WORKCELL = "workcell"
+REPLICAS = "replicas"
+STAGES = "stages"
+FRONTS = "fronts"
+SELECTED = "selected"
+POLISHED = "polished"
+POLISHED_SUFFIX = "-polished"
+DRIVABLE = "drivable"
+RECOMMENDED = "recommended.json"
+RECOMMENDATION = "recommendation.json"
+NO_RECOMMENDATION = "no-recommendation.json"
+SIMULATED = "simulated"
+HAND_MADE = "hand-made.json"
 
-    Attributes:
-        objectives, x: (2,) and (n_var,).
-        parent: row of the searched front that it replaced or still is, -1 for a new one.
-        polished: whether the polish made it.
-    """
-
-    objectives: Annotated[Array, Shape((2,))]
-    x: Annotated[Array, Shape((None,))]
-    parent: Annotated[int, Range(-1, 10**9)]
-    polished: bool
-
-
-@dataclass(frozen=True)
-class PolishEffort:
-    """Effort and success of a polish.
-
-    Attributes:
-        solver: what solved its programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
-        attempts: solves.
-        counts: attempts by status, and those not accepted also by 'status: reason'.
-        success_share: of the front's own points, those accepted or optimal.
-        seconds, median_attempt_seconds: spent in total and per attempt.
-        equivalent_evaluations: candidate evaluations that take as long.
-        widest_gap: share of the front's length between the neighbours that are farthest apart.
-        worst_stationarity, worst_feasibility, median_stationarity: residuals of the points that a
-            solve made and that stand on the front in the end.
-    """
-
-    solver: str
-    attempts: Count
-    counts: Mapping[str, Count]
-    success_share: Figure
-    seconds: Seconds
-    median_attempt_seconds: Figure
-    equivalent_evaluations: Count
-    widest_gap: Figure
-    worst_stationarity: Figure
-    worst_feasibility: Figure
-    median_stationarity: Figure
+EVALUATIONS = "evaluations.csv.gz"
+FRONT = "front.csv"
+DONE = "replica.json"
+JOURNAL = "journal.bin"
+POLISH = "polish.json"
 
 
-@dataclass(frozen=True)
-class PolishDocument:
-    """polish.json: a polished front, what it took, and every attempt as its journal has it."""
+def replica_folder(root: Path, algorithm: str, replica: int) -> Path:
+    """Folder of one replica, counted from 0."""
+    return root / REPLICAS / algorithm / f"{replica:02d}"
 
-    front: tuple[FrontPoint, ...]
-    figures: PolishEffort
-    attempts: tuple[Mapping[str, Any], ...]
+
+def selected_file(root: Path, algorithm: str, replica: int) -> Path:
+    """Trajectory file of the solution selected from one replica."""
+    return root / SELECTED / algorithm / f"{replica:02d}.json"
+
+
+def polished_folder(root: Path, algorithm: str, replica: int) -> Path:
+    """Folder of what the polish made of one replica's front."""
+    return root / POLISHED / algorithm / f"{replica:02d}"
+
+
+def polished_selected_file(root: Path, algorithm: str, replica: int) -> Path:
+    """Trajectory file of the solution selected from a replica's polished front."""
+    return root / SELECTED / f"{algorithm}{POLISHED_SUFFIX}" / f"{replica:02d}.json"
+
+
+def reference_front_file(root: Path) -> Path:
+    """Non-dominated union of all fronts of the campaign."""
+    return root / FRONTS / "reference.csv"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.store.files import csv_bytes
 from symbolic.array import Array
 
 _LEVEL = 4
@@ -167,11 +168,9 @@ def encode_front(table: EvaluationTable, rows: NDArray[np.intp]) -> bytes:
     """Some candidates as plain CSV: evaluation, objectives and decision vector."""
     found = table.evaluations
     names = [*table.objective_names, *(f"x_{k + 1}" for k in range(found.x.shape[1]))]
-    lines = [",".join(["evaluation", *names])]
-    for row in rows.tolist():
-        numbers = [*found.objectives[row].tolist(), *found.x[row].tolist()]
-        lines.append(f"{row + 1}," + ",".join(map(repr, numbers)))
-    return ("\n".join(lines) + "\n").encode()
+    numbers = np.hstack([found.objectives[rows], found.x[rows]]).tolist()
+    numbered = ([row + 1, *values] for row, values in zip(rows.tolist(), numbers, strict=True))
+    return csv_bytes(["evaluation", *names], numbered)
 
 
 def _between(names: list[str], prefix: str) -> tuple[str, ...]:

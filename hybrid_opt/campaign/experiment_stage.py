@@ -7,11 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from hybrid_opt.campaign.documents import CONFIGURATION, DRIVABLE
 from hybrid_opt.campaign.folder import CampaignFolder, open_folder
-from hybrid_opt.campaign.layout import CONFIGURATION, DRIVABLE
-from hybrid_opt.campaign.progress import Progress
 from hybrid_opt.campaign.settings import CampaignSettings
-from hybrid_opt.campaign.stages import Stage, run_stages
+from hybrid_opt.campaign.stages import Progress, Stage, run_stages
 from hybrid_opt.evaluate.objectives import force_kind
 from symbolic.read.cell_files import drivable_files, unpack_cell
 

@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from hybrid_opt.campaign.documents import CONFIGURATION, STAGES, WORKCELL
 from hybrid_opt.campaign.execution import ExecutionSettings
 from hybrid_opt.campaign.identity import identity, require_equal
-from hybrid_opt.campaign.layout import CONFIGURATION, STAGES, WORKCELL
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError

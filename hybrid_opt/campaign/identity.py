@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -66,9 +66,11 @@ def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:
     Raises:
         ResultsError: with every value that differs.
     """
-    differences = list(_differences(stored, dict(wanted), ""))
-    if differences:
-        listed = "\n".join(f"  - {line}" for line in differences)
+    listed = "\n".join(
+        f"  - {key}: stored {json.dumps(old)}, now {json.dumps(new)}"
+        for key, old, new in differences(stored, dict(wanted))
+    )
+    if listed:
         raise ResultsError(
             f"{where}: holds results of something else, and they are never mixed; choose another "
             "--output, remove them with --overwrite, or repeat the command with what they were "
@@ -76,15 +78,12 @@ def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:
         )
 
 
-def _differences(stored: Any, wanted: Any, key: str) -> list[str]:
-    if isinstance(stored, dict) and isinstance(wanted, dict):
-        return [
-            line
-            for name in dict.fromkeys((*stored, *wanted))
-            for line in _differences(
-                stored.get(name), wanted.get(name), f"{key}.{name}" if key else name
-            )
-        ]
-    if stored == wanted:
-        return []
-    return [f"{key}: stored {json.dumps(stored)}, now {json.dumps(wanted)}"]
+def differences(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Where two trees of JSON values differ: keys joined by points, and both values, None where one
+    has none."""
+    if isinstance(first, dict) and isinstance(second, dict):
+        for name in dict.fromkeys((*first, *second)):
+            inner = f"{key}.{name}" if key else name
+            yield from differences(first.get(name), second.get(name), inner)
+    elif first != second:
+        yield key, first, second

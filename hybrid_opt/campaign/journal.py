@@ -13,11 +13,15 @@ import os
 import struct
 import time
 import zlib
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from hybrid_opt.campaign.documents import JOURNAL
+from hybrid_opt.campaign.identity import replica_identity
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.store.files import read_bytes, storing
@@ -159,3 +163,46 @@ def _block_at(content: bytes, offset: int) -> bytes | None:
     if len(payload) != length or zlib.crc32(payload) != checksum or length < _HEAD.size:
         return None
     return payload
+
+
+Key = tuple[str, int]
+"""Algorithm and number of a replica."""
+
+
+class ReplicaLedger:
+    """The replicas that are not done, and the journals of those that are being worked on: what
+    ledgers (`hybrid_opt.work.service`) of the search and of the polish have alike."""
+
+    def __init__(self, folders: Mapping[Key, Path], identity: Mapping[str, Any]) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            folders: of the replicas that are left, for their journals.
+            identity: of what is done with them.
+        """
+        self._left, self._folders = list(folders), list(folders.values())
+        self._identity = identity
+        self._journals: dict[int, Journal] = {}
+
+    def __len__(self) -> int:
+        return len(self._left)
+
+    def heard(self, index: int, message: bytes) -> None:
+        """See `hybrid_opt.work.service.Ledger`."""
+        self.journal(index).append(message)
+
+    def journal(self, index: int) -> Journal:
+        """A replica's journal, opened when it is asked for first."""
+        if index not in self._journals:
+            key = replica_identity(self._identity, *self._left[index])
+            self._journals[index] = Journal(self._folders[index] / JOURNAL, key)
+        return self._journals[index]
+
+    def discard(self, index: int) -> None:
+        """Close and delete a replica's journal, once its answer is stored."""
+        self._journals.pop(index).discard()
+
+    def close(self) -> None:
+        """Close the journals; they stay where they are."""
+        for journal in self._journals.values():
+            journal.close()

@@ -4,39 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hybrid_opt.campaign.documents import Count, Pair
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ROBUST_FORCE, ForceKind
 from hybrid_opt.recommending.advice import Advice
+from hybrid_opt.recommending.choice import Wish
+from hybrid_opt.recommending.comparison import Rival
 from hybrid_opt.recommending.recommendation import Recommendation
 from hybrid_opt.robust.force import RobustPrice
 from hybrid_opt.robust.squeeze import Part
-from hybrid_opt.store.json_records import Figure
 from hybrid_opt.timing.robustness import Margin
-from symbolic.array import Array
-
-
-@dataclass(frozen=True)
-class StoredWish:
-    """The wish: at most one of duration [s], force [N] and payload [kg]."""
-
-    duration: float | None
-    force: float | None
-    payload: float | None
-
-
-@dataclass(frozen=True)
-class StoredRival:
-    """Another path beside the recommended carry, driven as fast as the same limits allow.
-
-    Attributes:
-        label: what it is.
-        duration_at_force: [s] with the same force commanded, null where it cannot.
-        force_at_duration: to command in the same time [N], null where it cannot.
-    """
-
-    label: str
-    duration_at_force: Figure
-    force_at_duration: Figure
+from symbolic.array import Array, Count, Figure, Pair
 
 
 @dataclass(frozen=True)
@@ -70,51 +46,6 @@ class ForceTable:
 
 
 @dataclass(frozen=True)
-class StoredPrice:
-    """Cost for the recommended carry to hold in every case of a set.
-
-    Attributes:
-        stated: whether the workcell states the set; else it is the usual one.
-        uncertainty: the set in words.
-        factors: multiples of it.
-        peak: largest normal force of each robot under them [N].
-        commanded: under the set itself [N].
-        limit: reference forces [N].
-        largest_factor: the largest multiple that they allow, at most
-            `hybrid_opt.robust.force.LARGEST_FACTOR`.
-        cases, failing: random cases held against the forces, and how many they did not hold.
-        closest: largest share of the forces that a case needed; less is told as 0.97.
-    """
-
-    stated: bool
-    uncertainty: str
-    factors: tuple[float, ...]
-    peak: tuple[Pair, ...]
-    commanded: Pair
-    limit: Pair
-    largest_factor: float
-    cases: Count
-    failing: Count
-    closest: float
-
-
-def stored_price(price: RobustPrice) -> StoredPrice:
-    """A price as a study stores it."""
-    return StoredPrice(
-        stated=price.uncertainty.stated,
-        uncertainty=str(price.uncertainty),
-        factors=tuple(price.factors.tolist()),
-        peak=tuple(price.peak),
-        commanded=price.commanded,
-        limit=price.limit,
-        largest_factor=price.largest_factor,
-        cases=price.check.cases,
-        failing=price.check.failing,
-        closest=price.check.closest,
-    )
-
-
-@dataclass(frozen=True)
 class StoredRecommendation:
     """The carry to run.
 
@@ -142,7 +73,7 @@ class StoredRecommendation:
         price: of robustness, null where no set leaves friction and patches.
     """
 
-    wish: StoredWish
+    wish: Wish
     why: str
     source: str
     file: str
@@ -156,13 +87,13 @@ class StoredRecommendation:
     squeeze: Pair
     squeeze_reason: str
     payload_limit: float
-    rivals: tuple[StoredRival, ...]
+    rivals: tuple[Rival, ...]
     margins: tuple[Margin, ...]
     advice: tuple[Advice, ...]
     warnings: tuple[str, ...]
     considered: Count
     durations: ForceTable
-    price: StoredPrice | None = None
+    price: RobustPrice | None = None
     robust_force: Pair | None = None
 
     @property
@@ -183,24 +114,23 @@ class NoRecommendation:
     reason: str
 
 
-@dataclass(frozen=True)
-class Told:
-    """Further statements about a recommendation: the attributes of those names there."""
-
-    source: str
-    file: str
-    export: str
-    considered: int
-    durations: ForceTable
-    price: StoredPrice | None
-
-
-def stored_recommendation(found: Recommendation, told: Told) -> StoredRecommendation:
-    """A recommendation as a study stores it."""
+def stored_recommendation(
+    found: Recommendation,
+    *,
+    source: str,
+    file: str,
+    export: str,
+    considered: int,
+    durations: ForceTable,
+    price: RobustPrice | None,
+) -> StoredRecommendation:
+    """A recommendation as a study stores it, with what else is said of it there."""
     return StoredRecommendation(
-        **vars(told),
-        wish=StoredWish(**vars(found.wish)),
+        wish=found.wish,
         why=str(found.wish),
+        source=source,
+        file=file,
+        export=export,
         duration=found.duration,
         force=found.force,
         parts=found.squeeze.parts,
@@ -210,12 +140,12 @@ def stored_recommendation(found: Recommendation, told: Told) -> StoredRecommenda
         squeeze=found.commanded,
         squeeze_reason=str(found.squeeze),
         payload_limit=found.carry.payload_limit,
-        rivals=tuple(
-            StoredRival(rival.label, rival.duration_at_force, rival.force_at_duration)
-            for rival in found.rivals
-        ),
+        rivals=found.rivals,
         margins=found.margins,
         advice=found.advice,
         warnings=found.warnings,
+        considered=considered,
+        durations=durations,
+        price=price,
         robust_force=found.limited_force if found.force_kind.robust else None,
     )

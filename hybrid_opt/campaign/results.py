@@ -6,38 +6,73 @@ written. docs/results.md describes the folder.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.campaign.documents import Configuration, FinishedReplica
-from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode
-from hybrid_opt.campaign.identity import FORMAT, VERSION
-from hybrid_opt.campaign.layout import (
+from hybrid_opt.campaign.documents import (
     CONFIGURATION,
     DONE,
     EVALUATIONS,
+    POLISH,
     STAGES,
     SUMMARY,
+    Configuration,
+    FinishedReplica,
+    polished_folder,
     replica_folder,
 )
+from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode
+from hybrid_opt.campaign.identity import FORMAT, VERSION
 from hybrid_opt.campaign.replica import front_rows
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.metaheuristics.registry import title
+from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.files import read_bytes, read_json, sha256
-from hybrid_opt.store.json_records import from_json, read_record
+from hybrid_opt.store.json_records import from_json, read_record, record_of
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.records import Workcell
 
-KEPT_TABLES = 64
-"""Tables of candidates that are remembered by their content: a study's stages read its replicas
-again and again."""
+KEPT = 64
+"""Tables of candidates, and polished fronts, that are remembered by their content: a study's stages
+read them again and again."""
+
+
+@dataclass(frozen=True)
+class ReplicaFront:
+    """The front of one replica, as searched or as polished; arrays are read-only.
+
+    Attributes:
+        algorithm, replica: whose it is; replicas count from 0.
+        polished: whether it is the polished one.
+        x, objectives: (k, n_var) and (k, n_obj), by increasing first objective.
+    """
+
+    algorithm: str
+    replica: int
+    polished: bool
+    x: Array
+    objectives: Array
+
+    def __len__(self) -> int:
+        return len(self.objectives)
+
+    @property
+    def label(self) -> str:
+        """The algorithm's title, and whether polished."""
+        return title(self.algorithm) + (", polished" if self.polished else "")
+
+    @property
+    def source(self) -> str:
+        """The label with the number of the replica, as its files have it."""
+        return f"{self.label}, replica {self.replica}"
 
 
 @dataclass(frozen=True)
@@ -69,6 +104,11 @@ class Replica:
     def front_x(self) -> Array:
         """(k, n_var) their decision vectors."""
         return self.evaluations.x[self.front_rows]
+
+    @property
+    def searched(self) -> ReplicaFront:
+        """Both of them together."""
+        return ReplicaFront(self.algorithm, self.replica, False, self.front_x, self.front)
 
 
 @dataclass(frozen=True)
@@ -105,6 +145,26 @@ class CampaignResults:
     def of(self, algorithm: str) -> tuple[Replica, ...]:
         """The replicas of one algorithm."""
         return tuple(found for found in self.replicas if found.algorithm == algorithm)
+
+    def polished(self, replica: Replica) -> PolishedFront | None:
+        """See `read_polished`."""
+        return read_polished(self.root, replica, self.workcell)
+
+    @property
+    def fronts(self) -> tuple[ReplicaFront, ...]:
+        """Those of all replicas, each as searched and then, where it was polished, as polished.
+
+        Raises:
+            ResultsError: a polished one is damaged.
+        """
+        found = []
+        for replica in self.replicas:
+            found.append(replica.searched)
+            polished = self.polished(replica)
+            if polished is not None:
+                key = replica.algorithm, replica.replica
+                found.append(ReplicaFront(*key, True, polished.x, polished.objectives))
+        return tuple(found)
 
 
 def read_campaign(root: str | Path) -> CampaignResults:
@@ -189,7 +249,7 @@ def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str,
     return _replica(algorithm, number, table, marker.seconds)
 
 
-@lru_cache(maxsize=KEPT_TABLES)
+@lru_cache(maxsize=KEPT)
 def _decoded(content: bytes, path: Path) -> EvaluationTable:
     return decode(content, path)
 
@@ -200,3 +260,31 @@ def _replica(algorithm: str, number: int, table: EvaluationTable, seconds: float
     for array in (*arrays, table.generation, rows):
         array.setflags(write=False)
     return Replica(algorithm, number, table.evaluations, table.generation, rows, seconds)
+
+
+def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedFront | None:
+    """The polished front of a replica; None where it was not polished.
+
+    Raises:
+        ResultsError: the file is damaged.
+    """
+    path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
+    if not path.exists():
+        return None
+    remedy = "--resume polishes it anew"
+    found, task = _polished(read_bytes(path), path, remedy), workcell.task
+    problem = ""
+    if bool(len(found.x)) != bool(len(replica.front)):
+        problem = f"at x: found {len(found.x)} points"
+    elif len(found.x) and found.x.shape[1] != task.n_var:
+        problem = f"at x: found {found.x.shape[1]} numbers; allowed are {task.n_var}"
+    elif len(found.x) and ((found.x < task.lower) | (found.x > task.upper)).any():
+        problem = "at x: is outside of the decision variables' bounds"
+    if problem:
+        raise ResultsError(f"{path}: damaged {problem}; {remedy}")
+    return found if len(found.x) else replace(found, x=found.x.reshape(0, task.n_var))
+
+
+@lru_cache(maxsize=KEPT)
+def _polished(content: bytes, path: Path, remedy: str) -> PolishedFront:
+    return record_of(PolishedFront, content, path, remedy)

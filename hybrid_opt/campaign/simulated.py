@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
-from hybrid_opt.campaign.layout import SIMULATED
-from hybrid_opt.store.json_records import Figure, Shape, read_record
+from hybrid_opt.campaign.documents import SIMULATED
+from hybrid_opt.store.json_records import read_record
 from hybrid_opt.witness.arms import Account
-from symbolic.array import Array
+from symbolic.array import Array, Figure, Row, Shape
 
 MOST_SAMPLES = 240
 """Most samples of the forces that are stored."""
@@ -25,11 +26,11 @@ class StoredSimulation:
         label: of the carry.
         trajectory: SHA-256 of its file.
         controller: of the arms.
-        duration: [s]; this and all further figures null where nothing could be simulated.
+        problem: why there is no threshold, or no simulation, and nothing else then.
+        duration: [s].
         slips, holds: multiples of the planned forces right below and above the threshold, null
             where there is none.
         pad, begins: where it slips first, 0 for nowhere, and when [s].
-        problem: why there is no threshold, or no simulation.
         robust: whether the run that is shown presses with robust forces.
         factor: there of the planned squeeze, null with robust forces.
         arrives: whether the box held and ended at its goal.
@@ -41,20 +42,20 @@ class StoredSimulation:
     label: str
     trajectory: str
     controller: str
-    duration: Figure
-    slips: Figure
-    holds: Figure
-    pad: int
-    begins: Figure
     problem: str
-    robust: bool
-    factor: Figure
-    arrives: bool
-    slip: Figure
-    misses: Figure
-    time: Annotated[Array, Shape((None,))]
-    predicted: Annotated[Array, Shape((None, 2))]
-    simulated: Annotated[Array, Shape((None, 2))]
+    duration: Figure = math.nan
+    slips: Figure = math.nan
+    holds: Figure = math.nan
+    pad: int = 0
+    begins: Figure = math.nan
+    robust: bool = False
+    factor: Figure = math.nan
+    arrives: bool = False
+    slip: Figure = math.nan
+    misses: Figure = math.nan
+    time: Row = field(default_factory=lambda: np.zeros(0))
+    predicted: Annotated[Array, Shape((None, 2))] = field(default_factory=lambda: np.zeros((0, 2)))
+    simulated: Annotated[Array, Shape((None, 2))] = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
         """Refuse curves of different lengths."""
@@ -81,61 +82,40 @@ class StoredSimulation:
         return float(np.abs(self.simulated / self.predicted - 1.0).max())
 
 
-@dataclass(frozen=True)
-class Whose:
-    """A simulation, as the attributes of those names in `StoredSimulation`."""
-
-    label: str
-    trajectory: str
-    controller: str
-
-
-def not_simulated(whose: Whose, problem: str) -> StoredSimulation:
-    """A carry that no arms can drive, or a cell that cannot be simulated, and why."""
-    nan, nothing = float("nan"), np.zeros((0, 2))
-    return StoredSimulation(
-        **vars(whose),
-        duration=nan,
-        slips=nan,
-        holds=nan,
-        pad=0,
-        begins=nan,
-        problem=problem,
-        robust=False,
-        factor=nan,
-        arrives=False,
-        slip=nan,
-        misses=nan,
-        time=nothing[:, 0],
-        predicted=nothing,
-        simulated=nothing,
-    )
-
-
-def stored_simulation(found: Account, whose: Whose) -> StoredSimulation:
+def stored_simulation(
+    found: Account, label: str, trajectory: str, controller: str
+) -> StoredSimulation:
     """An account as a study stores it: from the beginning of the carry on."""
-    nan, threshold, shown = float("nan"), found.threshold, found.shown
-    squeeze, motion = found.squeeze, found.reference.motion
+    threshold, shown, squeeze, motion = (
+        found.threshold,
+        found.shown,
+        found.squeeze,
+        found.reference.motion,
+    )
     begin = float(motion.time[2])
     rows = np.flatnonzero(shown.time >= begin)
     even = np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).round().astype(int)
     rows = rows[even] if len(rows) else np.array([len(shown.time) - 1])
+    slipped: dict[str, Any] = {}
+    if threshold is not None:
+        slips, holds = threshold.slips, threshold.holds
+        slipped = {"slips": slips.factor, "holds": holds.factor, "begins": slips.time[-1]}
+        slipped["pad"] = slips.pad + 1
     return StoredSimulation(
-        **vars(whose),
-        duration=float(motion.time[-1] - begin),
-        slips=nan if threshold is None else threshold.slips.factor,
-        holds=nan if threshold is None else threshold.holds.factor,
-        pad=0 if threshold is None else threshold.slips.pad + 1,
-        begins=nan if threshold is None else threshold.slips.time[-1],
+        label=label,
+        trajectory=trajectory,
+        controller=controller,
         problem=found.problem,
+        duration=float(motion.time[-1] - begin),
         robust=squeeze.factor is None,
-        factor=nan if squeeze.factor is None else squeeze.factor,
+        factor=math.nan if squeeze.factor is None else squeeze.factor,
         arrives=shown.arrives,
         slip=float(shown.slip.max()),
         misses=shown.misses,
         time=shown.time[rows] - begin,
         predicted=shown.normal_force_reference[rows],
         simulated=shown.normal_force[rows],
+        **slipped,
     )
 
 

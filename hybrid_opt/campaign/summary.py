@@ -4,76 +4,48 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
-from hybrid_opt.campaign.documents import (
-    Count,
-    Pair,
-    PolishEffort,
-    Seconds,
-    StoredCell,
-    StoredSettings,
-)
+from hybrid_opt.campaign.documents import Seconds, StoredCell, StoredSettings
 from hybrid_opt.campaign.recommended import StoredRecommendation
-from hybrid_opt.store.json_records import Figure, Range, Shape
-from symbolic.array import Array
+from hybrid_opt.indicators.metrics import BindingBound
+from hybrid_opt.indicators.statistics import RankTest, Summary
+from hybrid_opt.polishing.records import PolishEffort
+from hybrid_opt.static_hold import StaticHold
+from symbolic.array import Count, Figure, Pair, Range, Row
 
 Share = Annotated[float, Range(0.0, 1.0)]
 
 
 @dataclass(frozen=True)
-class Statistics:
-    """`hybrid_opt.indicators.statistics.Summary` of one figure, as stored."""
-
-    count: Count
-    missing: Count
-    mean: Figure
-    std: Figure
-    minimum: Figure
-    quartile1: Figure
-    median: Figure
-    quartile3: Figure
-    maximum: Figure
-
-
-@dataclass(frozen=True)
-class StoredTest:
-    """`hybrid_opt.indicators.statistics.RankTest` of one figure, as stored."""
-
-    figure: str
-    first: str
-    second: str
-    count_first: Count
-    count_second: Count
-    u: Figure
-    p: Figure
-    p_holm: Figure
-    a12: Figure
-    magnitude: Literal["negligible", "small", "medium", "large"]
-
-
-@dataclass(frozen=True)
 class SelectedEntry:
-    """The solution selected from a front.
+    """The solution selected from a front, or the hand-made trajectory.
 
     Attributes:
-        evaluation: its number, from 1.
+        evaluation: its number, from 1; 0 for the hand-made one.
         file: its trajectory file, relative to the folder.
         objectives: (n_obj,).
         peak_normal_force, minimum_normal_force: per robot [N].
         excess_above_static: per robot [%].
         payload_limit: [kg].
         duration: [s].
+        feasible: the evaluator's verdict.
     """
 
     evaluation: Count
     file: str | None
-    objectives: Annotated[Array, Shape((None,))]
+    objectives: Row
     peak_normal_force: Pair
     minimum_normal_force: Pair
     excess_above_static: Pair
     payload_limit: float
     duration: float
+    feasible: bool = True
+
+    @property
+    def mean_excess_above_static(self) -> float:
+        """Mean of both robots' [%]."""
+        return float(self.excess_above_static.mean())
 
 
 @dataclass(frozen=True)
@@ -122,7 +94,7 @@ class ReplicaFigures(FrontFigures):
     feasible_share: Share
     seconds: Seconds
     infeasible_by_reason: Mapping[str, Count]
-    best_so_far: tuple[Annotated[Array, Shape((None,))], ...]
+    best_so_far: tuple[Row, ...]
     polished: PolishedFigures | None = None
 
 
@@ -130,8 +102,8 @@ class ReplicaFigures(FrontFigures):
 class PolishedStatistics:
     """An algorithm's polished fronts, over the replicas."""
 
-    statistics: Mapping[str, Statistics]
-    hypervolume_gain: Statistics
+    statistics: Mapping[str, Summary]
+    hypervolume_gain: Summary
     replicas_improved: Count
 
 
@@ -147,7 +119,7 @@ class AlgorithmFigures:
     """
 
     representative: int | None
-    statistics: Mapping[str, Statistics]
+    statistics: Mapping[str, Summary]
     replicas: tuple[ReplicaFigures, ...]
     polished: PolishedStatistics | None = None
 
@@ -163,36 +135,12 @@ class AlgorithmFigures:
 
 
 @dataclass(frozen=True)
-class StaticForces:
-    """Forces of the payload held level and still: per robot [N], and the payload limit [kg]."""
-
-    normal_force: Pair
-    contact_force: Pair
-    payload_limit: float
-
-
-@dataclass(frozen=True)
 class StoredFront:
     """The campaign's reference front: its file, points and hypervolume."""
 
     file: str
     points: Count
     hypervolume: float
-
-
-@dataclass(frozen=True)
-class StoredBound:
-    """A bound of the decision variables that solutions lie on, see `hybrid_opt.indicators.metrics`.
-
-    Attributes:
-        variable, side, value: which bound [m, rad].
-        solutions: how many lie on it.
-    """
-
-    variable: str
-    side: Literal["lower", "upper"]
-    value: float
-    solutions: Count
 
 
 @dataclass(frozen=True)
@@ -205,7 +153,7 @@ class Bounds:
     """
 
     solutions: Count
-    binding: tuple[StoredBound, ...]
+    binding: tuple[BindingBound, ...]
 
 
 NO_BOUNDS = Bounds(0, ())
@@ -217,6 +165,7 @@ class CampaignSummary:
 
     Attributes:
         robots: their names, in the order of all pairs.
+        hand_made: the workcell file's own trajectory, None where it has no forces.
         recommendation: the carry to run, None where the study has none.
         no_recommendation: why it has none, '' where it has one or where the study is part of
             another, which recommends.
@@ -228,10 +177,11 @@ class CampaignSummary:
     environment: Mapping[str, str]
     objectives: tuple[str, ...]
     reference_force: Pair
-    static_hold: StaticForces
+    static_hold: StaticHold
     reference_front: StoredFront
     algorithms: Mapping[str, AlgorithmFigures]
-    tests: tuple[StoredTest, ...]
+    tests: tuple[RankTest, ...]
+    hand_made: SelectedEntry | None = None
     bounds: Bounds = NO_BOUNDS
     recommendation: StoredRecommendation | None = None
     no_recommendation: str = ""

@@ -13,7 +13,7 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.display.svg import ARMS, CLOUD, FRONT, REST, Series, plot
-from hybrid_opt.display.table import lines, table
+from hybrid_opt.display.table import figures_html, lines
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import excess_above_static
@@ -33,7 +33,7 @@ def text_of(shown: object) -> str:
 def html_of(shown: object) -> str:
     """What a notebook shows of an object."""
     heading = html.escape(heading_of(shown))
-    return f"<div><p>{heading}</p>{table(figures_of(shown))}{picture_of(shown)}</div>"
+    return f"<div><p>{heading}</p>{figures_html(figures_of(shown))}{picture_of(shown)}</div>"
 
 
 @singledispatch

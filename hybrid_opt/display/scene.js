@@ -15,8 +15,39 @@
     return group;
   }
 
+  function decode(text, Type) {
+    const binary = atob(text);
+    const bytes = new Uint8Array(binary.length);
+    for (let i = 0; i < binary.length; i += 1) bytes[i] = binary.charCodeAt(i);
+    return new Type(bytes.buffer);
+  }
+
+  /* Samples of a motion, rows of so many numbers, the first of which is the time. */
+  class Samples {
+    constructor(text, width) {
+      const flat = decode(text, Float32Array);
+      this.rows = [];
+      for (let i = 0; i < flat.length; i += width) this.rows.push(flat.subarray(i, i + width));
+      this.times = this.rows.map((row) => row[0]);
+      this.end = this.times[this.times.length - 1];
+      /* Of the box's centre. */
+      this.path = new Float32Array(3 * this.rows.length);
+      this.rows.forEach((row, i) => this.path.set(row.subarray(1, 4), 3 * i));
+    }
+
+    /* The row at a time, mixed of its neighbours, and the number of the nearer one. */
+    at(time) {
+      let k = 0;
+      while (k < this.rows.length - 2 && this.times[k + 1] < time) k += 1;
+      const [a, b] = [this.rows[k], this.rows[k + 1]];
+      const share = b[0] > a[0] ? Math.min(1, (time - a[0]) / (b[0] - a[0])) : 0;
+      const row = a.map((value, i) => value + share * (b[i] - value));
+      return { row, nearest: share < 0.5 ? k : k + 1 };
+    }
+  }
+
   class CellScene {
-    constructor(element, data, decode) {
+    constructor(element, data) {
       this.element = element;
       this.data = data;
       this.renderer = new THREE.WebGLRenderer({ antialias: true });
@@ -33,7 +64,7 @@
       this.box = new THREE.Group();
       this.scene.add(this.box);
       this.arms = data.arms.map((arm) => this.makeArm(arm));
-      data.solids.forEach((solid) => this.addSolid(solid, decode));
+      data.solids.forEach((solid) => this.addSolid(solid));
       this.path = new THREE.Line(new THREE.BufferGeometry(),
         new THREE.LineBasicMaterial({ color: 0xb00020 }));
       this.path.frustumCulled = false;
@@ -58,7 +89,7 @@
       });
     }
 
-    addSolid(solid, decode) {
+    addSolid(solid) {
       const positions = decode(solid.vertices, Float32Array);
       const geometry = new THREE.BufferGeometry();
       geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
@@ -182,4 +213,5 @@
   }
 
   window.CellScene = CellScene;
+  window.Samples = Samples;
 })();

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import base64
 import json
-import zipfile
 from collections.abc import Collection
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.display.solids import Solid, cell_solids, extent_points
-from hybrid_opt.errors import DisplayError
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.records.poses import Orientation
@@ -67,26 +63,8 @@ def scene_js() -> str:
 
 
 def three_js() -> str:
-    """three.js as trimesh's viewer carries it, with its licence line.
-
-    Raises:
-        DisplayError: the installed trimesh has no such file.
-    """
-    path = Path(trimesh.__file__).parent / "resources" / "templates" / "viewer.zip"
-    try:
-        with zipfile.ZipFile(path) as archive:
-            text = archive.read("viewer.html.template").decode("utf-8")
-    except (OSError, KeyError, zipfile.BadZipFile) as error:
-        raise DisplayError(
-            f"trimesh {trimesh.__version__}: no viewer template ({error})"
-        ) from error
-    library = max(text.splitlines(), key=len)
-    if "THREE={}" not in library:
-        raise DisplayError(
-            f"trimesh {trimesh.__version__}: its viewer carries three.js in another form than this "
-            "project knows; install a version that constraints.txt names"
-        )
-    return "/* three.js, Copyright 2010-2022 Three.js Authors, MIT licence */\n" + library
+    """three.js with its licence line."""
+    return (files("hybrid_opt.display") / "vendor" / "three.min.js").read_text("utf-8")
 
 
 def embedded_json(document: Any) -> str:

@@ -1,25 +1,146 @@
-"""Figures as a terminal's lines and columns, and as an HTML table."""
+"""Tables of texts in every form, and how a quantity reads in all of them."""
 
 from __future__ import annotations
 
+import csv
 import html
+import io
+import math
+import re
+import textwrap
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+LONG = 30
+"""Characters of a cell from which on it takes several lines."""
+
+NOTHING = "–"
+"""Text of a missing figure."""
+
+WIDTH = 100
+"""Characters of a line of text in a terminal."""
 
 
-def lines(figures: Mapping[str, str]) -> list[str]:
-    """One line per figure, values aligned."""
-    width = max((len(name) for name in figures), default=0)
-    return [f"  {name:<{width}}  {value}" for name, value in figures.items()]
+def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
+    """A figure in print; `NOTHING` where there is none."""
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    return f"{value * scale:z.{digits}f}"
 
 
-def table(figures: Mapping[str, str]) -> str:
-    """An HTML table of two columns."""
-    rows = "".join(
-        f'<tr><th style="text-align:left">{html.escape(name)}</th>'
-        f'<td style="text-align:left">{html.escape(value)}</td></tr>'
-        for name, value in figures.items()
-    )
-    return f"<table>{rows}</table>"
+def counted(count: int, noun: str) -> str:
+    """A number of things, whose plural ends in s."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """How a quantity reads wherever it is shown.
+
+    Attributes:
+        name, unit: of its column; a pure number has the unit ''.
+        digits: behind the point.
+        scale: from its value in SI units to that in print.
+    """
+
+    name: str
+    unit: str = ""
+    digits: int = 2
+    scale: float = 1.0
+
+    def heading(self, whose: str = "") -> str:
+        """Of a column: the name, whose it is, and the unit."""
+        named = f"{self.name}, {whose}" if whose else self.name
+        return f"{named} [{self.unit}]" if self.unit else named
+
+    def __call__(self, value: float | None) -> str:
+        """A value in print."""
+        return number(value, self.digits, self.scale)
+
+    def mean(self, mean: float | None, std: float | None) -> str:
+        """Mean and standard deviation."""
+        return f"{self(mean)} ± {self(std)}"
+
+    def spread(self, middle: float, low: float, high: float) -> str:
+        """A value in the middle and the range around it, the value alone where they are equal."""
+        if low == high or not math.isfinite(middle):
+            return self(middle)
+        return f"{self(middle)} [{self(low)}, {self(high)}]"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts.
+
+    Attributes:
+        name: of its files, without suffix.
+        title: above it.
+        header, rows: cells; the first column names the row.
+        note: below it.
+    """
+
+    name: str
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+    @property
+    def words(self) -> tuple[bool, ...]:
+        """Of every column, whether it holds words, which begin at the left; others hold figures."""
+        columns = zip(*self.rows, strict=True) if self.rows else [()] * len(self.header)
+        return tuple(k == 0 or not any(map(_is_figure, column)) for k, column in enumerate(columns))
+
+    def text(self) -> str:
+        """For a terminal."""
+        left = [k for k, word in enumerate(self.words) if word]
+        parts = [self.title, text_table([self.header, *self.rows], left)]
+        return "\n".join(parts + ([textwrap.fill(self.note, WIDTH)] if self.note else []))
+
+    def csv(self) -> str:
+        """Comma-separated values, without title and note."""
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([self.header, *self.rows])
+        return text.getvalue()
+
+    def markdown(self) -> str:
+        """A Markdown table with title and note."""
+        rule = tuple("---" if word else "---:" for word in self.words)
+        lines = [self.header, rule, *self.rows]
+        body = "\n".join("| " + " | ".join(map(_markdown, row)) + " |" for row in lines)
+        return f"**{_markdown(self.title)}**\n\n{body}\n\n{_markdown(self.note)}\n"
+
+    def latex(self) -> str:
+        """A LaTeX table with booktabs rules."""
+        columns = "".join("l" if word else "r" for word in self.words)
+        head, *rows = (" & ".join(map(_latex, row)) + r" \\" for row in (self.header, *self.rows))
+        lines = [
+            "% needs \\usepackage{booktabs}",
+            r"\begin{table}",
+            rf"\caption{{{_latex(self.title)} {_latex(self.note)}}}",
+            rf"\begin{{tabular}}{{{columns}}}",
+            r"\toprule",
+            head,
+            r"\midrule",
+            *rows,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+            "",
+        ]
+        return "\n".join(lines)
+
+    def html(self) -> str:
+        """An HTML table; every text is escaped."""
+        head, *body = (
+            "".join(map(_html_cell, [kind] * len(row), row, self.words))
+            for kind, row in (("th", self.header), *(("td", row) for row in self.rows))
+        )
+        return (
+            f"<h3>{html.escape(self.title)}</h3><div class='scroll'><table><thead><tr>{head}</tr>"
+            f"</thead><tbody>{''.join(f'<tr>{row}</tr>' for row in body)}</tbody></table></div>"
+            f"<p class='note'>{html.escape(self.note)}</p>"
+        )
 
 
 def text_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> str:
@@ -38,3 +159,47 @@ def text_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> s
         for row in rows
     ]
     return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
+
+
+def lines(figures: Mapping[str, str]) -> list[str]:
+    """One line per figure, values aligned."""
+    width = max((len(name) for name in figures), default=0)
+    return [f"  {name:<{width}}  {value}" for name, value in figures.items()]
+
+
+def figures_html(figures: Mapping[str, str]) -> str:
+    """An HTML table of two columns."""
+    rows = "".join(
+        f'<tr><th style="text-align:left">{html.escape(name)}</th>'
+        f'<td style="text-align:left">{html.escape(value)}</td></tr>'
+        for name, value in figures.items()
+    )
+    return f"<table>{rows}</table>"
+
+
+def _is_figure(cell: str) -> bool:
+    """Whether a cell is a figure, with what belongs to it."""
+    return len(cell) <= LONG and re.match(r"[-+\N{MINUS SIGN}]?\.?\d", cell) is not None
+
+
+def _html_cell(kind: str, cell: str, word: bool) -> str:
+    classes = " ".join(["word"] * word + ["long"] * (len(cell) > LONG))
+    named = f" class='{classes}'" if classes else ""
+    return f"<{kind}{named}>{html.escape(cell)}</{kind}>"
+
+
+def _markdown(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;").replace("\n", " ")
+
+
+_LATEX = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+    "–": "--",
+}
+
+
+def _latex(text: str) -> str:
+    return "".join(_LATEX.get(letter, letter) for letter in text)

@@ -50,11 +50,7 @@ class CarryView:
     look: Look | None = None
 
     def page(self) -> str:
-        """The page's text: no network, nothing but its own scripts.
-
-        Raises:
-            DisplayError: the library that draws is not installed in a form that is known.
-        """
+        """The page's text: no network, nothing but its own scripts."""
         carry = self.carry
         rows = np.unique(np.linspace(0, len(carry) - 1, min(len(carry), MAX_SAMPLES)).astype(int))
         columns = [carry.time[:, None] - carry.time[0], carry.pose, carry.q]

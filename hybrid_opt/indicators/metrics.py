@@ -17,7 +17,7 @@ import moocore
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from symbolic.array import Array
+from symbolic.array import Array, Count
 from symbolic.records import Task
 from symbolic.records.task import variable_names
 
@@ -211,7 +211,7 @@ class BindingBound:
     variable: str
     side: Literal["lower", "upper"]
     value: float
-    solutions: int
+    solutions: Count
 
     def __str__(self) -> str:
         return f"{self.side} bound of {self.variable}, {self.value:g}"

@@ -7,14 +7,14 @@ bettered. Source: Fonseca, Guerreiro, Lopez-Ibanez and Paquete 2011, through moo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import moocore
 import numpy as np
 from numpy.typing import ArrayLike
 
-from symbolic.array import Array
+from symbolic.array import Array, Count, Figure
 from symbolic.errors import SettingsError
 
 Magnitude = Literal["negligible", "small", "medium", "large"]
@@ -33,15 +33,15 @@ class Summary:
             interpolation (Hyndman and Fan 1996, type 7); NaN without values.
     """
 
-    count: int
-    missing: int
-    mean: float
-    std: float
-    minimum: float
-    quartile1: float
-    median: float
-    quartile3: float
-    maximum: float
+    count: Count
+    missing: Count
+    mean: Figure
+    std: Figure
+    minimum: Figure
+    quartile1: Figure
+    median: Figure
+    quartile3: Figure
+    maximum: Figure
 
 
 def summarise(values: ArrayLike) -> Summary:
@@ -67,17 +67,19 @@ class RankTest:
         a12: Vargha and Delaney's effect size, the chance that a value of the first sample
             exceeds one of the second, ties counting half; 0.5 is no effect.
         magnitude: of |a12 - 0.5|: small from 0.06, medium from 0.14, large from 0.21.
+        figure: what was compared, '' where that is told elsewhere.
     """
 
     first: str
     second: str
-    count_first: int
-    count_second: int
-    u: float
-    p: float
-    p_holm: float
-    a12: float
+    count_first: Count
+    count_second: Count
+    u: Figure
+    p: Figure
+    p_holm: Figure
+    a12: Figure
     magnitude: Magnitude
+    figure: str = ""
 
 
 def rank_test(
@@ -138,20 +140,7 @@ def holm(p_values: Sequence[float]) -> tuple[float, ...]:
 def corrected(tests: Sequence[RankTest]) -> tuple[RankTest, ...]:
     """The tests of one family with Holm's correction in `p_holm`."""
     adjusted = holm([test.p for test in tests])
-    return tuple(
-        RankTest(
-            test.first,
-            test.second,
-            test.count_first,
-            test.count_second,
-            test.u,
-            test.p,
-            p_holm,
-            test.a12,
-            test.magnitude,
-        )
-        for test, p_holm in zip(tests, adjusted, strict=True)
-    )
+    return tuple(replace(test, p_holm=p_holm) for test, p_holm in zip(tests, adjusted, strict=True))
 
 
 def _finite(values: ArrayLike) -> tuple[Array, int]:

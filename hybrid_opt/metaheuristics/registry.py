@@ -19,22 +19,30 @@ Settings = GeneticSettings | MopsoSettings | RandomSettings
 
 @dataclasses.dataclass(frozen=True)
 class _Entry:
+    title: str
     build: Callable[[Any, Array | None], Algorithm]
     defaults: Settings
 
 
 REGISTRY: dict[str, _Entry] = {
-    "nsga2": _Entry(nsga2, GeneticSettings()),
-    "mopso": _Entry(Mopso, MopsoSettings()),
-    "mopso-turbulent": _Entry(Mopso, MopsoSettings(inertia=0.45, mutation_share=0.75)),
-    "sms-emoa": _Entry(sms_emoa, GeneticSettings()),
-    "random": _Entry(RandomSearch, RandomSettings()),
+    "nsga2": _Entry("NSGA-II", nsga2, GeneticSettings()),
+    "mopso": _Entry("MOPSO", Mopso, MopsoSettings()),
+    "mopso-turbulent": _Entry(
+        "MOPSO, turbulent", Mopso, MopsoSettings(inertia=0.45, mutation_share=0.75)
+    ),
+    "sms-emoa": _Entry("SMS-EMOA", sms_emoa, GeneticSettings()),
+    "random": _Entry("random search", RandomSearch, RandomSettings()),
 }
 
 
 def names() -> tuple[str, ...]:
     """The names that `make` knows."""
     return tuple(REGISTRY)
+
+
+def title(name: str) -> str:
+    """How an algorithm is called in print; another name stays as it is."""
+    return REGISTRY[name].title if name in REGISTRY else name
 
 
 def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> Settings:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hybrid_opt.errors import ResultsError
 from hybrid_opt.polishing.solvers.base import Residuals
-from symbolic.array import Array
+from symbolic.array import Array, Count, Figure, Missing, Range, Shape
 
 Aim = Literal["point", "extreme", "balance", "gap", "probe"]
 Status = Literal["accepted", "optimal", "rejected", "failed"]
@@ -38,22 +38,52 @@ class PolishOutcome:
     """
 
     aim: Aim
-    parent: int
+    parent: Annotated[int, Range(-1, 10**9)]
     status: Status
     reason: str
-    x: Array
-    start: Array
-    objectives: Array
+    x: Annotated[Array, Shape((None,)), Missing()]
+    start: Annotated[Array, Shape((2,)), Missing()]
+    objectives: Annotated[Array, Shape((2,)), Missing()]
     residuals: Residuals
-    iterations: int
-    rounds: int
-    rows: int
-    seconds: float
+    iterations: Count
+    rounds: Count
+    rows: Count
+    seconds: Figure
+
+
+@dataclass(frozen=True)
+class PolishEffort:
+    """Effort and success of a polish.
+
+    Attributes:
+        solver: what solved its programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
+        attempts: solves.
+        counts: attempts by status, and those not accepted also by 'status: reason'.
+        success_share: of the attempted points of the given front, those accepted or optimal.
+        seconds, median_attempt_seconds: spent in total and per attempt.
+        equivalent_evaluations: candidate evaluations that take as long.
+        widest_gap: share of the front's length, along both objectives, between the neighbours that
+            are farthest apart; NaN for fewer than two points.
+        worst_stationarity, worst_feasibility, median_stationarity: residuals of the points that a
+            solve made and that stand on the front in the end.
+    """
+
+    solver: str
+    attempts: Count
+    counts: Mapping[str, Count]
+    success_share: Figure
+    seconds: Annotated[float, Range(0.0, 1e12)]
+    median_attempt_seconds: Figure
+    equivalent_evaluations: Count
+    widest_gap: Figure
+    worst_stationarity: Figure
+    worst_feasibility: Figure
+    median_stationarity: Figure
 
 
 @dataclass(frozen=True)
 class PolishedFront:
-    """A front after the polish; arrays are read-only.
+    """A front after the polish, as it is stored; arrays are read-only.
 
     Attributes:
         x: (k, n_var) non-dominated decision vectors, by increasing first objective.
@@ -66,29 +96,26 @@ class PolishedFront:
         evaluation_seconds: measured for one candidate evaluation, the unit of the search.
     """
 
-    x: Array
-    objectives: Array
-    parent: np.ndarray[tuple[int], np.dtype[np.int64]]
-    polished: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    x: Annotated[Array, Shape((None, None))]
+    objectives: Annotated[Array, Shape((None, 2))]
+    parent: Annotated[NDArray[np.int64], Shape((None,), int)]
+    polished: Annotated[NDArray[np.bool_], Shape((None,), bool)]
     outcomes: tuple[PolishOutcome, ...]
-    seconds: float
-    evaluation_seconds: float
+    seconds: Annotated[float, Range(0.0, 1e12)]
+    evaluation_seconds: Annotated[float, Range(1e-12, 1e12)]
     solver: str
 
     def __post_init__(self) -> None:
-        """Make the arrays read-only."""
-        for name in ("x", "objectives", "parent", "polished"):
-            getattr(self, name).setflags(write=False)
-
-    @property
-    def equivalent_evaluations(self) -> int:
-        """Candidate evaluations that take as long as the polish did."""
-        return int(np.ceil(self.seconds / self.evaluation_seconds))
+        """Make the arrays read-only; refuse those of different lengths."""
+        arrays = (self.x, self.objectives, self.parent, self.polished)
+        if len({len(array) for array in arrays}) > 1:
+            raise ValueError("its arrays have different lengths")
+        for array in arrays:
+            array.setflags(write=False)
 
     @property
     def widest_gap(self) -> float:
-        """Share of the front's length, along both objectives, between the neighbours that are
-        farthest apart; NaN for fewer than two points."""
+        """See `PolishEffort`."""
         if len(self.objectives) < 2:
             return float("nan")
         sides = np.abs(np.diff(self.objectives, axis=0))
@@ -102,59 +129,30 @@ class PolishedFront:
         return dict(listed)
 
     @property
-    def success_share(self) -> float:
-        """Share of the attempted points of the given front that were accepted or optimal; NaN
-        where none was attempted."""
-        own = [o.status for o in self.outcomes if o.aim == "point"]
-        good = sum(status in ("accepted", "optimal") for status in own)
-        return good / len(own) if own else float("nan")
-
-
-def outcome_to_json(outcome: PolishOutcome) -> dict[str, object]:
-    """An outcome as JSON values; NaN becomes null."""
-    values: dict[str, object] = {}
-    for field in fields(outcome):
-        value = getattr(outcome, field.name)
-        if isinstance(value, np.ndarray):
-            values[field.name] = [_number(float(v)) for v in value]
-        elif isinstance(value, Residuals):
-            values |= {f.name: _number(getattr(value, f.name)) for f in fields(value)}
-        else:
-            values[field.name] = _number(value) if isinstance(value, float) else value
-    return values
-
-
-def outcome_from_json(values: Mapping[str, Any]) -> PolishOutcome:
-    """The outcome that `outcome_to_json` wrote.
-
-    Raises:
-        ResultsError: the values are not those of an outcome.
-    """
-
-    def numbers(name: str) -> Array:
-        return np.array([np.nan if v is None else v for v in values[name]], dtype=float)
-
-    def number(name: str) -> float:
-        return float("nan") if values[name] is None else float(values[name])
-
-    try:
-        return PolishOutcome(
-            aim=values["aim"],
-            parent=int(values["parent"]),
-            status=values["status"],
-            reason=str(values["reason"]),
-            x=numbers("x"),
-            start=numbers("start"),
-            objectives=numbers("objectives"),
-            residuals=Residuals(*(number(field.name) for field in fields(Residuals))),
-            iterations=int(values["iterations"]),
-            rounds=int(values["rounds"]),
-            rows=int(values["rows"]),
-            seconds=float(values["seconds"]),
+    def effort(self) -> PolishEffort:
+        """What it took."""
+        own = [o.status in ("accepted", "optimal") for o in self.outcomes if o.aim == "point"]
+        # Others were judged as they are, without a solver.
+        solved = [o for o in self.outcomes if o.rounds or o.status == "failed"]
+        # What was dominated later, probes most of all, is no result.
+        standing = {x.tobytes() for x in self.x}
+        accepted = [
+            o.residuals for o in solved if o.status == "accepted" and o.x.tobytes() in standing
+        ]
+        return PolishEffort(
+            solver=self.solver,
+            attempts=len(solved),
+            counts=self.counts,
+            success_share=float(np.mean(own)) if own else float("nan"),
+            seconds=self.seconds,
+            median_attempt_seconds=_median([o.seconds for o in solved]),
+            equivalent_evaluations=int(np.ceil(self.seconds / self.evaluation_seconds)),
+            widest_gap=self.widest_gap,
+            worst_stationarity=max((r.stationarity for r in accepted), default=float("nan")),
+            worst_feasibility=max((r.feasibility for r in accepted), default=float("nan")),
+            median_stationarity=_median([r.stationarity for r in accepted]),
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise ResultsError(f"a recorded polish attempt is damaged ({error!r})") from error
 
 
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+def _median(values: list[float]) -> float:
+    return float(np.median(values)) if values else float("nan")

@@ -24,7 +24,7 @@ from hybrid_opt.recommending.choice import (
 from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.records import Timing
-from symbolic.array import Array
+from symbolic.array import Array, Figure
 from symbolic.records import Workcell
 
 BETTER = 1e-3
@@ -50,8 +50,8 @@ class Rival:
     """
 
     label: str
-    duration_at_force: float
-    force_at_duration: float
+    duration_at_force: Figure
+    force_at_duration: Figure
 
     def __repr__(self) -> str:
         force, time = "cannot be held with so little force", "is never so fast"

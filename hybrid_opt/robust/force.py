@@ -9,6 +9,7 @@ fixed by the motion (and the case), the commanded force decides the squeeze.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from hybrid_opt.robust.cases import (
     worst_cases,
 )
 from hybrid_opt.static_hold import kept_per_workcell
-from symbolic.array import Array
+from symbolic.array import Array, Count, Figure, Pair, Row, Shape
 from symbolic.contact.force_closure import has_force_closure
 from symbolic.contact.worst_cases import least_distance
 from symbolic.errors import SettingsError
@@ -108,8 +109,8 @@ class SampledCheck:
         closest: largest share of the commanded force that any case needs, at least `SCREENED`.
     """
 
-    cases: int
-    failing: int
+    cases: Count
+    failing: Count
     closest: float
 
     @property
@@ -365,11 +366,11 @@ class RobustPrice:
     """
 
     uncertainty: Uncertainty
-    factors: Array
-    peak: Array
-    commanded: Array
-    limit: Array
-    largest_factor: float
+    factors: Row
+    peak: Annotated[Array, Shape((None, 2))]
+    commanded: Pair
+    limit: Pair
+    largest_factor: Figure
     check: SampledCheck
 
 

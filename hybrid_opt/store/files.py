@@ -7,7 +7,7 @@ import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,13 @@ def write_json(path: Path, document: Any) -> None:
     write_atomically(path, (text + "\n").encode())
 
 
+def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[str | float]]) -> bytes:
+    """The content of a file of comma-separated values: numbers with as many digits as it takes to
+    get the same bits back."""
+    cells = ((one if isinstance(one, str) else repr(one) for one in row) for row in rows)
+    return "".join(f"{','.join(row)}\n" for row in (header, *cells)).encode()
+
+
 def read_json(path: Path, remedy: str = "") -> Any:
     """Read JSON values.
 
@@ -80,7 +87,7 @@ def read_json(path: Path, remedy: str = "") -> Any:
     return json_of(read_bytes(path), path, remedy)
 
 
-def json_of(content: bytes, path: Path, remedy: str = "") -> Any:
+def json_of(content: bytes, path: Path | str, remedy: str = "") -> Any:
     """The JSON values of a file's content; see `read_json`."""
     try:
         return outside.json_value(content)

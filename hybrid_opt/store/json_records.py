@@ -1,17 +1,19 @@
 """Frozen records as JSON and back, checked once at the door.
 
 The annotations of a dataclass's fields say what is allowed: `bool`, `int`, `float`, `str`,
-`Literal`, `tuple`, `Mapping[str, ...]`, `... | None`, further dataclasses, `Any` for JSON values
-that are only passed on, and `Annotated` with `Range` or `Shape`. Numbers are finite; a `Figure`
-may be missing, NaN here and null in the file. What a record's own `__post_init__` refuses with
-a `ValueError` is damaged as well.
+`Literal`, enumerations, `tuple`, `Mapping[str, ...]`, `... | None`, further dataclasses, `Any` for
+JSON values that are only passed on, and `Annotated` with what `symbolic.array` has. Numbers are
+finite; what is `Missing` is NaN here and null in the file. What a record's own `__post_init__`
+refuses is damaged as well. (msgspec, which was tried, knows neither numbers that may be missing nor
+shapes of arrays.)
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import UnionType
@@ -21,33 +23,10 @@ import numpy as np
 
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import json_of, read_bytes
-from symbolic.array import Array
+from symbolic.array import Missing, Range, Shape
+from symbolic.errors import DualArmError
 
 Record = TypeVar("Record")
-
-
-@dataclass(frozen=True)
-class Range:
-    """Lowest and highest value of a number."""
-
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
-class Shape:
-    """Sizes of an array's axes; None for any."""
-
-    sizes: tuple[int | None, ...]
-
-
-@dataclass(frozen=True)
-class Missing:
-    """Marks a number that may be missing."""
-
-
-Figure = Annotated[float, Missing()]
-"""A number, NaN where there is none."""
 
 
 class _Damaged(ValueError):
@@ -76,16 +55,18 @@ def to_json(value: Any) -> Any:
         return {key: to_json(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [to_json(entry) for entry in value]
+    if isinstance(value, Enum):
+        return value.value
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def from_json(kind: type[Record], value: Any, path: Path, remedy: str) -> Record:
+def from_json(kind: type[Record], value: Any, path: Path | str, remedy: str) -> Record:
     """The record that JSON values describe.
 
     Args:
         kind: the record's class.
         value: the values.
-        path: of the file, named in messages.
+        path: of the file, or what else they are called in messages.
         remedy: what to do about a damaged file.
 
     Raises:
@@ -108,7 +89,7 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
     return record_of(kind, read_bytes(path), path, remedy)
 
 
-def record_of(kind: type[Record], content: bytes, path: Path, remedy: str) -> Record:
+def record_of(kind: type[Record], content: bytes, path: Path | str, remedy: str) -> Record:
     """The record in a file's content; see `read_record`."""
     return from_json(kind, json_of(content, path, remedy), path, remedy)
 
@@ -125,9 +106,9 @@ def _read(kind: Any, value: Any, where: str) -> Any:
         (wanted,) = (choice for choice in arguments if choice is not type(None))
         return _read(wanted, value, where)
     if origin is Literal:
-        if value not in arguments or isinstance(value, bool):
-            raise _Damaged(where, f"found {_short(value)}; allowed is {' or '.join(arguments)}")
-        return value
+        return _one_of(arguments, value, where)
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return kind(_one_of(tuple(member.value for member in kind), value, where))
     if origin is tuple:
         return _tuple(arguments, value, where)
     if isinstance(origin, type) and issubclass(origin, Mapping):
@@ -135,6 +116,12 @@ def _read(kind: Any, value: Any, where: str) -> Any:
     if is_dataclass(kind):
         return _record(kind, value, where)
     return _plain(kind, value, where)
+
+
+def _one_of(allowed: tuple[str, ...], value: Any, where: str) -> Any:
+    if value not in allowed or isinstance(value, bool):
+        raise _Damaged(where, f"found {_short(value)}; allowed is {' or '.join(allowed)}")
+    return value
 
 
 def _plain(kind: Any, value: Any, where: str) -> Any:
@@ -156,11 +143,12 @@ def _plain(kind: Any, value: Any, where: str) -> Any:
 
 
 def _annotated(kind: Any, marks: tuple[Any, ...], value: Any, where: str) -> Any:
+    may_miss = any(isinstance(mark, Missing) for mark in marks)
     for mark in marks:
-        if isinstance(mark, Missing) and value is None:
-            return math.nan
         if isinstance(mark, Shape):
-            return _array(mark, value, where)
+            return _array(mark, value, where, may_miss)
+    if may_miss and value is None:
+        return math.nan
     found = _read(kind, value, where)
     for mark in marks:
         if isinstance(mark, Range) and not mark.low <= found <= mark.high:
@@ -168,8 +156,8 @@ def _annotated(kind: Any, marks: tuple[Any, ...], value: Any, where: str) -> Any
     return found
 
 
-def _array(shape: Shape, value: Any, where: str) -> Array:
-    """A read-only array of finite numbers."""
+def _array(shape: Shape, value: Any, where: str, may_miss: bool) -> np.ndarray[Any, Any]:
+    """A read-only array of numbers, finite unless they may miss."""
     expected = " x ".join("any" if size is None else str(size) for size in shape.sizes)
     try:
         found = np.array(value, dtype=float)
@@ -182,10 +170,13 @@ def _array(shape: Shape, value: Any, where: str) -> Array:
     )
     if not fits:
         raise _Damaged(where, f"found an array of shape {found.shape}; allowed is {expected}")
-    if not np.isfinite(found).all():
+    if np.isinf(found).any() or (np.isnan(found).any() and not may_miss):
         raise _Damaged(where, "holds numbers that are missing or not finite")
-    found.setflags(write=False)
-    return found
+    numbers = found if shape.kind is float else found.astype(shape.kind)
+    if not may_miss and (numbers != found).any():
+        raise _Damaged(where, "holds numbers that are not whole, or neither true nor false")
+    numbers.setflags(write=False)
+    return numbers
 
 
 def _tuple(kinds: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
@@ -218,11 +209,11 @@ def _record(kind: Any, value: Any, where: str) -> Any:
         place = f"{where}.{field.name}".removeprefix(".")
         if field.name in value:
             read[field.name] = _read(_hints(kind)[field.name], value[field.name], place)
-        elif field.default is MISSING:
+        elif field.default is MISSING and field.default_factory is MISSING:
             raise _Damaged(place, "is missing")
     try:
         return kind(**read)
-    except ValueError as error:
+    except (ValueError, DualArmError) as error:
         raise _Damaged(where, str(error)) from error
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.store.files import AGAIN, storing
+from hybrid_opt.store.json_records import from_json
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import BundleError, OutsideError
@@ -47,7 +48,6 @@ LARGEST_FORCE = 1e5
 """Largest last value of a decision vector, which may be a force limit [N]."""
 
 MOST_NUMBERS = 10_000
-_KEYS = {"format", "version", "decision", "start", "figures", "provenance", "cell"}
 
 START_TOLERANCE = 1e-6
 """Largest difference of the start postures [rad]."""
@@ -134,13 +134,17 @@ def write_trajectory(
     workcell = compiled.workcell
     if x.shape != (workcell.task.n_var,) or not np.isfinite(x).all():
         raise ResultsError(f"decision vector: expected {workcell.task.n_var} finite numbers")
+    for name, value in figures.items():
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (is_number and math.isfinite(value)):
+            raise ResultsError(f"{name}: found {shown(value)}; expected a finite number")
     outputs = compiled.evaluators["candidate"](x, *_standing_still(workcell))
     document = {
         "format": FORMAT,
         "version": VERSION,
         "decision": x.tolist(),
         "start": [outputs["q_1"][0].tolist(), outputs["q_2"][0].tolist()],
-        "figures": {name: _figure(name, value) for name, value in figures.items()},
+        "figures": dict(figures),
         "provenance": dict(provenance),
         "cell": cell_to_json(collect_cell(workcell)),
     }
@@ -177,70 +181,51 @@ def read_trajectory(path: str | Path) -> StoredTrajectory:
         data = outside.json_value(content)
     except OutsideError as error:
         raise ResultsError(f"{path}: not a trajectory file: {error}") from error
-    try:
-        return _checked(data)
-    except (ResultsError, BundleError) as error:
-        raise ResultsError(f"{path}: {error}") from error
-
-
-def _checked(data: Any) -> StoredTrajectory:
     if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise ResultsError(f"not a trajectory file: `format` is not {FORMAT!r}")
+        raise ResultsError(f"{path}: not a trajectory file: `format` is not {FORMAT!r}")
     if data.get("version") != VERSION:
-        raise ResultsError(f"version {shown(data.get('version'))}; this program reads {VERSION}")
-    if set(data) != _KEYS:
-        odd = ", ".join(map(shown, sorted(set(data) ^ _KEYS)[:10]))
-        raise ResultsError(f"keys missing or unknown: {odd}")
-    start = data["start"]
-    if not isinstance(start, list) or len(start) != 2:
-        raise ResultsError("start: expected two arrays")
-    if not isinstance(data["figures"], dict) or not isinstance(data["provenance"], dict):
-        raise ResultsError("figures and provenance: expected objects")
-    return StoredTrajectory(
-        x=_vector(data["decision"], "decision"),
-        start=(_vector(start[0], "start[0]"), _vector(start[1], "start[1]")),
-        figures=_figures(data["figures"]),
-        provenance=data["provenance"],
-        cell=cell_from_json(data["cell"]),
-    )
+        found = shown(data.get("version"))
+        raise ResultsError(f"{path}: version {found}; this program reads {VERSION}")
+    known = {"format", "version", *(field.name for field in fields(_Content))}
+    if set(data) != known:
+        odd = ", ".join(map(shown, sorted(set(data) ^ known)[:10]))
+        raise ResultsError(f"{path}: keys missing or unknown: {odd}")
+    read = from_json(_Content, data, path, "store the trajectory anew")
+    try:
+        cell = cell_from_json(read.cell)
+    except BundleError as error:
+        raise ResultsError(f"{path}: {error}") from error
+    x, *start = (np.array(values) for values in (read.decision, *read.start))
+    return StoredTrajectory(x, (start[0], start[1]), read.figures, read.provenance, cell)
 
 
-def _vector(value: Any, name: str) -> Array:
-    if not isinstance(value, list):
-        raise ResultsError(f"{name}: expected an array of numbers")
-    if len(value) > MOST_NUMBERS:
-        raise ResultsError(f"{name}: {len(value)} numbers; allowed are {MOST_NUMBERS}")
-    numbers = np.array([_figure(f"{name}[{k}]", entry) for k, entry in enumerate(value)])
-    most = np.full(len(numbers), LARGEST_DECISION)
-    if name == "decision":
-        most[-1:] = LARGEST_FORCE
-    for k in np.flatnonzero(np.abs(numbers) > most):
-        raise ResultsError(
-            f"{name}[{k}]: found {numbers[k]:g}; allowed is {-most[k]:g} to {most[k]:g}"
-        )
-    return numbers
+@dataclass(frozen=True)
+class _Content:
+    """What a file holds besides its format and version, as JSON values."""
 
+    decision: tuple[float, ...]
+    start: tuple[tuple[float, ...], tuple[float, ...]]
+    figures: Mapping[str, float]
+    provenance: Mapping[str, Any]
+    cell: Any
 
-def _figures(figures: dict[str, Any]) -> dict[str, float]:
-    if len(figures) > MOST_NUMBERS:
-        raise ResultsError(f"figures: {len(figures)} of them; allowed are {MOST_NUMBERS}")
-    for name in figures:
-        problem = text_problem(name)
-        if problem:
-            raise ResultsError(f"figures: found the name {shown(name)}; {problem}")
-    return {name: _figure(f"figures.{name}", value) for name, value in figures.items()}
-
-
-def _figure(name: str, value: Any) -> float:
-    is_number = isinstance(value, int | float | np.integer | np.floating)
-    if not isinstance(value, bool) and is_number:
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if math.isfinite(number):
-            return number
-    raise ResultsError(f"{name}: found {shown(value)}; expected a finite number")
+    def __post_init__(self) -> None:
+        """Refuse more numbers and larger ones than any cell has, and names that cannot be told."""
+        vectors = {"decision": self.decision, "start[0]": self.start[0], "start[1]": self.start[1]}
+        for name, values in (vectors | {"figures": tuple(self.figures.values())}).items():
+            if len(values) > MOST_NUMBERS:
+                raise ValueError(f"{name}: {len(values)} numbers; allowed are {MOST_NUMBERS}")
+        for name, values in vectors.items():
+            most = [LARGEST_DECISION] * len(values)
+            if name == "decision":
+                most[-1:] = [LARGEST_FORCE]
+            for k, (value, limit) in enumerate(zip(values, most, strict=False)):
+                if abs(value) > limit:
+                    allowed = f"allowed is {-limit:g} to {limit:g}"
+                    raise ValueError(f"{name}[{k}]: found {value:g}; {allowed}")
+        for name in self.figures:
+            if problem := text_problem(name):
+                raise ValueError(f"figures: found the name {shown(name)}; {problem}")
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from hybrid_opt.timing.use import (
     limited_force,
     worst,
 )
-from symbolic.array import Array
+from symbolic.array import Array, Figure, Missing, Row, Shape
 from symbolic.errors import SettingsError
 
 NEAREST_FORCE = 1.001
@@ -62,11 +63,11 @@ class ForceCurve:
         unlimited_force: largest limited force of the fastest timing without force limit [N].
     """
 
-    force: Array
-    duration: Array
+    force: Row
+    duration: Annotated[Array, Shape((None,)), Missing()]
     status: tuple[TimingStatus, ...]
     static_force: float
-    unlimited_force: float
+    unlimited_force: Figure
 
 
 def judge_timing(model: TimingModel, x: Array) -> JudgedTiming:

@@ -5,32 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
-from hybrid_opt.store.json_records import Figure, Range, Shape, read_record
+from hybrid_opt.store.json_records import read_record
 from hybrid_opt.timing.analysis import ForceCurve
 from hybrid_opt.timing.overview import TimedTrajectory
-from hybrid_opt.timing.records import JerkTiming, Timing, TimingStatus
+from hybrid_opt.timing.records import Excess, JerkTiming, Timing, TimingStatus
 from hybrid_opt.timing.robustness import Margin
 from hybrid_opt.timing.use import joint_use
-from symbolic.array import Array
-
-Count = Annotated[int, Range(0, 10**12)]
-Pair = Annotated[Array, Shape((2,))]
-
-
-@dataclass(frozen=True)
-class StoredUse:
-    """How far a limit is used: the largest value over it, and its `Place`."""
-
-    ratio: Figure
-    constraint: str
-    robot: str
-    joint: str
-    sample: Count
-    parameter: Annotated[float, Range(0.0, 1.0)]
+from symbolic.array import Array, Count, Figure, Pair, Row
 
 
 @dataclass(frozen=True)
@@ -50,13 +34,13 @@ class StoredTiming:
         joint_use: (n joints,) largest use of each joint by limit, both arms in order.
     """
 
-    status: str
+    status: TimingStatus
     reason: str
     duration: Figure
     iterations: Count
     slowed: Figure
     seconds: Figure
-    use: Mapping[str, StoredUse]
+    use: Mapping[str, Excess]
     objectives: Pair | None = None
     payload_limit: float | None = None
     peak_normal_force: Pair | None = None
@@ -65,11 +49,7 @@ class StoredTiming:
     peak_pressure_shift: Pair | None = None
     peak_point_moment_residual: float | None = None
     peak_moment_residual: float | None = None
-    joint_use: Mapping[str, Annotated[Array, Shape((None,))]] | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse a status that no timing has."""
-        TimingStatus(self.status)
+    joint_use: Mapping[str, Row] | None = None
 
 
 @dataclass(frozen=True)
@@ -83,43 +63,17 @@ class StoredJerk:
         joint_use, payload_use: largest jerks over their limits.
     """
 
-    status: str
+    status: TimingStatus
     duration: Figure
     without: Figure
     joint_use: Figure
     payload_use: Figure
 
-    def __post_init__(self) -> None:
-        """Refuse a status that no timing has."""
-        TimingStatus(self.status)
-
     @classmethod
     def of(cls, found: JerkTiming) -> StoredJerk:
         """As it is stored."""
         timing = found.timing
-        return cls(timing.status.value, timing.duration, found.without, *found.jerk_use)
-
-
-@dataclass(frozen=True)
-class StoredLimit:
-    """One limit of a force curve: force [N], duration [s] (NaN without a timing), status."""
-
-    force: float
-    duration: Figure
-    status: str
-
-    def __post_init__(self) -> None:
-        """Refuse a status that no timing has."""
-        TimingStatus(self.status)
-
-
-@dataclass(frozen=True)
-class StoredCurve:
-    """A `ForceCurve`: the forces at rest and without limit [N], and the limits between them."""
-
-    static_force: float
-    unlimited_force: Figure
-    points: tuple[StoredLimit, ...]
+        return cls(timing.status, timing.duration, found.without, *found.jerk_use)
 
 
 @dataclass(frozen=True)
@@ -137,7 +91,7 @@ class TimingDocument:
     nominal_duration: Figure
     timings: Mapping[str, StoredTiming]
     margins: tuple[Margin, ...]
-    force_curve: StoredCurve | None
+    force_curve: ForceCurve | None
     jerk: StoredJerk | None = None
 
 
@@ -147,7 +101,7 @@ def timing_document(timed: TimedTrajectory) -> TimingDocument:
         nominal_duration=timed.report.nominal_duration,
         timings={name: _timing(timing) for name, timing in timed.report.timings.items()},
         margins=timed.margins,
-        force_curve=None if timed.curve is None else _curve(timed.curve),
+        force_curve=timed.curve,
         jerk=None if timed.report.jerk is None else StoredJerk.of(timed.report.jerk),
     )
 
@@ -163,17 +117,14 @@ def read_timing(path: Path) -> TimingDocument:
 
 
 def _timing(timing: Timing) -> StoredTiming:
-    use = {
-        limit: StoredUse(excess.ratio, **vars(excess.place)) for limit, excess in timing.use.items()
-    }
     known = StoredTiming(
-        status=timing.status.value,
+        status=timing.status,
         reason=timing.reason,
         duration=timing.duration,
         iterations=timing.iterations,
         slowed=timing.slowed,
         seconds=timing.seconds,
-        use=use,
+        use=timing.use,
     )
     carry = timing.carry
     if carry is None:
@@ -195,12 +146,3 @@ def _timing(timing: Timing) -> StoredTiming:
 def _largest(vectors: Array) -> float:
     """Largest length of vectors (n, 3)."""
     return float(np.linalg.norm(vectors, axis=1).max())
-
-
-def _curve(curve: ForceCurve) -> StoredCurve:
-    points = zip(curve.force.tolist(), curve.duration.tolist(), curve.status, strict=True)
-    return StoredCurve(
-        curve.static_force,
-        curve.unlimited_force,
-        tuple(StoredLimit(force, duration, status.value) for force, duration, status in points),
-    )

@@ -57,24 +57,30 @@ class TimingReport:
         return named
 
 
-def report_timing(model: TimingModel, x: Array, force: float | None = None) -> TimingReport:
+def report_timing(
+    model: TimingModel, x: Array, force: float | None = None, own: TimingModel | None = None
+) -> TimingReport:
     """All timings of a trajectory beside one another.
 
     Args:
+        model: of the cell that robots drive.
+        x: (n_var,) decision vector.
         force: limit on the normal forces for the force-limited timing [N].
+        own: of the cell that x was found in, None for the same.
 
     Raises:
         SettingsError: x does not fit the workcell, or the limit is not a positive force.
     """
+    driven = model.workcell.task
     return TimingReport(
-        judged=judge_timing(model, x),
+        judged=judge_timing(own or model, x),
         nominal_duration=duration_at_speed_limits(
             model, model.path_motion(x), TimingLimits(reference_speed=True)
         ),
         fastest=fastest_timing(model, x),
         closest=closest_to_reference_timing(model, x),
         force_limited=None if force is None else force_limited_timing(model, x, force),
-        jerk=drive_with_jerk(model, x) if model.workcell.task.time_law == "optimal" else None,
+        jerk=drive_with_jerk(model, x) if len(x) == driven.n_var > driven.n_path else None,
     )
 
 
@@ -101,17 +107,19 @@ def timed_trajectory(
     x: Array,
     force_limit: float | None = None,
     curve_points: int | None = None,
+    own: TimingModel | None = None,
 ) -> TimedTrajectory:
     """Time one decision vector (n_var,) in every way.
 
     Args:
+        model, own: as for `report_timing`.
         force_limit: normal force [N] of a force-limited timing, None for no such timing.
         curve_points: points of the curve of duration against force limit, None for no curve.
 
     Raises:
         SettingsError: x does not fit the workcell, or the limit is not a positive force.
     """
-    report = report_timing(model, x, force_limit)
+    report = report_timing(model, x, force_limit, own)
     closest = report.closest.carry
     return TimedTrajectory(
         report,

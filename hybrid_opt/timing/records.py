@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.shown import Shown
-from symbolic.array import Array
+from symbolic.array import Array, Count, Figure, Range
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 
@@ -43,8 +44,8 @@ class Place:
     constraint: str
     robot: str
     joint: str
-    sample: int
-    parameter: float
+    sample: Count
+    parameter: Annotated[float, Range(0.0, 1.0)]
 
     def __str__(self) -> str:
         who = " ".join(part for part in (self.robot, self.joint) if part)
@@ -130,7 +131,7 @@ class JerkLimits:
 class Excess:
     """How far a limit is used: the largest value over its limit, and where."""
 
-    ratio: float
+    ratio: Figure
     place: Place
 
 

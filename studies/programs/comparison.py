@@ -7,21 +7,21 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from hybrid_opt.campaign.layout import DRIVABLE, SUMMARY
-from hybrid_opt.campaign.polish_stage import read_polished
+from hybrid_opt.campaign.documents import DRIVABLE, SUMMARY
+from hybrid_opt.campaign.identity import differences
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
 from hybrid_opt.campaign.summary import CampaignSummary
-from hybrid_opt.display.table import text_table
+from hybrid_opt.display.table import NOTHING, Quantity, Table, number
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
+from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.store.json_records import to_json
 from studies.study.summary import LEAST_TESTED, reference_front
-from studies.study.terminal import number, title
+from studies.study.tables import QUANTITIES
 from symbolic.array import Array
 
 SEARCHED = ("feasible_share", "non_dominated", "hypervolume", "igd", "spacing")
@@ -86,7 +86,6 @@ def compare(first: Path, second: Path) -> CampaignComparison:
     folders = (first, second)
     runs = tuple(read_campaign(folder) for folder in folders)
     summaries = tuple(read_summary(folder) for folder in folders)
-    polished = tuple(_polished(run) for run in runs)
     if runs[0].objectives != runs[1].objectives:
         raise ResultsError(
             f"{first} minimises {', '.join(runs[0].objectives)}, {second} "
@@ -95,19 +94,18 @@ def compare(first: Path, second: Path) -> CampaignComparison:
     shared = [name for name in runs[0].algorithms if name in runs[1].algorithms]
     if not shared:
         raise ResultsError(f"{first} and {second} have no algorithm in common")
-    every = [replica.front for run in runs for replica in run.replicas]
-    every += [front for fronts in polished for front in fronts.values()]
-    reference = reference_front(every)
+    reference = reference_front([front.objectives for run in runs for front in run.fronts])
     figures = [
-        figure
-        for name in shared
-        for figure in _algorithm_figures(name, runs, summaries, polished, reference)
+        figure for name in shared for figure in _algorithm_figures(name, runs, summaries, reference)
     ]
     both = all((folder / DRIVABLE / SUMMARY).exists() for folder in folders)
     return CampaignComparison(
         (str(first), str(second)),
         runs[0].workcell.digest == runs[1].workcell.digest,
-        tuple(_differences(*(to_json(run.configuration) for run in runs))),
+        tuple(
+            (name, _short(a), _short(b))
+            for name, a, b in differences(*(to_json(run.configuration) for run in runs))
+        ),
         _with_holm(figures),
         tuple(  # type: ignore[arg-type]
             tuple(name for name in run.algorithms if name not in shared) for run in runs
@@ -116,30 +114,19 @@ def compare(first: Path, second: Path) -> CampaignComparison:
     )
 
 
-def _polished(run: CampaignResults) -> dict[tuple[str, int], Array]:
-    """Objectives of a campaign's polished fronts, by algorithm and replica."""
-    found = {}
-    for replica in run.replicas:
-        polished = read_polished(run.root, replica, run.workcell)
-        if polished is not None:
-            found[replica.algorithm, replica.replica] = polished.objectives
-    return found
-
-
 def _algorithm_figures(
     name: str,
     runs: Sequence[CampaignResults],
     summaries: Sequence[CampaignSummary],
-    polished: Sequence[Mapping[tuple[str, int], Array]],
     reference: Array,
 ) -> list[ComparedFigure]:
     sides = []
-    for run, summary, fronts in zip(runs, summaries, polished, strict=True):
+    for run, summary in zip(runs, summaries, strict=True):
         stored = summary.algorithms[name].replicas
         values = {figure: [float(getattr(one, figure)) for one in stored] for figure in STORED}
         values |= _columns([_searched(replica, reference) for replica in run.of(name)])
         better = [one.polished for one in stored if one.polished is not None]
-        known = [front for (algorithm, _), front in fronts.items() if algorithm == name]
+        known = [f.objectives for f in run.fronts if f.polished and f.algorithm == name]
         if better and known:
             values |= _columns([_of_front(front, reference) for front in known], POLISHED)
             values |= {
@@ -190,20 +177,6 @@ def _with_holm(figures: list[ComparedFigure]) -> tuple[ComparedFigure, ...]:
     )
 
 
-def _differences(
-    first: Mapping[str, Any], second: Mapping[str, Any], prefix: str = ""
-) -> list[tuple[str, str, str]]:
-    found = []
-    for key in sorted({*first, *second}):
-        name = f"{prefix}{key}"
-        a, b = first.get(key), second.get(key)
-        if isinstance(a, dict) and isinstance(b, dict):
-            found += _differences(a, b, f"{name}.")
-        elif a != b:
-            found.append((name, _short(a), _short(b)))
-    return found
-
-
 def _short(value: object) -> str:
     text = "-" if value is None else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 60 else f"{text[:57]}..."
@@ -215,19 +188,24 @@ def as_text(found: CampaignComparison) -> str:
     if not found.same_workcell:
         lines += ["The workcells differ: the figures say more about them than about the runs.", ""]
     lines += [f"{name}: A {a}, B {b}" for name, a, b in found.differences] or ["Same configuration"]
-    rows = [["median [quartiles]", "A", "B", "A12", "p (Holm)"]]
-    for figure in found.figures:
-        test = figure.test
-        rows.append(
-            [
-                f"{title(figure.algorithm)}, {figure.figure.replace('_', ' ')}",
-                _spread(figure.first),
-                _spread(figure.second),
-                "-" if test is None else number(test.a12, 2),
-                "-" if test is None else number(test.p_holm, 5),
-            ]
-        )
-    lines += ["", text_table(rows)]
+    table = Table(
+        "comparison",
+        "",
+        ("median [quartiles]", "A", "B", "A12", "p (Holm)"),
+        tuple(
+            (
+                f"{title(figure.algorithm)}, {_quantity(figure.figure)[0]}",
+                *(
+                    _quantity(figure.figure)[1].spread(one.median, one.quartile1, one.quartile3)
+                    for one in (figure.first, figure.second)
+                ),
+                NOTHING if figure.test is None else number(figure.test.a12),
+                NOTHING if figure.test is None else number(figure.test.p_holm, 5),
+            )
+            for figure in found.figures
+        ),
+    )
+    lines.append(table.text())
     for side, names in zip("AB", found.only, strict=True):
         if names:
             lines.append(f"only in {side}: {', '.join(title(name) for name in names)}")
@@ -239,9 +217,11 @@ def as_text(found: CampaignComparison) -> str:
     return "\n".join(lines)
 
 
-def _spread(summary: Summary) -> str:
-    values = (summary.median, summary.quartile1, summary.quartile3)
-    return "{:.4g} [{:.4g}, {:.4g}]".format(*values)
+def _quantity(figure: str) -> tuple[str, Quantity]:
+    """What a figure is called, and how it reads."""
+    quantity = QUANTITIES[figure.removeprefix(POLISHED)]
+    of = "polished, " if figure.startswith(POLISHED) else ""
+    return f"{of}{quantity.heading()}", quantity
 
 
 def compare_folders(options: argparse.Namespace) -> int:

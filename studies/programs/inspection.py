@@ -6,7 +6,6 @@ import argparse
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +13,16 @@ import numpy as np
 
 import hybrid_opt as ho
 from hybrid_opt.building import Maker, build_all
-from hybrid_opt.campaign.progress import Progress
+from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.view import CarryView, Look
-from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
 from studies.program import load_workcell
-from studies.report.data import shown
-from studies.report.pictures_cell import environment, reachable_regions
-from studies.report.pictures_meeting import meeting
+from studies.report.data import DrawnCarry
+from studies.report.pictures_cell import environment, meeting, reachable_regions
 from studies.report.reach import reach_map
 from studies.report.style import in_style, save, settled
 from symbolic.array import Array
@@ -58,201 +55,173 @@ class Optimum:
     problem: str = ""
 
 
-class Inspection:
-    """What there is to know of a cell; each part is worked out when it is first asked for.
+@dataclass(frozen=True)
+class InspectionSettings:
+    """Settings of an inspection.
 
     Attributes:
-        candidates: random candidates to judge.
+        candidates: random ones to judge, at least 1.
         seed: of their randomness.
-        progress: where to show what takes long; nowhere unless another one is set.
+        output: folder for the pictures, None to draw none.
+        polish: whether to polish the hand-made trajectory shortly, to see which bounds bind.
+        view: file for a page that shows the hand-made trajectory, None for none.
+        pairs: whether every pair of bodies is listed as text.
     """
 
-    def __init__(
-        self,
-        workcell: Workcell,
-        candidates: int,
-        seed: int,
-        output: Path | None,
-        polish: bool = False,
-        view: Path | None = None,
-    ) -> None:
-        """Nothing is worked out yet.
+    candidates: int
+    seed: int
+    output: Path | None = None
+    polish: bool = False
+    view: Path | None = None
+    pairs: bool = False
 
-        Args:
-            workcell: the cell.
-            candidates: random ones to judge, at least 1.
-            seed: of their randomness.
-            output: folder for the pictures, None to draw none.
-            polish: whether to polish the hand-made trajectory shortly, to see which bounds bind.
-            view: file for a page that shows the hand-made trajectory, None for none.
+    def __post_init__(self) -> None:
+        """Refuse no candidates.
 
         Raises:
-            SettingsError: no candidates.
+            SettingsError: there are none.
         """
-        if candidates < 1:
-            raise SettingsError(f"--candidates is {candidates}; at least 1 is needed")
-        self.candidates, self.seed = candidates, seed
-        self._cell, self._output, self._polish, self._view = Cell(workcell), output, polish, view
-        self.progress = Progress(shown=False)
-
-    @property
-    def name(self) -> str:
-        """Of the workcell."""
-        return self._cell.workcell.name
-
-    @property
-    def facts(self) -> dict[str, str]:
-        """What is in the file, by heading."""
-        return _facts(self._cell.workcell)
-
-    def build(self) -> None:
-        """Compile what is not compiled yet; what cannot be is told by who needs it."""
-        makers: list[Maker] = [lambda: self._cell.evaluator]
-        if self._polish:
-            makers.append(lambda: self._cell.polish_functions)
-        build_all(makers, self.progress)
-
-    @cached_property
-    def branches(self) -> dict[str, tuple[Branch, ...]]:
-        """Per robot's name its postures at the start, best first."""
-        robots = self._cell.workcell.robots
-        return {robot.name: branches_of(self._cell, i) for i, robot in enumerate(robots)}
-
-    @property
-    def static_normal_force(self) -> tuple[float, ...]:
-        """Of both robots, the level payload at rest [N]."""
-        return tuple(self._cell.static_hold.normal_force.tolist())
-
-    @property
-    def static_objectives(self) -> tuple[float, ...]:
-        """The same over the reference forces."""
-        force = self._cell.static_hold.normal_force
-        return tuple((force / self._cell.workcell.task.reference_force).tolist())
-
-    @property
-    def static_payload_limit(self) -> float:
-        """Payload that reaches the reference force at rest [kg]."""
-        return self._cell.static_hold.payload_limit
-
-    @property
-    def unheld(self) -> str:
-        """Why the payload cannot be held still, and what would do; '' where it can."""
-        return self._cell.unheld
-
-    @property
-    def initial(self) -> Judgement:
-        """The verdict on the hand-made trajectory."""
-        return _judged(self._carries["initial"])
-
-    @property
-    def straight_line(self) -> Judgement:
-        """The verdict on the straight line."""
-        return _judged(self._carries["straight_line"])
-
-    @cached_property
-    def _carries(self) -> dict[str, Carry]:
-        line = straight_line(self._cell.workcell.task)
-        return {
-            "initial": self._cell.carry(self._cell.initial),
-            "straight_line": self._cell.carry(line),
-        }
-
-    @cached_property
-    def _explained(self) -> dict[str, Explanation]:
-        """What is in the way of those that fail, by their names."""
-        found = {}
-        for name, carry in self._carries.items():
-            for explanation in explain(self._cell.evaluator, self._cell.evaluate(carry.x)):
-                found[name] = explanation
-        return found
-
-    @property
-    def explained(self) -> dict[str, str]:
-        """By 'initial' and 'straight_line' what is in the way of them, where they fail."""
-        return {name: str(why) for name, why in self._explained.items()}
-
-    @cached_property
-    def _found(self) -> Evaluations:
-        rng = np.random.default_rng(self.seed)
-        return self._cell.evaluate(self._cell.random(self.candidates, rng))
-
-    @property
-    def feasible_share(self) -> float:
-        """Of the random candidates."""
-        return float(self._found.feasible.mean())
-
-    @property
-    def infeasible_by_reason(self) -> dict[str, int]:
-        """Of them, by the constraint violated first."""
-        return self._found.infeasible_by_reason
-
-    @property
-    def _failed(self) -> Evaluations:
-        return self._found[~self._found.feasible][:EXPLAINED]
-
-    @property
-    def explained_candidates(self) -> int:
-        """Infeasible ones of them that were looked at closer."""
-        return len(self._failed)
-
-    @cached_property
-    def in_the_way(self) -> dict[str, dict[str, int]]:
-        """Of these, how often each pair of bodies, joint and robot is in the way first."""
-        return frequent(explain(self._cell.evaluator, self._failed))
-
-    @cached_property
-    def optimum(self) -> Optimum | None:
-        """A short polish, None where none was asked for."""
-        return _optimum(self._cell, self.progress) if self._polish else None
-
-    @property
-    def active_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of bodies that are checked."""
-        return self._cell.geometry.pair_names
-
-    @property
-    def excluded_pairs(self) -> tuple[tuple[str, str, str], ...]:
-        """Pairs that are not, and why."""
-        geometry = self._cell.geometry
-        names = [body.name for body in geometry.bodies]
-        return tuple((names[p.first], names[p.second], p.reason) for p in geometry.excluded)
-
-    @cached_property
-    def files(self) -> tuple[str, ...]:
-        """Pictures written.
-
-        Raises:
-            SettingsError: the folder cannot be made.
-        """
-        if self._output is None:
-            return ()
-        self.progress.note("drawing pictures (--no-pictures leaves them out)")
-        return draw(self._cell, self._carries, self._explained, self._output)
-
-    @cached_property
-    def view(self) -> str:
-        """The page that shows the hand-made trajectory, '' where none was asked for.
-
-        Raises:
-            DualArmError: it cannot be written.
-        """
-        if self._view is None:
-            return ""
-        return show(self._carries["initial"], self._explained.get("initial"), self._view)
-
-    def document(self) -> dict[str, Any]:
-        """All of it as JSON values; records are left to `dataclasses.asdict`."""
-        public = [name for name, part in vars(Inspection).items() if _is_part(name, part)]
-        return {name: getattr(self, name) for name in ("candidates", "seed", *public)}
+        if self.candidates < 1:
+            raise SettingsError(f"--candidates is {self.candidates}; at least 1 is needed")
 
 
-def _is_part(name: str, part: object) -> bool:
-    return isinstance(part, property | cached_property) and not name.startswith("_")
+@dataclass(frozen=True)
+class Part:
+    """One finding of an inspection.
+
+    Attributes:
+        values: by name, for JSON; records are left to `dataclasses.asdict`.
+        lines: the same for people.
+    """
+
+    values: Mapping[str, Any]
+    lines: tuple[str, ...] = ()
 
 
-def _judged(carry: Carry) -> Judgement:
-    assert carry.judgement is not None, "carries of a cell are judged"
-    return carry.judgement
+def inspected(
+    workcell: Workcell, settings: InspectionSettings, progress: Progress | None = None
+) -> Iterator[Part]:
+    """All there is to know of a cell, each part worked out when it is asked for.
+
+    Raises:
+        DualArmError: the model cannot be built, or a picture cannot be written.
+    """
+    cell, progress = Cell(workcell), progress or Progress(shown=False)
+    yield Part({"candidates": settings.candidates, "seed": settings.seed})
+    facts = _facts(workcell)
+    yield Part(
+        {"name": workcell.name, "facts": facts},
+        (workcell.name, "", *(f"  {heading}: {text}" for heading, text in facts.items()), ""),
+    )
+    yield _at_rest(cell)
+    makers: list[Maker] = [lambda: cell.evaluator]
+    if settings.polish:
+        makers.append(lambda: cell.polish_functions)
+    # What cannot be compiled is told by who needs it.
+    build_all(makers, progress)
+    carries = {
+        "initial": cell.carry(cell.initial),
+        "straight_line": cell.carry(straight_line(workcell.task)),
+    }
+    whys: dict[str, Explanation] = {}
+    for (name, carry), title in zip(
+        carries.items(), ("Hand-made trajectory", "Straight line"), strict=True
+    ):
+        assert carry.judgement is not None, "carries of a cell are judged"
+        for why in explain(cell.evaluator, cell.evaluate(carry.x)):
+            whys[name] = why
+        told = (f"  {whys[name]}",) if name in whys else ()
+        yield Part({name: carry.judgement}, (f"{title}: {_judged_text(carry.judgement)}", *told))
+    yield Part({"explained": {name: str(why) for name, why in whys.items()}})
+    yield _postures(cell)
+    yield from _candidates(cell, settings)
+    yield _pairs(cell, settings.pairs)
+    optimum = _optimum(cell, progress) if settings.polish else None
+    lines = () if optimum is None else ("", *_optimum_lines(optimum))
+    yield Part({"optimum": optimum}, lines)
+    files: tuple[str, ...] = ()
+    if settings.output is not None:
+        progress.note("drawing pictures (--no-pictures leaves them out)")
+        files = draw(cell, carries, whys, settings.output)
+    yield Part({"files": files}, ("", "Pictures: " + ", ".join(files)) if files else ())
+    view = ""
+    if settings.view is not None:
+        view = show(carries["initial"], whys.get("initial"), settings.view)
+    yield Part({"view": view}, ("", f"View: {view} (open it in a browser)") if view else ())
+
+
+def _at_rest(cell: Cell) -> Part:
+    """Forces of holding the payload level and still, and whether it can be held."""
+    hold, unheld = cell.static_hold, cell.unheld
+    force = hold.normal_force
+    share = force / cell.workcell.task.reference_force
+    still, objectives = (
+        ", ".join(f"{value:.{digits}f}" for value in values)
+        for values, digits in ((force, 2), (share, 4))
+    )
+    lines = [
+        f"At rest, level: normal forces {still} N, objectives {objectives}; payload at the "
+        f"reference force {hold.payload_limit:.2f} kg"
+    ]
+    lines += [f"Infeasible, whatever the path: {unheld}"] if unheld else []
+    values = {
+        "static_normal_force": tuple(force.tolist()),
+        "static_objectives": tuple(share.tolist()),
+        "static_payload_limit": hold.payload_limit,
+        "unheld": unheld,
+    }
+    return Part(values, tuple(lines))
+
+
+def _postures(cell: Cell) -> Part:
+    """Per robot's name its postures at the start, best first."""
+    robots = cell.workcell.robots
+    branches = {robot.name: branches_of(cell, i) for i, robot in enumerate(robots)}
+    lines = ["", "Postures at the start, best first (* used), along the hand-made trajectory"]
+    for robot, found in branches.items():
+        lines.append(f"  {robot}")
+        lines += [f"  {'*' if b.chosen else ' '} {_branch_text(b)}" for b in found]
+    return Part({"branches": branches}, tuple(lines))
+
+
+def _candidates(cell: Cell, settings: InspectionSettings) -> Iterator[Part]:
+    """Random candidates: how many are feasible, and what is in the way of the others."""
+    count, rng = settings.candidates, np.random.default_rng(settings.seed)
+    found = cell.evaluate(cell.random(count, rng))
+    share, reasons = float(found.feasible.mean()), found.infeasible_by_reason
+    lines = [
+        "",
+        f"{count} random candidates within the bounds (seed {settings.seed}): "
+        f"{100.0 * share:.1f} % feasible",
+    ]
+    for name, number in reasons.items():
+        lines.append(f"  {name.replace('_', ' ')}: {number} ({100.0 * number / count:.1f} %)")
+    yield Part({"feasible_share": share, "infeasible_by_reason": reasons}, tuple(lines))
+    failed = found[~found.feasible][:EXPLAINED]
+    in_the_way = frequent(explain(cell.evaluator, failed))
+    lines = []
+    for heading, title in _IN_THE_WAY.items():
+        counts = list(in_the_way[heading].items())[:MOST_TOLD]
+        if counts:
+            lines += ["", f"{title}, in {len(failed)} of the infeasible ones:"]
+            lines += [f"  {name}: {number}" for name, number in counts]
+    yield Part({"explained_candidates": len(failed), "in_the_way": in_the_way}, tuple(lines))
+
+
+def _pairs(cell: Cell, listed: bool) -> Part:
+    """Pairs of bodies that are checked, and those that are not, and why."""
+    geometry = cell.geometry
+    names, active = [body.name for body in geometry.bodies], geometry.pair_names
+    excluded = tuple((names[p.first], names[p.second], p.reason) for p in geometry.excluded)
+    lines = [
+        "",
+        f"Collision pairs: {len(active)} checked, {len(excluded)} left out"
+        + ("" if listed else " (--pairs lists them, and why)"),
+    ]
+    if listed:
+        lines += [f"  {first} – {second}" for first, second in active]
+        lines += [f"  {first} – {second}: {why}" for first, second, why in excluded]
+    return Part({"active_pairs": active, "excluded_pairs": excluded}, tuple(lines))
 
 
 def _optimum(cell: Cell, progress: Progress) -> Optimum:
@@ -374,7 +343,7 @@ def draw(
         SettingsError: the folder cannot be made.
     """
     _made(output)
-    geometry, initial = cell.geometry, shown("", carries["initial"])
+    geometry, initial = cell.geometry, DrawnCarry("", carries["initial"])
     reach = reach_map(geometry, np.random.default_rng(0))
     with in_style():
         figures = {
@@ -420,64 +389,6 @@ MOST_TOLD = 10
 """Most obstacles that are told."""
 
 
-def told(found: Inspection, pairs: bool = False) -> Iterator[str]:
-    """An inspection for people, in lines that come as soon as they are known.
-
-    Args:
-        pairs: whether every pair of bodies is listed.
-    """
-    yield from (found.name, "")
-    yield from (f"  {heading}: {text}" for heading, text in found.facts.items())
-    still = ", ".join(f"{force:.2f}" for force in found.static_normal_force)
-    share = ", ".join(f"{value:.4f}" for value in found.static_objectives)
-    yield ""
-    yield (
-        f"At rest, level: normal forces {still} N, objectives {share}; payload at the reference "
-        f"force {found.static_payload_limit:.2f} kg"
-    )
-    if found.unheld:
-        yield f"Infeasible, whatever the path: {found.unheld}"
-    found.build()
-    yield f"Hand-made trajectory: {_judged_text(found.initial)}"
-    yield from _why(found, "initial")
-    yield f"Straight line: {_judged_text(found.straight_line)}"
-    yield from _why(found, "straight_line")
-    yield from ("", "Postures at the start, best first (* used), along the hand-made trajectory")
-    for robot, branches in found.branches.items():
-        yield f"  {robot}"
-        yield from (f"  {'*' if b.chosen else ' '} {_branch_text(b)}" for b in branches)
-    yield ""
-    yield (
-        f"{found.candidates} random candidates within the bounds (seed {found.seed}): "
-        f"{100.0 * found.feasible_share:.1f} % feasible"
-    )
-    for name, count in found.infeasible_by_reason.items():
-        yield f"  {name.replace('_', ' ')}: {count} ({100.0 * count / found.candidates:.1f} %)"
-    for heading, title in _IN_THE_WAY.items():
-        counts = list(found.in_the_way[heading].items())[:MOST_TOLD]
-        if counts:
-            yield from ("", f"{title}, in {found.explained_candidates} of the infeasible ones:")
-            yield from (f"  {name}: {count}" for name, count in counts)
-    checked, left_out = len(found.active_pairs), len(found.excluded_pairs)
-    yield ""
-    yield f"Collision pairs: {checked} checked, {left_out} left out" + (
-        "" if pairs else " (--pairs lists them, and why)"
-    )
-    if pairs:
-        yield from (f"  {first} – {second}" for first, second in found.active_pairs)
-        yield from (f"  {first} – {second}: {why}" for first, second, why in found.excluded_pairs)
-    if found.optimum is not None:
-        yield from ("", *_optimum_lines(found.optimum))
-    if found.files:
-        yield from ("", "Pictures: " + ", ".join(found.files))
-    if found.view:
-        yield from ("", f"View: {found.view} (open it in a browser)")
-
-
-def _why(found: Inspection, name: str) -> list[str]:
-    return [f"  {found.explained[name]}"] if name in found.explained else []
-
-
 def _optimum_lines(optimum: Optimum) -> list[str]:
     if optimum.problem:
         return [f"Bounds at the optimum: not known: {optimum.problem}"]
@@ -517,19 +428,19 @@ def inspect(options: argparse.Namespace) -> int:
         DualArmError: the workcell is wrong, or a picture cannot be written.
     """
     output = options.output or Path("inspect") / options.workcell.stem
-    found = Inspection(
-        load_workcell(options.workcell),
+    settings = InspectionSettings(
         options.candidates,
         options.seed,
         None if options.no_pictures else output,
         options.polish,
         output / "view.html" if options.view else None,
+        options.pairs,
     )
-    found.progress = Progress()
-    if options.json:
-        found.build()
-        print(json.dumps(found.document(), default=asdict, indent=2))
-    else:
-        for line in told(found, options.pairs):
+    values: dict[str, Any] = {}
+    for part in inspected(load_workcell(options.workcell), settings, Progress()):
+        values |= part.values
+        for line in () if options.json else part.lines:
             print(line, flush=True)
+    if options.json:
+        print(json.dumps(values, default=asdict, indent=2))
     return 0

@@ -27,7 +27,7 @@ def regenerate(options: argparse.Namespace) -> int:
     seconds: float | None = None
     if options.study and options.workcell is not None:
         from hybrid_opt.building import build_study
-        from hybrid_opt.campaign.progress import Progress
+        from hybrid_opt.campaign.stages import Progress
         from hybrid_opt.cell import Cell
 
         begin = time.perf_counter()

@@ -41,8 +41,8 @@ from hybrid_opt.witness.reference import (
     with_tracking_error,
 )
 from hybrid_opt.witness.scene import LARGEST_STEP, ArmSettings, Pads, SimulationSettings
+from studies.options import DRIVEN, PADS
 from studies.report.animation import Film, write_animation
-from studies.simulate import DRIVEN, PADS
 from symbolic.array import Array
 from symbolic.records import Workcell
 

@@ -16,7 +16,7 @@ from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
 from hybrid_opt.bundles.manifest import warnings_of
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.display.table import text_table
+from hybrid_opt.display.table import number, text_table
 from hybrid_opt.job.compliance import (
     SKEWS,
     STIFFNESSES,
@@ -51,8 +51,7 @@ from hybrid_opt.timing import (
 from hybrid_opt.timing.document import timing_document
 from hybrid_opt.timing.model import TimingModel
 from studies.program import load_workcell
-from studies.study.terminal import number
-from studies.study.timing import timing_text
+from studies.study.tables import force_curve, margins, timings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
@@ -88,7 +87,11 @@ def _timings(
 ) -> tuple[dict[str, Any], str]:
     model = replayed.cell.timing_model
     timed = timed_trajectory(model, stored.x, options.force_limit, options.force_curve)
-    return to_json(timing_document(timed)), timing_text(timed)
+    document, robots = timing_document(timed), [robot.name for robot in timed.workcell.robots]
+    found = [timings([("", document)], robots)]
+    found += [margins([("", document)])] if document.margins else []
+    found += [force_curve(document.force_curve)] if document.force_curve is not None else []
+    return to_json(document), "\n\n".join(table.text() for table in found)
 
 
 def _replay_json(stored: StoredTrajectory, replayed: Replay) -> dict[str, Any]:

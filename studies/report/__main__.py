@@ -35,7 +35,7 @@ def _run(options: argparse.Namespace) -> int:
     from studies.report.stage import follow_looks, rewrite
 
     if options.into:
-        from studies.report.look import insert_tables
+        from studies.report.generate import insert_tables
 
         insert_tables(options.results, options.into)
     elif options.animation or options.view:

@@ -16,8 +16,8 @@ from PIL import Image
 from hybrid_opt.display.scene import motion_points
 from hybrid_opt.display.solids import cell_solids
 from studies.errors import ReportError
+from studies.report.data import DrawnCarry, gather_carries
 from studies.report.drawing import ISOMETRIC, CutCell, draw_cell, draw_path, frame_axes
-from studies.report.records import DrawnCarry
 from studies.report.style import in_style
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
@@ -59,6 +59,16 @@ class Film:
     def duration(self) -> float:
         """Time from the first to the last sample [s]."""
         return float(self.time[-1] - self.time[0])
+
+
+def animate(root: Path, path: Path) -> None:
+    """Write the best selected trajectory of the first algorithm that has one.
+
+    Raises:
+        DualArmError: the results, the suffix or a library do not fit.
+    """
+    geometry, carries = gather_carries(root)
+    write_animation(geometry, Film.of(carries[min(1, len(carries) - 1)]), path)
 
 
 def write_animation(geometry: CellGeometry, film: Film, path: Path) -> None:

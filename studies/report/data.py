@@ -1,60 +1,231 @@
-"""Gathers what a report shows from a results folder."""
+"""Content of a report, gathered once from a results folder and frozen. Pictures, tables and the
+page are functions of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.branch_choice import read_branches
-from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.campaign.polish_stage import read_polished
-from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
-from hybrid_opt.campaign.simulated import read_simulations
-from hybrid_opt.campaign.summary import AlgorithmFigures, CampaignSummary, ReplicaFigures
+from hybrid_opt.campaign.cell_source import CellsSource, ReadyCell
+from hybrid_opt.campaign.documents import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
+from hybrid_opt.campaign.results import (
+    CampaignResults,
+    ReplicaFront,
+    read_campaign,
+    read_summary,
+)
+from hybrid_opt.campaign.simulated import StoredSimulation, read_simulations
+from hybrid_opt.campaign.summary import CampaignSummary, PolishedFigures, ReplicaFigures
 from hybrid_opt.carry import Carry
-from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
+from hybrid_opt.display.table import Table
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.evaluate.objectives import (
+    OBJECTIVES,
+    PAPER_OBJECTIVES,
+    ForceKind,
+    duration_unit,
+    force_kind,
+)
 from hybrid_opt.indicators.selection import selected_row
-from hybrid_opt.job.plan import JobModel
+from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.recommending.comparison import level_force
-from hybrid_opt.timing import TimingLimits, timed_trajectory
-from hybrid_opt.timing.robustness import payload_sensitivity
+from hybrid_opt.store.trajectory_file import read_trajectory
+from hybrid_opt.timing import TimingLimits
+from hybrid_opt.timing.document import TimingDocument, read_timing
+from hybrid_opt.timing.robustness import PayloadSensitivity, payload_sensitivity
 from hybrid_opt.work.service import Emit, Executor, SerialExecutor, Service, answer_all
-from studies.report.data_drivable import gather_drivable
-from studies.report.jobs import (
-    RECOMMENDED_LABEL,
-    DrawnJob,
-    JobModelSource,
-    JobRequest,
-    drawn_job,
-)
-from studies.report.reach import reach_map
-from studies.report.records import (
-    AlgorithmRuns,
-    DrawnCarry,
-    DrivableReport,
-    Front,
-    ReachMap,
-    ReportData,
-    Run,
-    TimedSelection,
-)
-from studies.study.terminal import title
+from studies.report.jobs import RECOMMENDED_LABEL, DrawnJob, JobRequest, drawn_job
+from studies.report.reach import ReachMap, reach_map
+from studies.study.drivable import drivable_root, is_drivable, limits_on_jerk
+from studies.study.timing import TIMING, shown_files
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
-from symbolic.read.cell_files import collect_cell
+from symbolic.read.cell_files import CellFiles, collect_cell
+from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
 
-INITIAL_LABEL = "hand-made"
-CURVE_POINTS = 12
-"""Points of the curve of duration against force limit."""
+INITIAL_LABEL = Path(HAND_MADE).stem
 
 REACH_SEED = 0
 """Seed of the postures that the reach is drawn from; no result depends on it."""
+
+
+@dataclass(frozen=True)
+class DrawnCarry:
+    """One judged trajectory under the search's timing, and its label for legends."""
+
+    label: str
+    timed: Carry
+
+    @property
+    def x(self) -> Array:
+        """(n_var,) decision vector."""
+        return self.timed.x
+
+    @property
+    def objectives(self) -> Array:
+        """(n_obj,) of the campaign, without penalty."""
+        assert self.timed.judgement is not None, "carries of a cell are judged"
+        return np.array(list(self.timed.judgement.objectives.values()))
+
+    @cached_property
+    def sensitivity(self) -> PayloadSensitivity:
+        """Its forces against the payload's mass."""
+        return payload_sensitivity(self.timed)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One replica of one algorithm.
+
+    Attributes:
+        evaluations: every candidate that the search evaluated.
+        front: what the search found.
+        hybrid: what the polish made of it, None without a polish.
+        figures: indicators of both, as in summary.json.
+    """
+
+    evaluations: Evaluations
+    front: ReplicaFront
+    hybrid: ReplicaFront | None
+    figures: ReplicaFigures
+
+    @property
+    def hybrid_figures(self) -> PolishedFigures | None:
+        """Those of the polished front."""
+        return self.figures.polished
+
+
+@dataclass(frozen=True)
+class AlgorithmRuns:
+    """All replicas of one algorithm.
+
+    Attributes:
+        name, title: on the command line, and for people.
+        index: its place in the campaign, which decides its look.
+        runs: the replicas.
+        representative: position in `runs` of the one with the largest hypervolume, which the
+            figures of single runs show (the paper's 'best-performing run').
+        best: of that run's polished front, else of its front, the selected trajectory; None if the
+            algorithm found no feasible candidate, and in a drivable experiment beside another.
+    """
+
+    name: str
+    title: str
+    index: int
+    runs: tuple[Run, ...]
+    representative: int
+    best: DrawnCarry | None
+
+    @property
+    def shown(self) -> Run:
+        """The representative run."""
+        return self.runs[self.representative]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One experiment of a study.
+
+    Attributes:
+        workcell: the cell.
+        files: its files.
+        objectives: names of what the search minimised.
+        summary: the content of summary.json.
+        algorithms: in the campaign's order.
+    """
+
+    workcell: Workcell
+    files: CellFiles
+    objectives: tuple[str, ...]
+    summary: CampaignSummary
+    algorithms: tuple[AlgorithmRuns, ...]
+
+    @property
+    def force_kind(self) -> ForceKind:
+        """Kind of forces that limits and drivable fronts are about."""
+        return force_kind(self.objectives)
+
+    @property
+    def solved(self) -> tuple[AlgorithmRuns, ...]:
+        """The algorithms that found a feasible candidate."""
+        return tuple(a for a in self.algorithms if len(a.shown.front))
+
+    @property
+    def has_hybrid(self) -> bool:
+        """Whether fronts were polished."""
+        return any(run.hybrid is not None for a in self.algorithms for run in a.runs)
+
+    def fronts(self) -> Iterator[tuple[AlgorithmRuns, ReplicaFront, bool]]:
+        """Fronts of the representative runs, and whether a polished one stands beside each."""
+        for algorithm in self.solved:
+            run = algorithm.shown
+            polished = run.hybrid if run.hybrid is not None and len(run.hybrid) else None
+            yield algorithm, run.front, polished is not None
+            if polished is not None:
+                yield algorithm, polished, False
+
+    def driven(self, objectives: Array) -> Array:
+        """(k, 2) force [N] and duration [s] of a drivable experiment's objectives (k, 2)."""
+        reference = float(self.workcell.task.reference_force.max())
+        return objectives[:, ::-1] * [reference, duration_unit(self.workcell)]
+
+
+@dataclass(frozen=True)
+class ReportData(Experiment):
+    """Everything that a report shows: the first experiment, and what stands beside it.
+
+    Attributes:
+        root: the results folder.
+        geometry: the cell's collision bodies and pairs.
+        objective_titles: for axes.
+        static: (n_obj,) the objectives of the level payload at rest, NaN where an objective has
+            no such value.
+        initial: the hand-made trajectory.
+        timings: of the hand-made and the selected trajectories by label, as `carries` has them.
+        reach: where the arms reach.
+        level_force: largest of the forces of `force_kind` that hold the level payload at rest [N].
+        drivable: the drivable experiment, None without one.
+        recommended: decision vector of the carry to run, None without one.
+        jerk: what limits on jerk cost the selected carries, None without limits.
+        branches: how the start branches were decided, None where the workcell decides them.
+        simulations: of the carries that were driven in the simulated cell, empty without.
+        jobs: the whole jobs around the recommended, the hand-made and the selected trajectories.
+    """
+
+    root: Path
+    geometry: CellGeometry
+    objective_titles: tuple[str, ...]
+    static: Array
+    initial: DrawnCarry
+    timings: tuple[tuple[str, TimingDocument], ...]
+    reach: ReachMap
+    level_force: float
+    drivable: Experiment | None = None
+    recommended: Array | None = None
+    jerk: Table | None = None
+    branches: BranchCompetition | None = None
+    simulations: tuple[StoredSimulation, ...] = ()
+    jobs: tuple[DrawnJob, ...] = ()
+
+    @property
+    def alone(self) -> bool:
+        """Whether the first experiment is the drivable one."""
+        return is_drivable(self.workcell, self.objectives)
+
+    @property
+    def carries(self) -> tuple[DrawnCarry, ...]:
+        """The initial trajectory and each algorithm's best selected one."""
+        return (self.initial, *(a.best for a in self.algorithms if a.best is not None))
 
 
 def gather(results: CampaignResults, executor: Executor | None = None) -> ReportData:
@@ -68,45 +239,89 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         ResultsError: the folder is not complete or damaged.
         DualArmError: the workcell's functions cannot be built.
     """
-    summary = read_summary(results.root)
-    workcell = results.workcell
-    maker = _CarryMaker(results)
-    geometry = build_geometry(workcell)
-    algorithms = _algorithms(results, summary, maker)
-    carries = _best(results, algorithms, maker)
-    drivable = gather_drivable(results, summary)
-    slow: list[Callable[[JobModel], Any]] = [partial(_reach, geometry)]
-    slow += [partial(_timing, carry.label, carry.x) for carry in carries]
-    files, workers = collect_cell(workcell), executor or SerialExecutor()
-    service = Service(JobModelSource(PackedCell.of(files), results.objectives), _called)
-    reach, *timings = answer_all(workers, service, slow)
-    # Jobs are what robots are told: by the cell that they drive, whose contact model may differ.
-    if drivable is not None:
-        kind = results.cell.force_kind.drivable
-        service = Service(JobModelSource(PackedCell.of(drivable.files), kind), _called)
-    asked: list[Callable[[JobModel], Any]] = [
-        partial(_job, request) for request in _job_requests(carries, drivable, results.cell)
-    ]
-    jobs = answer_all(workers, service, asked)
+    first, initial = _experiment(results), _hand_made(results.cell.evaluator)
+    carries = (initial, *(a.best for a in first.algorithms if a.best is not None))
+    place = drivable_root(results.root, results.workcell, results.objectives)
+    drivable, jerk, recommended = None, None, None
+    if (place / CONFIGURATION).exists():
+        drivable = _experiment(read_campaign(place), select=False)
+        jerk = limits_on_jerk(place)
+    if drivable is not None and first.summary.recommendation is not None:
+        recommended = read_trajectory(results.root / RECOMMENDED).x
+    files = shown_files(first.summary).values()
+    timings = [read_timing(results.root / TIMING / file) for file in files]
+    if len(timings) != len(carries):
+        raise ResultsError(f"{results.root / SUMMARY}: damaged: does not fit the fronts beside it")
+    geometry = build_geometry(results.workcell)
+    calls: list[Callable[[ReadyCell], Any]] = [partial(_reach, geometry)]
+    calls += [partial(_job, request) for request in _job_requests(carries, recommended, first)]
+    alone = results.workcell.task.time_law == "optimal"
+    # Jobs are what robots are told: by the cell that they drive.
+    service = Service(CellsSource.of(first.files, results.objectives, alone), _called)
+    reach, *jobs = answer_all(executor or SerialExecutor(), service, calls)
     return ReportData(
+        **vars(first),
         root=results.root,
-        workcell=workcell,
-        files=files,
         geometry=geometry,
-        summary=summary,
-        objectives=results.objectives,
         objective_titles=_titles(results),
-        static=_static(results, summary),
-        algorithms=algorithms,
-        initial=carries[0],
-        timings=tuple(timings),
+        static=_static(first),
+        initial=initial,
+        timings=tuple(zip((carry.label for carry in carries), timings, strict=True)),
         reach=reach,
+        level_force=level_force((drivable or first).workcell, first.force_kind),
+        drivable=drivable,
+        recommended=recommended,
+        jerk=jerk,
         branches=read_branches(results.root),
         simulations=read_simulations(results.root),
-        level_force=level_force(workcell, results.cell.force_kind),
-        drivable=drivable,
         jobs=tuple(jobs),
     )
+
+
+def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
+    """The cell, the hand-made trajectory and every algorithm's best selected one.
+
+    Raises:
+        ResultsError: the folder is not complete or damaged.
+    """
+    results = read_campaign(root)
+    best = [algorithm.best for algorithm in _experiment(results).algorithms]
+    carries = (_hand_made(results.cell.evaluator), *(c for c in best if c is not None))
+    return build_geometry(results.workcell), carries
+
+
+def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
+    """One experiment; its best trajectories are selected where that is wanted."""
+    summary, fronts = read_summary(results.root), results.fronts
+    evaluator = results.cell.evaluator if select else None
+    algorithms = []
+    for index, name in enumerate(results.algorithms):
+        entry, runs = summary.algorithms[name], []
+        for replica, figures in zip(results.of(name), entry.replicas, strict=True):
+            front, *polished = (
+                f for f in fronts if (f.algorithm, f.replica) == (name, replica.replica)
+            )
+            runs.append(Run(replica.evaluations, front, next(iter(polished), None), figures))
+        representative = entry.representative or 0
+        best = None if evaluator is None else _best(evaluator, runs[representative])
+        algorithms.append(
+            AlgorithmRuns(name, title(name), index, tuple(runs), representative, best)
+        )
+    files = collect_cell(results.workcell)
+    return Experiment(results.workcell, files, results.objectives, summary, tuple(algorithms))
+
+
+def _best(evaluator: CandidateEvaluator, run: Run) -> DrawnCarry | None:
+    """The trajectory that stands for a run."""
+    front = run.hybrid if run.hybrid is not None and len(run.hybrid) else run.front
+    if not len(front):
+        return None
+    return DrawnCarry(front.label, evaluator.carry(front.x[selected_row(evaluator, front.x)]))
+
+
+def _hand_made(evaluator: CandidateEvaluator) -> DrawnCarry:
+    task = evaluator.workcell.task
+    return DrawnCarry(INITIAL_LABEL, evaluator.carry(initial_decision(task)))
 
 
 def _titles(results: CampaignResults) -> tuple[str, ...]:
@@ -117,126 +332,33 @@ def _titles(results: CampaignResults) -> tuple[str, ...]:
     return tuple(titles)
 
 
-def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
-    """The cell, the hand-made trajectory and every algorithm's best selected one.
-
-    Raises:
-        ResultsError: the folder is not complete or damaged.
-    """
-    results, summary = read_campaign(root), read_summary(root)
-    maker = _CarryMaker(results)
-    algorithms = _algorithms(results, summary, maker)
-    return build_geometry(results.workcell), _best(results, algorithms, maker)
+def _static(first: Experiment) -> Array:
+    """Objectives of the level payload at rest."""
+    still = first.summary.static_hold.normal_force / first.summary.reference_force
+    known = dict(zip(PAPER_OBJECTIVES, still, strict=True))
+    return np.array([known.get(name, np.nan) for name in first.objectives])
 
 
-def _algorithms(
-    results: CampaignResults, summary: CampaignSummary, maker: _CarryMaker
-) -> tuple[AlgorithmRuns, ...]:
-    return tuple(
-        _algorithm(index, name, results, summary.algorithms[name], maker)
-        for index, name in enumerate(results.algorithms)
-    )
+def _called(cells: tuple[ReadyCell, ...], call: Callable[[ReadyCell], Any], emit: Emit) -> Any:
+    return call(cells[-1])
 
 
-def _best(
-    results: CampaignResults, algorithms: tuple[AlgorithmRuns, ...], maker: _CarryMaker
-) -> tuple[DrawnCarry, ...]:
-    initial = maker.carry(initial_decision(results.workcell.task), INITIAL_LABEL)
-    best = [algorithm.best for algorithm in algorithms]
-    return (initial, *(carry for carry in best if carry is not None))
-
-
-class _CarryMaker:
-    """Evaluates trajectories of one campaign in detail."""
-
-    def __init__(self, results: CampaignResults) -> None:
-        self.evaluator = results.cell.evaluator
-
-    def carry(self, x: Array, label: str) -> DrawnCarry:
-        return shown(label, self.evaluator.carry(x))
-
-    def selected(self, front: Front, label: str) -> DrawnCarry:
-        """The trajectory that stands for a front."""
-        row = selected_row(self.evaluator, front.x)
-        return self.carry(front.x[row], label)
-
-
-def _called(model: JobModel, call: Callable[[JobModel], Any], emit: Emit) -> Any:
-    return call(model)
-
-
-def _reach(geometry: CellGeometry, model: JobModel) -> ReachMap:
+def _reach(geometry: CellGeometry, _: ReadyCell) -> ReachMap:
     return reach_map(geometry, np.random.default_rng(REACH_SEED))
 
 
-def _timing(label: str, x: Array, model: JobModel) -> TimedSelection:
-    timed = timed_trajectory(model.timing, x, curve_points=CURVE_POINTS)
-    assert timed.curve is not None
-    return TimedSelection(label, timed.report, timed.curve, timed.margins)
+def _job(request: JobRequest, driven: ReadyCell) -> DrawnJob:
+    return drawn_job(driven.jobs, request)
 
 
 def _job_requests(
-    carries: Sequence[DrawnCarry], drivable: DrivableReport | None, cell: Cell
+    carries: Sequence[DrawnCarry], recommended: Array | None, first: Experiment
 ) -> list[JobRequest]:
     """The recommended carry's job, then those of hand-made and selected ones."""
     found = []
-    if drivable is not None and drivable.recommended is not None:
-        n_var, force = cell.workcell.task.n_var, float(drivable.recommended[-1])
-        within = TimingLimits(force=force, robust=cell.force_kind.robust)
-        found.append(JobRequest(RECOMMENDED_LABEL, drivable.recommended[:n_var], within, True))
+    if recommended is not None:
+        n_var, force = first.workcell.task.n_var, float(recommended[-1])
+        within = TimingLimits(force=force, robust=first.force_kind.robust)
+        found.append(JobRequest(RECOMMENDED_LABEL, recommended[:n_var], within, True))
     limits = TimingLimits(reference_speed=True)
     return found + [JobRequest(carry.label, carry.x, limits, True) for carry in carries]
-
-
-def _job(request: JobRequest, model: JobModel) -> DrawnJob:
-    return drawn_job(model, request)
-
-
-def shown(label: str, carry: Carry) -> DrawnCarry:
-    """A judged carry with what is drawn of it."""
-    judgement = carry.judgement
-    assert judgement is not None
-    objectives = np.array(list(judgement.objectives.values()))
-    return DrawnCarry(
-        label, carry.x, objectives, carry, payload_sensitivity(carry), judgement.feasible
-    )
-
-
-def _algorithm(
-    index: int,
-    name: str,
-    results: CampaignResults,
-    entry: AlgorithmFigures,
-    maker: _CarryMaker,
-) -> AlgorithmRuns:
-    runs = tuple(
-        _run(results, replica, figures)
-        for replica, figures in zip(results.of(name), entry.replicas, strict=True)
-    )
-    representative = entry.representative or 0
-    front, hybrid = runs[representative].front, runs[representative].hybrid
-    return AlgorithmRuns(
-        name=name,
-        title=title(name),
-        index=index,
-        runs=runs,
-        representative=representative,
-        selected=maker.selected(front, title(name)) if len(front) else None,
-        hybrid_selected=None
-        if hybrid is None or not len(hybrid)
-        else maker.selected(hybrid, f"{title(name)}, polished"),
-    )
-
-
-def _run(results: CampaignResults, replica: Replica, figures: ReplicaFigures) -> Run:
-    front = Front(replica.front_x, replica.front)
-    polished = read_polished(results.root, replica, results.workcell)
-    hybrid = None if polished is None else Front(polished.x, polished.objectives)
-    return Run(replica.replica, replica.evaluations, front, hybrid, figures, figures.polished)
-
-
-def _static(results: CampaignResults, summary: CampaignSummary) -> Array:
-    """Objectives of the level payload at rest."""
-    still = summary.static_hold.normal_force / summary.reference_force
-    known = dict(zip(PAPER_OBJECTIVES, still, strict=True))
-    return np.array([known.get(name, np.nan) for name in results.objectives])

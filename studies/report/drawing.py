@@ -58,9 +58,6 @@ FRONT = View(-_Y, _Z, "y [m]", "z [m]", mirrored=True)
 SIDE = View(_X, _Z, "x [m]", "z [m]")
 """From the side of -y."""
 
-TOP = View(_X, _Y, "x [m]", "y [m]")
-"""From above."""
-
 
 def oblique(azimuth: float, elevation: float) -> View:
     """A view from a direction: azimuth about z from +x, elevation above the ground [rad]."""

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from hybrid_opt.bundles.manifest import phase_documents
-from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.cell import Cell
+from hybrid_opt.display.table import NOTHING, Table, number
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase, contact_effort
 from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, time_path
-from hybrid_opt.work.service import Emit
 from symbolic.array import Array
 from symbolic.errors import DualArmError
-from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
-from symbolic.records.task import initial_decision
 
 RECOMMENDED_LABEL = "recommended"
 
@@ -78,32 +74,7 @@ class DrawnJob:
     contact_torque_use: Array | None = None
 
 
-@dataclass(frozen=True)
-class JobModelSource:
-    """Makes what plans a workcell's jobs, in any process.
-
-    Attributes:
-        cell: the workcell.
-        objectives: what is minimised, which says what force limits are about.
-    """
-
-    cell: PackedCell
-    objectives: tuple[str, ...]
-
-    def __call__(self) -> JobModel:
-        """Load the compiled functions, or build them where they are missing."""
-        return self.cell.make(partial(_ready_model, self.objectives))
-
-
-def _ready_model(objectives: tuple[str, ...], workcell: Workcell) -> JobModel:
-    cell = Cell(workcell, objectives)
-    timing = cell.timing_model
-    # The cell's files are there only now: what is loaded when it is first needed is needed now.
-    timing.search_carry(initial_decision(workcell.task))
-    return JobModel(cell.compiled, timing)
-
-
-def drawn_job(model: JobModel, request: JobRequest, emit: Emit | None = None) -> DrawnJob:
+def drawn_job(model: JobModel, request: JobRequest) -> DrawnJob:
     """The job around a path, with the forces that an export commands by default."""
     try:
         timing = time_path(model.timing, request.x, request.limits)
@@ -168,3 +139,56 @@ def pressure_shift(job: Job, phase: Phase) -> Array:
         pressed = normal > _TOUCHES
         shifts[pressed, arm] = np.linalg.norm(tilting[pressed], axis=1) / normal[pressed]
     return shifts
+
+
+LIMITS = (
+    "joint velocity",
+    "joint acceleration",
+    "joint torque",
+    "payload velocity",
+    "payload acceleration",
+)
+"""Limits of which every phase states its use."""
+
+
+def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
+    """The phases of whole jobs.
+
+    Args:
+        robots: their names.
+    """
+    rows: list[tuple[str, ...]] = []
+    for job in jobs:
+        if job.problem:
+            rows.append((f"{job.label}: {job.problem}", *[NOTHING] * (4 + len(LIMITS))))
+        rows += [
+            (
+                f"{job.label}: {phase['name'].replace('_', ' ')}",
+                number(phase["begin"]),
+                number(phase["duration"]),
+                *(number(force, 1) for force in phase["peak_normal_force"]),
+                *(number(100.0 * phase["limits"][name], 1) for name in LIMITS),
+            )
+            for phase in job.phases
+        ]
+        if job.phases:
+            forces = [number(force, 1) for force in job.peaks]
+            most = [max(phase["limits"][name] for phase in job.phases) for name in LIMITS]
+            uses = [number(100.0 * value, 1) for value in most]
+            total = number(job.duration)
+            rows.append((f"{job.label}: all, {job.remark}", NOTHING, total, *forces, *uses))
+    return Table(
+        "phases",
+        "Phases of the whole jobs.",
+        (
+            "trajectory and phase",
+            "begins [s]",
+            "takes [s]",
+            *(f"presses, {robot} [N]" for robot in robots),
+            *(f"{name} [%]" for name in LIMITS),
+        ),
+        tuple(rows),
+        "Largest commanded normal forces, and largest uses of the limits with them. The "
+        "recommended carry within its force, the others closest to the reference speed, as an "
+        "export plans them by default; every phase is certified free of collisions.",
+    )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.display.solids import Solid, cell_solids, frame_placements
 from studies.errors import ReportError
-from studies.report.records import DrawnCarry
+from studies.report.data import DrawnCarry, gather_carries
 from symbolic.array import Array
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry
@@ -128,6 +130,21 @@ class LiveView:
             color=COLOURS[solid.group],
             flat_shading=True,
         )
+
+
+def watch(root: Path, port: int) -> None:
+    """Show all selected trajectories until Ctrl-C.
+
+    Raises:
+        DualArmError: the results are incomplete or viser is missing.
+    """
+    view = LiveView(*gather_carries(root), port=port)
+    address = f"http://{view.server.get_host()}:{view.server.get_port()}"
+    print(f"Open {address} in a browser; Ctrl-C ends it.", file=sys.stderr)
+    try:
+        view.serve()
+    except KeyboardInterrupt:
+        view.stop()
 
 
 def _at(moment: float, time_: Array, values: Array) -> Array:

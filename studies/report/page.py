@@ -16,12 +16,11 @@ from string import Template
 from typing import Any
 
 from hybrid_opt.display.scene import embedded_json, scene_js, three_js
+from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.store.json_records import to_json
 from studies.errors import ReportError
-from studies.report.records import ReportData
-from studies.report.table_text import Table, number
+from studies.report.data import ReportData
 from studies.study.recommendation import study_words
-from studies.study.terminal import counted
 
 
 def render_page(
@@ -39,8 +38,7 @@ def render_page(
         pictures: PNG file and caption of every figure.
 
     Raises:
-        ReportError, DisplayError: an installed library does not hold the script that the page
-            embeds.
+        ReportError: the installed plotly does not hold the script that the page embeds.
     """
     texts = files("studies.report") / "page"
     own = (texts / "page.js").read_text("utf-8")

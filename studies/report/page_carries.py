@@ -1,28 +1,25 @@
 """The trajectories on the page: what robots drive, what the search assumed, and what is saved.
 
-Each is worked out for itself, in any process: `PageCarries` is what workers do it with.
+Each is worked out for itself, in any process.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 import hybrid_opt as ho
-from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.cell_source import ReadyCell
 from hybrid_opt.display.scene import packed
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
-from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.timing import drivable_timing, time_path
 from hybrid_opt.work.service import Emit
 from studies.report.jobs import DrawnJob, JobRequest, drawn
 from symbolic.array import Array
-from symbolic.records import Workcell
 
 MAX_SAMPLES = 60
 """Samples of a trajectory on the page; its force peaks are kept besides."""
@@ -58,36 +55,6 @@ class Shown:
     jerk: bool = False
     job: DrawnJob | None = None
     has_job: bool = True
-
-
-@dataclass(frozen=True)
-class PageCarriesSource:
-    """Makes what works out a page's trajectories, in any process.
-
-    Attributes:
-        cells: of the page in order, the first experiment's first, each with its objectives.
-    """
-
-    cells: tuple[tuple[PackedCell, tuple[str, ...]], ...]
-
-    def __call__(self) -> PageCarries:
-        """Load the compiled functions, or build them where they are missing."""
-        made = [cell.make(partial(_loaded, names)) for cell, names in self.cells]
-        return PageCarries([cell for cell, _ in made], [jobs for _, jobs in made])
-
-
-def _loaded(objectives: tuple[str, ...], workcell: Workcell) -> tuple[ho.Cell, JobModel]:
-    cell = ho.Cell(workcell, objectives)
-    # The cell's files are there only now: what is loaded when it is first needed is needed now.
-    cell.carry(cell.initial)
-    if workcell.task.time_law == "optimal" and cell.force_kind.robust:
-        cell.timing_model.search_timing(cell.initial)
-    return cell, JobModel(cell.compiled, cell.timing_model)
-
-
-def page_trajectory(carries: PageCarries, shown: Shown, emit: Emit | None = None) -> dict[str, Any]:
-    """A trajectory of the page as JSON values."""
-    return carries.trajectory(shown)
 
 
 def _with_job(trajectory: dict[str, Any], job: DrawnJob) -> None:
@@ -126,81 +93,76 @@ def _phase(phase: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-class PageCarries:
-    """Works out the trajectories of a page. A resource: one per process."""
+def page_trajectory(
+    cells: Sequence[ReadyCell], shown: Shown, emit: Emit | None = None
+) -> dict[str, Any]:
+    """A trajectory of the page as JSON values: its motions, and all that is said of it.
 
-    def __init__(self, cells: Sequence[ho.Cell], jobs: Sequence[JobModel]) -> None:
-        """Take the cells.
+    Args:
+        cells: of the page; the last one is the cell that robots drive. Under 'optimal' carries are
+            timed within their force limits, else as close to the reference speeds as limits allow.
+    """
+    cell, driving = cells[shown.cell].cell, cells[-1]
+    law = cell.workcell.task.time_law
+    judged = cell.carry(shown.x)
+    assert judged.judgement is not None, "carries of a cell are judged"
+    path = shown.x[: cell.workcell.task.n_path]
+    request = JobRequest(shown.label, path, _limits(cell, shown.x))
+    if shown.jerk:
+        # What is recommended is driven as an export does, others without limits on jerk.
+        timing = driven_timing(cell.timing_model, shown.x)
+    elif request.limits.robust:
+        # Anew, robust forces take long: as the search found it.
+        timing = drivable_timing(cell.timing_model, shown.x)
+    else:
+        timing = time_path(driving.jobs.timing, path, request.limits)
+    driven = timing.carry
+    motions = [] if driven is None else [_motion(DRIVEN, driven)]
+    if law != "optimal":
+        motions.append(_motion(f"{ASSUMED}: {LAWS[law]}", judged))
+    if not motions:
+        motions.append(_motion(ASSUMED, judged))
+    name, values = shown.label, judged.judgement.objectives
+    if not judged.judgement.feasible:
+        name = f"{name} (infeasible)"
+    figures = judged.figures.items()
+    found = {
+        "label": f"{name}: {_values(cell, judged, timing, shown.job)}",
+        "objectives": [float(value) for value in values.values()],
+        "problem": "" if timing.ok else f"robots cannot drive it: {timing.reason}",
+        "force": max(motions[0]["peaks"]) if driven is None else round(timing.peak_force, 4),
+        "motions": motions,
+        "cell": shown.cell,
+        "decision": shown.x.tolist(),
+        "start": [arm.q[0].tolist() for arm in judged.arms],
+        "figures": {key: float(value) for key, value in figures if np.isfinite(value)},
+        "provenance": {"source": shown.provenance},
+    }
+    if shown.job is not None:
+        _with_job(found, shown.job)
+    elif not shown.has_job:
+        found["jobProblem"] = NO_JOB
+    elif timing.ok:
+        _with_job(found, drawn(driving.jobs, request, timing))
+    return found
 
-        Args:
-            cells: of the page; under 'optimal' their carries are timed within their force limits,
-                else as close to the reference speeds as limits allow.
-            jobs: of each cell what times its carries and plans their jobs.
-        """
-        self._cells, self._jobs = cells, jobs
-        self._n_path = cells[0].workcell.task.n_path
-        self._limit = np.concatenate([robot.torque_max for robot in cells[0].workcell.robots])
 
-    def trajectory(self, shown: Shown) -> dict[str, Any]:
-        """A trajectory as JSON values: its motions, and all that is said of it."""
-        cell = self._cells[shown.cell]
-        law = cell.workcell.task.time_law
-        judged = cell.carry(shown.x)
-        assert judged.judgement is not None, "carries of a cell are judged"
-        request = JobRequest(shown.label, shown.x[: self._n_path], _limits(cell, shown.x))
-        timing = self._timed(cell, shown, request)
-        driven = timing.carry
-        motions = [] if driven is None else [self._motion(DRIVEN, driven)]
-        if law != "optimal":
-            motions.append(self._motion(f"{ASSUMED}: {LAWS[law]}", judged))
-        if not motions:
-            motions.append(self._motion(ASSUMED, judged))
-        name, values = shown.label, judged.judgement.objectives
-        if not judged.judgement.feasible:
-            name = f"{name} (infeasible)"
-        figures = judged.figures.items()
-        found = {
-            "label": f"{name}: {_values(cell, judged, timing, shown.job)}",
-            "objectives": [float(value) for value in values.values()],
-            "problem": "" if timing.ok else f"robots cannot drive it: {timing.reason}",
-            "force": max(motions[0]["peaks"]) if driven is None else round(timing.peak_force, 4),
-            "motions": motions,
-            "cell": shown.cell,
-            "decision": shown.x.tolist(),
-            "start": [arm.q[0].tolist() for arm in judged.arms],
-            "figures": {key: float(value) for key, value in figures if np.isfinite(value)},
-            "provenance": {"source": shown.provenance},
-        }
-        if shown.job is not None:
-            _with_job(found, shown.job)
-        elif not shown.has_job:
-            found["jobProblem"] = NO_JOB
-        elif timing.ok:
-            _with_job(found, drawn(self._jobs[shown.cell], request, timing))
-        return found
+def _motion(name: str, carry: ho.Carry) -> dict[str, Any]:
+    return {
+        "name": name,
+        "peaks": [round(float(value), 4) for value in carry.peak_normal_force],
+        "duration": round(carry.duration, 5),
+        "payloadLimit": round(carry.payload_limit, 4),
+        "torqueUse": torque_use(carry, carry.torque).round(3).tolist(),
+        "contactTorqueUse": torque_use(carry, carry.contact_torque).round(3).tolist(),
+        "data": packed(_samples(carry), np.float32),
+    }
 
-    def _timed(self, cell: ho.Cell, shown: Shown, request: JobRequest) -> ho.Timing:
-        """As robots drive it: what is recommended as an export does; others without limits on jerk,
-        and points of time against robust force, for which that takes long, as the search found
-        them."""
-        if shown.jerk:
-            return driven_timing(cell.timing_model, shown.x)
-        if request.limits.robust:
-            return drivable_timing(cell.timing_model, shown.x)
-        return time_path(self._jobs[shown.cell].timing, request.x, request.limits)
 
-    def _motion(self, name: str, carry: ho.Carry) -> dict[str, Any]:
-        torque = 100.0 * np.abs(carry.torque).max(axis=0) / self._limit
-        contact = 100.0 * np.abs(carry.contact_torque).max(axis=0) / self._limit
-        return {
-            "name": name,
-            "peaks": [round(float(value), 4) for value in carry.peak_normal_force],
-            "duration": round(carry.duration, 5),
-            "payloadLimit": round(carry.payload_limit, 4),
-            "torqueUse": [round(float(value), 3) for value in torque],
-            "contactTorqueUse": [round(float(value), 3) for value in contact],
-            "data": packed(_samples(carry), np.float32),
-        }
+def torque_use(carry: ho.Carry, torque: Array) -> Array:
+    """(all joints,) largest use of each joint's torque (n, all joints) in percent."""
+    limit = np.concatenate([robot.torque_max for robot in carry.workcell.robots])
+    return np.asarray(100.0 * np.abs(torque).max(axis=0) / limit)
 
 
 def driven_point(trajectory: Mapping[str, Any]) -> tuple[float, float]:

@@ -1,185 +1,249 @@
-"""Data for the page's scripts: trajectories, pictures of fronts and shapes as JSON values."""
+"""What the page shows: which trajectories, in which groups, and the pictures that they stand in."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import islice
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
 
-from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.display.scene import packed, scene_data
+from hybrid_opt.campaign.cell_source import CellsSource, PackedCell
+from hybrid_opt.display.scene import scene_data
 from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all
-from studies.report.page_carries import (
-    PageCarriesSource,
-    driven_point,
-    page_trajectory,
+from studies.report.data import DrawnCarry, Experiment, ReportData
+from studies.report.jobs import RECOMMENDED_LABEL, DrawnJob
+from studies.report.page_carries import Shown, driven_point, page_trajectory
+from studies.report.page_plots import (
+    CHOICE,
+    Plot,
+    carry_plots,
+    cloud,
+    drive_look,
+    front_plot,
+    line,
+    mark,
+    marker,
+    points,
 )
-from studies.report.page_groups import (
-    RECOMMENDED,
-    SYMBOLS,
-    Group,
-    curves,
-    drive_groups,
-    search_groups,
-    spread,
-)
-from studies.report.page_views import FrontView, drive_look
-from studies.report.records import DrivableReport, ReportData
-from studies.report.style import HAND_MADE, LineStyle, series
-from studies.study.drivable import is_drivable
+from studies.report.style import HAND_MADE, LineStyle, series, spread
 from symbolic.array import Array
 from symbolic.read.cell_files import CellFiles, cell_to_json
 
-MAX_CLOUD = 1500
-"""Feasible candidates per algorithm in the background of the fronts."""
+MAX_FRONT = 40
+"""Trajectories of one front on the page, spread evenly over it."""
+
+CURVE_MEMBERS = 6
+"""Points of a path's time against force that can be clicked."""
 
 MAX_CELL_BYTES = 2_000_000
 """A cell whose files are larger is not put into the page, so that nothing can be saved from it."""
+
+RECOMMENDED = "Recommended"
+
+
+@dataclass(frozen=True)
+class Group:
+    """Trajectories that a page shows together.
+
+    Attributes:
+        listed: name of their list.
+        shown: the trajectories.
+        label, look: of their points in the picture; without a look they are only listed.
+        points: (k, 2) of the picture, None for the force and the duration as robots drive them.
+    """
+
+    listed: str
+    shown: tuple[Shown, ...]
+    label: str = ""
+    look: Plot | None = None
+    points: Array | None = None
+
 
 Numbered = tuple[Group, list[int]]
 """A group and the numbers of its trajectories on the page."""
 
 
-class PageData:
-    """Collects what the page shows."""
+def page_document(data: ReportData, executor: Executor | None = None) -> dict[str, Any]:
+    """The page's data as JSON values.
 
-    def __init__(self, data: ReportData) -> None:
-        """Collect what a page shows of a report's data."""
-        self._data = data
-        self._trajectories: list[dict[str, Any]] = []
-        # Where the cell itself is drivable there is one experiment.
-        alone = is_drivable(data.workcell, data.objectives)
-        self._cells = [] if alone else [(data.files, data.objectives)]
-        if data.drivable is not None:
-            self._cells.append((data.drivable.files, data.drivable.summary.objectives))
-
-    def document(self, executor: Executor | None = None) -> dict[str, Any]:
-        """The page's data as JSON values.
-
-        Args:
-            executor: who works out the trajectories, None for this process.
-        """
-        data = self._data
-        last, drive = len(self._cells) - 1, list[Group]()
-        if data.drivable is not None:
-            drive = drive_groups(data, data.drivable, last)
-        alone = is_drivable(data.workcell, data.objectives)
-        search = [] if alone else search_groups(data, 0)
-        numbered = self._work_out([*drive, *search], executor or SerialExecutor())
-        views = []
-        if data.drivable is not None:
-            views.append(self._drive_view(data.drivable, numbered[: len(drive)]))
-        if search:
-            views.append(self._search_view(numbered[len(drive) :]))
-        contacts = data.workcell.contacts
-        rest = data.static[:2]
-        known_rest = bool(np.isfinite(rest).all()) and len(rest) == 2
-        force = rest * data.workcell.task.reference_force[: len(rest)]
-        return {
-            "robots": [robot.name for robot in data.workcell.robots],
-            "joints": [len(robot.torque_max) for robot in data.workcell.robots],
-            "patchRadius": min(contact.patch_radius for contact in contacts),
-            "restForce": float(force.max()) if known_rest else None,
-            "first": self._first(numbered),
-            "trajectories": self._trajectories,
-            "views": views,
-            "lists": [{"label": group.listed, "members": members} for group, members in numbered],
-            "cells": [_cell_json(files) for files, _ in self._cells],
-            **scene_data(data.geometry, data.carries[-1].timed),
-        }
-
-    def _work_out(self, groups: Sequence[Group], executor: Executor) -> list[Numbered]:
-        """Work out every trajectory of the groups, each with its number on the page."""
-        source = PageCarriesSource(
-            tuple((PackedCell.of(files), objectives) for files, objectives in self._cells)
-        )
-        shown = [one for group in groups for one in group.shown]
-        self._trajectories = answer_all(executor, Service(source, page_trajectory), shown)
-        numbers = iter(range(len(shown)))
-        return [(group, list(islice(numbers, len(group.shown)))) for group in groups]
-
-    def _first(self, groups: Sequence[Numbered]) -> int:
-        """The trajectory to begin with: the recommended one, else the first selected one."""
-        members = groups[0][1] if groups else []
-        if self._data.drivable is None and len(members) > 1:
-            return members[1]
-        return members[0] if members else 0
-
-    def _add(self, view: FrontView, groups: Sequence[Numbered]) -> None:
-        """Put the points of groups into their picture."""
-        for group, members in groups:
-            if group.look is None:
-                continue
-            points = group.points
-            if points is None:
-                points = np.array([driven_point(self._trajectories[k]) for k in members])
-            view.add(group.label, members, points, group.look)
-
-    def _drive_view(self, drivable: DrivableReport, groups: Sequence[Numbered]) -> dict[str, Any]:
-        """Time against force of hand-made path, the other experiment's optimum and the fronts."""
-        kind = self._data.force_kind
-        view = FrontView(
-            f"Time against {kind.name}", f"{kind.title} [N]", "duration [s]", clouds=[]
-        )
-        self._add(view, groups)
-        for _, label, look, force, duration in curves(self._data):
-            view.lines.append(
-                {
-                    "label": label,
-                    "x": force.tolist(),
-                    "y": duration.tolist(),
-                    "colour": look.colour,
-                    "dash": "dot" if look is HAND_MADE else "dash",
-                }
-            )
-        for entry in drivable.fronts:
-            if len(entry.cloud):
-                view.clouds.append(_cloud(entry.front.label, entry.cloud, series(entry.index)))
-        drawn = [np.column_stack([line["x"], line["y"]]) for line in view.lines]
-        for group in view.groups:
-            # What robots cannot drive has no place between force and time.
-            can = [not self._trajectories[member]["problem"] for member in group["members"]]
-            drawn.append(np.column_stack([group["x"], group["y"]])[can])
-        chosen = [
-            np.column_stack([g["x"], g["y"]]) for g in view.groups if g["label"] == RECOMMENDED
-        ]
-        nothing = np.zeros((0, 2))
-        seen = drive_look(np.concatenate([*drawn, nothing]), np.concatenate([*chosen, nothing]))
-        return view.document(seen)
-
-    def _search_view(self, groups: Sequence[Numbered]) -> dict[str, Any]:
-        """The fronts of the first experiment."""
-        data = self._data
-        titles = [*data.objective_titles, "", ""]
-        view = FrontView("The search's objectives", f"{titles[0]} [-]", f"{titles[1]} [-]")
-        selected = np.array([carry.objectives for carry in data.carries])
-        searched = [selected[1:] if len(selected) > 1 else selected]
-        two = len(data.objectives) >= 2
-        self._add(view, groups)
-        for algorithm in data.solved:
-            run = algorithm.shown
-            cloud = run.evaluations.objectives[run.evaluations.feasible]
-            if two:
-                view.clouds.append(_cloud(algorithm.title, cloud[:, :2], series(algorithm.index)))
-            searched.append(run.front.objectives)
-        rest = data.static[:2]
-        if len(rest) == 2 and np.isfinite(rest).all():
-            view.star = (float(rest[0]), float(rest[1]), "level payload at rest")
-            searched.append(rest[None])
-        first = np.concatenate([points[:, :2] for points in searched])
-        return view.document(first if two else np.zeros((0, 2)))
-
-
-def _cloud(label: str, points: Array, look: LineStyle) -> dict[str, Any]:
-    rows = spread(len(points), MAX_CLOUD)
+    Args:
+        executor: who works out the trajectories, None for this process.
+    """
+    # Where the cell itself is drivable there is one experiment.
+    cells = [] if data.alone else [(data.files, data.objectives)]
+    drive, search = list[Group](), [] if data.alone else list(_search_groups(data))
+    if data.drivable is not None:
+        drive = list(_drive_groups(data, data.drivable, len(cells)))
+        cells.append((data.drivable.files, data.drivable.objectives))
+        source = CellsSource(tuple((PackedCell.of(files), names) for files, names in cells))
+    else:
+        source = CellsSource.of(data.files, data.objectives, data.alone)
+    shown = [one for group in (*drive, *search) for one in group.shown]
+    found = answer_all(executor or SerialExecutor(), Service(source, page_trajectory), shown)
+    numbers = count()
+    numbered = [(group, [next(numbers) for _ in group.shown]) for group in (*drive, *search)]
+    views = []
+    if data.drivable is not None:
+        views.append(_drive_view(data, data.drivable, numbered[: len(drive)], found))
+    if search:
+        views.append(_search_view(data, numbered[len(drive) :], found))
+    rest = data.static[:2] * data.workcell.task.reference_force[: len(data.static[:2])]
+    known = len(rest) == 2 and bool(np.isfinite(rest).all())
     return {
-        "label": f"{label}: feasible",
-        "points": packed(points[rows], np.float32),
-        "colour": look.colour,
-        "symbol": SYMBOLS[look.marker],
+        "joints": [len(robot.torque_max) for robot in data.workcell.robots],
+        "robots": [robot.name for robot in data.workcell.robots],
+        "first": _first(data, numbered),
+        "trajectories": found,
+        "views": views,
+        "plots": carry_plots(data.workcell, float(rest.max()) if known else None),
+        "lists": [{"label": group.listed, "members": members} for group, members in numbered],
+        "cells": [_cell_json(files) for files, _ in cells],
+        **scene_data(data.geometry, data.carries[-1].timed),
     }
+
+
+def _first(data: ReportData, groups: Sequence[Numbered]) -> int:
+    """The trajectory to begin with: the recommended one, else the first selected one."""
+    members = groups[0][1] if groups else []
+    if data.drivable is None and len(members) > 1:
+        return members[1]
+    return members[0] if members else 0
+
+
+def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[Group]:
+    """The recommended carry, some of the paths' points at every force, and the fronts."""
+    if data.recommended is not None:
+        found = data.summary.recommendation
+        source = "" if found is None else found.source
+        title, job = f"{RECOMMENDED} ({source})", _planned(data, RECOMMENDED_LABEL)
+        shown = Shown(title, data.recommended, source, cell, jerk=True, job=job)
+        yield Group(RECOMMENDED, (shown,), RECOMMENDED, CHOICE)
+    low, high = drivable.workcell.task.force_limit
+    for carry, label, look, curve in curves(data):
+        source, path = _source(data, carry), carry.x[: drivable.workcell.task.n_path]
+        force = curve[spread(len(curve), CURVE_MEMBERS), 0]
+        some = tuple(
+            Shown(source, np.append(path, limit), source, cell)
+            for limit in force
+            if low <= limit <= high
+        )
+        yield Group(f"{label}, timed", some, f"{label}, timed", marker(look, size=7))
+    for algorithm, front, opened in drivable.fronts():
+        some = tuple(
+            Shown(front.source, front.x[k], front.source, cell)
+            for k in spread(len(front), MAX_FRONT)
+        )
+        yield Group(front.source, some, front.label, marker(series(algorithm.index), opened))
+
+
+def _search_groups(data: ReportData) -> Iterator[Group]:
+    """Hand-made and selected trajectories, and the fronts of the first experiment."""
+    sources = [_source(data, carry) for carry in data.carries]
+    picked = [
+        Shown(source, carry.x, source, job=_planned(data, carry.label))
+        for carry, source in zip(data.carries, sources, strict=True)
+    ]
+    yield Group("Hand-made and selected", tuple(picked))
+    two = len(data.objectives) >= 2
+    for algorithm, front, opened in data.fronts():
+        rows = spread(len(front), MAX_FRONT)
+        some = tuple(Shown(front.source, front.x[k], front.source, has_job=False) for k in rows)
+        look = marker(series(algorithm.index), opened) if two else None
+        yield Group(front.source, some, front.label, look, front.objectives[rows][:, :2])
+
+
+def curves(data: ReportData) -> Iterator[tuple[DrawnCarry, str, LineStyle, Array]]:
+    """Hand-made and selected paths: carry, label, look, and where they can be driven force limits
+    [N] and durations [s] (k, 2)."""
+    looks = [HAND_MADE, *(series(a.index) for a in data.algorithms if a.best is not None)]
+    for carry, (_, timed), look in zip(data.carries, data.timings, looks, strict=True):
+        if timed.force_curve is None:
+            continue
+        length = len(timed.force_curve.force)
+        curve = np.column_stack([timed.force_curve.force, timed.force_curve.duration[:length]])
+        label = carry.label if carry is data.initial else f"{carry.label}: least force"
+        yield carry, label, look, curve[np.isfinite(curve[:, 1])]
+
+
+def _source(data: ReportData, carry: DrawnCarry) -> str:
+    """Source of a trajectory: algorithm and replica, where it is no hand-made one."""
+    for algorithm in data.algorithms:
+        if carry is algorithm.best:
+            return f"{carry.label}, replica {algorithm.shown.front.replica}: least force"
+    return carry.label
+
+
+def _planned(data: ReportData, label: str) -> DrawnJob | None:
+    """The job that is planned already, where there is one."""
+    return next((job for job in data.jobs if job.label == label), None)
+
+
+def _traces(groups: Sequence[Numbered], found: Sequence[dict[str, Any]]) -> Iterator[Plot]:
+    """The points of groups that stand in a picture."""
+    for group, members in groups:
+        if group.look is None:
+            continue
+        at = group.points
+        if at is None:
+            at = np.array([driven_point(found[k]) for k in members])
+        yield points(group.label, at, members, [found[k]["label"] for k in members], group.look)
+
+
+def _drive_view(
+    data: ReportData,
+    drivable: Experiment,
+    groups: Sequence[Numbered],
+    found: Sequence[dict[str, Any]],
+) -> Plot:
+    """Time against force of hand-made path, the other experiment's optimum and the fronts."""
+    clouds, lines, drawn = [], [], []
+    for algorithm, front, _ in drivable.fronts():
+        if not front.polished:
+            run = algorithm.shown.evaluations
+            at = drivable.driven(run.objectives[run.feasible])
+            clouds.append(cloud(front.label, at, series(algorithm.index)))
+    for _, label, look, curve in curves(data):
+        lines.append(line(label, curve, look.colour, "dot" if look is HAND_MADE else "dash"))
+        drawn.append(curve)
+    # What is recommended is drawn last, above all others.
+    shown = sorted(_traces(groups, found), key=lambda trace: trace["name"] == RECOMMENDED)
+    timed = {f"{one['name']}, timed" for one in lines}
+    chosen = np.zeros((0, 2))
+    for trace in shown:
+        at = np.column_stack([trace["x"], trace["y"]])
+        trace["showlegend"] = trace["name"] not in timed
+        # What robots cannot drive has no place between force and time.
+        drawn.append(at[[not found[member]["problem"] for member in trace["customdata"]]])
+        chosen = at if trace["name"] == RECOMMENDED else chosen
+    seen = drive_look(np.concatenate([*drawn, np.zeros((0, 2))]), chosen)
+    kind = data.force_kind
+    titles = (f"{kind.title} [N]", "duration [s]")
+    return front_plot(f"Time against {kind.name}", titles, [*clouds, *lines, *shown], seen)
+
+
+def _search_view(
+    data: ReportData, groups: Sequence[Numbered], found: Sequence[dict[str, Any]]
+) -> Plot:
+    """The fronts of the first experiment."""
+    titles = [*data.objective_titles, "", ""]
+    selected = np.array([carry.objectives for carry in data.carries])
+    searched, two = [selected[1:] if len(selected) > 1 else selected], len(data.objectives) >= 2
+    traces, shown = list[Plot](), list(_traces(groups, found))
+    for algorithm in data.solved:
+        run = algorithm.shown
+        feasible = run.evaluations.objectives[run.evaluations.feasible]
+        if two:
+            traces.append(cloud(algorithm.title, feasible[:, :2], series(algorithm.index)))
+        searched.append(run.front.objectives)
+    rest = data.static[:2]
+    if len(rest) == 2 and np.isfinite(rest).all():
+        shown.append(mark("level payload at rest", rest))
+        searched.append(rest[None])
+    first = np.concatenate([points[:, :2] for points in searched]) if two else np.zeros((0, 2))
+    axes = (f"{titles[0]} [-]", f"{titles[1]} [-]")
+    return front_plot("The search's objectives", axes, [*traces, *shown], first)
 
 
 def _cell_json(files: CellFiles) -> dict[str, Any] | None:

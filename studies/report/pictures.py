@@ -10,13 +10,9 @@ from matplotlib.figure import Figure
 from studies.report import (
     pictures_carry,
     pictures_cell,
-    pictures_drive,
     pictures_fronts,
-    pictures_robust,
-    pictures_search,
-    pictures_simulation,
 )
-from studies.report.records import DrawnCarry, ReportData
+from studies.report.data import DrawnCarry, ReportData
 from studies.report.style import in_style, settled
 
 
@@ -66,7 +62,7 @@ def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
         "infeasibility",
         "What made candidates infeasible: the constraint violated first, over all replicas, and "
         "where on the path.",
-        lambda: pictures_search.infeasibility(data),
+        lambda: pictures_fronts.infeasibility(data),
     )
     yield from _carry_pictures(data)
 
@@ -76,14 +72,14 @@ def _search_pictures(data: ReportData) -> Iterator[ReportPicture]:
         yield ReportPicture(
             "fig07_fronts",
             "Feasible candidates and non-dominated ones of each algorithm's run with the largest "
-            "hypervolume (paper Figure 7). The star is the level payload at rest.",
+            "hypervolume (paper Figure 7). The cross is the level payload at rest.",
             lambda: pictures_fronts.fronts(data),
         )
     yield ReportPicture(
         "fig08_best_so_far",
         "Best feasible value of each objective so far, in the same runs; the inset enlarges the "
         "second half (paper Figure 8).",
-        lambda: pictures_search.histories(data),
+        lambda: pictures_fronts.histories(data),
     )
     if len(data.objective_titles) == 2:
         yield ReportPicture(
@@ -95,7 +91,7 @@ def _search_pictures(data: ReportData) -> Iterator[ReportPicture]:
     yield ReportPicture(
         "indicators",
         "Indicators of every replica, with medians and quartiles.",
-        lambda: pictures_search.indicators(data),
+        lambda: pictures_fronts.indicators(data),
     )
     if data.has_hybrid and len(data.objective_titles) >= 2:
         yield ReportPicture(
@@ -147,13 +143,13 @@ def _carry_pictures(data: ReportData) -> Iterator[ReportPicture]:
         carry = algorithm.best
         assert carry is not None
         yield _motion(data, carry, f"motion_{algorithm.name}")
-    if data.timings:
+    if any(timed.force_curve is not None for _, timed in data.timings):
         yield ReportPicture(
             "duration_against_force",
             f"Drivable durations against the {data.force_kind.title}: single paths timed anew "
             "at every limit, and the members of the drivable fronts. All other limits hold "
             "throughout.",
-            lambda: pictures_drive.duration_against_force(data),
+            lambda: pictures_fronts.duration_against_force(data),
         )
     yield from _price_picture(data)
     if any(len(found.time) for found in data.simulations):
@@ -161,7 +157,7 @@ def _carry_pictures(data: ReportData) -> Iterator[ReportPicture]:
             "simulated_forces",
             "Normal forces in the simulated cell, arms under force control, beside those that were "
             "predicted for how the carries were pressed there.",
-            lambda: pictures_simulation.simulated_forces(data),
+            lambda: pictures_carry.simulated_forces(data),
         )
 
 
@@ -169,12 +165,14 @@ def _price_picture(data: ReportData) -> Iterator[ReportPicture]:
     choice = data.summary.recommendation
     if choice is not None and choice.price is not None:
         price = choice.price
-        whose = "the workcell's [uncertainty]" if price.stated else "the usual uncertainty"
+        whose = (
+            "the workcell's [uncertainty]" if price.uncertainty.stated else "the usual uncertainty"
+        )
         yield ReportPicture(
             "robust_price",
             "The price of robustness: largest normal forces of the recommended carry that hold in "
             f"every case of {whose} ({price.uncertainty}), times a factor.",
-            lambda: pictures_robust.robust_price(data, price),
+            lambda: pictures_carry.robust_price(data, price),
         )
 
 

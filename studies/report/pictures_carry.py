@@ -1,26 +1,37 @@
-"""Pictures of selected trajectories: forces, joint torques, pressure shift, payload, timing."""
+"""Pictures of selected trajectories: forces, joint torques, pressure shift, payload, simulation."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from hybrid_opt.robust.force import RobustPrice
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
-from studies.report.records import DrawnCarry, ReportData
+from studies.report.data import DrawnCarry, ReportData
+from studies.report.page_carries import torque_use
 from studies.report.style import (
     FULL_WIDTH,
     HAND_MADE,
+    MARKED,
     LineStyle,
+    legend_below,
+    limit_line,
     new_figure,
     panel_label,
+    rest_line,
     series,
     shortened,
 )
 from symbolic.array import Array
 
-STATIC_COLOUR = "#b00020"
+PREDICTED: dict[str, Any] = {"color": "black", "linestyle": (0, (2, 1.5)), "linewidth": 0.8}
+"""How it is drawn what was predicted of a simulation."""
 
 
 def styled(data: ReportData) -> tuple[tuple[DrawnCarry, LineStyle], ...]:
@@ -32,50 +43,117 @@ def styled(data: ReportData) -> tuple[tuple[DrawnCarry, LineStyle], ...]:
     )
 
 
-def normal_forces(data: ReportData) -> Figure:
-    """Normal force of each robot along the carries (paper Figure 9)."""
-    figure = new_figure(FULL_WIDTH, 0.46 * FULL_WIDTH)
+def _per_robot(
+    data: ReportData, titles: tuple[str, str], draw: Callable[[Axes, int], None], columns: int = 0
+) -> Figure:
+    """A panel per robot with common axes, whose titles are given, and one legend."""
+    figure = new_figure(FULL_WIDTH, 0.48 * FULL_WIDTH)
     panels = figure.subplots(1, 2, sharey=True)
-    task = data.workcell.task
     for i, (axes, robot) in enumerate(zip(panels, data.workcell.robots, strict=True)):
-        for carry, look in styled(data):
-            axes.plot(
-                carry.timed.time,
-                carry.timed.normal_force[:, i],
-                color=look.colour,
-                linestyle=look.line,
-                label=carry.label,
-            )
-        if np.isfinite(data.static[:2]).all():
-            axes.axhline(
-                data.static[i] * task.reference_force[i],
-                color=STATIC_COLOUR,
-                linewidth=0.8,
-                linestyle=(0, (2, 2)),
-                label="level payload at rest",
-            )
-        axes.set_xlabel("time [s]")
+        draw(axes, i)
+        axes.set_xlabel(titles[0])
         panel_label(axes, "ab"[i], f"robot {shortened(robot.name)!r}")
-    panels[0].set_ylabel("normal contact force [N]")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+    panels[0].set_ylabel(titles[1])
+    legend_below(figure, panels[0], columns)
     return figure
 
 
-def torque_use(workcell_torque: Array, torque: Array) -> Array:
-    """(all joints,) largest use of each joint's torque in percent."""
-    return np.asarray(100.0 * np.abs(torque).max(axis=0) / workcell_torque)
+def normal_forces(data: ReportData) -> Figure:
+    """Normal force of each robot along the carries (paper Figure 9)."""
+
+    def draw(axes: Axes, i: int) -> None:
+        for carry, look in styled(data):
+            force = carry.timed.normal_force[:, i]
+            axes.plot(carry.timed.time, force, **look.drawn, label=carry.label)
+        if np.isfinite(data.static[:2]).all():
+            still = data.static[i] * data.workcell.task.reference_force[i]
+            rest_line(axes, still, "level payload at rest")
+
+    return _per_robot(data, ("time [s]", "normal contact force [N]"), draw)
+
+
+def pressure_shift(data: ReportData) -> Figure:
+    """Shift of the centres of pressure and the patch radius (paper Figure 11)."""
+
+    def draw(axes: Axes, i: int) -> None:
+        for carry, look in styled(data):
+            shift = 1e3 * carry.timed.pressure_shift[:, i]
+            axes.plot(carry.timed.time, shift, **look.drawn, label=carry.label)
+        limit_line(axes, 1e3 * data.workcell.contacts[i].patch_radius, "patch radius")
+        axes.set_ylim(bottom=0.0)
+
+    return _per_robot(data, ("time [s]", "shift of the centre of pressure [mm]"), draw)
+
+
+def payload(data: ReportData) -> Figure:
+    """Largest force of each robot against the payload's mass (paper Figure 12)."""
+    reference = data.workcell.task.reference_force / KILOGRAM_FORCE
+    limits = np.concatenate([c.sensitivity.mass_by_resultant for c, _ in styled(data)])
+    masses = np.array([0.75 * limits.min(), 1.1 * limits.max()])
+
+    def draw(axes: Axes, i: int) -> None:
+        known = []
+        for carry, look in styled(data):
+            force = carry.sensitivity.force_at(masses)[:, i] / KILOGRAM_FORCE
+            limit = float(carry.sensitivity.mass_by_resultant[i])
+            axes.plot(masses, force, **look.drawn, label=carry.label)
+            axes.plot(limit, reference[i], **look.marks(4.0))
+            known.append(f"{carry.label}: {limit:.2f} kg")
+        limit_line(axes, reference[i], "reference force")
+        axes.set_xlim(*masses)
+        axes.text(
+            0.97,
+            0.05,
+            "\n".join(["payload at the limit", *known]),
+            fontsize=6.5,
+            ha="right",
+            va="bottom",
+            transform=axes.transAxes,
+            bbox={"facecolor": "white", "edgecolor": "#cccccc", "linewidth": 0.5},
+        )
+
+    figure = _per_robot(data, ("payload mass [kg]", "largest contact force [kgf]"), draw)
+    newton = figure.axes[1].secondary_yaxis(
+        "right", functions=(partial(np.multiply, KILOGRAM_FORCE), _kilograms)
+    )
+    newton.set_ylabel("largest contact force [N]")
+    return figure
+
+
+def _kilograms(force: Any) -> Any:
+    return force / KILOGRAM_FORCE
+
+
+def simulated_forces(data: ReportData) -> Figure:
+    """Normal force of each robot: reference dashed, measured in the simulated cell solid."""
+    looks, number = [], 0
+    for found in data.simulations:
+        # The hand-made trajectory looks as everywhere, the others by their order.
+        own = found.label == data.initial.label
+        looks.append(HAND_MADE if own else series(number))
+        number += not own
+    drawn = [(f, look) for f, look in zip(data.simulations, looks, strict=True) if len(f.time)]
+
+    def draw(axes: Axes, i: int) -> None:
+        for found, look in drawn:
+            label = f"{found.label}, simulated"
+            axes.plot(
+                found.time, found.simulated[:, i], color=look.colour, linewidth=0.9, label=label
+            )
+            told = "predicted" if found is drawn[-1][0] else None
+            axes.plot(found.time, found.predicted[:, i], **PREDICTED, label=told)
+
+    return _per_robot(data, ("time [s]", "normal contact force [N]"), draw, 3)
 
 
 def joint_torques(data: ReportData) -> Figure:
     """Largest joint torque over its maximum, contact wrench alone and with the arm (Figure 10)."""
     figure = new_figure(FULL_WIDTH, 0.98 * FULL_WIDTH)
     panels = figure.subplots(2, 2, subplot_kw={"projection": "polar"})
-    limit = np.concatenate([robot.torque_max for robot in data.workcell.robots])
     split = [len(data.workcell.robots[0].torque_max)]
     kinds = (("contact wrench alone", "contact_torque"), ("with the arm", "torque"))
     uses = {
-        (row, carry.label): np.split(torque_use(limit, getattr(carry.timed, name)), split)
+        (row, carry.label): np.split(torque_use(carry.timed, getattr(carry.timed, name)), split)
         for row, (_, name) in enumerate(kinds)
         for carry, _ in styled(data)
     }
@@ -83,29 +161,19 @@ def joint_torques(data: ReportData) -> Figure:
     top = max(float(use.max()) for both in uses.values() for use in both)
     for row, (text, _) in enumerate(kinds):
         for i, robot in enumerate(data.workcell.robots):
-            axes = panels[row, i]
-            joints = len(robot.torque_max)
-            angles = np.linspace(0.0, 2.0 * np.pi, joints + 1)
-            most = np.zeros(joints)
+            axes, joints = panels[row, i], len(robot.torque_max)
+            angles, most = np.linspace(0.0, 2.0 * np.pi, joints + 1), np.zeros(joints)
             for carry, look in styled(data):
                 use = uses[row, carry.label][i]
                 most = np.maximum(most, use)
-                axes.plot(
-                    angles,
-                    [*use, use[0]],
-                    color=look.colour,
-                    linestyle=look.line,
-                    marker=look.marker,
-                    markersize=3,
-                    label=carry.label,
-                )
+                looks = {**look.drawn, "marker": look.marker, "markersize": 3}
+                axes.plot(angles, [*use, use[0]], **looks, label=carry.label)
             axes.set_xticks(angles[:-1], [f"joint {j + 1}" for j in range(joints)])
             axes.tick_params(axis="x", pad=4)
             _label_rings(axes, most, top)
             letter = "abcd"[2 * row + i]
             axes.set_title(f"({letter}) {shortened(robot.name)!r}: {text} [% of maximum]", pad=12)
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+    legend_below(figure, panels[0, 0])
     return figure
 
 
@@ -120,35 +188,6 @@ def _label_rings(axes: Axes, most: Array, top: float) -> None:
     axes.set_rlabel_position(place)  # type: ignore[attr-defined]
 
 
-def pressure_shift(data: ReportData) -> Figure:
-    """Shift of the centres of pressure and the patch radius (paper Figure 11)."""
-    figure = new_figure(FULL_WIDTH, 0.46 * FULL_WIDTH)
-    panels = figure.subplots(1, 2, sharey=True)
-    for i, (axes, robot) in enumerate(zip(panels, data.workcell.robots, strict=True)):
-        for carry, look in styled(data):
-            axes.plot(
-                carry.timed.time,
-                1e3 * carry.timed.pressure_shift[:, i],
-                color=look.colour,
-                linestyle=look.line,
-                label=carry.label,
-            )
-        axes.axhline(
-            1e3 * data.workcell.contacts[i].patch_radius,
-            color="black",
-            linestyle="--",
-            linewidth=0.9,
-            label="patch radius",
-        )
-        axes.set_ylim(bottom=0.0)
-        axes.set_xlabel("time [s]")
-        panel_label(axes, "ab"[i], f"robot {shortened(robot.name)!r}")
-    panels[0].set_ylabel("shift of the centre of pressure [mm]")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
-    return figure
-
-
 def residual_moments(data: ReportData) -> Figure:
     """Moment missing with point contacts; in the legend, with the centres of pressure shifted."""
     figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
@@ -156,13 +195,8 @@ def residual_moments(data: ReportData) -> Figure:
     for carry, look in styled(data):
         point = np.linalg.norm(carry.timed.point_moment_residual, axis=1)
         shifted = float(np.linalg.norm(carry.timed.moment_residual, axis=1).max())
-        axes.plot(
-            carry.timed.time,
-            point,
-            color=look.colour,
-            linestyle=look.line,
-            label=f"{carry.label} (shifted: at most {shifted:.1e} N m)",
-        )
+        label = f"{carry.label} (shifted: at most {shifted:.1e} N m)"
+        axes.plot(carry.timed.time, point, **look.drawn, label=label)
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("residual moment [N m]")
@@ -170,60 +204,21 @@ def residual_moments(data: ReportData) -> Figure:
     return figure
 
 
-def payload(data: ReportData) -> Figure:
-    """Largest force of each robot against the payload's mass (paper Figure 12)."""
-    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
-    panels = figure.subplots(1, 2, sharey=True)
-    reference = data.workcell.task.reference_force
-    limits = np.concatenate([c.sensitivity.mass_by_resultant for c, _ in styled(data)])
-    masses = np.array([0.75 * limits.min(), 1.1 * limits.max()])
-    for i, (axes, robot) in enumerate(zip(panels, data.workcell.robots, strict=True)):
-        for carry, look in styled(data):
-            force = carry.sensitivity.force_at(masses)[:, i] / KILOGRAM_FORCE
-            limit = float(carry.sensitivity.mass_by_resultant[i])
-            axes.plot(masses, force, color=look.colour, linestyle=look.line, label=f"{carry.label}")
-            axes.plot(
-                limit,
-                reference[i] / KILOGRAM_FORCE,
-                look.marker,
-                color=look.colour,
-                markeredgecolor="black",
-                markeredgewidth=0.5,
-            )
-        axes.axhline(
-            reference[i] / KILOGRAM_FORCE,
-            color="black",
-            linestyle="--",
-            linewidth=0.9,
-            label="reference force",
-        )
-        axes.set_xlabel("payload mass [kg]")
-        axes.set_xlim(*masses)
-        panel_label(axes, "ab"[i], f"robot {shortened(robot.name)!r}")
-        _note_limits(axes, data, i)
-    panels[0].set_ylabel("largest contact force [kgf]")
-    newton = panels[1].secondary_yaxis(
-        "right", functions=(lambda v: v * KILOGRAM_FORCE, lambda v: v / KILOGRAM_FORCE)
-    )
-    newton.set_ylabel("largest contact force [N]")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+def robust_price(data: ReportData, price: RobustPrice) -> Figure:
+    """Peak normal forces of the recommended carry against the factor of the set."""
+    figure = new_figure(0.62 * FULL_WIDTH, 0.42 * FULL_WIDTH)
+    axes = figure.subplots()
+    for i, robot in enumerate(data.workcell.robots):
+        look = series(i)
+        label = shortened(robot.name)
+        axes.plot(price.factors, price.peak[:, i], **look.drawn, marker=look.marker, label=label)
+    axes.axvline(1.0, color="black", linewidth=0.8, linestyle=(0, (2, 2)), label="the set")
+    if float(price.limit.min()) <= 1.25 * float(price.peak.max()):
+        limit_line(axes, float(price.limit.min()), "reference force")
+        if 0.0 < price.largest_factor < np.inf:
+            label = f"largest set: {price.largest_factor:.2f}"
+            axes.axvline(price.largest_factor, color=MARKED, linewidth=0.8, label=label)
+    axes.set_xlabel("multiple of the set [-]")
+    axes.set_ylabel("peak normal force [N]")
+    axes.legend(loc="upper left")
     return figure
-
-
-def _note_limits(axes: Axes, data: ReportData, i: int) -> None:
-    """Payloads at the reference force as text in the free corner."""
-    lines = [
-        f"{carry.label}: {carry.sensitivity.mass_by_resultant[i]:.2f} kg"
-        for carry, _ in styled(data)
-    ]
-    axes.text(
-        0.97,
-        0.05,
-        "payload at the limit\n" + "\n".join(lines),
-        fontsize=6.5,
-        ha="right",
-        va="bottom",
-        transform=axes.transAxes,
-        bbox={"facecolor": "white", "edgecolor": "#cccccc", "linewidth": 0.5},
-    )

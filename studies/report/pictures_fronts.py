@@ -1,19 +1,33 @@
-"""Pictures of fronts: of single runs, over the replicas, before and after the polish."""
+"""Pictures of fronts: of single runs, over the replicas, before and after the polish, and of time
+against force."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from hybrid_opt.indicators.metrics import front_of
+from hybrid_opt.campaign.recommended import StoredRecommendation
+from hybrid_opt.display.table import counted
+from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
+from hybrid_opt.indicators.metrics import best_so_far, front_of
 from hybrid_opt.indicators.statistics import attainment_surfaces
-from studies.report.records import AlgorithmRuns, ReportData
-from studies.report.style import FULL_WIDTH, new_figure, panel_label, series
-from studies.study.terminal import counted
+from studies.report.data import AlgorithmRuns, Experiment, ReportData
+from studies.report.page_data import curves
+from studies.report.page_plots import drive_look, limits
+from studies.report.style import (
+    FULL_WIDTH,
+    MARKED,
+    legend_below,
+    new_figure,
+    panel_label,
+    rest_line,
+    series,
+)
 from symbolic.array import Array
 
 QUARTILES = (25.0, 75.0)
@@ -24,85 +38,54 @@ def fronts(data: ReportData) -> Figure:
     """Feasible points and fronts of each algorithm's representative run (paper Figure 7)."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     panels = figure.subplots(1, 2)
-    for algorithm in data.solved:
+    found = [a.shown.front.objectives for a in data.solved]
+    for algorithm, front in zip(data.solved, found, strict=True):
         look, run = series(algorithm.index), algorithm.shown
         cloud = run.evaluations.objectives[run.evaluations.feasible]
-        front = run.front.objectives
+        behind = look.marks(2.2) | {"alpha": 0.25, "markeredgewidth": 0, "rasterized": True}
         for axes in panels:
-            axes.plot(
-                cloud[:, 0],
-                cloud[:, 1],
-                look.marker,
-                color=look.colour,
-                alpha=0.25,
-                markersize=2.2,
-                markeredgewidth=0,
-                rasterized=True,
-                label=f"{algorithm.title}: feasible",
-            )
-            axes.plot(
-                front[:, 0],
-                front[:, 1],
-                look.marker,
-                color=look.colour,
-                markersize=4.5,
-                markeredgecolor="black",
-                markeredgewidth=0.5,
-                label=f"{algorithm.title}: non-dominated",
-            )
-    union = front_of(np.concatenate([a.shown.front.objectives for a in data.solved]))
+            axes.plot(*cloud[:, :2].T, **behind, label=f"{algorithm.title}: feasible")
+            label = f"{algorithm.title}: non-dominated"
+            axes.plot(*front[:, :2].T, **look.marks(4.5), label=label)
+    union = front_of(np.concatenate(found))[:, :2]
+    joined = {"color": "black", "linewidth": 0.9, "zorder": 1.5, "where": "post"}
     for axes in panels:
-        axes.step(
-            union[:, 0],
-            union[:, 1],
-            where="post",
-            color="black",
-            linewidth=0.9,
-            label="non-dominated of all",
-            zorder=1.5,
-        )
-        _static_point(axes, data)
-        _label_objectives(axes, data)
+        axes.step(*union.T, **joined, label="non-dominated of all")
+        _objectives(axes, data)
     panel_label(panels[0], "a", "all feasible candidates")
     panel_label(panels[1], "b", "the fronts")
-    _zoom(panels[1], [a.shown.front.objectives for a in data.solved], data.static)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    _zoom(panels[1], found, data.static)
+    legend_below(figure, panels[0], 3)
     return figure
 
 
 def attainment(data: ReportData) -> Figure:
     """Median and quartile attainment surfaces over the replicas."""
     figure = new_figure(FULL_WIDTH, 0.48 * FULL_WIDTH)
-    sets = [[run.front.objectives for run in a.runs] for a in data.algorithms]
-    hybrid = [
-        [run.hybrid.objectives for run in a.runs if run.hybrid is not None] for a in data.algorithms
-    ]
-    has_hybrid = any(hybrid)
-    panels = figure.subplots(1, 2 if has_hybrid else 1, squeeze=False)[0]
-    groups = [("search", sets)] + ([("after the polish", hybrid)] if has_hybrid else [])
-    for axes, letter, (text, group) in zip(panels, "ab", groups, strict=False):
-        for k, (algorithm, found) in enumerate(zip(data.algorithms, group, strict=True)):
-            look = series(k)
-            if not found:
-                continue
-            for surface in attainment_surfaces(found, (*QUARTILES, 50.0)):
+    groups = {"search": [[run.front.objectives for run in a.runs] for a in data.algorithms]}
+    if data.has_hybrid:
+        groups["after the polish"] = [
+            [run.hybrid.objectives for run in a.runs if run.hybrid is not None]
+            for a in data.algorithms
+        ]
+    panels = figure.subplots(1, len(groups), squeeze=False)[0]
+    for axes, letter, (text, group) in zip(panels, "ab", groups.items(), strict=False):
+        for algorithm, found in zip(data.algorithms, group, strict=True):
+            look = series(algorithm.index)
+            for surface in attainment_surfaces(found, (*QUARTILES, 50.0)) if found else ():
                 median = surface.percentile not in QUARTILES
                 axes.step(
-                    surface.points[:, 0],
-                    surface.points[:, 1],
+                    *surface.points.T,
                     where="post",
                     color=look.colour,
                     linestyle=look.line if median else (0, (1, 1)),
                     linewidth=1.6 if median else 0.8,
                     label=_attained(algorithm.title, surface.percentile),
                 )
-        _static_point(axes, data)
-        _label_objectives(axes, data)
+        _objectives(axes, data)
         panel_label(axes, letter, f"{text}, {counted(max(len(f) for f in group), 'replica')}")
         _zoom(axes, [points for found in group for points in found], data.static)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    legend_below(figure, panels[0], 3)
     return figure
 
 
@@ -119,73 +102,55 @@ def polish(data: ReportData) -> Figure:
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     left, right = figure.subplots(1, 2)
     drawn = []
-    for algorithm in data.solved:
-        look, run = series(algorithm.index), algorithm.shown
-        assert run.hybrid is not None
-        for points, fill, text in (
-            (run.front.objectives, "white", "search"),
-            (run.hybrid.objectives, look.colour, "polished"),
-        ):
-            left.plot(
-                points[:, 0],
-                points[:, 1],
-                look.marker,
-                color=look.colour,
-                markerfacecolor=fill,
-                markersize=4,
-                label=f"{algorithm.title}: {text}",
-            )
-            drawn.append(points)
-    _static_point(left, data)
-    _label_objectives(left, data)
+    for algorithm, front, _ in data.fronts():
+        text = "polished" if front.polished else "search"
+        drawn.append(front.objectives)
+        look = series(algorithm.index).marks(4.0, opened=not front.polished)
+        left.plot(*front.objectives[:, :2].T, **look, label=f"{algorithm.title}: {text}")
+    _objectives(left, data)
     _zoom(left, drawn, data.static)
     left.legend(loc="upper right")
     panel_label(left, "a", "fronts of the representative runs")
-    _paired(right, data.algorithms, "hypervolume")
+    _paired(right, data.algorithms)
     right.set_ylabel("hypervolume, reference (1.1, 1.1) [-]")
     panel_label(right, "b", "every replica")
     return figure
 
 
-def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns], figure: str) -> None:
-    ticks, names = [], []
+def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
+    """Hypervolumes of all replicas before and after."""
+    names = []
     for k, algorithm in enumerate(algorithms):
         look = series(k)
+        style: dict[str, Any] = {
+            "marker": look.marker,
+            "color": look.colour,
+            "linewidth": 0.7,
+            "markersize": 3.5,
+        }
         for run in algorithm.runs:
             if run.hybrid_figures is not None:
-                values = [getattr(run.figures, figure), getattr(run.hybrid_figures, figure)]
-                axes.plot(
-                    [3 * k, 3 * k + 1],
-                    values,
-                    "-",
-                    marker=look.marker,
-                    color=look.colour,
-                    linewidth=0.7,
-                    markersize=3.5,
-                )
-        ticks += [3 * k, 3 * k + 1]
+                values = [run.figures.hypervolume, run.hybrid_figures.hypervolume]
+                axes.plot([3 * k, 3 * k + 1], values, "-", **style)
         names += [f"{algorithm.title}\nsearch", f"{algorithm.title}\npolished"]
-    axes.set_xticks(ticks, names)
+    axes.set_xticks([3 * (k // 2) + k % 2 for k in range(len(names))], names)
     axes.margins(x=0.12)
 
 
-def _label_objectives(axes: Axes, data: ReportData) -> None:
+def _objectives(axes: Axes, data: ReportData) -> None:
+    """The axes of the first two objectives, with the level payload at rest."""
+    if np.isfinite(data.static[:2]).all():
+        look: dict[str, Any] = {
+            "color": MARKED,
+            "markersize": 7,
+            "markeredgewidth": 1.6,
+            "zorder": 5,
+        }
+        axes.plot(*data.static[:2], "+", **look, label="level payload at rest")
     axes.set_xlabel(f"{data.objective_titles[0]} [-]")
     axes.set_ylabel(f"{data.objective_titles[1]} [-]")
     # Fronts span little, so that labels are long; steps of 2.5 would make them longer.
     axes.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
-
-
-def _static_point(axes: Axes, data: ReportData) -> None:
-    if np.isfinite(data.static[:2]).all():
-        axes.plot(
-            *data.static[:2],
-            "*",
-            color="#b00020",
-            markersize=8,
-            zorder=5,
-            label="level payload at rest",
-        )
 
 
 def _zoom(axes: Axes, sets: Sequence[Array], static: Array) -> None:
@@ -198,3 +163,199 @@ def _zoom(axes: Axes, sets: Sequence[Array], static: Array) -> None:
     room = np.maximum(0.07 * (high - low), 1e-4)
     axes.set_xlim(low[0] - room[0], high[0] + room[0])
     axes.set_ylim(low[1] - room[1], high[1] + room[1])
+
+
+def duration_against_force(data: ReportData) -> Figure:
+    """Durations for each limit on the forces: of single paths, and of the drivable fronts
+    where there are any: members at their peak forces, and the fastest of a replica's paths at
+    every force (median and range of the replicas)."""
+    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    axes = figure.subplots()
+    drawn = []
+    for _, label, look, curve in curves(data):
+        marked = "" if data.drivable else look.marker
+        axes.plot(*curve.T, **look.drawn, marker=marked, markersize=3.5, label=label)
+        drawn.append(curve)
+    choice = data.summary.recommendation
+    if data.drivable is not None:
+        for algorithm, front, opened in data.drivable.fronts():
+            found, look = data.drivable.driven(front.objectives), series(algorithm.index)
+            axes.plot(*found.T, **look.marks(4.0, opened=opened), label=front.label)
+            drawn.append(found)
+        if choice is not None:
+            drawn += _replicas(axes, data.drivable, choice)
+    always = np.zeros((0, 2))
+    if choice is not None:
+        always = np.array([[choice.force_limit, choice.duration]])
+        axes.plot(*always[0], "*", color=MARKED, markersize=11.0, label="recommended")
+    rest_line(axes, data.level_force, "at rest", across=False)
+    if any(len(found) for found in drawn):
+        x_limits, y_limits = limits(drive_look(np.concatenate(drawn), always))
+        axes.set_xlim(*x_limits)
+        axes.set_ylim(*y_limits)
+    axes.set_xlabel(f"{data.force_kind.title} [N]")
+    axes.set_ylabel("duration [s]")
+    axes.legend(loc="upper right")
+    return figure
+
+
+def _replicas(axes: Axes, drivable: Experiment, choice: StoredRecommendation) -> list[Array]:
+    """Durations of the best fronts' paths at the same forces; returns the points of the medians."""
+    # Of fronts that a polished one stands beside, that one alone.
+    looks = {f.label: series(a.index) for a, f, opened in drivable.fronts() if not opened}
+    force, drawn = np.array(choice.durations.forces), []
+    for row in choice.durations.rows:
+        if row.label not in looks:
+            continue
+        colour, label = looks[row.label].colour, f"{row.label}: {counted(row.replicas, 'replica')}"
+        axes.plot(force, row.median, color=colour, linestyle="-", linewidth=0.9, label=label)
+        axes.fill_between(force, row.least, row.largest, color=colour, alpha=0.2, linewidth=0.0)
+        median = np.array(row.median)
+        drawn.append(np.stack([force, median], axis=1)[np.isfinite(median)])
+    return drawn
+
+
+LATE = 0.5
+"""The inset of the histories shows evaluations from this share of the budget on."""
+
+
+def histories(data: ReportData) -> Figure:
+    """Best-so-far objectives of the representative runs, late part enlarged (paper Figure 8)."""
+    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    axes = figure.subplots()
+    inset = axes.inset_axes((0.42, 0.47, 0.56, 0.46))
+    lines = []
+    for algorithm in data.solved:
+        k, look, run = algorithm.index, series(algorithm.index), algorithm.shown
+        history = best_so_far(run.evaluations.objectives, run.evaluations.feasible)
+        number = np.arange(1, len(history) + 1)
+        for m, title in enumerate(data.objective_titles[:2]):
+            dashes = "-" if m == 0 else (0, (4, 1.5))
+            for target in (axes, inset):
+                target.plot(
+                    number,
+                    history[:, m],
+                    color=look.colour,
+                    linestyle=dashes,
+                    linewidth=1.3 if m == 0 else 1.0,
+                    marker=look.marker,
+                    markevery=(k * 17 + m * 41, max(1, len(number) // 12)),
+                    markersize=3,
+                    label=f"{algorithm.title}: {_short(title)}",
+                )
+        lines.append(history)
+    count = max(len(history) for history in lines)
+    start = int(LATE * count)
+    late = np.concatenate([history[start:, :2] for history in lines])
+    low, high = np.nanmin(late), np.nanmax(late)
+    room = max(0.08 * (high - low), 1e-4)
+    inset.set_xlim(start, count)
+    inset.set_ylim(low - room, high + room)
+    inset.tick_params(labelsize=6)
+    inset.set_title(f"evaluations {start} to {count}", fontsize=7)
+    # The curves stay below the inset.
+    bottom = float(np.nanmin(np.concatenate(lines)[:, :2]))
+    top = max(float(np.nanmax(np.concatenate(lines)[:, :2])), bottom + (high - bottom) / 0.36)
+    axes.set_ylim(bottom - 0.03 * (top - bottom), top + 0.03 * (top - bottom))
+    axes.indicate_inset_zoom(inset, edgecolor="black", alpha=0.4)
+    axes.set_xlabel("evaluated candidates [-]")
+    axes.set_ylabel("best feasible objective so far [-]")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    return figure
+
+
+def infeasibility(data: ReportData) -> Figure:
+    """Reasons of infeasible candidates: the share of every constraint, and where on the path."""
+    figure = new_figure(FULL_WIDTH, 0.46 * FULL_WIDTH)
+    left, right = figure.subplots(1, 2)
+    pooled = []
+    for algorithm in data.algorithms:
+        reason = np.concatenate([run.evaluations.reason for run in algorithm.runs])
+        position = np.concatenate([run.evaluations.position for run in algorithm.runs])
+        pooled.append((reason, position))
+    present = [k for k in range(len(REASONS)) if any((reason == k).any() for reason, _ in pooled)]
+    height = 0.8 / max(len(pooled), 1)
+    for n, (algorithm, (reason, position)) in enumerate(zip(data.algorithms, pooled, strict=True)):
+        look = series(n)
+        shares = [100.0 * float((reason == k).mean()) for k in (FEASIBLE, *present)]
+        offsets = np.arange(len(shares)) + (n - (len(pooled) - 1) / 2.0) * height
+        left.barh(
+            offsets,
+            shares,
+            height,
+            color=look.colour,
+            hatch=look.hatch,
+            edgecolor="white",
+            label=algorithm.title,
+        )
+        right.hist(
+            position[reason != FEASIBLE],
+            bins=25,
+            range=(0.0, 1.0),
+            histtype="step",
+            color=look.colour,
+            linestyle=look.line,
+            linewidth=1.4,
+            label=algorithm.title,
+            weights=np.full((reason != FEASIBLE).sum(), 100.0 / len(reason)),
+        )
+    names = ["feasible", *(REASONS[k].replace("_", " ") for k in present)]
+    left.set_yticks(np.arange(len(names)), names)
+    left.invert_yaxis()
+    left.grid(visible=False, axis="y")
+    left.set_xlabel("share of evaluated candidates [%]")
+    panel_label(left, "a", "first violated constraint")
+    right.set_xlabel("path parameter of the first violation [-]")
+    right.set_ylabel("share of evaluated candidates [%]")
+    right.set_xlim(0.0, 1.0)
+    panel_label(right, "b", "where on the path")
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+    return figure
+
+
+def indicators(data: ReportData) -> Figure:
+    """Hypervolume, IGD, spacing and feasible share of every replica."""
+    figure = new_figure(FULL_WIDTH, 0.36 * FULL_WIDTH)
+    shown = (
+        ("hypervolume", "hypervolume [-]"),
+        ("igd", "IGD [-]"),
+        ("spacing", "spacing [-]"),
+        ("feasible_share", "feasible share [-]"),
+    )
+    for axes, letter, (name, label) in zip(
+        figure.subplots(1, len(shown)), "abcd", shown, strict=True
+    ):
+        for k, algorithm in enumerate(data.algorithms):
+            look = series(k)
+            values = np.array([getattr(run.figures, name) for run in algorithm.runs], dtype=float)
+            values = values[np.isfinite(values)]
+            if len(values):
+                axes.boxplot(
+                    values,
+                    positions=[k],
+                    widths=0.55,
+                    showfliers=False,
+                    medianprops={"color": "black"},
+                )
+            axes.plot(
+                k + np.linspace(-0.15, 0.15, len(values)),
+                values,
+                look.marker,
+                color=look.colour,
+                markersize=3,
+                alpha=0.8,
+            )
+        axes.set_xticks(
+            range(len(data.algorithms)), [a.title for a in data.algorithms], rotation=25
+        )
+        axes.set_xlim(-0.6, len(data.algorithms) - 0.4)
+        axes.grid(visible=False, axis="x")
+        axes.set_ylabel(label)
+        panel_label(axes, letter, "")
+    return figure
+
+
+def _short(title: str) -> str:
+    return title.split(" / ")[0]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from studies.report.records import ReachMap
 from symbolic.array import Array
 from symbolic.geometry.bodies import ArmGeometry
 from symbolic.geometry.pairs import CellGeometry
@@ -18,6 +20,26 @@ POSTURES = 300_000
 """Random postures per arm; some ten per cube of the reach of an arm of 1.3 m."""
 
 _BATCH = 50_000
+
+
+@dataclass(frozen=True)
+class ReachMap:
+    """Where the arms' pads and the box can be, on a grid of cubes, positions only.
+
+    A cube is reached if a sampled posture within the joint limits puts the pad there.
+
+    Attributes:
+        lower: (3,) corner of the grid in the world [m].
+        step: edge of the cubes [m].
+        pads: per arm a boolean (nx, ny, nz).
+        common: boolean (nx, ny, nz), box centres from which a level box has both its pads in
+            cubes that their arms reach.
+    """
+
+    lower: Array
+    step: float
+    pads: tuple[NDArray[Any], NDArray[Any]]
+    common: NDArray[Any]
 
 
 def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:

@@ -10,6 +10,11 @@ from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
 from hybrid_opt.work.processes import local_executor
 from hybrid_opt.work.service import Executor
 
+PAGE = "report.html"
+PICTURES = "figures"
+TABLES = "tables"
+"""The report in a results folder."""
+
 # Drawing libraries are heavy: they are imported when something is drawn.
 
 
@@ -34,13 +39,13 @@ def follow_looks(root: Path, options: argparse.Namespace) -> None:
     Raises:
         DualArmError: the results or an optional library are missing.
     """
-    if not options.animation and not options.view:
-        return
-    from studies.report.look import animate, watch
-
     if options.animation:
+        from studies.report.animation import animate
+
         animate(root, options.animation)
     if options.view:
+        from studies.report.live import watch
+
         watch(root, options.port)
 
 
@@ -70,7 +75,7 @@ def rewrite(root: Path, progress: Progress, pdf: bool = False) -> None:
     Raises:
         DualArmError: the folder is not complete.
     """
-    from hybrid_opt.campaign.layout import STAGES
+    from hybrid_opt.campaign.documents import STAGES
     from hybrid_opt.store.files import read_json
 
     marker = root / STAGES / "report.json"

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -59,6 +60,23 @@ class LineStyle:
     marker: str
     hatch: str
 
+    @property
+    def drawn(self) -> dict[str, Any]:
+        """Of a line, for Matplotlib."""
+        return {"color": self.colour, "linestyle": self.line}
+
+    def marks(self, size: float, edge: str = "black", opened: bool = False) -> dict[str, Any]:
+        """Of marks without a line, open ones in the colour alone, for Matplotlib."""
+        return {
+            "marker": self.marker,
+            "linestyle": "none",
+            "color": self.colour,
+            "markersize": size,
+            "markerfacecolor": "none" if opened else self.colour,
+            "markeredgecolor": self.colour if opened else edge,
+            "markeredgewidth": 0.6,
+        }
+
 
 HAND_MADE = LineStyle("#555555", ":", "s", "....")
 """Style of the hand-made trajectory."""
@@ -91,6 +109,12 @@ def shortened(name: str, length: int = 24) -> str:
     return name if len(name) <= length else f"{name[: length - 1]}\N{HORIZONTAL ELLIPSIS}"
 
 
+def spread(count: int, most: int) -> list[int]:
+    """At most `most` of `count` rows, both ends among them."""
+    rows = np.linspace(0, count - 1, min(count, most)).round().astype(int)
+    return [int(row) for row in np.unique(rows)]
+
+
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of this size [inch]; draw it inside `in_style`."""
     return Figure(figsize=(width, height), layout="constrained")
@@ -118,6 +142,24 @@ def settled(figure: Figure) -> Figure:
 
 def _keeps_shape(axes: Axes) -> bool:
     return axes.get_aspect() != "auto"
+
+
+def legend_below(figure: Figure, axes: Axes, columns: int = 0) -> None:
+    """The legend of a panel below the whole figure, in one row unless columns are given."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns or len(handles))
+
+
+def limit_line(axes: Axes, level: float, label: str | None = None, across: bool = True) -> None:
+    """A limit as a dashed line, across or up the panel."""
+    draw = axes.axhline if across else axes.axvline
+    draw(level, color="black", linestyle="--", linewidth=0.9, label=label)
+
+
+def rest_line(axes: Axes, level: float, label: str, across: bool = True) -> None:
+    """What holds the payload still as a line, across or up the panel."""
+    draw = axes.axhline if across else axes.axvline
+    draw(level, color=MARKED, linewidth=0.8, linestyle=(0, (2, 2)), label=label)
 
 
 def panel_label(axes: Axes, letter: str, text: str) -> None:

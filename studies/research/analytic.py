@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from hybrid_opt import metaheuristics
-from hybrid_opt.display.table import text_table
+from hybrid_opt.display.table import number, text_table
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
 from hybrid_opt.metaheuristics import Evaluated, analytic_problems
@@ -23,7 +23,6 @@ from studies.research.algorithms import (
     SHIFTED_EVALUATIONS,
     SHIFTED_POPULATION,
 )
-from studies.study.terminal import number
 from symbolic.errors import SettingsError
 
 Verdict = Literal["inside", "better", "worse"]

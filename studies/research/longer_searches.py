@@ -19,18 +19,17 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
-from hybrid_opt.campaign.layout import CONFIGURATION
-from hybrid_opt.campaign.polish_stage import read_polished
+from hybrid_opt.campaign.documents import CONFIGURATION
 from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_summary
 from hybrid_opt.campaign.settings import SIZE_KEYS
 from hybrid_opt.campaign.summary import CampaignSummary
-from hybrid_opt.display.table import text_table
+from hybrid_opt.display.table import number, text_table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
+from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.store.json_records import to_json
 from studies.research.best_front import ReferenceFront, read_reference_front
 from studies.research.control import LONG
-from studies.study.terminal import number, title
 
 
 @dataclass(frozen=True)
@@ -182,7 +181,7 @@ def approaches(root: Path, reference: ReferenceFront) -> list[Approach]:
     for name in study.algorithms:
         searched, polished = [], []
         for replica in study.of(name):
-            after = read_polished(root, replica, study.workcell)
+            after = study.polished(replica)
             if after is None:
                 raise ResultsError(f"{root}: replica {replica.replica} of {name} is not polished")
             searched.append(replica.front)

@@ -15,11 +15,11 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.door import search
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.store.files import write_json
-from hybrid_opt.store.json_records import Figure, read_record, to_json
+from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.box import Witness, bisected, drive_of
 from hybrid_opt.witness.scene import SimulationSettings
-from symbolic.array import Array
+from symbolic.array import Array, Figure
 
 WORKCELLS = Path(__file__).parents[1] / "workcells"
 

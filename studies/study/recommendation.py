@@ -13,33 +13,30 @@ import numpy as np
 import hybrid_opt as ho
 from codegen.function import available_cores
 from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Progress, Stage
-from hybrid_opt.campaign.layout import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
-from hybrid_opt.campaign.progress import Advance
+from hybrid_opt.campaign.documents import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
 from hybrid_opt.campaign.recommended import (
     ForceTable,
     NoRecommendation,
     StoredDurations,
-    StoredPrice,
     StoredRecommendation,
-    StoredRival,
-    Told,
-    stored_price,
     stored_recommendation,
 )
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.campaign.stages import Advance
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.evaluate.evaluations import concatenated
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.recommending.choice import LEADER, DrivenPaths
 from hybrid_opt.recommending.comparison import (
+    Rival,
     front_durations,
     over_replicas,
     spread_rows,
     table_forces,
 )
 from hybrid_opt.recommending.recommendation import HAND_MADE, STEPS, Recommendation
-from hybrid_opt.robust.force import pressing_model, robust_price
+from hybrid_opt.robust.force import RobustPrice, pressing_model, robust_price
 from hybrid_opt.robust.squeeze import account
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
@@ -163,7 +160,8 @@ def recommend_from(
     write_trajectory(path, cell.compiled, found.x, figures, provenance)
     inside = path.resolve().is_relative_to(root.resolve())
     file = path.resolve().relative_to(root.resolve()).as_posix() if inside else str(path)
-    told = Told(
+    return stored_recommendation(
+        found,
         source=source,
         file=file,
         export=export_command(Path(file), found.limit),
@@ -171,7 +169,6 @@ def recommend_from(
         durations=durations,
         price=price,
     )
-    return stored_recommendation(found, told)
 
 
 def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
@@ -191,12 +188,12 @@ def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
     return f"{told}{hand_made}; a longer search or wider bounds may find one"
 
 
-def _price(carry: ho.Carry, seed: int, threads: int) -> StoredPrice | None:
+def _price(carry: ho.Carry, seed: int, threads: int) -> RobustPrice | None:
     """Cost of robustness for the recommended carry; None where nothing is uncertain."""
     if carry.workcell.uncertainty.is_empty:
         return None
     model, rng = pressing_model(carry.workcell), np.random.default_rng(seed)
-    return stored_price(robust_price(model, carry, rng, LEADER, threads=threads))
+    return robust_price(model, carry, rng, LEADER, threads=threads)
 
 
 def _force_table(
@@ -310,7 +307,7 @@ def export_command(path: Path, force: float) -> str:
     )
 
 
-def _rival(rival: StoredRival, found: StoredRecommendation) -> str:
+def _rival(rival: Rival, found: StoredRecommendation) -> str:
     """Another path beside the recommended carry."""
     duration, force = rival.duration_at_force, rival.force_at_duration
     same_force, same_time = "cannot be held with so little force", "is never so fast"
@@ -321,14 +318,15 @@ def _rival(rival: StoredRival, found: StoredRecommendation) -> str:
     return f"{same_force}, {same_time}"
 
 
-def _robust(price: StoredPrice) -> str:
+def _robust(price: RobustPrice) -> str:
     """What the set is, the largest multiple of it that the arms allow, and random cases."""
-    named = "[uncertainty]" if price.stated else "the usual uncertainty"
-    slips = "slips" if price.failing == 1 else "slip"
+    named = "[uncertainty]" if price.uncertainty.stated else "the usual uncertainty"
+    slips = "slips" if price.check.failing == 1 else "slip"
     return (
         f"in every case of {named} ({price.uncertainty}), of which the leading arm feels up to "
         f"{max(price.commanded):.1f} N; the reference forces allow {price.largest_factor:.2f} "
-        f"times the set; {price.failing or 'none'} of {price.cases} random cases {slips}"
+        f"times the set; {price.check.failing or 'none'} of {price.check.cases} random cases "
+        f"{slips}"
     )
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
-from hybrid_opt.campaign.layout import (
+from hybrid_opt.campaign.documents import (
     HAND_MADE,
     RECOMMENDED,
     SELECTED,
@@ -19,16 +18,15 @@ from hybrid_opt.campaign.layout import (
     selected_file,
 )
 from hybrid_opt.campaign.results import read_summary
-from hybrid_opt.campaign.simulated import StoredSimulation, Whose, not_simulated, stored_simulation
-from hybrid_opt.display.table import text_table
+from hybrid_opt.campaign.simulated import StoredSimulation, stored_simulation
 from hybrid_opt.errors import ResultsError, WitnessError
+from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.witness.arms import CellWitness, account_of
 from hybrid_opt.witness.reference import Control, driven_carry
 from hybrid_opt.work.service import Emit, ListLedger, Service
-from studies.study.terminal import number, title
 from symbolic.errors import SettingsError
 
 CONTROL: Control = "leader"
@@ -124,55 +122,12 @@ def _nothing() -> None:
 
 
 def _simulated(_: None, one: Simulated, emit: Emit) -> StoredSimulation:
-    whose = Whose(one.label, one.digest, CONTROL)
+    whose = (one.label, one.digest, CONTROL)
     with TemporaryDirectory() as folder:
         cell = one.trajectory.open_cell(Path(folder))
         try:
             carry = driven_carry(cell, one.trajectory.x)
             found = account_of(cell, carry, CellWitness(cell.workcell), CONTROL)
         except (WitnessError, SettingsError) as error:
-            return not_simulated(whose, str(error))
-        return stored_simulation(found, whose)
-
-
-HEADINGS = (
-    "carry",
-    "duration [s]",
-    "holds from",
-    "slips first",
-    "pressed with",
-    "peak predicted [N]",
-    "peak simulated [N]",
-    "largest error [%]",
-    "slip [mm]",
-    "arrives",
-)
-
-MEANING = (
-    "Holds from: multiple of the planned forces, between a run that slips and one that holds. The "
-    "other columns: a run pressed as said, forces of both robots, their error over the reference."
-)
-
-
-def simulation_rows(found: Sequence[StoredSimulation]) -> list[tuple[str, ...]]:
-    """One row per carry, cells in the order of `HEADINGS`."""
-    return [
-        (
-            one.label,
-            number(one.duration, 2),
-            f"{one.slips:.3f} to {one.holds:.3f}" if math.isfinite(one.holds) else one.problem,
-            f"pad {one.pad} at {one.begins:.2f} s" if one.pad else "-",
-            "robust forces" if one.robust else f"{number(one.factor, 1)} times the plan",
-            *(" / ".join(number(force, 2) for force in forces) for forces in one.peaks),
-            number(100.0 * one.largest_error, 1),
-            number(1e3 * one.slip, 3),
-            "yes" if one.arrives else "NO",
-        )
-        for one in found
-    ]
-
-
-def simulation_text(found: Sequence[StoredSimulation]) -> str:
-    """The table for a terminal."""
-    rows = [HEADINGS, *simulation_rows(found)]
-    return f"In the simulated cell\n{text_table(rows, left=(0, 2, 3, 4))}\n{MEANING}"
+            return StoredSimulation(*whose, problem=str(error))
+        return stored_simulation(found, *whose)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage
-from hybrid_opt.campaign.layout import (
+from hybrid_opt.campaign.documents import (
     FRONTS,
     HAND_MADE,
     SELECTED,
@@ -21,7 +21,6 @@ from hybrid_opt.campaign.layout import (
     reference_front_file,
     selected_file,
 )
-from hybrid_opt.campaign.polish_stage import PolishedReplica, read_polished
 from hybrid_opt.campaign.recommended import NoRecommendation
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign
 from hybrid_opt.campaign.summary import (
@@ -33,18 +32,23 @@ from hybrid_opt.campaign.summary import (
     PolishedStatistics,
     ReplicaFigures,
     SelectedEntry,
-    StaticForces,
-    Statistics,
-    StoredBound,
     StoredFront,
-    StoredTest,
 )
+from hybrid_opt.carry import Carry
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.metrics import binding_bounds
 from hybrid_opt.indicators.selection import Selected, select
-from hybrid_opt.indicators.statistics import attainment_surfaces, corrected, rank_test, summarise
+from hybrid_opt.indicators.statistics import (
+    RankTest,
+    Summary,
+    attainment_surfaces,
+    corrected,
+    rank_test,
+    summarise,
+)
+from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.static_hold import StaticHold
-from hybrid_opt.store.files import storing, write_atomically, write_json
+from hybrid_opt.store.files import csv_bytes, storing, write_atomically, write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.study.recommendation import read_recommendation
@@ -105,16 +109,18 @@ def front_indicators(
         "spacing": metrics.spacing(front),
         "mean_excess_above_static": math.nan if carry is None else carry.mean_excess_above_static,
         "payload_limit": math.nan if carry is None else carry.payload_limit,
-        "selected": _selected_entry(selected, file),
+        "selected": None
+        if selected is None
+        else carry_entry(selected.carry, selected.row + 1, file),
     }
 
 
 def polished_figures(
-    polished: PolishedReplica, reference: Array, selected: Selected | None, file: str | None
+    polished: PolishedFront, reference: Array, selected: Selected | None, file: str | None
 ) -> PolishedFigures:
     """A polished replica: indicators, selected solution, and effort."""
     indicators = front_indicators(polished.objectives, reference, selected, file)
-    return PolishedFigures(**indicators, **vars(polished.figures))
+    return PolishedFigures(**indicators, **vars(polished.effort))
 
 
 def replica_figures(
@@ -144,19 +150,19 @@ def best_steps(history: Array) -> tuple[Array, ...]:
     return tuple(np.array([first + row + 1, *known[row]]) for row in rows)
 
 
-def _selected_entry(selected: Selected | None, file: str | None) -> SelectedEntry | None:
-    if selected is None:
-        return None
-    carry = selected.carry
+def carry_entry(carry: Carry, evaluation: int, file: str | None) -> SelectedEntry:
+    """The entry of a judged carry."""
+    assert carry.judgement is not None, "selected carries are judged"
     return SelectedEntry(
-        evaluation=selected.row + 1,
+        evaluation=evaluation,
         file=file,
-        objectives=selected.objectives,
+        objectives=np.array(list(carry.judgement.objectives.values())),
         peak_normal_force=carry.peak_normal_force,
         minimum_normal_force=carry.normal_force.min(axis=0),
         excess_above_static=carry.excess_above_static,
         payload_limit=carry.payload_limit,
         duration=carry.duration,
+        feasible=carry.judgement.feasible,
     )
 
 
@@ -183,7 +189,7 @@ def campaign_summary(
         environment=configuration.environment,
         objectives=results.objectives,
         reference_force=results.workcell.task.reference_force,
-        static_hold=StaticForces(static.normal_force, static.contact_force, static.payload_limit),
+        static_hold=static,
         reference_front=StoredFront(
             file=reference_front_file(results.root).relative_to(results.root).as_posix(),
             points=len(reference),
@@ -204,16 +210,11 @@ def campaign_summary(
 
 def bounds_of(workcell: Workcell, x: Array) -> Bounds:
     """Bounds that solutions (k, n_var) of the best fronts lie on."""
-    found = binding_bounds(workcell.task, x)
-    return Bounds(len(x), tuple(StoredBound(**vars(bound)) for bound in found))
+    return Bounds(len(x), binding_bounds(workcell.task, x))
 
 
-def _statistics(rows: Sequence[FrontFigures], names: Sequence[str]) -> dict[str, Statistics]:
-    return {name: _over([getattr(row, name) for row in rows]) for name in names}
-
-
-def _over(values: Sequence[float]) -> Statistics:
-    return Statistics(**asdict(summarise(values)))
+def _statistics(rows: Sequence[FrontFigures], names: Sequence[str]) -> dict[str, Summary]:
+    return {name: summarise([getattr(row, name) for row in rows]) for name in names}
 
 
 def _polished_statistics(rows: Sequence[ReplicaFigures]) -> PolishedStatistics | None:
@@ -224,7 +225,7 @@ def _polished_statistics(rows: Sequence[ReplicaFigures]) -> PolishedStatistics |
     gains = [after.hypervolume - row.hypervolume for row, after in zip(rows, polished, strict=True)]
     return PolishedStatistics(
         statistics=_statistics(polished, POLISHED_FIGURES),
-        hypervolume_gain=_over(gains),
+        hypervolume_gain=summarise(gains),
         replicas_improved=sum(gain > 0.0 for gain in gains),
     )
 
@@ -235,7 +236,7 @@ def _representative(rows: Sequence[ReplicaFigures]) -> int | None:
     return None if best.selected is None else best.replica
 
 
-def _tests(entries: Mapping[str, Sequence[ReplicaFigures]]) -> tuple[StoredTest, ...]:
+def _tests(entries: Mapping[str, Sequence[ReplicaFigures]]) -> tuple[RankTest, ...]:
     """Rank tests of every pair of algorithms in every figure, Holm-corrected as one family.
 
     None with few replicas, whose effects say nothing.
@@ -252,7 +253,7 @@ def _tests(entries: Mapping[str, Sequence[ReplicaFigures]]) -> tuple[StoredTest,
         for figure, first, second in pairs
     ]
     return tuple(
-        StoredTest(figure=figure, **asdict(test))
+        replace(test, figure=figure)
         for (figure, _, _), test in zip(pairs, corrected(tests), strict=True)
     )
 
@@ -277,27 +278,23 @@ def summary_stage(not_asked: str = "") -> Stage:
 def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
     results = read_campaign(folder.root)
     evaluator = folder.cell.evaluator
-    polished = {
-        (replica.algorithm, replica.replica): read_polished(results.root, replica, results.workcell)
-        for replica in results.replicas
-    }
-    fronts = [replica.front for replica in results.replicas]
-    fronts += [found.objectives for found in polished.values() if found is not None]
-    reference = reference_front(fronts)
+    reference = reference_front([front.objectives for front in results.fronts])
     entries: dict[str, list[ReplicaFigures]] = {name: [] for name in results.algorithms}
+    best = list[Array]()
     with progress.stage("summary", len(results.replicas), "replicas") as advance:
         for replica in results.replicas:
             key = replica.algorithm, replica.replica
             selected = select(evaluator, replica.front_x, replica.front_rows)
             file = _store_selected(folder, selected_file(folder.root, *key), key, selected)
             entry = replica_figures(replica, reference, selected, file)
-            front = polished[key]
+            best.append(replica.front_x)
+            front = results.polished(replica)
             if front is not None:
                 chosen = select(evaluator, front.x)
                 path = polished_selected_file(folder.root, *key)
                 file = _store_selected(folder, path, key, chosen)
                 figures = polished_figures(front, reference, chosen, file)
-                entry = replace(entry, polished=figures)
+                entry, best[-1] = replace(entry, polished=figures), front.x
             entries[replica.algorithm].append(entry)
             advance(1)
     _write_points(folder, "reference", results.objectives, reference)
@@ -306,16 +303,12 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
         _write_points(folder, name, results.objectives, union)
         if len(results.objectives) in (2, 3):
             _write_attainment(folder, name, results)
-    best = [
-        replica.front_x if front is None else front.x
-        for replica in results.replicas
-        for front in [polished[replica.algorithm, replica.replica]]
-    ]
-    _store_hand_made(folder)
+    hand_made = _store_hand_made(folder)
     found = read_recommendation(folder.root)
     reason = found.reason if isinstance(found, NoRecommendation) else ""
     summary = replace(
         campaign_summary(results, reference, folder.cell.static_hold, entries),
+        hand_made=hand_made,
         bounds=bounds_of(folder.workcell, np.concatenate(best)),
         recommendation=None if isinstance(found, NoRecommendation) else found,
         no_recommendation=reason if found else not_asked,
@@ -323,8 +316,9 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
     write_json(folder.root / SUMMARY, to_json(summary))
 
 
-def _store_hand_made(folder: CampaignFolder) -> None:
-    """Write the workcell file's own trajectory, feasible or not, beside the selected ones."""
+def _store_hand_made(folder: CampaignFolder) -> SelectedEntry | None:
+    """Write the workcell file's own trajectory, feasible or not, beside the selected ones; its
+    figures, None where it has not all of them."""
     carry = folder.cell.carry(folder.cell.initial)
     path = folder.root / SELECTED / HAND_MADE
     with storing(path):
@@ -334,6 +328,10 @@ def _store_hand_made(folder: CampaignFolder) -> None:
     figures = carry.figures.items()
     known = {name: value for name, value in figures if np.isfinite(value)}
     write_trajectory(path, folder.cell.compiled, carry.x, known, provenance)
+    entry = carry_entry(carry, 0, path.relative_to(folder.root).as_posix())
+    numbers = [entry.objectives, entry.peak_normal_force, entry.minimum_normal_force]
+    every = np.concatenate([*numbers, [entry.payload_limit, entry.duration]])
+    return entry if np.isfinite(every).all() else None
 
 
 def _store_selected(
@@ -358,18 +356,14 @@ def _store_selected(
 def _write_points(
     folder: CampaignFolder, name: str, objectives: Sequence[str], points: Array
 ) -> None:
-    lines = [",".join(objectives), *(",".join(map(repr, row)) for row in points.tolist())]
     path = reference_front_file(folder.root).with_name(f"{name}.csv")
-    write_atomically(path, ("\n".join(lines) + "\n").encode())
+    write_atomically(path, csv_bytes(objectives, points.tolist()))
 
 
 def _write_attainment(folder: CampaignFolder, name: str, results: CampaignResults) -> None:
     surfaces = attainment_surfaces([replica.front for replica in results.of(name)], PERCENTILES)
-    lines = [",".join(["percentile", *results.objectives])]
-    lines += [
-        ",".join([f"{surface.percentile:g}", *map(repr, row)])
-        for surface in surfaces
-        for row in surface.points.tolist()
+    rows = [
+        [f"{surface.percentile:g}", *row] for surface in surfaces for row in surface.points.tolist()
     ]
     path = folder.root / FRONTS / f"{name}-attainment.csv"
-    write_atomically(path, ("\n".join(lines) + "\n").encode())
+    write_atomically(path, csv_bytes(["percentile", *results.objectives], rows))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from symbolic.array import Array
+from symbolic.array import Array, Vector
 from symbolic.records.poses import inverse
 from symbolic.records.task import Task
 
@@ -261,9 +261,9 @@ class Uncertainty:
 
     friction: float = 0.0
     mass: float = 0.0
-    centre_of_mass: Array = field(default_factory=lambda: np.zeros(3))
+    centre_of_mass: Vector = field(default_factory=lambda: np.zeros(3))
     pad_position: float = 0.0
-    disturbance: Array = field(default_factory=lambda: np.zeros(3))
+    disturbance: Vector = field(default_factory=lambda: np.zeros(3))
     tracking: float = 0.0
     internal_force: float = 0.0
     tilt: float = 0.0

@@ -14,11 +14,12 @@ import numpy as np
 
 from codegen.cache import Cache
 from hybrid_opt.bundles.bundle import read_manifest
-from hybrid_opt.campaign.documents import FinishedReplica, PolishDocument, StageMark
+from hybrid_opt.campaign.documents import FinishedReplica, StageMark
 from hybrid_opt.campaign.evaluations_file import decode
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.results import read_configuration
 from hybrid_opt.campaign.summary import CampaignSummary
+from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.files import read_bytes
 from hybrid_opt.store.json_records import read_record
 from hybrid_opt.store.trajectory_file import read_trajectory
@@ -38,7 +39,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "configuration": lambda path: read_configuration(path.parent),
     "summary": lambda path: read_record(CampaignSummary, path, ""),
     "replica": lambda path: read_record(FinishedReplica, path, ""),
-    "polish": lambda path: read_record(PolishDocument, path, ""),
+    "polish": lambda path: read_record(PolishedFront, path, ""),
     "stage": lambda path: read_record(StageMark, path, ""),
     "evaluations": lambda path: decode(read_bytes(path), path),
     "journal": lambda path: Journal(path, b"\0" * 32),

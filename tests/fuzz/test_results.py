@@ -17,12 +17,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
-from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.polishing.settings import PolishSettings
 from studies.programs.comparison import compare
+from studies.programs.study import StudySettings, run_study
 from studies.report.data import gather_carries
-from studies.study.stages import StudySettings, run_study
 from symbolic.read.cell import load
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
 from tests.fuzz.promises import kept
@@ -74,7 +73,7 @@ def judged(root: Path, whole: Path) -> None:
     results = read_campaign(root)
     for replica in results.replicas:
         assert np.isfinite(replica.front).all()
-        polished = read_polished(root, replica, results.workcell)
+        polished = results.polished(replica)
         if polished is not None:
             assert np.isfinite(polished.objectives).all()
             assert polished.x.shape[1] == results.workcell.task.n_var

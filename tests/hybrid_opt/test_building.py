@@ -8,7 +8,7 @@ import pytest
 
 from codegen.compiler import Compiler
 from hybrid_opt.building import build_study
-from hybrid_opt.campaign.progress import Progress
+from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.collisions import JobCollisions
 from hybrid_opt.polishing.polisher import Polisher

@@ -138,7 +138,7 @@ def test_a_polish_makes_it_better() -> None:
 def test_a_front_prints_and_draws_itself() -> None:
     assert f"{len(front())} carries" in repr(front())
     page = front()._repr_html_()
-    assert page.count("<circle") > len(front())
+    assert page.count("<use") > len(front())
     assert "level and still" in page
 
 

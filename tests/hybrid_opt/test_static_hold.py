@@ -14,7 +14,7 @@ from hybrid_opt.static_hold import still_load, unheld
 from hybrid_opt.timing.model import TimingModel
 from studies import propose, run
 from studies.program import BAD_INPUT
-from studies.programs.inspection import Inspection, told
+from studies.programs.inspection import InspectionSettings, inspected
 from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
 from symbolic.records import Workcell
@@ -146,9 +146,11 @@ def test_no_study_begins(
 
 
 def test_the_inspection_says_infeasible(slippery: Path) -> None:
-    found = Inspection(load(slippery), 1, 1, None)
-    assert f"Infeasible, whatever the path: {found.unheld}" in told(found)
-    assert "981 N" in found.unheld
+    parts = inspected(load(slippery), InspectionSettings(1, 1))
+    part = next(part for part in parts if "unheld" in part.values)
+    unheld = part.values["unheld"]
+    assert f"Infeasible, whatever the path: {unheld}" in part.lines
+    assert "981 N" in unheld
 
 
 def test_no_workcell_is_proposed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
-from hybrid_opt.campaign.documents import PolishEffort
-from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.campaign.results import ReplicaFront, read_campaign
 from hybrid_opt.campaign.simulated import StoredSimulation
 from hybrid_opt.campaign.summary import PolishedFigures
 from hybrid_opt.indicators.metrics import non_dominated
-from studies.report.data import gather
-from studies.report.records import Front, ReportData
-from studies.study.stages import StudySettings, run_study
+from hybrid_opt.polishing.records import PolishEffort
+from studies.programs.study import StudySettings, run_study
+from studies.report.data import ReportData, Run, gather
 from studies.study.summary import front_indicators
 from symbolic.read.cell import load
 from tests.symbolic.cells import ROOT
@@ -48,16 +47,17 @@ def hybrid_data(data: ReportData) -> ReportData:
     x = np.concatenate([front.x for front in fronts])
     objectives = np.concatenate([front.objectives for front in fronts])
     best = non_dominated(objectives)
-    hybrid = Front(x[best], objectives[best])
     effort = PolishEffort("dense", 1, {}, 1.0, 1.0, 1.0, 1, 0.5, 0.0, 0.0, 0.0)
-    indicators = front_indicators(hybrid.objectives, hybrid.objectives, None, None)
+    indicators = front_indicators(objectives[best], objectives[best], None, None)
     figures = PolishedFigures(**indicators, **vars(effort))
+
+    def polished(run: Run) -> Run:
+        of = run.front.algorithm, run.front.replica
+        hybrid = ReplicaFront(*of, True, x[best], objectives[best])
+        return replace(run, hybrid=hybrid, figures=replace(run.figures, polished=figures))
+
     algorithms = tuple(
-        replace(
-            algorithm,
-            runs=tuple(replace(r, hybrid=hybrid, hybrid_figures=figures) for r in algorithm.runs),
-            hybrid_selected=data.algorithms[-1].selected,
-        )
+        replace(algorithm, runs=tuple(map(polished, algorithm.runs)), best=data.algorithms[-1].best)
         for algorithm in data.algorithms
     )
     simulations = tuple(simulation(label) for label in (data.initial.label, "recommended"))

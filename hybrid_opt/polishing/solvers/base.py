@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 
 from codegen.build import c_text, load_or_build_library
 from codegen.cache import Cache
-from symbolic.array import Array
+from symbolic.array import Array, Figure
 
 TOLERANCE = 1e-6
 """Of the optimality conditions, in a program's scaled rows and variables."""
@@ -76,9 +76,9 @@ class Residuals:
         complementarity: largest product of a multiplier and its constraint's slack.
     """
 
-    stationarity: float
-    feasibility: float
-    complementarity: float
+    stationarity: Figure
+    feasibility: Figure
+    complementarity: Figure
 
     def scaled(self, unit: float) -> Residuals:
         """With the objective in units that are so many times smaller."""

@@ -4,38 +4,20 @@
   const data = JSON.parse(document.getElementById("report-data").textContent);
   const $ = (id) => document.getElementById(id);
   const FORCE = 7 + data.joints[0] + data.joints[1];
-  const COLUMNS = { time: 0, pose: 1, q: 7, force: FORCE, shift: FORCE + 2, width: FORCE + 4 };
+  const COLUMNS = { pose: 1, q: 7, force: FORCE, width: FORCE + 4 };
   /* Nothing of the page leaves the machine: no upload, no address that one could go to. */
   const OWN = { responsive: true, displaylogo: false, showSendToCloud: false,
     plotlyServerURL: "", showEditInChartStudio: false };
   const CONFIG = { ...OWN,
     modeBarButtonsToRemove: ["sendChartToCloud", "lasso2d", "select2d", "autoScale2d"] };
   const PLAIN = { ...OWN, displayModeBar: false };
-  const STAR = "star", NEAR = 12;
+  const STAR = "star", NEAR = 12, OVER_TIME = ["force-plot", "pressure-plot"];
   const FONT = { family: "system-ui, DejaVu Sans, sans-serif", size: 12 };
-
-  function decode(text, Type) {
-    const binary = atob(text);
-    const bytes = new Uint8Array(binary.length);
-    for (let i = 0; i < binary.length; i += 1) bytes[i] = binary.charCodeAt(i);
-    return new Type(bytes.buffer);
-  }
-
-  /* Plotly reads a small markup in its texts; names must not be taken for it. */
-  function plain(text) {
-    return String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
-  }
 
   const carries = data.trajectories;
 
   function samplesOf(motion) {
-    if (!motion.samples) {
-      const flat = decode(motion.data, Float32Array);
-      motion.samples = [];
-      for (let i = 0; i < flat.length; i += COLUMNS.width) {
-        motion.samples.push(flat.subarray(i, i + COLUMNS.width));
-      }
-    }
+    if (!motion.samples) motion.samples = new Samples(motion.data, COLUMNS.width);
     return motion.samples;
   }
 
@@ -43,7 +25,7 @@
     last: 0, marked: 0 };
   let scene = null;
   try {
-    scene = new CellScene($("scene"), data, decode);
+    scene = new CellScene($("scene"), data);
   } catch (error) {
     const note = document.createElement("p");
     note.className = "missing";
@@ -53,37 +35,6 @@
 
   function shown() {
     return carries[state.selected].motions[state.motion];
-  }
-
-  function frontTraces(view) {
-    const traces = view.clouds.map((cloud) => {
-      const points = decode(cloud.points, Float32Array);
-      return { type: "scatter", mode: "markers", name: plain(cloud.label), hoverinfo: "skip",
-        x: points.filter((_, i) => i % 2 === 0), y: points.filter((_, i) => i % 2 === 1),
-        marker: { color: cloud.colour, size: 3, opacity: 0.25, symbol: cloud.symbol } };
-    });
-    view.lines.forEach((line) => traces.push({ type: "scatter", mode: "lines",
-      name: plain(line.label), x: line.x, y: line.y, hoverinfo: "skip",
-      line: { color: line.colour, dash: line.dash, width: 1.6 } }));
-    /* What is recommended is drawn last, above all others. */
-    const ordered = [...view.groups].sort((a, b) =>
-      Number(a.symbol === STAR) - Number(b.symbol === STAR));
-    ordered.forEach((group) => traces.push({ type: "scatter", mode: "markers",
-      name: plain(group.label), x: group.x, y: group.y, customdata: group.members,
-      text: group.members.map((k) => plain(carries[k].label)),
-      hovertemplate: "%{text}<extra></extra>",
-      showlegend: !view.lines.some((line) => group.label === line.label + ", timed"),
-      marker: { color: group.colour, size: group.size, symbol: group.symbol,
-        line: { color: "#000", width: 0.7 } } }));
-    if (view.star) {
-      traces.push({ type: "scatter", mode: "markers", name: view.star[2],
-        x: [view.star[0]], y: [view.star[1]], hoverinfo: "name",
-        marker: { color: "#1d2327", size: 11, symbol: "x-thin", line: { width: 2.5 } } });
-    }
-    traces.push({ type: "scatter", mode: "markers", name: "chosen", x: [], y: [],
-      hoverinfo: "skip", showlegend: false,
-      marker: { color: "rgba(0,0,0,0)", size: 20, line: { color: "#b00020", width: 2.5 } } });
-    return traces;
   }
 
   /* Of a legend below a picture so wide [px], whose columns are as wide as its longest entry. */
@@ -96,42 +47,37 @@
 
   function drawFront() {
     const view = data.views[state.view];
-    const traces = frontTraces(view);
     const range = state.whole ? view.whole : view.first;
-    const below = 60 + legendHeight(traces, $("front-plot").clientWidth - 85);
+    const below = 60 + legendHeight(view.data, $("front-plot").clientWidth - 85);
     $("front-plot").style.height = `${340 + below}px`;
-    const layout = { font: FONT, hovermode: "closest",
-      margin: { l: 70, r: 15, t: 20, b: below },
-      xaxis: { title: { text: plain(view.xTitle), standoff: 8 }, range: range[0].slice() },
-      yaxis: { title: { text: plain(view.yTitle) }, range: range[1].slice() },
-      legend: { orientation: "h", yref: "container", y: 0.01, yanchor: "bottom",
-        font: { size: 11 } } };
-    Plotly.react("front-plot", traces, layout, CONFIG);
-    state.chosenTrace = traces.length - 1;
+    const { margin, xaxis, yaxis } = view.layout;
+    const layout = { ...view.layout, font: FONT, margin: { ...margin, b: below },
+      xaxis: { ...xaxis, range: range[0].slice() }, yaxis: { ...yaxis, range: range[1].slice() } };
+    Plotly.react("front-plot", view.data.map((trace) => ({ ...trace })), layout, CONFIG);
     mark();
     [...$("views").querySelectorAll("button[data-view]")].forEach((button) =>
       button.setAttribute("aria-pressed", String(Number(button.dataset.view) === state.view)));
     $("whole").setAttribute("aria-pressed", String(state.whole));
   }
 
-  /* A ring around the point of the chosen trajectory, where the picture has it. */
+  /* A ring around the point of the chosen trajectory, where the picture has it: its last trace. */
   function mark() {
-    const place = { x: [[]], y: [[]] };
-    data.views[state.view].groups.forEach((group) => {
-      const at = group.members.indexOf(state.selected);
-      if (at >= 0) { place.x = [[group.x[at]]]; place.y = [[group.y[at]]]; }
+    const place = { x: [[]], y: [[]] }, traces = data.views[state.view].data;
+    traces.filter((trace) => trace.customdata).forEach((trace) => {
+      const at = trace.customdata.indexOf(state.selected);
+      if (at >= 0) { place.x = [[trace.x[at]]]; place.y = [[trace.y[at]]]; }
     });
-    Plotly.restyle("front-plot", place, [state.chosenTrace]);
+    Plotly.restyle("front-plot", place, [traces.length - 1]);
   }
 
   /* The trajectory of a clicked point; where the star covers the point, the recommended one. */
   function clicked(event) {
     const point = event.points.find((p) => p.customdata !== undefined);
-    const star = data.views[state.view].groups.find((group) => group.symbol === STAR);
+    const star = data.views[state.view].data.find((trace) => trace.marker?.symbol === STAR);
     if (!point || !star) return point && point.customdata;
     const across = point.xaxis.d2p(point.x) - point.xaxis.d2p(star.x[0]);
     const along = point.yaxis.d2p(point.y) - point.yaxis.d2p(star.y[0]);
-    return Math.hypot(across, along) < NEAR ? star.members[0] : point.customdata;
+    return Math.hypot(across, along) < NEAR ? star.customdata[0] : point.customdata;
   }
 
   function fillViews() {
@@ -150,22 +96,18 @@
     button("Whole fronts", () => { state.whole = !state.whole; drawFront(); }).id = "whole";
   }
 
-  function lines(id, motion, column, scale, title, limits) {
+  /* Both plots over time, with the samples of a motion. */
+  function drawOverTime(motion) {
     const samples = samplesOf(motion);
-    const times = samples.map((s) => s[COLUMNS.time]);
-    const end = times[times.length - 1];
-    const traces = data.robots.map((robot, i) => ({ type: "scatter", mode: "lines",
-      name: plain(robot), x: times, y: samples.map((s) => scale * s[column + i]),
-      line: { color: ["#3b6ea8", "#a8733b"][i], dash: ["solid", "dash"][i], width: 2 } }));
-    limits.forEach((limit) => traces.push({ type: "scatter", mode: "lines", name: limit.label,
-      x: [0, end], y: [limit.value, limit.value], hoverinfo: "name",
-      line: { color: limit.colour, dash: "dot", width: 1.5 } }));
-    const layout = { font: FONT, margin: { l: 60, r: 15, t: 40, b: 55 }, showlegend: true,
-      xaxis: { title: { text: "time [s]", standoff: 6 }, range: [0, end] },
-      yaxis: { title: { text: title }, rangemode: "normal" },
-      legend: { orientation: "h", yref: "container", y: 0.99, yanchor: "top",
-        font: { size: 10 } }, shapes: marks(motion, 0) };
-    Plotly.react(id, traces, layout, PLAIN);
+    OVER_TIME.forEach((id) => {
+      const { data: traces, layout } = data.plots[id];
+      const filled = traces.map((trace) => "level" in trace.meta
+        ? { ...trace, x: [0, samples.end], y: [trace.meta.level, trace.meta.level] }
+        : { ...trace, x: samples.times,
+          y: samples.rows.map((row) => trace.meta.scale * row[trace.meta.column]) });
+      Plotly.react(id, filled, { ...layout, font: FONT, shapes: marks(motion, 0),
+        xaxis: { ...layout.xaxis, range: [0, samples.end] } }, PLAIN);
+    });
   }
 
   function cursor(time) {
@@ -235,24 +177,13 @@
   }
 
   function drawTorque(motion) {
-    const closed = (use) => [...use, use[0]];
-    const traces = data.robots.flatMap((robot, i) => {
-      const whole = useOf(motion.torqueUse, i), load = useOf(motion.contactTorqueUse, i);
-      const joints = [...whole.keys(), 0].map((j) => "joint " + (j + 1));
-      const colour = ["#3b6ea8", "#a8733b"][i];
-      return [
-        { type: "scatterpolar", mode: "lines+markers", name: plain(robot), r: closed(whole),
-          theta: joints, line: { color: colour, dash: ["solid", "dash"][i] } },
-        { type: "scatterpolar", mode: "lines", name: plain(robot) + ", load alone",
-          r: closed(load), theta: joints, line: { color: colour, dash: "dot", width: 1 } },
-      ];
+    const { data: traces, layout } = data.plots["torque-plot"];
+    const filled = traces.map((trace) => {
+      const use = useOf(motion[trace.meta.use], trace.meta.arm);
+      return { ...trace, r: [...use, use[0]] };
     });
-    const layout = { font: FONT, margin: { l: 50, r: 50, t: 40, b: 30 },
-      title: { text: "largest joint torque [% of maximum]", font: { size: 12 } },
-      polar: { radialaxis: { rangemode: "tozero", ticksuffix: " %", nticks: 5,
-        angle: freeDirection(motion.torqueUse), tickfont: { size: 10 } } },
-      legend: { orientation: "h", y: -0.08, font: { size: 10 } } };
-    Plotly.react("torque-plot", traces, layout, PLAIN);
+    const radialaxis = { ...layout.polar.radialaxis, angle: freeDirection(motion.torqueUse) };
+    Plotly.react("torque-plot", filled, { ...layout, font: FONT, polar: { radialaxis } }, PLAIN);
   }
 
   function select(index) {
@@ -264,7 +195,7 @@
     $("motion").value = String(state.motion);
     $("motion").disabled = carry.motions.length < 2;
     $("save").disabled = !data.cells[carry.cell];
-    if (data.views.some((view) => view.groups.length)) mark();
+    if (data.views.some((view) => view.data.some((trace) => trace.customdata))) mark();
     show();
   }
 
@@ -279,19 +210,10 @@
     $("figures-of-choice").textContent = [`${motion.duration.toFixed(2)} s, ${what}, payload at ` +
       `the limit ${motion.payloadLimit.toFixed(2)} kg (${motion.name})`,
       ...problems.filter((text) => text)].join("; ");
-    const rest = data.restForce === null ? []
-      : [{ label: "level payload at rest", value: data.restForce, colour: "#b00020" }];
-    lines("force-plot", motion, COLUMNS.force, 1, "normal force [N]", rest);
+    drawOverTime(motion);
     fillPhases();
-    lines("pressure-plot", motion, COLUMNS.shift, 1000, "pressure shift [mm]",
-      [{ label: "patch radius", value: 1000 * data.patchRadius, colour: "#000" }]);
     drawTorque(motion);
-    if (scene) {
-      const samples = samplesOf(motion);
-      const points = new Float32Array(3 * samples.length);
-      samples.forEach((s, i) => points.set(s.subarray(COLUMNS.pose, COLUMNS.pose + 3), 3 * i));
-      scene.showPath(points);
-    }
+    if (scene) scene.showPath(samplesOf(motion).path);
     seek(0);
   }
 
@@ -314,17 +236,11 @@
 
   function seek(share) {
     const samples = samplesOf(shown());
-    const end = samples[samples.length - 1][COLUMNS.time];
     state.share = Math.min(1, Math.max(0, share));
-    const time = state.share * end;
-    let k = 0;
-    while (k < samples.length - 2 && samples[k + 1][COLUMNS.time] < time) k += 1;
-    const [a, b] = [samples[k], samples[k + 1]];
-    const step = b[COLUMNS.time] - a[COLUMNS.time];
-    const w = step > 0 ? (time - a[COLUMNS.time]) / step : 0;
-    const mixed = a.map((value, i) => value + w * (b[i] - value));
+    const time = state.share * samples.end;
     if (scene) {
-      scene.place(mixed.subarray(COLUMNS.pose, COLUMNS.q), mixed.subarray(COLUMNS.q, COLUMNS.force));
+      const { row } = samples.at(time);
+      scene.place(row.subarray(COLUMNS.pose, COLUMNS.q), row.subarray(COLUMNS.q, COLUMNS.force));
     }
     $("scrub").value = String(Math.round(1000 * state.share));
     const phase = phaseAt(shown(), time);
@@ -335,7 +251,7 @@
     const now = performance.now();
     if (!state.playing || now - state.marked > 120) {
       state.marked = now;
-      ["force-plot", "pressure-plot"].forEach((id) =>
+      OVER_TIME.forEach((id) =>
         Plotly.relayout(id, { shapes: marks(shown(), time) }));
     }
   }
@@ -371,7 +287,7 @@
   }
 
   fillChooser();
-  const pictures = data.views.some((view) => view.groups.length);
+  const pictures = data.views.some((view) => view.data.some((trace) => trace.customdata));
   if (pictures) {
     fillViews();
     drawFront();

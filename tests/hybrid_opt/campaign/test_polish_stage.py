@@ -20,29 +20,23 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
+from hybrid_opt.campaign.documents import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.journal import Journal
-from hybrid_opt.campaign.layout import JOURNAL, POLISH, polished_folder
-from hybrid_opt.campaign.polish_document import polish_document
 from hybrid_opt.campaign.polish_stage import (
     PolishLedger,
     PolishRequest,
     polish_replica,
     polish_stage,
-    read_polished,
 )
-from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.campaign.results import read_campaign, read_polished
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.records import (
-    PolishedFront,
-    PolishOutcome,
-    outcome_from_json,
-    outcome_to_json,
-)
+from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.polishing.solvers.base import Residuals
+from hybrid_opt.store.json_records import from_json, to_json
 from symbolic.array import Array
 from symbolic.read.cell import load
 from tests.symbolic.cells import RACK
@@ -82,9 +76,9 @@ def test_a_polished_front_is_feasible_certified_and_better(finished: Path) -> No
     probes = 2 * (2 + 1)
     # A front that stays short is filled twice; the end and the middle are finished.
     most = POLISHED.attempts * (1 + 2 * POLISHED.fill.attempts) + 2 + probes
-    assert POLISHED.attempts + probes < polished.figures.attempts <= most
-    assert 0.0 < polished.figures.widest_gap < 1.0
-    assert polished.figures.equivalent_evaluations > 0
+    assert POLISHED.attempts + probes < polished.effort.attempts <= most
+    assert 0.0 < polished.effort.widest_gap < 1.0
+    assert polished.effort.equivalent_evaluations > 0
     assert not (polished_folder(finished, "nsga2", 0) / JOURNAL).exists()
 
 
@@ -149,7 +143,7 @@ def test_what_was_not_solved_counts_in_no_figure_of_solves() -> None:
         1.0,
         "ipopt",
     )
-    figures = polish_document(front).figures
+    figures = front.effort
     assert figures.solver == "ipopt"
     assert figures.attempts == 2
     assert figures.median_attempt_seconds == 3.0
@@ -158,10 +152,10 @@ def test_what_was_not_solved_counts_in_no_figure_of_solves() -> None:
 
 def test_attempts_come_back_from_their_file(finished: Path) -> None:
     document = json.loads((polished_folder(finished, "nsga2", 0) / POLISH).read_text())
-    for stored in document["attempts"]:
-        assert outcome_to_json(outcome_from_json(stored)) == stored
+    for stored in document["outcomes"]:
+        assert to_json(from_json(PolishOutcome, stored, "an attempt", "")) == stored
     with pytest.raises(ResultsError, match="damaged"):
-        outcome_from_json({"aim": "point"})
+        from_json(PolishOutcome, {"aim": "point"}, "an attempt", "")
 
 
 def test_an_interrupted_polish_repeats_no_attempt(
@@ -199,9 +193,10 @@ def test_a_damaged_front_is_polished_anew(finished: Path, tmp_path: Path) -> Non
     path = polished_folder(root, "nsga2", 0) / POLISH
     before = json.loads(path.read_text())
     path.write_text("{}")
-    with pytest.warns(DamagedResultsWarning, match=r"polish.json: damaged at front: is missing"):
+    with pytest.warns(DamagedResultsWarning, match=r"polish.json: damaged at x: is missing"):
         run(root, resume=True)
-    assert json.loads(path.read_text())["front"] == before["front"]
+    after = json.loads(path.read_text())
+    assert [after[key] for key in ("x", "objectives")] == [before["x"], before["objectives"]]
 
 
 def test_a_recorded_attempt_of_nonsense_is_told() -> None:
@@ -231,31 +226,40 @@ def test_other_settings_are_refused(finished: Path) -> None:
 
 
 def spoilt(document: Any, fault: str) -> Any:
-    point = document["front"][0]
+    x = document["x"]
     if fault == "no point":
-        document["front"] = []
+        document |= {key: [] for key in ("x", "objectives", "parent", "polished")}
     elif fault == "too short":
-        point["x"] = point["x"][:3]
+        document["x"] = [point[:3] for point in x]
+    elif fault == "ragged":
+        x[0] = x[0][:3]
+    elif fault == "fewer":
+        document["x"] = x[1:]
     elif fault == "missing":
-        point["x"][1] = None
+        x[0][1] = None
     elif fault == "huge":
-        point["x"][1] = 1e308
+        x[0][1] = 1e308
     elif fault == "objectives":
-        point["objectives"] = ["a", "b"]
+        document["objectives"][0] = ["a", "b"]
+    elif fault == "whole":
+        document["parent"][0] = 0.5
     else:
-        document = {"front": [{}], "figures": {}}
+        document = {"x": []}
     return document
 
 
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
-        ("no point", "at front: found 0 points"),
-        ("too short", r"at front\[0\].x: found 3 numbers; allowed are 18"),
-        ("missing", r"at front\[0\].x: holds numbers that are missing"),
-        ("huge", r"at front\[0\].x: is outside"),
-        ("objectives", r"at front\[0\].objectives: no numbers of shape 2"),
-        ("nothing", r"at front\[0\].objectives: is missing"),
+        ("no point", "at x: found 0 points"),
+        ("too short", "at x: found 3 numbers; allowed are 18"),
+        ("ragged", "at x: no numbers of shape any x any"),
+        ("fewer", ": its arrays have different lengths"),
+        ("missing", "at x: holds numbers that are missing"),
+        ("huge", "at x: is outside"),
+        ("objectives", "at objectives: no numbers of shape any x 2"),
+        ("whole", "at parent: holds numbers that are not whole"),
+        ("nothing", "at objectives: is missing"),
     ],
 )
 def test_a_damaged_file_is_told(finished: Path, tmp_path: Path, fault: str, told: str) -> None:
@@ -265,5 +269,5 @@ def test_a_damaged_file_is_told(finished: Path, tmp_path: Path, fault: str, told
     path = polished_folder(tmp_path, "nsga2", 0) / POLISH
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(spoilt(whole, fault)))
-    with pytest.raises(ResultsError, match=rf"damaged {told}.*; --resume polishes it anew"):
+    with pytest.raises(ResultsError, match=rf"damaged ?{told}.*; --resume polishes it anew"):
         read_polished(tmp_path, replica, load(RACK))

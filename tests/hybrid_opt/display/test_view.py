@@ -43,14 +43,6 @@ def test_embedded_json_reads_back_and_ends_no_element(value: object) -> None:
     assert json.loads(embedded)[0] == value
 
 
-def test_a_library_without_its_script_is_told(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("trimesh.__file__", str(tmp_path / "__init__.py"))
-    with pytest.raises(DisplayError, match="trimesh"):
-        scene.three_js()
-
-
 def test_the_page_holds_the_carry() -> None:
     page = carry().view().page()
     found = re.search(r'id="carry">(.*?)</script>', page, flags=re.DOTALL)

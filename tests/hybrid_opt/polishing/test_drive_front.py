@@ -13,8 +13,9 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, duration_unit
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.drive_front import best_of
 from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.records import PolishedFront, outcome_from_json, outcome_to_json
+from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
+from hybrid_opt.store.json_records import from_json, to_json
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.task import initial_decision
@@ -53,8 +54,8 @@ def test_the_front_dominates_more_than_before() -> None:
 
 
 def test_a_polish_goes_on_where_it_was_interrupted() -> None:
-    written = [outcome_to_json(outcome) for outcome in polished().outcomes[:2]]
-    recorded = [outcome_from_json(values) for values in written]
+    written = [to_json(outcome) for outcome in polished().outcomes[:2]]
+    recorded = [from_json(PolishOutcome, values, "an attempt", "") for values in written]
     again = polisher(ROUNDS).polish(starts(), np.random.default_rng(0), recorded=recorded)
     np.testing.assert_array_equal(again.x, polished().x)
     np.testing.assert_array_equal(again.objectives, polished().objectives)

@@ -26,13 +26,9 @@ from hybrid_opt.polishing.force_front import (
 from hybrid_opt.polishing.front import OPTIMAL, TOLERANCE, GrowingFront, Lost
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.records import (
-    PolishedFront,
-    PolishOutcome,
-    outcome_from_json,
-    outcome_to_json,
-)
+from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
+from hybrid_opt.store.json_records import from_json, to_json
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
@@ -89,7 +85,7 @@ def test_points_of_the_front_never_get_worse() -> None:
     for outcome in own:
         assert np.all(outcome.objectives <= outcome.start + TOLERANCE)
     assert sum(o.status in ("accepted", "optimal") for o in own) >= 0.9 * len(own)
-    assert polished().success_share == pytest.approx(
+    assert polished().effort.success_share == pytest.approx(
         np.mean([o.status in ("accepted", "optimal") for o in own])
     )
 
@@ -130,7 +126,7 @@ def test_with_time_most_points_become_stationary() -> None:
 def test_what_it_cost_is_told_in_evaluations() -> None:
     result = polished()
     assert result.seconds > 0.0
-    assert result.equivalent_evaluations == pytest.approx(
+    assert result.effort.equivalent_evaluations == pytest.approx(
         result.seconds / result.evaluation_seconds, abs=1.0
     )
     ends_and_middle = 3
@@ -141,8 +137,8 @@ def test_what_it_cost_is_told_in_evaluations() -> None:
 
 
 def test_recorded_attempts_are_not_repeated() -> None:
-    texts = [outcome_to_json(outcome) for outcome in polished().outcomes]
-    recorded = [outcome_from_json(text) for text in texts[:5]]
+    texts = [to_json(outcome) for outcome in polished().outcomes]
+    recorded = [from_json(PolishOutcome, text, "an attempt", "") for text in texts[:5]]
     emitted: list[PolishOutcome] = []
     again = polisher().polish(
         start_front(), np.random.default_rng(0), recorded=recorded, emit=emitted.append
@@ -179,7 +175,7 @@ def test_an_empty_front() -> None:
     assert result.objectives.shape == (0, 2)
     assert result.outcomes == ()
     assert result.counts == {}
-    assert np.isnan(result.success_share)
+    assert np.isnan(result.effort.success_share)
 
 
 def test_infeasible_points_are_no_front() -> None:

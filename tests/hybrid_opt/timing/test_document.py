@@ -49,7 +49,7 @@ def test_figures_are_those_of_the_timings() -> None:
     assert limited.peak_normal_force is None
     assert to_json(limited)["duration"] is None
     assert document.force_curve is not None
-    assert len(document.force_curve.points) == 3
+    assert len(document.force_curve.force) == 3
     assert document.margins == timed().margins
 
 

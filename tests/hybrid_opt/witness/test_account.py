@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from hybrid_opt.campaign.simulated import MOST_SAMPLES, Whose, stored_simulation
+from hybrid_opt.campaign.simulated import MOST_SAMPLES, stored_simulation
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.force import soft_model
@@ -42,9 +42,7 @@ def test_forces_beside_what_was_told_are_stored_from_the_carrys_beginning() -> N
     pressed, squeeze = pressed_reference(cell, carry)
     assert squeeze.factor is None
     shown = CellWitness(cell.workcell).simulate(pressed, "leader")
-    found = stored_simulation(
-        Account(None, "none", pressed, squeeze, shown), Whose("a", "b", "leader")
-    )
+    found = stored_simulation(Account(None, "none", pressed, squeeze, shown), "a", "b", "leader")
     assert found.arrives
     assert found.duration == pytest.approx(carry.duration)
     assert 0.0 <= found.time[0] < 0.02

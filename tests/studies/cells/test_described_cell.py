@@ -12,7 +12,7 @@ import pytest
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import REASONS
-from studies.programs.inspection import Inspection, told
+from studies.programs.inspection import InspectionSettings, inspected
 from studies.research.plain.verdict import PlainJudge
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
@@ -69,10 +69,15 @@ def test_verdicts_are_those_of_the_plain_cell(described: Cell, plain: CellModel)
 
 @pytest.mark.slow
 def test_an_inspection_tells_of_it(described: Cell, tmp_path: Path) -> None:
-    found = Inspection(described.workcell, 40, 1, None, view=tmp_path / "view.html")
-    text = "\n".join(told(found, pairs=True))
+    settings = InspectionSettings(40, 1, view=tmp_path / "view.html", pairs=True)
+    parts = list(inspected(described.workcell, settings))
+    text = "\n".join(line for part in parts for line in part.lines)
     assert "left/link_1 – left/link_4: disabled in gofa.srdf: Never" in text
-    why = {frozenset(pair[:2]): pair[2] for pair in found.excluded_pairs}
+    why = {
+        frozenset(pair[:2]): pair[2]
+        for part in parts
+        for pair in part.values.get("excluded_pairs", ())
+    }
     pair = frozenset(("right/grip_finger", "middle board"))
     assert why[pair] == "ignored in the file: for the test"
     assert "left/grip_finger" not in text

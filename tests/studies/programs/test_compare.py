@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress, open_folder
-from hybrid_opt.campaign.polish_stage import polish_stage, read_polished
+from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.stages import run_stages
@@ -84,7 +84,7 @@ def test_polished_fronts_are_compared_too(own_study: Path, study: Path) -> None:
         run_stages(folder, (search_stage(), polished, summary_stage()), Progress(shown=False))
     figures = {f.figure: f for f in compare(own_study, own_study).figures if f.algorithm == "nsga2"}
     run = read_campaign(own_study)
-    fronts = [read_polished(own_study, replica, workcell) for replica in run.of("nsga2")]
+    fronts = [run.polished(replica) for replica in run.of("nsga2")]
     volumes = [metrics.hypervolume(front.objectives) for front in fronts if front is not None]
     assert len(volumes) == 2
     assert figures["polished_hypervolume"].first.median == pytest.approx(np.median(volumes))

@@ -95,14 +95,19 @@ def test_timing_report(stored: Path, capsys: pytest.CaptureFixture[str]) -> None
     arguments = [str(stored), "--force-limit", "60", "--force-curve", "3"]
     assert main(arguments) == 0
     text = capsys.readouterr().out
-    for part in ("closest to reference", "force limited", "Margins", "Duration against force"):
+    for part in (
+        "closest to reference",
+        "force limited",
+        "How far assumptions",
+        "Duration against force",
+    ):
         assert part in text
     assert main([*arguments, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     limited = document["timing"]["timings"]["force limited"]
     assert limited["status"] == "ok"
     assert max(limited["peak_normal_force"]) <= 60.0 * 1.005
-    assert len(document["timing"]["force_curve"]["points"]) == 3
+    assert len(document["timing"]["force_curve"]["force"]) == 3
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ import pytest
 from selenium import webdriver
 from selenium.webdriver.support.ui import WebDriverWait
 
+from studies.report.data import ReportData
 from studies.report.generate import write_report
-from studies.report.records import ReportData
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")

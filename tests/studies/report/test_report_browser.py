@@ -13,9 +13,9 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
-from studies.report import page_groups
+from studies.report import page_data
+from studies.report.data import ReportData
 from studies.report.generate import write_report
-from studies.report.records import ReportData
 from tests.studies.report.browsing import (
     NARROW,
     WIDE,
@@ -72,11 +72,8 @@ def test_a_click_on_a_point_selects_its_trajectory(browser: webdriver.Chrome, re
     opened(browser, report)
     # The first view may leave out the ends of fronts.
     browser.find_element(By.ID, "whole").click()
-    front = browser.execute_script(
-        "return report.data.views[0].groups.findIndex((g) => g.label === 'NSGA-II')"
-    )
     group = browser.execute_script(
-        "return report.data.views[0].groups[arguments[0]].members", front
+        "return report.data.views[0].data.find((t) => t.name === 'NSGA-II').customdata"
     )
     trace = browser.execute_script(
         "return document.getElementById('front-plot').data.findIndex((t) => t.name === 'NSGA-II')"
@@ -124,7 +121,9 @@ def test_every_point_can_be_saved_as_a_trajectory_file(
 ) -> None:
     """What the browser saves is read, unpacked and reproduced."""
     opened(browser, report)
-    views = browser.execute_script("return report.data.views.map((v) => v.groups[0].members[0])")
+    views = browser.execute_script(
+        "return report.data.views.map((v) => v.data.find((t) => t.customdata).customdata[0])"
+    )
     assert len(views) == 2
     for number in views:
         text = browser.execute_script(
@@ -160,7 +159,9 @@ def test_pictures_and_timings_can_be_switched(browser: webdriver.Chrome, report:
         moments.append(browser.find_element(By.ID, "figures-of-choice").text)
     assert len(moments) == len(set(moments)) == 3
     # The chosen kind of timing stays chosen.
-    browser.execute_script("report.select(report.data.views[1].groups[0].members[1])")
+    browser.execute_script(
+        "report.select(report.data.views[1].data.find((t) => t.customdata).customdata[1])"
+    )
     assert "as the search assumed" in browser.find_element(By.ID, "figures-of-choice").text
 
 
@@ -275,7 +276,7 @@ def test_fits_the_window(
 def test_hostile_names_are_shown_as_text(
     browser: webdriver.Chrome, data: ReportData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page_groups, "MAX_FRONT", 2)
+    monkeypatch.setattr(page_data, "MAX_FRONT", 2)
     hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False)
     logged(browser, "browser")
     opened(browser, hostile)

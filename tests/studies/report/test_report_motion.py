@@ -14,8 +14,8 @@ from PIL import Image, ImageSequence
 from studies.errors import ReportError
 from studies.report.__main__ import main
 from studies.report.animation import FRAMES_PER_SECOND, Film, frames, write_animation
+from studies.report.data import DrawnCarry, ReportData
 from studies.report.live import LiveView
-from studies.report.records import DrawnCarry, ReportData
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ def test_nothing_on_the_page_offers_to_leave_the_machine(
 def test_the_star_is_the_recommended_carry(browser: webdriver.Chrome, report: Path) -> None:
     opened(browser, report)
     star = browser.execute_script(
-        "return report.data.views[0].groups.find((g) => g.symbol === 'star').members[0]"
+        "return report.data.views[0].data.find((t) => t.marker?.symbol === 'star').customdata[0]"
     )
     lists = browser.execute_script("return report.data.lists")
     assert lists[0] == {"label": "Recommended", "members": [star]}

@@ -16,16 +16,17 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.branches import BranchCompetition, PairResult
+from hybrid_opt.campaign.cell_source import ReadyCell
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.robust.squeeze import SqueezeSettings
-from studies.report import page_carries, page_groups
+from studies.report import page_carries, page_data
+from studies.report.data import ReportData
 from studies.report.generate import write_report
 from studies.report.jobs import DrawnJob, pressure_shift
-from studies.report.page_carries import PageCarries, Shown
-from studies.report.page_data import PageData
-from studies.report.records import ReportData
+from studies.report.page_carries import Shown, page_trajectory
+from studies.report.page_data import page_document
 from studies.study.recommendation import recommendation_text
 
 HOSTILE = "</title></script><script>window.broken = 1</script><img src=x onerror=alert(1)>\"'&"
@@ -113,7 +114,7 @@ def test_the_policy_allows_exactly_the_pages_scripts(text: str) -> None:
 def test_hostile_names_stay_text(
     data: ReportData, tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page_groups, "MAX_FRONT", 2)
+    monkeypatch.setattr(page_data, "MAX_FRONT", 2)
     hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False).read_text("utf-8")
     assert HOSTILE not in hostile
     assert html.escape(HOSTILE) in hostile
@@ -128,16 +129,21 @@ def test_hostile_names_stay_text(
 
 @pytest.fixture(scope="module")
 def document(data: ReportData) -> dict[str, Any]:
-    return PageData(data).document()
+    return page_document(data)
+
+
+def points(view: dict[str, Any]) -> list[dict[str, Any]]:
+    """The traces of a picture whose points show trajectories."""
+    return [trace for trace in view["data"] if "customdata" in trace]
 
 
 def test_data_of_the_page_are_the_trajectories(data: ReportData, document: dict[str, Any]) -> None:
     front = data.algorithms[0].shown.front
     view = document["views"][1]
-    group = view["groups"][0]
-    assert len(group["members"]) == len(front)
+    group = points(view)[0]
+    assert len(group["customdata"]) == len(front)
     np.testing.assert_allclose(group["x"], front.objectives[:, 0])
-    first = document["trajectories"][group["members"][0]]
+    first = document["trajectories"][group["customdata"][0]]
     np.testing.assert_allclose(first["objectives"], front.objectives[0], rtol=1e-12)
     assumed = first["motions"][-1]
     samples = np.frombuffer(base64.b64decode(assumed["data"]), "<f4").reshape(-1, 23)
@@ -154,26 +160,26 @@ def test_every_point_shows_what_robots_drive(data: ReportData, document: dict[st
     """Timed by `time_path`, and named by algorithm, replica and values."""
     assert data.drivable is not None
     view = document["views"][0]
-    entry = data.drivable.fronts[0]
-    group = next(g for g in view["groups"] if g["label"] == entry.front.label)
-    assert len(group["members"]) == len(entry.front.x)
+    _, front, _ = next(data.drivable.fronts())
+    group = next(g for g in points(view) if g["name"] == front.label)
+    assert len(group["customdata"]) == len(front.x)
     cell = ho.Cell(data.drivable.workcell, DRIVABLE_OBJECTIVES)
-    for k in (0, len(entry.front.x) - 1):
-        x = entry.front.x[k]
+    for k in (0, len(front.x) - 1):
+        x = front.x[k]
         timing = ho.time_path(cell, x, ho.TimingLimits(force=float(x[-1])))
-        shown = document["trajectories"][group["members"][k]]
+        shown = document["trajectories"][group["customdata"][k]]
         motion, job = shown["motions"]
         assert job["name"] == "the whole job"
         assert motion["duration"] == pytest.approx(timing.duration, abs=1e-5)
         assert max(motion["peaks"]) <= x[-1] * 1.005
         assert (group["x"][k], group["y"][k]) == (max(motion["peaks"]), motion["duration"])
-        name = f"{entry.front.source}: {timing.duration:.2f} s, "
+        name = f"{front.source}: {timing.duration:.2f} s, "
         assert shown["label"].startswith(name)
         assert timing.carry is not None
         torque = np.abs(timing.carry.torque).max(axis=0)
         limit = np.concatenate([robot.torque_max for robot in data.workcell.robots])
         np.testing.assert_allclose(motion["torqueUse"], 100.0 * torque / limit, atol=1e-2)
-    searched = document["trajectories"][document["views"][1]["groups"][0]["members"][0]]
+    searched = document["trajectories"][points(document["views"][1])[0]["customdata"][0]]
     assert [motion["name"] for motion in searched["motions"]] == [
         "as robots drive it",
         "as the search assumed: ramped speed",
@@ -186,15 +192,14 @@ def test_every_point_has_the_phases_of_its_job(
 ) -> None:
     """As `plan_job` plans them around the same timing."""
     assert data.drivable is not None
-    entry = data.drivable.fronts[0]
-    label = entry.front.label
-    group = next(g for g in document["views"][0]["groups"] if g["label"] == label)
-    x = entry.front.x[0]
-    cell = Cell(data.workcell)
+    _, front, _ = next(data.drivable.fronts())
+    group = next(g for g in points(document["views"][0]) if g["name"] == front.label)
+    x = front.x[0]
+    cell = Cell(data.drivable.workcell, DRIVABLE_OBJECTIVES)
     limits = ho.TimingLimits(force=float(x[-1]))
     timing = ho.time_path(cell, x[: data.workcell.task.n_var], limits)
     job = JobModel(cell.compiled, cell.timing_model).plan(timing, within_jerk=False)
-    shown = document["trajectories"][group["members"][0]]["motions"][1]
+    shown = document["trajectories"][group["customdata"][0]]["motions"][1]
     assert [phase["name"] for phase in shown["phases"]] == [
         phase.name.replace("_", " ") for phase in job.phases
     ]
@@ -220,8 +225,8 @@ def test_every_point_has_the_phases_of_its_job(
 
 def test_points_are_named_by_what_was_minimised(data: ReportData) -> None:
     cell = Cell(data.workcell, ("mean_force", "friction_use"))
-    carries = PageCarries([cell], [JobModel(cell.compiled, cell.timing_model)])
-    trajectory = carries.trajectory(Shown("NSGA-II, replica 1", data.initial.x, ""))
+    ready = ReadyCell(cell, JobModel(cell.compiled, cell.timing_model))
+    trajectory = page_trajectory((ready,), Shown("NSGA-II, replica 1", data.initial.x, ""))
     mean, friction = trajectory["objectives"]
     assert trajectory["label"] == (
         f"NSGA-II, replica 1: mean force {mean:.4f}, friction use {friction:.4f}"
@@ -233,7 +238,7 @@ def test_selected_trajectories_name_their_replica(
 ) -> None:
     best = data.solved[0].best
     assert best is not None
-    name = f"{best.label}, replica {data.solved[0].shown.replica}: least force: "
+    name = f"{best.label}, replica {data.solved[0].shown.front.replica}: least force: "
     labels = [trajectory["label"] for trajectory in document["trajectories"]]
     # In both pictures: once as it was selected, and at some of the forces of its curve.
     assert sum(label.startswith(name) for label in labels) >= 2
@@ -288,14 +293,14 @@ def test_polished_fronts_stand_beside_the_searchs(
 ) -> None:
     no_job = DrawnJob("", "not what is looked at")
     monkeypatch.setattr(page_carries, "drawn", lambda *_: no_job)
-    document = PageData(hybrid_data).document()
-    groups = document["views"][1]["groups"]
-    assert [group["label"] for group in groups] == [
+    document = page_document(hybrid_data)
+    groups = points(document["views"][1])
+    assert [group["name"] for group in groups] == [
         f"{title}{stage}" for title in ("NSGA-II", "MOPSO") for stage in ("", ", polished")
     ]
     hybrid = hybrid_data.algorithms[0].shown.hybrid
     assert hybrid is not None
-    assert len(groups[1]["members"]) == len(hybrid)
+    assert len(groups[1]["customdata"]) == len(hybrid)
 
 
 def test_every_file_of_the_report_is_written(report: Path, text: str) -> None:

@@ -18,9 +18,9 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from PIL import Image
 
+from studies.report.data import ReportData, Run
 from studies.report.pictures import ReportPicture, report_pictures
 from studies.report.pictures_cell import planes
-from studies.report.records import ReportData, Run
 from studies.report.style import ARMS, HAND_MADE, SERIES, in_style, save
 from symbolic.array import Array
 
@@ -50,6 +50,8 @@ NAMES = (
 HYBRID = ("polish", "simulated_forces")
 """What `hybrid_data` has besides."""
 
+
+NONE = np.empty((0, 2))
 
 Drawn = dict[str, tuple[ReportPicture, Figure]]
 
@@ -105,7 +107,17 @@ def test_without_a_polish_there_is_no_figure_of_it(data: ReportData) -> None:
 
 
 def test_without_a_feasible_candidate_the_rest_is_drawn(data: ReportData) -> None:
-    failed = tuple(replace(algorithm, selected=None) for algorithm in data.algorithms)
+    failed = tuple(
+        replace(
+            algorithm,
+            best=None,
+            runs=tuple(
+                replace(run, front=replace(run.front, x=run.front.x[:0], objectives=NONE))
+                for run in algorithm.runs
+            ),
+        )
+        for algorithm in data.algorithms
+    )
     shown = replace(data, algorithms=failed, timings=data.timings[:1])
     names = [entry.name for entry in report_pictures(shown)]
     assert "fig07_fronts" not in names

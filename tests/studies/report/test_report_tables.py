@@ -1,27 +1,20 @@
-"""The report's tables: figures of the summary, in formats that hold any text."""
+"""The report's tables: figures of the summary."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from hybrid_opt.campaign.summary import StoredBound
+from hybrid_opt.display.table import NOTHING, Table
+from hybrid_opt.indicators.metrics import BindingBound
 from studies.errors import ReportError
-from studies.report import tables
-from studies.report.look import BEGIN, END, insert_tables
-from studies.report.records import ReportData
-from studies.report.table_text import NOTHING, Table
-from studies.report.tables import report_tables
-
-TEXTS = st.text(st.characters(blacklist_categories=("Cs", "Cc")), min_size=1, max_size=20)
+from studies.report.data import ReportData
+from studies.report.generate import BEGIN, END, insert_tables, report_tables
+from studies.study import tables
 
 
 def named(tables: tuple[Table, ...], name: str) -> Table:
@@ -66,26 +59,17 @@ def test_the_papers_figures_are_those_that_it_states(data: ReportData) -> None:
 
 
 def test_words_begin_at_the_left_and_figures_end_at_the_right(data: ReportData) -> None:
-    rows = (("a", "1.0 ± 2", "none", NOTHING), ("b", "-0.5", "upper, x", "\N{MINUS SIGN}3 of 4"))
-    table = Table("t", "title", ("who", "how much", "which", "of"), rows, "")
-    assert table.words == (True, False, True, False)
-    assert "| --- | ---: | --- | ---: |" in table.markdown()
-    assert r"\begin{tabular}{lrlr}" in table.latex()
-    assert "<th class='word'>which</th>" in table.html()
-    assert "<td class='word'>upper, x</td>" in table.html()
-    assert "<td>-0.5</td>" in table.html()
     timing = named(report_tables(data, with_paper=False), "timing")
-    assert timing.words == (True, False, False, False, True, True)
-    assert tables.bounds(data).words[1]
+    assert timing.words == (True, *[False] * 6, True, True)
+    assert tables.bounds(data.summary.bounds).words[1]
 
 
 def test_the_bounds_that_matter_are_listed(data: ReportData) -> None:
-    def bound(k: int) -> StoredBound:
-        return StoredBound(f"waypoint {k}", "upper", 0.1, k)
+    def bound(k: int) -> BindingBound:
+        return BindingBound(f"waypoint {k}", "upper", 0.1, k)
 
     many = replace(data.summary.bounds, solutions=40, binding=tuple(map(bound, range(1, 21))))
-    shown = replace(data, summary=replace(data.summary, bounds=many))
-    rows = [row for row in tables.bounds(shown).rows if row[0] == "search"]
+    rows = tables.bounds(many).rows
     assert [row[3] for row in rows[:2]] == ["20 of 40", "19 of 40"]
     assert len(rows) == tables.MOST_BOUNDS + 1
     assert rows[-1] == ("search", "and 12 further bounds", NOTHING, "at most 12 of 40")
@@ -97,44 +81,12 @@ def test_every_row_fits_its_header(data: ReportData) -> None:
         assert len(table.rows) > 0
 
 
-@given(st.lists(TEXTS, min_size=2, max_size=4))
-def test_csv_reads_back(cells: list[str]) -> None:
-    table = Table("t", "title", tuple(cells), (tuple(cells),), "note")
-    assert list(csv.reader(io.StringIO(table.csv()))) == [cells, cells]
-
-
-@given(TEXTS)
-def test_html_holds_no_markup_of_its_texts(text: str) -> None:
-    hostile = f"<script>{text}</script>\"'&"
-    page = Table("t", hostile, (hostile, "b"), ((hostile, "c"),), hostile).html()
-    assert "<script" not in page
-    assert page.count("</td>") == 2
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("a_b & 50 % #1 {x} $y$", r"a\_b \& 50 \% \#1 \{x\} \$y\$"),
-        ("C:\\x^2~", r"C:\textbackslash{}x\textasciicircum{}2\textasciitilde{}"),
-        ("1 ± 2 –", r"1 $\pm$ 2 --"),
-    ],
-)
-def test_latex_escapes_what_latex_would_read(text: str, expected: str) -> None:
-    assert expected in Table("t", text, ("a", "b"), (("c", "d"),), "").latex()
-
-
-def test_markdown_keeps_one_row_per_line() -> None:
-    text = Table("t", "x", ("a|b", "c"), (("1\n2", "<b>"),), "n").markdown()
-    assert "| a\\|b | c |" in text
-    assert "| 1 2 | &lt;b> |" in text
-
-
 def test_an_algorithm_without_a_feasible_candidate_is_told(data: ReportData) -> None:
-    failed = replace(data.algorithms[0], selected=None)
-    shown = replace(data, algorithms=(failed, *data.algorithms[1:]))
-    rows = [row[0] for row in named(report_tables(shown, with_paper=False), "table2_selected").rows]
-    assert "NSGA-II" not in rows
-    assert "MOPSO" in rows
+    failed = replace(data.summary.algorithms["nsga2"], representative=None)
+    algorithms = {**data.summary.algorithms, "nsga2": failed}
+    table = tables.selected(replace(data.summary, algorithms=algorithms), with_paper=False)
+    rows = [row[0] for row in table.rows]
+    assert rows[:3] == ["hand-made", "NSGA-II: no feasible candidate", "MOPSO"]
 
 
 def test_tables_are_put_between_the_markers_of_a_document(

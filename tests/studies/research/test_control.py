@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
-from hybrid_opt.campaign.polish_stage import read_polished
 from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.settings import PolishSettings
+from studies.programs.study import StudySettings, run_study
 from studies.research import longer_searches
 from studies.research.best_front import ReferenceFront
 from studies.research.control import main
-from studies.study.stages import StudySettings, run_study
 from symbolic.read.cell import load
 from tests.symbolic.read.samples import RACK
 
@@ -59,7 +58,7 @@ def test_longer_searches_repeat_the_studys_own_settings(study: Path) -> None:
 
 def test_distance_to_a_reference_front(study: Path) -> None:
     own = read_campaign(study)
-    polished = [read_polished(study, replica, own.workcell) for replica in own.replicas]
+    polished = [own.polished(replica) for replica in own.replicas]
     fronts = [found.objectives for found in polished if found is not None]
     assert len(fronts) == 2
     union = metrics.front_of(np.concatenate(fronts))

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
-from hybrid_opt.campaign.documents import PolishDocument
-from hybrid_opt.campaign.layout import POLISH, polished_folder
 from hybrid_opt.campaign.recommended import StoredRecommendation
 from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.carry import Carry
@@ -20,16 +18,14 @@ from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.robust.force import robust_model
-from hybrid_opt.store.json_records import read_record
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
 from hybrid_opt.timing.document import read_timing
 from studies import export
-from studies.report.data import gather
-from studies.report.page_data import PageData
-from studies.report.pictures_drive import duration_against_force
-from studies.report.records import ReportData
-from studies.report.tables import report_tables
-from studies.study.stages import StudySettings, run_study
+from studies.programs.study import StudySettings, run_study
+from studies.report.data import ReportData, gather
+from studies.report.generate import report_tables
+from studies.report.page_data import page_document
+from studies.report.pictures_fronts import duration_against_force
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
@@ -83,16 +79,16 @@ def test_one_experiment_is_searched_and_polished(study: tuple[Path, str]) -> Non
     results = read_campaign(root)
     assert results.objectives == ROBUST_DRIVABLE_OBJECTIVES
     assert not (root / "drivable").exists()
-    path = polished_folder(root, "nsga2", 0) / POLISH
-    front = read_record(PolishDocument, path, "").front
-    assert any(point.polished for point in front)
+    front = results.polished(results.replicas[0])
+    assert front is not None
+    assert front.polished.any()
     reference = results.workcell.task.reference_force
-    for point in front[:: max(1, len(front) // 3)]:
-        carry = results.cell.carry(point.x)
+    for k in range(0, len(front.x), max(1, len(front.x) // 3)):
+        carry, force = results.cell.carry(front.x[k]), front.objectives[k, 1]
         most = (robust_peak(results.workcell, carry) / reference).max()
         # The carry is sampled at the task's samples, the objective is of the whole path, and forces
         # of pads that press evenly have sharp peaks.
-        assert 0.97 * point.objectives[1] < most <= point.objectives[1] * (1.0 + 5e-3)
+        assert 0.97 * force < most <= force * (1.0 + 5e-3)
         assert most > 1.05 * (carry.peak_normal_force / reference).max()
 
 
@@ -173,23 +169,23 @@ def test_the_report_shows_robust_forces(data: ReportData) -> None:
     assert min(values.min() for values in lines.values()) >= MORE * 49.05 * (1.0 - 1e-4)
     titles = {table.name: table.title for table in report_tables(data, False)}
     assert titles["time_against_force"].startswith("Time against robust force")
-    page = PageData(data).document()
+    page = page_document(data)
     (view,) = page["views"]
-    assert view["xTitle"] == "largest robust force [N]"
+    assert view["layout"]["xaxis"]["title"]["text"] == "largest robust force [N]"
     choice = data.summary.recommendation
     assert choice is not None
-    (group,) = (each for each in view["groups"] if each["label"] == "Recommended")
+    (group,) = (each for each in view["data"] if each["name"] == "Recommended")
     assert choice.robust_force is not None
     assert group["x"][0] == pytest.approx(max(choice.robust_force), rel=5e-3)
     assert group["y"][0] == pytest.approx(choice.duration, abs=0.01)
     # Points of the fronts are driven as the search found them.
     assert data.drivable is not None
-    entry = data.drivable.fronts[0].front
-    (shown,) = (each for each in view["groups"] if each["label"] == entry.label)
+    _, front, _ = next(data.drivable.fronts())
+    (shown,) = (each for each in view["data"] if each["name"] == front.label)
     cell = Cell(data.drivable.workcell, data.objectives)
-    for k in (0, len(entry.x) - 1):
-        point = page["trajectories"][shown["members"][k]]
+    for k in (0, len(front.x) - 1):
+        point = page["trajectories"][shown["customdata"][k]]
         assert point["motions"][0]["duration"] == pytest.approx(
-            cell.carry(entry.x[k]).duration, rel=1e-4
+            cell.carry(front.x[k]).duration, rel=1e-4
         )
-        assert point["force"] <= 1.005 * entry.x[k][-1]
+        assert point["force"] <= 1.005 * front.x[k][-1]

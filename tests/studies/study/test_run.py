@@ -25,7 +25,8 @@ from hybrid_opt.recommending.choice import Wish
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
 from hybrid_opt.timing.document import read_timing
 from studies import rack, recommend, run
-from studies.programs.study import PAGE, campaign_settings, polish_settings
+from studies.programs.study import campaign_settings, polish_settings
+from studies.report.stage import PAGE
 from studies.study.recommendation import recommend_from, recommendation_text
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell

@@ -63,7 +63,7 @@ def test_what_is_refused_is_refused_before_anything_is_compiled(
     def begin(*given: object, **more: object) -> None:
         raise AssertionError("compiles")
 
-    monkeypatch.setattr("studies.study.stages.build_study", begin)
+    monkeypatch.setattr("studies.programs.study.build_study", begin)
     assert run.main(asked) == 2
     assert "continue it with --resume, or choose another --output" in capsys.readouterr().err
     assert run.main([*asked[:-2], "--polish", "--resume"]) == 2

@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign.layout import SIMULATED
-from hybrid_opt.campaign.simulated import StoredSimulation, Whose, not_simulated, read_simulations
+from hybrid_opt.campaign.documents import SIMULATED
+from hybrid_opt.campaign.simulated import StoredSimulation, read_simulations
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.work.service import SerialExecutor, Service
 from studies import run
-from studies.study.simulation import Simulated, Written, is_done, simulation_text, wanted_carries
+from studies.study.simulation import Simulated, Written, is_done, wanted_carries
+from studies.study.tables import simulated
 from tests.studies.conftest import simulation
 from tests.symbolic.cells import RACK
 
@@ -59,8 +60,7 @@ def test_the_table_tells_threshold_forces_and_what_became_of_the_box() -> None:
     slips = replace(
         simulation("slippery"), slips=nan, holds=nan, problem=lost, pad=0, arrives=False
     )
-    text = simulation_text((simulation("good"), slips))
-    first, second = text.splitlines()[3:5]
+    first, second = simulated((simulation("good"), slips)).text().splitlines()[3:5]
     assert "1.000 to 1.004" in first
     assert "pad 2 at 0.50 s" in first
     assert "50.50 / 50.00" in first
@@ -71,11 +71,11 @@ def test_the_table_tells_threshold_forces_and_what_became_of_the_box() -> None:
 
 def test_what_cannot_be_simulated_is_told_and_kept(own_study: Path) -> None:
     one = wanted_carries(own_study)[0]
-    lost = not_simulated(Whose(one.label, one.digest, "leader"), "joint 'lift' moves both arms")
+    lost = StoredSimulation(one.label, one.digest, "leader", "joint 'lift' moves both arms")
     (own_study / SIMULATED).mkdir()
     write_json(own_study / SIMULATED / f"{one.name}.json", to_json(lost))
     assert is_done(own_study, one)
-    (row,) = simulation_text(read_simulations(own_study)).splitlines()[3:4]
+    (row,) = simulated(read_simulations(own_study)).text().splitlines()[3:4]
     assert "joint 'lift' moves both arms" in row
     assert row.split()[-1] == "NO"
 

@@ -1,0 +1,464 @@
+"""The tables of a study, each once, from what the results folder holds.
+
+The terminal shows some of them, the page all, and `tables/` has them as files.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hybrid_opt.campaign.recommended import StoredRecommendation
+from hybrid_opt.campaign.simulated import StoredSimulation
+from hybrid_opt.campaign.summary import (
+    AlgorithmFigures,
+    Bounds,
+    CampaignSummary,
+    FrontFigures,
+    SelectedEntry,
+)
+from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number
+from hybrid_opt.indicators.statistics import summarise
+from hybrid_opt.metaheuristics.registry import title
+from hybrid_opt.robust.force import RobustPrice
+from hybrid_opt.timing.analysis import ForceCurve
+from hybrid_opt.timing.document import StoredTiming, TimingDocument
+from hybrid_opt.timing.robustness import KILOGRAM_FORCE
+
+FORCE = Quantity("normal force", "N")
+DURATION = Quantity("duration", "s")
+FINE_DURATION = Quantity("duration", "s", 3)
+PAYLOAD = Quantity("payload at the limit", "kg")
+ABOVE_REST = Quantity("above rest", "%")
+TORQUE = Quantity("joint torque", "%", 1, 100.0)
+SHIFT = Quantity("pressure shift", "mm", 1, 1e3)
+
+QUANTITIES = {
+    "feasible": Quantity("feasible", digits=0),
+    "feasible_share": Quantity("feasible", "%", 1, 100.0),
+    "non_dominated": Quantity("non-dominated", digits=1),
+    "hypervolume": Quantity("hypervolume", digits=4),
+    "igd": Quantity("IGD", digits=5),
+    "igd_plus": Quantity("IGD+", digits=5),
+    "spacing": Quantity("spacing", digits=5),
+    "mean_excess_above_static": ABOVE_REST,
+    "payload_limit": PAYLOAD,
+    "seconds": Quantity("computing time", "s"),
+    "widest_gap": Quantity("widest gap", "%", 0, 100.0),
+    "equivalent_evaluations": Quantity("evaluations as long", digits=0),
+}
+"""Figures of replicas by their names in summary.json."""
+
+MOST_BOUNDS = 8
+"""Bounds of one experiment that are listed."""
+
+
+@dataclass(frozen=True)
+class PaperFigures:
+    """Figures of the paper's text for an algorithm on its rack; its tables are not reproduced.
+
+    Attributes:
+        feasible: feasible candidates of 1000 (Section 7).
+        payload_limit: payload at which the selected trajectory reaches 12 kgf [kg] (Section 6.3).
+    """
+
+    feasible: int
+    payload_limit: float
+
+
+PAPER = {"nsga2": PaperFigures(694, 16.71), "mopso": PaperFigures(296, 16.06)}
+
+
+def study_tables(
+    summary: CampaignSummary,
+    drivable: CampaignSummary | None = None,
+    jerk: Table | None = None,
+    simulations: Sequence[StoredSimulation] = (),
+    with_paper: bool = False,
+) -> tuple[Table, ...]:
+    """All tables that need no more than a study's documents.
+
+    Args:
+        summary: of its first experiment.
+        drivable: of the drivable experiment beside that, None without one.
+        jerk: what limits on jerk cost, see `studies.study.drivable.limits_on_jerk`.
+        simulations: carries in the simulated cell.
+        with_paper: whether figures that the paper states of its own rack stand beside ours.
+    """
+    found = summary.recommendation
+    tables = [quality(summary, with_paper), selected(summary, with_paper)]
+    if found is not None:
+        tables.append(time_against_force(found))
+        if found.price is not None:
+            tables.append(robust_price(found.price, summary.robots))
+    tables += [] if jerk is None else [jerk]
+    tables += [simulated(simulations)] if simulations else []
+    tables += [replicas(summary), infeasible(summary)]
+    if drivable is not None:
+        heading = "Quality of the drivable search."
+        tables.append(quality(drivable, False, "drivable_quality", heading))
+    tables.append(bounds(summary.bounds, None if drivable is None else drivable.bounds))
+    tables += [rank_tests(summary)] if summary.tests else []
+    return tuple(tables)
+
+
+_QUALITY = ("feasible", "feasible_share", "non_dominated", "hypervolume", "igd", "spacing")
+
+
+def quality(
+    summary: CampaignSummary,
+    with_paper: bool,
+    name: str = "table1_quality",
+    heading: str = "Table 1. Quality of the search.",
+) -> Table:
+    """Indicators over the replicas (paper Table 1)."""
+    rows = []
+    for algorithm, entry in summary.algorithms.items():
+        for label, figures in _variants(algorithm, entry):
+            rows.append((label, *(_mean(figures, key) for key in _QUALITY)))
+        if with_paper and algorithm in PAPER:
+            stated = PAPER[algorithm]
+            cells = [str(stated.feasible), f"{stated.feasible / 10.0:.1f}"]
+            rows.append((f"{title(algorithm)}, paper", *cells, *[NOTHING] * 4))
+    settings = summary.settings
+    return Table(
+        name,
+        heading,
+        ("algorithm", *(QUANTITIES[key].heading() for key in _QUALITY)),
+        tuple(rows),
+        f"Mean ± standard deviation of {counted(settings.replicas, 'replica')} of "
+        f"{settings.evaluations} evaluations. Hypervolume: reference 1.1 in every objective. "
+        "IGD: mean distance to the non-dominated union of the campaign. Spacing: Schott's."
+        + (" The paper's rows hold what its text states." if with_paper else ""),
+    )
+
+
+def _variants(name: str, entry: AlgorithmFigures) -> list[tuple[str, list[FrontFigures]]]:
+    """An algorithm's replicas as searched, and as polished where they were."""
+    found: list[tuple[str, list[FrontFigures]]] = [(title(name), list(entry.replicas))]
+    polished = [row.polished for row in entry.replicas if row.polished is not None]
+    return found + ([(f"{title(name)} + polish", list(polished))] if polished else [])
+
+
+def _mean(figures: Sequence[FrontFigures], key: str) -> str:
+    """Mean and standard deviation of a figure over replicas; polished ones lack some."""
+    if not hasattr(figures[0], key):
+        return NOTHING
+    found = summarise([getattr(row, key) for row in figures])
+    return QUANTITIES[key].mean(found.mean, found.std)
+
+
+def selected(summary: CampaignSummary, with_paper: bool) -> Table:
+    """Normal forces of the selected trajectories (paper Table 2)."""
+    rows = [_forces("hand-made", summary.hand_made)]
+    for name, entry in summary.algorithms.items():
+        if entry.representative is None:
+            rows.append((f"{title(name)}: no feasible candidate", *[NOTHING] * 7))
+        else:
+            best = [entry.replicas[entry.representative]]
+            shown = AlgorithmFigures(0, {}, tuple(best), entry.polished)
+            rows += [_forces(label, row[0].selected) for label, row in _variants(name, shown)]
+        if with_paper and name in PAPER:
+            limit = f"{PAPER[name].payload_limit:.2f}"
+            rows.append((f"{title(name)}, paper", *[NOTHING] * 6, limit))
+    still = summary.static_hold
+    force = [FORCE(value) for value in still.normal_force]
+    rows.append(
+        ("level payload at rest", *force, *force, "0.00", NOTHING, PAYLOAD(still.payload_limit))
+    )
+    return Table(
+        "table2_selected",
+        "Table 2. Normal contact forces of the selected trajectories.",
+        (
+            "trajectory",
+            *(f"{which}, {robot} [N]" for which in ("least", "peak") for robot in summary.robots),
+            *(quantity.heading() for quantity in (ABOVE_REST, DURATION, PAYLOAD)),
+        ),
+        tuple(rows),
+        "Selected: least mean peak force of the replica with the largest hypervolume. Above rest: "
+        "mean of both peaks over that of the level payload at rest. Payload: at which the first "
+        "robot's whole contact force reaches its reference force.",
+    )
+
+
+def _forces(label: str, found: SelectedEntry | None) -> tuple[str, ...]:
+    if found is None:
+        return (f"{label} (infeasible)", *[NOTHING] * 7)
+    return (
+        label if found.feasible else f"{label} (infeasible)",
+        *(FORCE(value) for value in (*found.minimum_normal_force, *found.peak_normal_force)),
+        ABOVE_REST(found.mean_excess_above_static),
+        DURATION(found.duration),
+        PAYLOAD(found.payload_limit),
+    )
+
+
+_OF_REPLICAS = ("mean_excess_above_static", "payload_limit", "seconds")
+
+
+def replicas(summary: CampaignSummary) -> Table:
+    """Selected carries of all replicas, and what a replica took."""
+    rows, solvers = [], set[str]()
+    for name, entry in summary.algorithms.items():
+        solvers |= {row.polished.solver for row in entry.replicas if row.polished is not None}
+        for label, figures in _variants(name, entry):
+            found = [summarise([getattr(row, key) for row in figures]) for key in _OF_REPLICAS]
+            cells = [
+                QUANTITIES[key].spread(one.median, one.quartile1, one.quartile3)
+                for key, one in zip(_OF_REPLICAS, found, strict=True)
+            ]
+            after = entry.polished if label != title(name) else None
+            better = NOTHING if after is None else f"{after.replicas_improved} of {len(figures)}"
+            effort = [
+                NOTHING if after is None else QUANTITIES[key](after.statistics[key].median)
+                for key in ("widest_gap", "equivalent_evaluations")
+            ]
+            rows.append((label, *cells, better, *effort))
+    by = f" Solver of the polish: {' and '.join(sorted(solvers))}." if solvers else ""
+    return Table(
+        "replicas",
+        "Selected solutions of all replicas, and what a replica took.",
+        (
+            "algorithm",
+            *(QUANTITIES[key].heading() for key in _OF_REPLICAS),
+            "better in",
+            *(QUANTITIES[key].heading() for key in ("widest_gap", "equivalent_evaluations")),
+        ),
+        tuple(rows),
+        "Median [quartiles]. Better in: replicas whose hypervolume the polish made larger. Widest "
+        "gap: between neighbours, as a share of the front's length. Evaluations as long: those "
+        f"that take the time of a polish.{by}",
+    )
+
+
+def infeasible(summary: CampaignSummary) -> Table:
+    """What made candidates infeasible."""
+    shares: dict[str, dict[str, float]] = {}
+    for name, entry in summary.algorithms.items():
+        total = sum(row.evaluations for row in entry.replicas)
+        for row in entry.replicas:
+            for reason, count in row.infeasible_by_reason.items():
+                own = shares.setdefault(reason, {})
+                own[name] = own.get(name, 0.0) + count / total
+    ranked = sorted(shares, key=lambda reason: -max(shares[reason].values()))
+    share = Quantity("", "%", 1, 100.0)
+    return Table(
+        "infeasibility",
+        "What made candidates infeasible.",
+        ("constraint", *(f"{title(name)} [%]" for name in summary.algorithms)),
+        tuple(
+            (
+                reason.replace("_", " "),
+                *(share(shares[reason].get(name, 0.0)) for name in summary.algorithms),
+            )
+            for reason in ranked
+        ),
+        "The constraint violated first along the path, in percent of all candidates.",
+    )
+
+
+def bounds(search: Bounds, drivable: Bounds | None = None) -> Table:
+    """The bounds of the variables that the best fronts lie on, of one or both experiments."""
+    rows = []
+    for name, found in (("search", search), ("drivable", drivable)):
+        if found is None:
+            continue
+        if not found.binding:
+            rows.append((name, "none", NOTHING, f"0 of {found.solutions}"))
+        often = sorted(found.binding, key=lambda bound: -bound.solutions)
+        rows += [
+            (
+                name,
+                f"{bound.side}, {bound.variable}",
+                f"{bound.value:g}",
+                f"{bound.solutions} of {found.solutions}",
+            )
+            for bound in often[:MOST_BOUNDS]
+        ]
+        if left := often[MOST_BOUNDS:]:
+            fewer = f"at most {left[0].solutions} of {found.solutions}"
+            rows.append((name, f"and {counted(len(left), 'further bound')}", NOTHING, fewer))
+    return Table(
+        "bounds",
+        "Bounds of the variables that members of the best fronts lie on.",
+        ("experiment", "bound", "value [m, rad]", "members"),
+        tuple(rows),
+        "All replicas, polished fronts where there are any; most members first, all bounds are in "
+        "summary.json. A bound that many lie on may have "
+        "decided them: wider ones might allow better carries.",
+    )
+
+
+def rank_tests(summary: CampaignSummary) -> Table:
+    """Mann-Whitney tests between algorithms."""
+    return Table(
+        "tests",
+        "Comparison over replicas.",
+        ("pair", "figure", "A12", "effect", "p", "p (Holm)"),
+        tuple(
+            (
+                f"{title(test.first)} / {title(test.second)}",
+                test.figure.replace("_", " "),
+                number(test.a12),
+                test.magnitude,
+                number(test.p, 5),
+                number(test.p_holm, 5),
+            )
+            for test in summary.tests
+        ),
+        "Exact Mann-Whitney tests. A12: chance that the first of the pair has the larger figure.",
+    )
+
+
+def time_against_force(found: StoredRecommendation) -> Table:
+    """How long paths and fronts take at the same forces."""
+    table = found.durations
+    return Table(
+        "time_against_force",
+        f"Time against {found.force_kind.name}: shortest drivable durations [s].",
+        ("path or front", *(f"{force:.2f} N" for force in table.forces)),
+        tuple(
+            (row.label, *map(FINE_DURATION.spread, row.median, row.least, row.largest))
+            for row in table.rows
+        ),
+        "Every path timed anew at the force. Of fronts the fastest member: median over the "
+        "replicas [least, most].",
+    )
+
+
+def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
+    """Forces of the recommended carry that hold for multiples of a set of cases."""
+    check, of = price.check, "" if price.uncertainty.stated else ", the usual one"
+    return Table(
+        "robust_price",
+        "The price of robustness of the recommended carry.",
+        ("times the set", *(f"peak, {robot} [N]" for robot in robots)),
+        tuple(
+            (number(factor), *map(FORCE, peak))
+            for factor, peak in zip(price.factors, price.peak, strict=True)
+        ),
+        f"The set{of}: {price.uncertainty}. The first robot "
+        "leads, the force of the second is commanded. The reference forces allow "
+        f"{number(price.largest_factor)} times the set. Of {check.cases} random cases of the set "
+        f"{check.failing} slip under its forces; the hardest needs {100.0 * check.closest:.2f} % of them.",
+    )
+
+
+def simulated(found: Sequence[StoredSimulation]) -> Table:
+    """Carries in the simulated cell."""
+    return Table(
+        "simulation",
+        "The selected carries in the simulated cell.",
+        (
+            "carry",
+            DURATION.heading(),
+            "holds from",
+            "slips first",
+            "pressed with",
+            "peak predicted [N]",
+            "peak simulated [N]",
+            "largest error [%]",
+            "slip [mm]",
+            "arrives",
+        ),
+        tuple(
+            (
+                one.label,
+                DURATION(one.duration),
+                f"{one.slips:.3f} to {one.holds:.3f}" if math.isfinite(one.holds) else one.problem,
+                f"pad {one.pad} at {one.begins:.2f} s" if one.pad else NOTHING,
+                "robust forces" if one.robust else f"{number(one.factor, 1)} times the plan",
+                *(" / ".join(map(FORCE, forces)) for forces in one.peaks),
+                number(100.0 * one.largest_error, 1),
+                number(1e3 * one.slip, 3),
+                "yes" if one.arrives else "NO",
+            )
+            for one in found
+        ),
+        f"MuJoCo, both arms with their links' masses, controller {found[0].controller!r}. Holds "
+        "from: multiple of the planned forces, between a run that slips and one that holds. The "
+        "other columns: a run pressed as said, forces of both robots, their error over the "
+        "reference.",
+    )
+
+
+Timed = Sequence[tuple[str, TimingDocument]]
+"""Timings of trajectories by their labels; a trajectory alone needs none."""
+
+
+def timings(timed: Timed, robots: Sequence[str]) -> Table:
+    """Durations and forces under the search's timing and under drivable ones."""
+    return Table(
+        "timing",
+        "What real timing makes of the selected trajectories.",
+        (
+            "trajectory and timing",
+            FINE_DURATION.heading(),
+            *(f"peak, {robot} [N]" for robot in robots),
+            *(quantity.heading() for quantity in (PAYLOAD, TORQUE, SHIFT)),
+            "status",
+            "why",
+        ),
+        tuple(
+            (_of(label, name), *_timing_cells(timing), str(timing.status), timing.reason)
+            for label, document in timed
+            for name, timing in document.timings.items()
+        ),
+        "Judged against joint speed, acceleration and torque, payload speed and acceleration, "
+        "friction and pressure shift; drivable timings start and end at rest, in the cell that "
+        "robots drive. At the reference speeds without ramps: "
+        + ", ".join(
+            f"{_of(label, '')}{FINE_DURATION(found.nominal_duration)} s" for label, found in timed
+        )
+        + ".",
+    )
+
+
+def _of(label: str, name: str) -> str:
+    return f"{label}: {name}" if label and name else label + " " * bool(label) or name
+
+
+def _timing_cells(timing: StoredTiming) -> tuple[str, ...]:
+    if timing.peak_normal_force is None or timing.peak_pressure_shift is None:
+        return (NOTHING,) * 6
+    torque = (timing.joint_use or {}).get("joint torque")
+    return (
+        FINE_DURATION(timing.duration),
+        *map(FORCE, timing.peak_normal_force),
+        PAYLOAD(timing.payload_limit),
+        TORQUE(None if torque is None else torque.max()),
+        SHIFT(timing.peak_pressure_shift.max()),
+    )
+
+
+def margins(timed: Timed) -> Table:
+    """How wrong the model's assumptions may be, under the drivable timing; of trajectories that
+    have one, at least one."""
+    judged = [(label, document.margins) for label, document in timed if document.margins]
+    rows = []
+    for found in zip(*(margins for _, margins in judged), strict=True):
+        unit = f" [{found[0].unit}]" if found[0].unit else ""
+        cells = [f"{one.limit:.4g}" + (f" ({one.fails})" if one.fails else "") for one in found]
+        rows.append((f"{found[0].quantity}{unit}", f"{found[0].nominal:.4g}", *cells))
+    return Table(
+        "margins",
+        "How far assumptions may be off before a carry fails.",
+        ("assumption", "nominal", *(label or "limit" for label, _ in judged)),
+        tuple(rows),
+        "Under the timing closest to the reference speed. In brackets: what fails beyond that.",
+    )
+
+
+def force_curve(curve: ForceCurve) -> Table:
+    """Durations against force limits."""
+    rows = zip(curve.force, curve.duration, curve.status, strict=False)
+    return Table(
+        "force_curve",
+        f"Duration against force limit (at rest {FORCE(curve.static_force)} N).",
+        ("limit [N]", "limit [kgf]", FINE_DURATION.heading(), "status"),
+        tuple(
+            (FORCE(force), number(force / KILOGRAM_FORCE), FINE_DURATION(duration), str(status))
+            for force, duration, status in rows
+        ),
+    )
