@@ -133,7 +133,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--view",
         action="store_true",
-        help='show the trajectories live in a browser; needs pip install "dual-arm-carry[view]"',
+        help="serve the report's page, where trajectories play, to a browser of this machine",
     )
     group.add_argument("--port", type=whole(0, 65535), default=8080, metavar="N", help="of --view")
 

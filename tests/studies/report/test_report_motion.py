@@ -1,10 +1,11 @@
-"""Animation files and the live view of a carry."""
+"""Animation files, and the page that a browser is given."""
 
 from __future__ import annotations
 
 import urllib.request
 from itertools import pairwise
 from pathlib import Path
+from threading import Thread
 
 import imageio_ffmpeg  # type: ignore[import-untyped]
 import numpy as np
@@ -15,7 +16,8 @@ from studies.errors import ReportError
 from studies.report.__main__ import main
 from studies.report.animation import FRAMES_PER_SECOND, Film, frames, write_animation
 from studies.report.data import DrawnCarry, ReportData
-from studies.report.live import LiveView
+from studies.report.live import page_of, page_server
+from studies.report.stage import PAGE
 
 
 @pytest.fixture(scope="module")
@@ -73,20 +75,18 @@ def test_the_program_tells_what_is_no_results_folder(
     assert "configuration.json is missing" in capsys.readouterr().err
 
 
-def test_the_live_view_serves_and_moves(data: ReportData) -> None:
-    view = LiveView(data.geometry, data.carries, port=0)
-    try:
-        address = f"http://127.0.0.1:{view.server.get_port()}"
-        with urllib.request.urlopen(address) as answer:
-            assert answer.status == 200
-        handles = {frame.kind: handle for frame, handle in view._frames.items()}
-        chosen = data.carries[-1].timed
-        view.show(0.0)
-        np.testing.assert_allclose(handles["box"].position, chosen.pose[0, :3], atol=1e-6)
-        view.show(1.0)
-        np.testing.assert_allclose(handles["box"].position, chosen.pose[-1, :3], atol=1e-6)
-        before = float(view._share.value)
-        view.step(0.5)
-        assert float(view._share.value) == pytest.approx(before + 50.0 / chosen.duration, abs=0.2)
-    finally:
-        view.stop()
+def test_a_browser_is_given_the_report(study: Path, own_study: Path) -> None:
+    """Or, where there is none, a page that plays a trajectory."""
+    (own_study / PAGE).write_text("<p>the report</p>")
+    for page, words in ((page_of(own_study), "<p>the report</p>"), (page_of(study), "CellScene")):
+        server = page_server(page, 0)
+        Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{server.server_port}") as answer:
+                assert words in answer.read().decode()
+            other = page_server(page, server.server_port)
+            assert other.server_port != server.server_port
+            other.server_close()
+        finally:
+            server.shutdown()
+            server.server_close()
