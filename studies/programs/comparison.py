@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,25 +12,21 @@ import numpy as np
 
 from hybrid_opt.campaign.documents import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.identity import differences
-from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_summary
+from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_summary
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.display.table import NOTHING, Quantity, Table, number
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.store.json_records import to_json
-from studies.study.summary import LEAST_TESTED, reference_front
+from studies.study.summary import LEAST_TESTED, front_indicators, reference_front
 from studies.study.tables import QUANTITIES
 from symbolic.array import Array
 
-SEARCHED = ("feasible_share", "non_dominated", "hypervolume", "igd", "spacing")
-"""Figures computed anew from the stored candidates."""
+ANEW = ("non_dominated", "hypervolume", "igd", "spacing")
+"""Figures of fronts, computed anew with the reference front of both campaigns."""
 
-OF_FRONTS = SEARCHED[1:]
-"""Those of them that a polished front has as well."""
-
-STORED = ("mean_excess_above_static", "payload_limit", "seconds")
+STORED = ("feasible_share", "mean_excess_above_static", "payload_limit", "seconds")
 """Figures taken from summary.json."""
 
 POLISHED = "polished_"
@@ -120,48 +116,38 @@ def _algorithm_figures(
     summaries: Sequence[CampaignSummary],
     reference: Array,
 ) -> list[ComparedFigure]:
-    sides = []
-    for run, summary in zip(runs, summaries, strict=True):
-        stored = summary.algorithms[name].replicas
-        values = {figure: [float(getattr(one, figure)) for one in stored] for figure in STORED}
-        values |= _columns([_searched(replica, reference) for replica in run.of(name)])
-        better = [one.polished for one in stored if one.polished is not None]
-        known = [f.objectives for f in run.fronts if f.polished and f.algorithm == name]
-        if better and known:
-            values |= _columns([_of_front(front, reference) for front in known], POLISHED)
-            values |= {
-                POLISHED + figure: [float(getattr(one, figure)) for one in better]
-                for figure in STORED
-            }
-        sides.append(values)
-    order = [prefix + figure for prefix in ("", POLISHED) for figure in (*SEARCHED, *STORED)]
-    return [
-        _compared(name, figure, *(np.array(side[figure]) for side in sides))
-        for figure in order
-        if all(figure in side for side in sides)
+    sides = [
+        _values(run, name, summary, reference) for run, summary in zip(runs, summaries, strict=True)
     ]
+    return [
+        _compared(name, figure, *(np.array(side[figure], dtype=float) for side in sides))
+        for figure in sides[0]
+        if figure in sides[1]
+    ]
+
+
+def _values(
+    run: CampaignResults, name: str, summary: CampaignSummary, reference: Array
+) -> dict[str, list[float]]:
+    """An algorithm's figures by name, one per replica, those of polished fronts last."""
+    stored = summary.algorithms[name].replicas
+    better = [row.polished for row in stored if row.polished is not None]
+    values: dict[str, list[float]] = {}
+    for prefix, rows in (("", stored), (POLISHED, better)):
+        fronts = [f for f in run.fronts if (f.algorithm, f.polished) == (name, bool(prefix))]
+        if not rows or not fronts:
+            continue
+        anew = [front_indicators(front.objectives, reference, None, None) for front in fronts]
+        known = [figure for figure in STORED if hasattr(rows[0], figure)]
+        values |= {prefix + figure: [getattr(row, figure) for row in rows] for figure in known}
+        values |= {prefix + figure: [one[figure] for one in anew] for figure in ANEW}
+    return values
 
 
 def _compared(name: str, figure: str, first: Array, second: Array) -> ComparedFigure:
     known = all(np.isfinite(side).any() and len(side) >= LEAST_TESTED for side in (first, second))
     test = rank_test(first, second, ("first", "second")) if known else None
     return ComparedFigure(name, figure, summarise(first), summarise(second), test)
-
-
-def _columns(rows: Sequence[Mapping[str, float]], prefix: str = "") -> dict[str, list[float]]:
-    return {prefix + figure: [row[figure] for row in rows] for figure in rows[0]}
-
-
-def _searched(replica: Replica, reference: Array) -> dict[str, float]:
-    share = metrics.feasible_share(replica.evaluations.feasible)
-    return {"feasible_share": share, **_of_front(replica.front, reference)}
-
-
-def _of_front(front: Array, reference: Array) -> dict[str, float]:
-    """`OF_FRONTS` of a front (k, n_obj)."""
-    volume = metrics.hypervolume(front, metrics.reference_point(reference.shape[1]))
-    found = (float(len(front)), volume, metrics.igd(front, reference), metrics.spacing(front))
-    return dict(zip(OF_FRONTS, found, strict=True))
 
 
 def _with_holm(figures: list[ComparedFigure]) -> tuple[ComparedFigure, ...]:
