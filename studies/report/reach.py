@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from hybrid_opt.display.solids import joint_placements
 from symbolic.array import Array
-from symbolic.geometry.bodies import ArmGeometry
 from symbolic.geometry.pairs import CellGeometry
 
 STEP = 0.05
@@ -61,41 +61,15 @@ def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
 
 
 def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> Array:
-    """(POSTURES, 3) pad positions in the world."""
+    """(POSTURES, 3) pad positions in the world, of random postures within the joint limits."""
     arm, contact = geometry.arms[i], geometry.workcell.contacts[i]
     pad = (arm.T_joint_box @ contact.T_box_pad)[:3, 3]
-    batches = POSTURES // _BATCH
-    return np.concatenate([last_points(arm, pad, rng, _BATCH) for _ in range(batches)])
-
-
-def last_points(arm: ArmGeometry, point: Array, rng: np.random.Generator, count: int) -> Array:
-    """(count, 3) world positions of a point (3,) of the last joint's frame in random postures.
-
-    The points go from frame to frame, which takes a fraction of what whole placements take.
-    """
-    q = rng.uniform(arm.lower, arm.upper, (count, arm.joints))
-    points = np.broadcast_to(point, (count, 3))
-    for joint in reversed(range(arm.joints)):
-        axis, value = arm.axes[joint], q[:, joint]
-        if arm.turning[joint]:
-            points = _turned(points, axis, value)
-        else:
-            points = points + np.outer(value, axis)
-        points = _moved(points, arm.origins[joint])
-    return _moved(points, arm.T_world_root)
-
-
-def _turned(points: Array, axis: Array, angle: Array) -> Array:
-    """Points (n, 3) turned about a unit axis (3,) by angles (n,) [rad] (Rodrigues' formula)."""
-    along = np.outer(points @ axis, axis)
-    across = points - along
-    sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
-    return np.asarray(along + cosine * across + sine * (across @ np.cross(axis, np.eye(3))))
-
-
-def _moved(points: Array, T: Array) -> Array:
-    """Points (n, 3) in the frame that T (4, 4) leads to."""
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+    found = []
+    for _ in range(POSTURES // _BATCH):
+        q = rng.uniform(arm.lower, arm.upper, (_BATCH, arm.joints))
+        T_world_joint = joint_placements(arm, q)[:, -1]
+        found.append(T_world_joint[:, :3, :3] @ pad + T_world_joint[:, :3, 3])
+    return np.concatenate(found)
 
 
 def _common(geometry: CellGeometry, pads: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:

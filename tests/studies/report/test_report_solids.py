@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid_opt.display.solids import frame_placements, joint_placements
+from hybrid_opt.display.solids import frame_placements
 from studies.report.data import ReportData
 from studies.report.drawing import FRONT, SIDE, oblique
-from studies.report.reach import last_points, reach_map
+from studies.report.reach import reach_map
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.read.cell import load
@@ -61,12 +61,3 @@ def test_reach_holds_the_carry_and_ends_where_the_arm_does(data: ReportData) -> 
 def test_reach_repeats_with_its_seed(geometry: CellGeometry) -> None:
     first, second = (reach_map(geometry, np.random.default_rng(5)) for _ in range(2))
     np.testing.assert_array_equal(first.common, second.common)
-
-
-def test_points_go_through_the_arm_as_placements_do(geometry: CellGeometry) -> None:
-    arm, point = geometry.arms[0], np.array([0.05, -0.1, 0.2])
-    found = last_points(arm, point, np.random.default_rng(2), 50)
-    q = np.random.default_rng(2).uniform(arm.lower, arm.upper, (50, 6))
-    T_world_joint = joint_placements(arm, q)[:, 5]
-    expected = T_world_joint[:, :3, :3] @ point + T_world_joint[:, :3, 3]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
