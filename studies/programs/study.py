@@ -44,7 +44,7 @@ from studies.study.drivable import is_drivable, known_paths, limits_on_jerk
 from studies.study.recommendation import recommendation_stage, study_words
 from studies.study.simulation import simulation_stage
 from studies.study.summary import summary_stage
-from studies.study.tables import study_tables
+from studies.study.tables import effort, study_tables
 from studies.study.timing import timing_stage
 from symbolic.array import Array
 from symbolic.records import Workcell
@@ -191,16 +191,15 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
         read_simulations(root),
         with_paper,
     )
-    settings, rows = summary.settings, [r for a in summary.algorithms.values() for r in a.replicas]
-    solvers = sorted({row.polished.solver for row in rows if row.polished is not None})
+    settings = summary.settings
     made = (
         f"{summary.workcell.name}: {counted(settings.replicas, 'replica')} of "
         f"{settings.evaluations} evaluations, seed {settings.seed}"
-        + (f", polished with the solver {' and '.join(solvers)}" if solvers else "")
     )
     written = root / TABLES
     shown = [t for t in tables if t.name in OPENING or not written.exists()]
-    told = [part for part in (carry, made) if part] + [table.text() for table in shown]
+    told = [part for part in (carry, made) if part]
+    told += [table.text() for table in (*shown, effort(summary))]
     return "\n\n".join(told + ([f"All tables: {written}"] if written.exists() else []))
 
 

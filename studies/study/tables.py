@@ -194,42 +194,62 @@ def _forces(label: str, found: SelectedEntry | None) -> tuple[str, ...]:
     )
 
 
-_OF_REPLICAS = ("mean_excess_above_static", "payload_limit", "seconds")
-
-
 def replicas(summary: CampaignSummary) -> Table:
-    """Selected carries of all replicas, and what a replica took."""
-    rows, solvers = [], set[str]()
+    """Selected carries of all replicas, and what the polish made better."""
+    rows = []
     for name, entry in summary.algorithms.items():
-        solvers |= {row.polished.solver for row in entry.replicas if row.polished is not None}
         for label, figures in _variants(name, entry):
-            found = [summarise([getattr(row, key) for row in figures]) for key in _OF_REPLICAS]
-            cells = [
-                QUANTITIES[key].spread(one.median, one.quartile1, one.quartile3)
-                for key, one in zip(_OF_REPLICAS, found, strict=True)
-            ]
-            after = entry.polished if label != title(name) else None
-            better = NOTHING if after is None else f"{after.replicas_improved} of {len(figures)}"
-            effort = [
-                NOTHING if after is None else QUANTITIES[key](after.statistics[key].median)
-                for key in ("widest_gap", "equivalent_evaluations")
-            ]
-            rows.append((label, *cells, better, *effort))
-    by = f" Solver of the polish: {' and '.join(sorted(solvers))}." if solvers else ""
+            cells = [_median(figures, key) for key in ("mean_excess_above_static", "payload_limit")]
+            better, gap = NOTHING, NOTHING
+            if entry.polished is not None and label != title(name):
+                better = f"{entry.polished.replicas_improved} of {len(figures)}"
+                gap = QUANTITIES["widest_gap"](entry.polished.statistics["widest_gap"].median)
+            rows.append((label, *cells, better, gap))
+    headings = (ABOVE_REST.heading(), PAYLOAD.heading(), "better in")
     return Table(
         "replicas",
-        "Selected solutions of all replicas, and what a replica took.",
-        (
-            "algorithm",
-            *(QUANTITIES[key].heading() for key in _OF_REPLICAS),
-            "better in",
-            *(QUANTITIES[key].heading() for key in ("widest_gap", "equivalent_evaluations")),
-        ),
+        "Selected solutions of all replicas.",
+        ("algorithm", *headings, QUANTITIES["widest_gap"].heading()),
         tuple(rows),
         "Median [quartiles]. Better in: replicas whose hypervolume the polish made larger. Widest "
-        "gap: between neighbours, as a share of the front's length. Evaluations as long: those "
-        f"that take the time of a polish.{by}",
+        f"gap: between neighbours, as a share of the front's length.{_solvers(summary)}",
     )
+
+
+def effort(summary: CampaignSummary) -> Table:
+    """What a replica took: of no table that is stored, because times differ from run to run."""
+    rows = []
+    for name, entry in summary.algorithms.items():
+        for label, figures in _variants(name, entry):
+            equal = _median(figures, "equivalent_evaluations")
+            rows.append((label, _median(figures, "seconds"), equal))
+    return Table(
+        "effort",
+        "What a replica took.",
+        (
+            "algorithm",
+            QUANTITIES["seconds"].heading(),
+            QUANTITIES["equivalent_evaluations"].heading(),
+        ),
+        tuple(rows),
+        "Median [quartiles]. Evaluations as long: candidates that are evaluated in the time of a "
+        f"polish.{_solvers(summary)}",
+    )
+
+
+def _solvers(summary: CampaignSummary) -> str:
+    """The solvers of the polish in a sentence, '' without one."""
+    rows = [row.polished for entry in summary.algorithms.values() for row in entry.replicas]
+    names = sorted({polished.solver for polished in rows if polished is not None})
+    return f" Solver of the polish: {' and '.join(names)}." if names else ""
+
+
+def _median(figures: Sequence[FrontFigures], key: str) -> str:
+    """Median and quartiles of a figure over replicas; searched ones lack some."""
+    if not hasattr(figures[0], key):
+        return NOTHING
+    found = summarise([getattr(row, key) for row in figures])
+    return QUANTITIES[key].spread(found.median, found.quartile1, found.quartile3)
 
 
 def infeasible(summary: CampaignSummary) -> Table:

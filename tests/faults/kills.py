@@ -40,7 +40,12 @@ STRIKES = (BEGINNING, *sorted(2 * STAGES, key=STAGES.index))
 """Where one folder is struck, in the order in which a study gets there."""
 
 WAYS = ("kill", "kill all", "interrupt", "terminate", "kill a worker")
-TIMES = {"seconds", "median_attempt_seconds", "equivalent_evaluations"}
+TIMES = {
+    "seconds",
+    "evaluation_seconds",
+    "median_attempt_seconds",
+    "equivalent_evaluations",
+}
 """Figures that are times, or follow from them."""
 
 ENDS = {0, 2, 130, -signal.SIGINT, -signal.SIGKILL, -signal.SIGTERM}
