@@ -29,7 +29,6 @@ ROOMS = {
     "browser": (
         "hybrid_opt/display/test_view.py",
         "studies/report/test_report_browser.py",
-        "studies/report/test_report_own.py",
     ),
     "heavy": (
         "symbolic/contact/test_grasp.py",
@@ -46,6 +45,7 @@ ROOMS = {
 models and conic programs, 14 to 33 s of computing per file."""
 
 PLAIN = (
+    "hybrid_opt/display/test_table.py",
     "hybrid_opt/indicators/test_metrics.py",
     "hybrid_opt/indicators/test_statistics.py",
     "hybrid_opt/metaheuristics/test_algorithms.py",
