@@ -118,11 +118,10 @@ def test_a_measurement_has_its_date_and_its_command(name: str) -> None:
 QUESTION = re.compile(r"^\| (.*\*\*(.+?)\*\*.*\?) \| `([^`]+)` \|$", flags=re.MULTILINE)
 
 
-def test_twenty_questions_are_answered_by_one_file_each() -> None:
+def test_questions_are_answered_by_one_file_each() -> None:
     """The file exists and speaks of what the question is about."""
     asked = QUESTION.findall((ROOT / "CONTRIBUTING.md").read_text("utf-8"))
-    assert len(asked) == 20
-    assert len({file for _, _, file in asked}) == 20
+    assert len({file for _, _, file in asked}) == len(asked) >= 20
     for question, subject, file in asked:
         assert subject.lower() in (ROOT / file).read_text("utf-8").lower(), question
 
