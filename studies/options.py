@@ -110,14 +110,16 @@ def add_wishes(parser: argparse._ActionsContainer) -> None:
         parser,
         "--force-limit",
         help="recommend the shortest carry that needs at most N newtons commanded; a study also "
-        "times every selected trajectory with that limit of its planned forces",
+        "times every selected trajectory with that limit of its planned forces (default: the least "
+        "product of duration and commanded force)",
     )
     parser.add_argument(
         "--payload",
         type=force,
         metavar="KG",
         help="recommend the shortest carry on whose motion the robots would hold a box of KG "
-        "kilograms in every case of the uncertainty",
+        "kilograms in every case of the uncertainty (default: the least product of duration and "
+        "commanded force)",
     )
 
 
