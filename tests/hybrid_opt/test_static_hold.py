@@ -27,14 +27,19 @@ CELLS = sorted(RACK.parent.glob("*.toml"))
 
 
 def changed(name: str, folder: Path, **values: float) -> Path:
-    """A shipped cell with other values of some keys."""
+    """A shipped cell with other values of some keys, its uncertainty as it is."""
     path = RACK.with_name(f"{name}.toml")
     text = path.read_text().replace("../robots", str(RACK.parents[1] / "robots"))
+    tables = re.split(r"^(?=\[)", text, flags=re.MULTILINE)
     for key, value in values.items():
-        text, count = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
-        assert count
+        pattern = re.compile(rf"^{key} = .*$", flags=re.MULTILINE)
+        assert any(map(pattern.search, tables))
+        tables = [
+            table if table.startswith("[uncertainty]") else pattern.sub(f"{key} = {value}", table)
+            for table in tables
+        ]
     other = folder / path.name
-    other.write_text(text)
+    other.write_text("".join(tables))
     return other
 
 
