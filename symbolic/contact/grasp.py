@@ -21,7 +21,7 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import qr
+from numpy.typing import NDArray
 
 from symbolic.array import Array
 from symbolic.contact.central_path import (
@@ -128,9 +128,7 @@ class Grasp:
         # load reaches best.
         n = in_units.shape[1]
         whole = np.hstack([state_to_box(pad, even) for pad in pads])
-        self._left = (
-            np.sort(qr(whole, pivoting=True)[2][:LOAD_SIZE]) if even else np.arange(n - 6, n)
-        )
+        self._left = _reached_best(whole) if even else np.arange(n - 6, n)
         self._free = np.setdiff1d(np.arange(n), self._left)
         to_left = np.asarray(np.linalg.inv(in_units[:, self._left]), dtype=float)
         self._load_to_left = _sparse(to_left)
@@ -276,6 +274,14 @@ def grasp_wrenches(
     solve = differentiable_least_effort if differentiable else least_effort
     found = solve(grasp, load / size, friction)
     return _in_newtons(grasp)(found, size, friction)
+
+
+def _reached_best(to_box: Array) -> NDArray[np.intp]:
+    """Components (6,) of states that a load reaches best, by a QR decomposition with pivots."""
+    # Not imported at the top: a warm start makes no grasp.
+    from scipy.linalg import qr
+
+    return np.sort(qr(to_box, pivoting=True)[2][:LOAD_SIZE])
 
 
 def _in_newtons(grasp: Grasp) -> ca.Function:

@@ -105,7 +105,7 @@ def moved(q: list[float] | None, by: float) -> list[float]:
 WRONG: dict[str, tuple[Callable[[float], Seen], str]] = {
     "off its path": (lambda s: Seen([moved(posture(s)[0], 0.05), posture(s)[1]]), "left its path"),
     "late": (lambda s: Seen([posture(s - 0.08)[0], posture(s - 0.08)[1]]), "behind"),
-    "apart": (lambda s: Seen([posture(s)[0], posture(s - 0.045)[1]]), "apart|behind"),
+    "apart": (lambda s: Seen([posture(s)[0], posture(s - 0.08)[1]]), "apart|behind"),
     "silent": (lambda s: Seen(posture(s), silence=[0.0, 0.3]), "no news from right for 0.30 s"),
     "weak": (lambda s: Seen(posture(s), force=[None, 10.0]), "right presses 10.0 N instead of"),
     "told": (lambda s: Seen(posture(s), fault="the door opens"), "the door opens"),

@@ -60,7 +60,7 @@ def test_a_stop_keeps_the_squeeze() -> None:
     job = rack_job()
     stop = stop_of(job)
     assert stop.force_use <= 1.0
-    weak = [replace(p, force=replace(p.force, normal=0.7 * p.force.normal)) for p in job.phases]
+    weak = [replace(p, force=replace(p.force, normal=0.4 * p.force.normal)) for p in job.phases]
     with pytest.raises(JobError, match="of the commanded forces: press more"):
         stop_of(replace(job, phases=tuple(weak)))
 

