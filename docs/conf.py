@@ -19,7 +19,7 @@ import hybrid_opt as ho  # noqa: E402
 
 project = "dual-arm-carry"
 author = copyright = "the project's contributors"
-release = version = "0.1.0"
+release = version = ho.__version__
 
 extensions = [
     "myst_parser",

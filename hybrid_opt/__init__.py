@@ -18,11 +18,13 @@ from typing import TYPE_CHECKING, Any
 from hybrid_opt.shown import shown_by
 
 if TYPE_CHECKING:
+    __version__: str
     from hybrid_opt.branches import search_branches
     from hybrid_opt.bundles.bundle import export
     from hybrid_opt.bundles.job_file import BundleOptions
     from hybrid_opt.bundles.manifest import Origin
     from hybrid_opt.carry import Carry
+    from hybrid_opt.catalogue import algorithms, example, load, objectives, targets
     from hybrid_opt.cell import Cell
     from hybrid_opt.door import (
         polish,
@@ -67,7 +69,11 @@ __all__ = [
     "TimingLimits",
     "Wish",
     "Workcell",
+    "algorithms",
+    "example",
     "export",
+    "load",
+    "objectives",
     "plan_job",
     "polish",
     "propose",
@@ -75,6 +81,7 @@ __all__ = [
     "save",
     "search",
     "search_branches",
+    "targets",
     "time_every_way",
     "time_path",
     "time_with_jerk",
@@ -94,14 +101,18 @@ _HOMES = {
     "PolishSettings": "hybrid_opt.polishing.settings",
     "Proposal": "hybrid_opt.proposing.proposal",
     "ProposeSettings": "hybrid_opt.proposing.proposal",
-    "SqueezeSettings": "hybrid_opt.robust.squeeze",
     "Recommendation": "hybrid_opt.recommending.recommendation",
     "SearchSettings": "hybrid_opt.metaheuristics.carries",
+    "SqueezeSettings": "hybrid_opt.robust.squeeze",
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",
     "Wish": "hybrid_opt.recommending.choice",
     "Workcell": "symbolic.records",
+    "algorithms": "hybrid_opt.catalogue",
+    "example": "hybrid_opt.catalogue",
     "export": "hybrid_opt.bundles.bundle",
+    "load": "hybrid_opt.catalogue",
+    "objectives": "hybrid_opt.catalogue",
     "plan_job": "hybrid_opt.job.plan",
     "polish": "hybrid_opt.door",
     "propose": "hybrid_opt.proposing.proposal",
@@ -109,6 +120,7 @@ _HOMES = {
     "save": "hybrid_opt.door",
     "search": "hybrid_opt.door",
     "search_branches": "hybrid_opt.branches",
+    "targets": "hybrid_opt.catalogue",
     "time_every_way": "hybrid_opt.door",
     "time_path": "hybrid_opt.door",
     "time_with_jerk": "hybrid_opt.door",
@@ -119,6 +131,8 @@ shown_by(lambda room: import_module(f"hybrid_opt.display.{room}"))
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("hybrid_opt.version").own_version()
     if name not in _HOMES:
         raise AttributeError(f"module 'hybrid_opt' has no attribute {name!r}")
     value = getattr(import_module(_HOMES[name]), name)

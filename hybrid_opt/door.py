@@ -1,8 +1,8 @@
-"""What is done with a cell: search, polish, time, export, store. `hybrid_opt` exports all of it."""
+"""What is done with a cell: search, polish, time, store. `hybrid_opt` exports all of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
 from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
 from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.records import PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings, usual_settings
+from hybrid_opt.progress import Progress, counted
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk
 from hybrid_opt.timing.overview import TimedTrajectory, timed_trajectory
@@ -32,15 +32,17 @@ def search(
     evaluations: int = 1000,
     rng: np.random.Generator,
     settings: SearchSettings | None = None,
+    progress: Progress = False,
 ) -> Front:
     """Search for the carries of least objectives.
 
     Args:
-        algorithm: one of `hybrid_opt.metaheuristics.names()`.
+        algorithm: one of `algorithms()`.
         evaluations: candidates that may be evaluated.
         rng: the search's only randomness; the same state gives the same front to the bit.
         settings: see there; None for the defaults. Where it names no initial candidates, the
             hand-made trajectory is in the first generation of all but the random search.
+        progress: True for a bar, or what takes candidates done and in all.
 
     Raises:
         SettingsError: an unknown algorithm or a value that is not allowed.
@@ -50,18 +52,18 @@ def search(
     settings = settings or SearchSettings()
     if settings.initial is None and algorithm != "random":
         settings = replace(settings, initial=cell.initial[None])
-    found = search_carries(cell.evaluator, algorithm, evaluations, rng, settings)
+    with counted(progress, algorithm, evaluations) as advance:
+        found = search_carries(cell.evaluator, algorithm, evaluations, rng, settings, advance)
     return Front.of_search(cell, algorithm, found.evaluations)
 
 
 def polish(
-    cell: Cell,
     front: Front,
     *,
     rng: np.random.Generator,
     settings: PolishSettings | None = None,
     paths: Sequence[Carry | Array] = (),
-    told: Callable[[PolishOutcome], None] = lambda outcome: None,
+    progress: Progress = False,
 ) -> Front:
     """Improve a front: both peak forces with an interior-point method, or, under the time law
     'optimal', path and speed profile together.
@@ -72,12 +74,12 @@ def polish(
         paths: carries of the cell whose paths are known to be good, or their decision vectors,
             with or without a force limit; under the time law 'optimal' only. The front is nowhere
             behind them. The hand-made path always takes part.
-        told: takes the outcome of every attempt as it ends.
+        progress: True for a bar, or what takes attempts done and at most.
 
     Raises:
         SettingsError: the cell's objectives are not those of the polish, or a path does not fit.
     """
-    task = cell.workcell.task
+    cell, task = front.cell, front.cell.workcell.task
     settings = settings or usual_settings(task.time_law)
     polisher = Polisher(cell.evaluator, settings, cell.polish_functions)
     known = [np.asarray(_decision(path), dtype=float) for path in paths]
@@ -93,7 +95,8 @@ def polish(
                 f"{task.n_var} with a force limit"
             )
     beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
-    done = polisher.polish(front.x, rng, emit=told, paths=beside)
+    with counted(progress, "polish", settings.attempts) as advance:
+        done = polisher.polish(front.x, rng, emit=lambda outcome: advance(1), paths=beside)
     title = f"{front.title}, polished"
     return Front(cell, title, done.x, done.objectives, front.evaluations, done)
 

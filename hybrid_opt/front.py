@@ -50,6 +50,19 @@ class Front(Shown):
         rows = metrics.front_rows(evaluations.objectives, evaluations.feasible)
         return cls(cell, title, evaluations.x[rows], evaluations.objectives[rows], evaluations)
 
+    @classmethod
+    def of(cls, cell: Cell, x: Array, title: str = "given") -> Front:
+        """The front of carries that are known to be feasible and free; they are evaluated anew.
+
+        Args:
+            x: (k, n_var) decision vectors by increasing first objective.
+
+        Raises:
+            SettingsError: x has the wrong shape.
+        """
+        found = cell.evaluate(x)
+        return cls(cell, title, found.x, found.objectives, found)
+
     @property
     def objective_names(self) -> tuple[str, ...]:
         """Names of the objectives."""

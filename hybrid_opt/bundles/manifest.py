@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from hybrid_opt.job.compliance import (
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
 from hybrid_opt.store.files import sha256
+from hybrid_opt.version import own_version
 
 UNITS = {
     "length": "m",
@@ -203,7 +203,7 @@ def manifest(
         "warnings": warnings_of(job),
         "units": UNITS,
         "how_to_run": target.how_to_run,
-        "written_by": f"dual-arm-carry {_version()}",
+        "written_by": f"dual-arm-carry {own_version()}",
     }
 
 
@@ -270,13 +270,6 @@ def _skew(found: Skew) -> dict[str, Any]:
         "margin": found.margin,
         "holds": found.survived,
     }
-
-
-def _version() -> str:
-    try:
-        return version("dual-arm-carry")
-    except PackageNotFoundError:
-        return "from a source folder"
 
 
 def job_digest(job: Job) -> str:

@@ -7,13 +7,14 @@ import json
 import platform
 from collections.abc import Iterator, Mapping
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from codegen.cache import source_digest
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.version import own_version
 from symbolic.records import Workcell
 
 FORMAT = "dual-arm-carry campaign"
@@ -26,10 +27,7 @@ _PACKAGES = ("casadi", "moocore", "numpy", "pin", "pymoo", "python-fcl", "scipy"
 def environment() -> Mapping[str, str]:
     """Versions of everything that takes part in a search, and a digest of our own sources."""
     versions = {name: version(name) for name in _PACKAGES}
-    try:
-        versions["dual-arm-carry"] = version("dual-arm-carry")
-    except PackageNotFoundError:  # run from its sources, which the digest tells
-        versions["dual-arm-carry"] = "not installed"
+    versions["dual-arm-carry"] = own_version()  # beside the digest of the sources
     versions["sources"] = source_digest("symbolic", "codegen", "hybrid_opt")
     versions["python"] = platform.python_version()
     versions["machine"] = platform.machine()

@@ -17,6 +17,8 @@ from hybrid_opt.display.table import figures_html, lines
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import excess_above_static
+from hybrid_opt.job.records import Job
+from hybrid_opt.recommending.recommendation import Recommendation
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
@@ -31,7 +33,9 @@ def text_of(shown: object) -> str:
 
 
 def html_of(shown: object) -> str:
-    """What a notebook shows of an object."""
+    """What a notebook shows of an object: its figures, or else its own text, and its picture."""
+    if isinstance(shown, Job | Recommendation):
+        return f"<div><pre>{html.escape(repr(shown))}</pre>{picture_of(shown)}</div>"
     heading = html.escape(heading_of(shown))
     return f"<div><p>{heading}</p>{figures_html(figures_of(shown))}{picture_of(shown)}</div>"
 
@@ -95,6 +99,24 @@ def _(carry: Carry) -> str:
     series.append(Series("level and still", rest, REST, size=0.8))
     focus = np.concatenate([one.points for one in series])
     return plot(series, "time [s]", "normal force [N]", focus)
+
+
+@picture_of.register
+def _(job: Job) -> str:
+    """The commanded normal forces of the whole job."""
+    time = np.concatenate([phase.begin + phase.motion.time for phase in job.phases])
+    force = np.concatenate([phase.force.normal for phase in job.phases])
+    series = [
+        Series(robot.name, np.column_stack([time, force[:, i]]), ARMS[i])
+        for i, robot in enumerate(job.workcell.robots)
+    ]
+    focus = np.concatenate([one.points for one in series])
+    return plot(series, "time [s]", "commanded normal force [N]", focus)
+
+
+@picture_of.register
+def _(found: Recommendation) -> str:
+    return picture_of(found.carry if found.job is None else found.job)
 
 
 def _pair(values: Array, digits: int) -> str:

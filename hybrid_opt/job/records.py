@@ -13,6 +13,7 @@ from scipy.interpolate import CubicHermiteSpline
 from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.display.table import text_table
 from hybrid_opt.robust.squeeze import Squeeze
+from hybrid_opt.shown import Shown
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -129,8 +130,8 @@ def contact_effort(motion: PhaseMotion, wrench: Array) -> Array:
     return np.concatenate(torques, axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class Job:
+@dataclass(frozen=True, eq=False, repr=False)
+class Job(Shown):
     """A carry with all that has to happen before and after it.
 
     Attributes:

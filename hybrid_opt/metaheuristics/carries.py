@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -51,16 +51,18 @@ def search_carries(
     evaluations: int,
     rng: np.random.Generator,
     settings: SearchSettings,
+    evaluated: Callable[[int], None] = lambda count: None,
 ) -> SearchedCarries:
     """Spend exactly that many evaluations and certify the front of all of them.
 
     Args:
         algorithm: one of `hybrid_opt.metaheuristics.names()`.
+        evaluated: called with the number of candidates after each batch.
 
     Raises:
         SettingsError: an unknown algorithm or a value that is not allowed.
     """
-    problem = CarryProblem(evaluator, settings.constraint_handling)
+    problem = CarryProblem(evaluator, settings.constraint_handling, evaluated)
     search(problem, make(algorithm, settings.algorithm, settings.initial), evaluations, rng)
     sizes = [len(batch) for batch in problem.batches]
     generation = np.repeat(np.arange(1, len(sizes) + 1), sizes)

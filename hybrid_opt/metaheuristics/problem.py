@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any, Literal, Protocol, get_args
 
@@ -72,10 +73,16 @@ class CarryProblem(Problem):  # type: ignore[misc]
     Attributes:
         evaluator: what evaluates.
         handling: see above.
+        evaluated: called with the number of candidates after each batch.
         batches: the evaluations of each call, in order.
     """
 
-    def __init__(self, evaluator: Evaluator, handling: ConstraintHandling = "penalty") -> None:
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        handling: ConstraintHandling = "penalty",
+        evaluated: Callable[[int], None] = lambda count: None,
+    ) -> None:
         if handling not in get_args(ConstraintHandling):
             raise SettingsError(
                 f"constraint handling {handling!r}; known are "
@@ -90,6 +97,7 @@ class CarryProblem(Problem):  # type: ignore[misc]
         )
         self.evaluator = evaluator
         self.handling = handling
+        self.evaluated = evaluated
         self.batches: list[Evaluations] = []
 
     @property
@@ -100,6 +108,7 @@ class CarryProblem(Problem):  # type: ignore[misc]
     def _evaluate(self, x: Array, out: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         batch = disarmed(self.evaluator.evaluate(x))
         self.batches.append(batch)
+        self.evaluated(len(batch.feasible))
         if self.handling == "penalty":
             out["F"] = batch.penalised
         else:

@@ -19,6 +19,7 @@ from hybrid_opt.front import Front
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_timing
+from hybrid_opt.progress import Progress, counted
 from hybrid_opt.recommending.advice import Advice, advice, commanded_margins
 from hybrid_opt.recommending.choice import (
     LEADER,
@@ -32,6 +33,7 @@ from hybrid_opt.recommending.choice import (
 )
 from hybrid_opt.recommending.comparison import BETTER, Rival, rival, spread_rows
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
+from hybrid_opt.shown import Shown
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from hybrid_opt.timing.use import limited_force
@@ -52,8 +54,8 @@ STEPS = 5
 """Of a recommendation, and one more per rival."""
 
 
-@dataclass(frozen=True, eq=False)
-class Recommendation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Recommendation(Shown):
     """The carry to run.
 
     Attributes:
@@ -120,11 +122,10 @@ class Recommendation:
 
 
 def recommend(
-    cell: Cell,
-    front: Front | Array,
+    front: Front,
     wish: Wish | None = None,
     others: Mapping[str, Array] | None = None,
-    told: Callable[[], None] = lambda: None,
+    progress: Progress = False,
 ) -> Recommendation:
     """The carry to run of a drivable front.
 
@@ -132,30 +133,36 @@ def recommend(
     least product of duration and commanded force of all that do.
 
     Args:
-        cell: under the time law 'optimal', see `Cell.drivable`.
-        front: certified free of collisions; or its members' decision vectors (k, n_var).
+        front: of a cell under the time law 'optimal', see `Cell.drivable`.
         wish: what is asked for instead of the least product.
         others: (n_path,) paths by label, beside which the answer stands; the hand-made one always
             is.
-        told: called `STEPS` times, and once more per path beside it, as the work goes on.
+        progress: True for a bar, or what takes steps done and in all.
 
     Raises:
         SettingsError: the cell has another time law, the front is empty, no member can do what is
             wished for, or the uncertainty leaves no friction or patch.
     """
-    task, wish = cell.workcell.task, wish or Wish()
-    if task.time_law != "optimal":
+    cell, wish = front.cell, wish or Wish()
+    if cell.workcell.task.time_law != "optimal":
         raise SettingsError(
-            f"the cell's time law is {task.time_law!r}, which no robot drives; give the front of "
-            "cell.drivable()"
+            f"the cell's time law is {cell.workcell.task.time_law!r}, which no robot drives; give "
+            "the front of cell.drivable()"
         )
-    given = front.x if isinstance(front, Front) else np.asarray(front, dtype=float)
-    given = given.reshape(-1, task.n_var)
-    if len(given) == 0:
+    if len(front) == 0:
         raise SettingsError(
             "the drivable front is empty: no feasible carry was found; give the search more "
             "evaluations or the task wider bounds"
         )
+    named = {HAND_MADE: cell.initial[:-1]} | dict(others or {})
+    with counted(progress, "recommendation", STEPS + len(named)) as advance:
+        return _recommended(front, wish, named, lambda: advance(1))
+
+
+def _recommended(
+    front: Front, wish: Wish, named: Mapping[str, Array], told: Callable[[], None]
+) -> Recommendation:
+    cell, given = front.cell, front.x
     rows = spread_rows(given[:, :-1])
     paths = DrivenPaths.of(cell, given[rows, :-1])
     options = paths.all_options(given[rows, -1])
@@ -176,7 +183,6 @@ def recommend(
     commanded, squeeze, job, problem = _job(cell, timing)
     doubts += problem
     told()
-    named = {HAND_MADE: cell.initial[:-1]} | dict(others or {})
     beside = []
     for label, path in named.items():
         beside.append(rival(cell, label, path, timing, squeeze.force))

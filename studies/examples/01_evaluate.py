@@ -2,9 +2,9 @@
 
 import hybrid_opt as ho
 
-cell = ho.Cell.load("studies/workcells/rack.toml")
+cell = ho.example("rack")
 print(cell)
-carry = cell.carry(cell.initial)
+carry: ho.Carry = cell.carry(cell.initial)
 print(carry)
 print("peak normal forces [N]:", carry.peak_normal_force)
 print("payload limit [kg]:", carry.payload_limit)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import hybrid_opt as ho
 
-cell = ho.Cell.load("studies/workcells/rack.toml")
+cell = ho.example("rack")
 carry = cell.carry(cell.initial)
 Path("out").mkdir(exist_ok=True)
 carry.view().save("out/view.html")

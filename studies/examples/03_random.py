@@ -4,7 +4,7 @@ import numpy as np
 
 import hybrid_opt as ho
 
-cell = ho.Cell.load("studies/workcells/rack.toml")
+cell = ho.example("rack")
 x = cell.random(500, np.random.default_rng(1))
 found = cell.evaluate(x)
 print(found)

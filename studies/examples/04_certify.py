@@ -2,7 +2,7 @@
 
 import hybrid_opt as ho
 
-cell = ho.Cell.load("studies/workcells/rack.toml")
+cell = ho.example("rack")
 certificate = cell.certify(cell.initial)
 print(certificate)
 print("free:", certificate.is_free, "- grid points:", certificate.grid_points)

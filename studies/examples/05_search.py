@@ -4,8 +4,11 @@ import numpy as np
 
 import hybrid_opt as ho
 
-cell = ho.Cell.load("studies/workcells/rack.toml")
-front = ho.search(cell, "mopso", evaluations=1000, rng=np.random.default_rng(1))
+print("algorithms:", *ho.algorithms())
+cell = ho.example("rack")
+settings = ho.SearchSettings(algorithm={"inertia": 0.5})
+rng = np.random.default_rng(1)
+front: ho.Front = ho.search(cell, "mopso", evaluations=1000, rng=rng, settings=settings)
 print(front)
 print("hypervolume:", front.hypervolume())
 print("infeasible candidates:", front.evaluations.infeasible_by_reason)

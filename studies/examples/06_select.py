@@ -4,7 +4,7 @@ import numpy as np
 
 import hybrid_opt as ho
 
-cell = ho.Cell.load("studies/workcells/rack.toml")
+cell = ho.example("rack")
 front = ho.search(cell, "nsga2", evaluations=1000, rng=np.random.default_rng(1))
 for name, carry in {
     "balanced": front.balanced(),

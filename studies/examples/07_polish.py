@@ -5,9 +5,8 @@ import numpy as np
 import hybrid_opt as ho
 
 rng = np.random.default_rng(1)
-cell = ho.Cell.load("studies/workcells/rack.toml")
-front = ho.search(cell, "nsga2", evaluations=1000, rng=rng)
-polished = ho.polish(cell, front, rng=rng)
+front = ho.search(ho.example("rack"), "nsga2", evaluations=1000, rng=rng)
+polished = ho.polish(front, rng=rng, settings=ho.PolishSettings(attempts=60), progress=True)
 print(polished)
 print("hypervolume:", front.hypervolume(), "->", polished.hypervolume())
 print("payload [kg]:", front.balanced().payload_limit, "->", polished.balanced().payload_limit)

@@ -2,7 +2,7 @@
 
 import hybrid_opt as ho
 
-cell = ho.Cell.load("studies/workcells/rack.toml")
+cell = ho.example("rack")
 carry = cell.carry(cell.initial)
 print(ho.time_path(cell, carry))
 print(ho.time_path(cell, carry, ho.TimingLimits(force=51.0)))

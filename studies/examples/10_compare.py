@@ -4,7 +4,7 @@ import numpy as np
 
 import hybrid_opt as ho
 
-cell = ho.Cell.load("studies/workcells/rack.toml")
+cell = ho.example("rack")
 for algorithm in ("nsga2", "mopso"):
     fronts = [
         ho.search(cell, algorithm, evaluations=300, rng=np.random.default_rng(seed))

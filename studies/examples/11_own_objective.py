@@ -13,8 +13,9 @@ def height(outputs: Mapping[str, np.ndarray], workcell: ho.Workcell) -> np.ndarr
     return np.asarray(outputs["pose"][:, :, 2].max(axis=1) / (2.0 * goal))
 
 
+print("known objectives:", *ho.objectives())
 low = ho.Objective("height", "largest height / twice the goal's", height)
-cell = ho.Cell.load("studies/workcells/rack.toml", objectives=("peak_force_1", low))
+cell = ho.example("rack", objectives=("peak_force_1", low))
 front = ho.search(cell, "nsga2", evaluations=1000, rng=np.random.default_rng(1))
 print(front)
 print(front.lowest("height"))

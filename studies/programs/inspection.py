@@ -233,11 +233,10 @@ def _optimum(cell: Cell, progress: Progress) -> Optimum:
     try:
         with progress.stage("short polish", POLISH_ATTEMPTS, "attempts") as advance:
             front = ho.polish(
-                cell,
                 Front.of_search(cell, "hand-made", verdicts),
                 rng=np.random.default_rng(0),
                 settings=ho.PolishSettings(attempts=POLISH_ATTEMPTS),
-                told=lambda outcome: advance(1),
+                progress=lambda done, total: advance(1),
             )
     except SettingsError as error:
         return Optimum(0, (), str(error))

@@ -58,7 +58,7 @@ def profile_study(workcell: Workcell, seed: int) -> tuple[StageTime, ...]:
 
     def polishing() -> None:
         settings = PolishSettings(attempts=POLISH_ATTEMPTS)
-        fronts.append(polish(cell, fronts[0], rng=np.random.default_rng(seed), settings=settings))
+        fronts.append(polish(fronts[0], rng=np.random.default_rng(seed), settings=settings))
 
     stages: dict[str, Callable[[], object]] = {
         f"search ({EVALUATIONS} evaluations, certified)": searching,

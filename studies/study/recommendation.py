@@ -146,7 +146,8 @@ def recommend_from(
     # The choice with its rivals, the table's rows and the price.
     steps = STEPS + 3 + 2 * len(others) + len(drivable.fronts)
     with progress.stage("recommendation", steps, "steps") as advance:
-        found = ho.recommend(cell, drivable.x, wish, others, told=lambda: advance(1))
+        front = ho.Front.of(cell, drivable.x)
+        found = ho.recommend(front, wish, others, progress=lambda done, total: advance(1))
         durations = _force_table(cell, drivable, others, found, advance)
         price = _price(found.carry, campaign.configuration.settings.seed, threads)
         advance(1)

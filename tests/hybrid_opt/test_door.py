@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import hybrid_opt as ho
 from hybrid_opt.bundles.bundle import read_manifest
 from hybrid_opt.campaign.replica import ReplicaRequest, run_replica
 from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.store.files import sha256
 from hybrid_opt.store.trajectory_file import read_trajectory
@@ -40,7 +42,7 @@ def front() -> ho.Front:
 @cache
 def polished() -> ho.Front:
     rng = np.random.default_rng(1)
-    return ho.polish(cell(), front(), rng=rng, settings=ho.PolishSettings(attempts=2))
+    return ho.polish(front(), rng=rng, settings=ho.PolishSettings(attempts=2))
 
 
 def test_an_unknown_objective_is_refused_where_a_cell_is_loaded() -> None:
@@ -52,7 +54,7 @@ def test_an_unknown_objective_is_refused_where_a_cell_is_loaded() -> None:
 
 def test_known_paths_are_refused_where_they_take_no_part() -> None:
     with pytest.raises(SettingsError, match=r"Cell\.drivable\(\)"):
-        ho.polish(cell(), front(), rng=np.random.default_rng(1), paths=[cell().initial])
+        ho.polish(front(), rng=np.random.default_rng(1), paths=[cell().initial])
 
 
 def test_everything_that_is_promised_is_there() -> None:
@@ -183,3 +185,43 @@ def test_objectives_of_ones_own() -> None:
     assert carry.judgement.objectives["height"] == carry.pose[:, 2].max() / 2
     with pytest.raises(SettingsError, match="each once"):
         ho.Cell.load(RACK, objectives=(tall, tall)).carry(mine.initial)
+
+
+def test_what_there_is_to_choose_from() -> None:
+    assert ho.algorithms()["nsga2"] == "NSGA-II"
+    assert set(cell().objective_names) <= set(ho.objectives())
+    assert {"ros2-control", "csv"} <= set(ho.targets())
+    assert repr(ho.example("rack")) == repr(ho.Cell.load(RACK))
+    with pytest.raises(SettingsError, match="no cell 'shelf' ships; known are corner, drum"):
+        ho.example("shelf")
+    assert ho.__version__ == version("dual-arm-carry")
+
+
+def test_what_was_stored_is_read_back(tmp_path: Path) -> None:
+    carry = cell().carry(cell().initial)
+    ho.save(carry, tmp_path / "carry.json")
+    again = ho.load(tmp_path / "carry.json")
+    assert isinstance(again, ho.Carry)
+    np.testing.assert_array_equal(again.normal_force, carry.normal_force)
+    ho.save(again, tmp_path / "again.json")  # its cell's files are still there
+    ho.export(ho.time_path(cell(), carry), "csv", tmp_path)
+    (bundle,) = tmp_path.glob("*/csv")
+    manifest = ho.load(bundle)
+    assert isinstance(manifest, Mapping)
+    assert manifest["written_by"].endswith(ho.__version__)
+    assert isinstance(ho.load(RACK), ho.Cell)
+    with pytest.raises(ResultsError, match="is no results folder"):
+        ho.load(tmp_path)
+
+
+def test_calls_tell_how_far_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    told: list[tuple[int, int]] = []
+    ho.search(
+        cell(),
+        evaluations=60,
+        rng=np.random.default_rng(1),
+        progress=lambda done, total: told.append((done, total)),
+    )
+    assert told[-1] == (60, 60)
+    ho.search(cell(), evaluations=60, rng=np.random.default_rng(1), progress=True)
+    assert "nsga2: 100%" in capsys.readouterr().err

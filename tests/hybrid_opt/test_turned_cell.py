@@ -48,7 +48,7 @@ def test_most_carries_are_feasible_and_certified(cell: Cell) -> None:
 def test_the_polish_lowers_the_forces(cell: Cell) -> None:
     front = ho.search(cell, "nsga2", evaluations=60, rng=np.random.default_rng(3))
     settings = ho.PolishSettings(attempts=3, rounds=4)
-    polished = ho.polish(cell, front, rng=np.random.default_rng(3), settings=settings)
+    polished = ho.polish(front, rng=np.random.default_rng(3), settings=settings)
     assert polished.objectives.sum(axis=1).min() < front.objectives.sum(axis=1).min()
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+import hybrid_opt as ho
+
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "studies" / "examples").glob("[0-9]*.py"))
 NAMES = [path.name for path in EXAMPLES]
@@ -17,9 +19,8 @@ SMALL = {
     "evaluations=300": "evaluations=60",
     "range(5)": "range(2)",
     "cell.random(500": "cell.random(60",
-    "polish(cell, front, rng=rng)": (
-        "polish(cell, front, rng=rng, settings=ho.PolishSettings(attempts=2))"
-    ),
+    "attempts=60": "attempts=2",
+    "evaluations=2000": "evaluations=400",
     "curve_points=5": "curve_points=2",
 }
 """What makes the examples after the first small enough for a test."""
@@ -41,7 +42,14 @@ def blocks(page: str) -> list[str]:
     return [block.strip() for block in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)]
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=NAMES)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=pytest.mark.slow if "propose" in path.name else ())
+        for path in EXAMPLES
+    ],
+    ids=NAMES,
+)
 def test_it_runs(
     path: Path,
     tmp_path: Path,
@@ -83,6 +91,11 @@ def test_the_library_page_holds_every_example_in_order() -> None:
 
 def test_the_readme_shows_the_first() -> None:
     assert code_of(EXAMPLES[0]) in blocks((ROOT / "README.md").read_text("utf-8"))
+
+
+def test_every_public_name_is_used_in_an_example() -> None:
+    used = set(re.findall(r"\bho\.(\w+)", "".join(code_of(path) for path in EXAMPLES)))
+    assert set(ho.__all__) <= used
 
 
 def test_the_first_is_short_and_imports_one_thing_of_ours() -> None:

@@ -196,7 +196,7 @@ class Job:
         if self.distance(arm, q, s) <= NEAR:
             return s
         best, low, high = s, *window
-        for step in (4.0 * SEARCH_STEP, SEARCH_STEP):
+        for step in (4.0 * SEARCH_STEP, SEARCH_STEP, SEARCH_STEP / 8.0, SEARCH_STEP / 64.0):
             numbers = sorted(range(round(low / step), round(high / step) + 1), key=abs)
             places = [min(max(best + k * step, 0.0), self.end) for k in numbers]
             best = min(places, key=lambda place: round(self.distance(arm, q, place), 7))

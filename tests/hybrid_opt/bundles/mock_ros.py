@@ -29,6 +29,9 @@ from symbolic.array import Array
 STEP = 0.005
 """Of the simulated world [s]."""
 
+LONGEST = 200.0
+"""A program that is not done by then, of a world that begins at 100 s, waits for ever [s]."""
+
 JOINTS_EVERY = 0.01
 """Between two joint states [s]."""
 
@@ -268,6 +271,7 @@ class World:
         if self.pause:
             until, self.pause = until + self.pause, 0.0
         while self.now < until - 1e-9:
+            assert self.now < LONGEST, f"not done after {LONGEST:g} s: {self.log}"
             self.now += STEP
             while self.at and self.at[0][0] <= self.now:
                 heapq.heappop(self.at)[2]()

@@ -111,10 +111,10 @@ def test_they_do_so_at_the_front_door() -> None:
     found = evaluator().evaluate(starts())
     front = ho.Front(cell, "two", starts(), found.objectives, found)
     for path in (known, known[:-1]):
-        polished = ho.polish(cell, front, rng=rng(0), settings=settings, paths=[path])
+        polished = ho.polish(front, rng=rng(0), settings=settings, paths=[path])
         np.testing.assert_array_equal(polished.x, wanted.x)
     with pytest.raises(SettingsError, match=r"shape \(5,\); needs 18 finite numbers"):
-        ho.polish(cell, front, rng=rng(0), paths=[known[:5]])
+        ho.polish(front, rng=rng(0), paths=[known[:5]])
 
 
 def test_an_empty_front_stays_empty() -> None:

@@ -120,7 +120,7 @@ def test_rows_are_the_papers_where_patches_suffice_and_joint_ones_elsewhere() ->
 def test_a_front_gets_better_and_all_of_it_is_believed(name: str) -> None:
     cell = ho.Cell.load(WORKCELLS / f"{name}.toml")
     front = ho.search(cell, "nsga2", evaluations=200, rng=np.random.default_rng(1))
-    done = ho.polish(cell, front, rng=np.random.default_rng(1), settings=SMALL)
+    done = ho.polish(front, rng=np.random.default_rng(1), settings=SMALL)
     assert done.hypervolume() > front.hypervolume() + 1e-3
     for point in front.objectives:
         assert (done.objectives <= point + 1e-12).all(axis=1).any()

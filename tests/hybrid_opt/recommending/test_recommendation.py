@@ -37,9 +37,9 @@ def held(cell: ho.Cell, carry: ho.Carry | None) -> Array:
 @pytest.fixture(scope="module")
 def found(drivable: ho.Cell, front: ho.Front) -> Recommendation:
     """Without a wish."""
-    steps: list[int] = []
-    answer = ho.recommend(drivable, front, told=lambda: steps.append(1))
-    assert len(steps) == STEPS + 1
+    steps: list[tuple[int, int]] = []
+    answer = ho.recommend(front, progress=lambda done, total: steps.append((done, total)))
+    assert steps == [(k + 1, STEPS + 1) for k in range(STEPS + 1)]
     return answer
 
 
@@ -102,15 +102,15 @@ def test_wishes_are_kept_and_little_is_given_away(
     drivable: ho.Cell, front: ho.Front, found: Recommendation
 ) -> None:
     force = 0.95 * found.force
-    gentle = ho.recommend(drivable, front, ho.Wish(force=force))
+    gentle = ho.recommend(front, ho.Wish(force=force))
     assert 0.97 * force < gentle.force <= force * 1.002
     assert gentle.duration > found.duration
     asked = 1.2 * found.duration
-    slow = ho.recommend(drivable, front, ho.Wish(duration=asked))
+    slow = ho.recommend(front, ho.Wish(duration=asked))
     assert slow.wish.duration == asked
     assert 0.97 * asked < slow.duration <= asked * 1.002
     assert slow.force < found.force
-    heavy = ho.recommend(drivable, front, ho.Wish(payload=10.4))
+    heavy = ho.recommend(front, ho.Wish(payload=10.4))
     box = drivable.workcell.payload
     heavier = replace(box, mass=10.4, inertia=1.04 * box.inertia)
     model = pressing_model(replace(drivable.workcell, payload=heavier))
@@ -138,7 +138,7 @@ def test_a_better_path_is_warned_of(drivable: ho.Cell, front: ho.Front) -> None:
     durations = [timed(drivable, x[:-1], limit).duration for x in front.x]
     quick, slow = front.x[int(np.argmin(durations))], front.x[int(np.argmax(durations))]
     assert min(durations) < 0.98 * max(durations)
-    alone = ho.recommend(drivable, slow[None], None, {"other": quick[:-1]})
+    alone = ho.recommend(ho.Front.of(drivable, slow[None]), None, {"other": quick[:-1]})
     assert any("other trajectory is better" in text for text in alone.warnings)
     assert alone.rivals[1].duration_at_force < alone.duration
     assert alone.rivals[1].force_at_duration < alone.force
@@ -193,7 +193,7 @@ def test_where_nothing_holds_it_is_the_gentlest_and_says_so(
 ) -> None:
     """The rack's robots are too weak for the usual set."""
     unsure = ho.Cell(replace(drivable.workcell, uncertainty=USUAL), drivable.objective_names)
-    gentle = ho.recommend(unsure, front.x[:2])
+    gentle = ho.recommend(ho.Front.of(unsure, front.x[:2]))
     assert "no carry of the front holds in every case" in gentle.warnings[0]
     assert gentle.force > 117.0
     assert any("exceeds the reference force" in text for text in gentle.warnings)
@@ -213,15 +213,15 @@ def test_wishes_that_nothing_answers_say_what_is_possible(
     drivable: ho.Cell, front: ho.Front
 ) -> None:
     with pytest.raises(SettingsError, match="the shortest takes"):
-        ho.recommend(drivable, front, ho.Wish(duration=0.5))
+        ho.recommend(front, ho.Wish(duration=0.5))
     with pytest.raises(SettingsError, match=r"the gentlest needs 9\d\.\d N commanded"):
-        ho.recommend(drivable, front, ho.Wish(force=40.0))
+        ho.recommend(front, ho.Wish(force=40.0))
     with pytest.raises(SettingsError, match="payload 30 kg"):
-        ho.recommend(drivable, front, ho.Wish(payload=30.0))
+        ho.recommend(front, ho.Wish(payload=30.0))
     with pytest.raises(SettingsError, match="empty"):
-        ho.recommend(drivable, np.zeros((0, 19)))
+        ho.recommend(replace(front, x=np.zeros((0, 19))))
     with pytest.raises(SettingsError, match="drivable"):
-        ho.recommend(ho.Cell.load(RACK), front)
+        ho.recommend(replace(front, cell=ho.Cell.load(RACK)))
 
 
 @pytest.mark.parametrize(

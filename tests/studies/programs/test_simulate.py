@@ -76,7 +76,7 @@ def recommended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cell = Cell.load(RACK).drivable()
     front = search(cell, evaluations=300, rng=np.random.default_rng(1))
     path = tmp_path_factory.mktemp("rack") / "recommended.json"
-    write_trajectory(path, cell.workcell, recommend(cell, front).x, {}, {"algorithm": "nsga2"})
+    write_trajectory(path, cell.workcell, recommend(front).x, {}, {"algorithm": "nsga2"})
     return path
 
 
