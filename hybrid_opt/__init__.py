@@ -20,9 +20,8 @@ from hybrid_opt.shown import shown_by
 if TYPE_CHECKING:
     __version__: str
     from hybrid_opt.branches import search_branches
-    from hybrid_opt.bundles.bundle import export
+    from hybrid_opt.bundles.bundle import Origin, export
     from hybrid_opt.bundles.job_file import BundleOptions
-    from hybrid_opt.bundles.manifest import Origin
     from hybrid_opt.carry import Carry
     from hybrid_opt.catalogue import algorithms, example, load, objectives, targets
     from hybrid_opt.cell import Cell
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
     from hybrid_opt.front import Front
     from hybrid_opt.job.plan import plan_job
     from hybrid_opt.job.records import Job
-    from hybrid_opt.metaheuristics.carries import SearchSettings
+    from hybrid_opt.metaheuristics.run import SearchSettings
     from hybrid_opt.polishing.settings import PolishSettings
     from hybrid_opt.proposing.proposal import Proposal, ProposeSettings, propose
     from hybrid_opt.recommending.choice import Wish
@@ -97,12 +96,12 @@ _HOMES = {
     "JerkTiming": "hybrid_opt.timing.records",
     "Job": "hybrid_opt.job.records",
     "Objective": "hybrid_opt.evaluate.objectives",
-    "Origin": "hybrid_opt.bundles.manifest",
+    "Origin": "hybrid_opt.bundles.bundle",
     "PolishSettings": "hybrid_opt.polishing.settings",
     "Proposal": "hybrid_opt.proposing.proposal",
     "ProposeSettings": "hybrid_opt.proposing.proposal",
     "Recommendation": "hybrid_opt.recommending.recommendation",
-    "SearchSettings": "hybrid_opt.metaheuristics.carries",
+    "SearchSettings": "hybrid_opt.metaheuristics.run",
     "SqueezeSettings": "hybrid_opt.robust.squeeze",
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",

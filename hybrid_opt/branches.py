@@ -22,7 +22,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations, concatenated
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import REFERENCE_POINT, front_rows, hypervolume
-from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
+from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.functions import CONSTRAINTS

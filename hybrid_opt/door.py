@@ -12,7 +12,7 @@ import numpy as np
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
-from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
+from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings, usual_settings
 from hybrid_opt.progress import Progress, counted

@@ -33,7 +33,7 @@ ALGORITHMS: tuple[str, ...] = stated("hybrid_opt.metaheuristics.registry.REGISTR
 
 WORKERS_LOAD = (
     "hybrid_opt.campaign.polish_stage",
-    "studies.study.timing",
+    "studies.study.drivable",
     "studies.study.recommendation",
     "studies.report.generate",
 )
@@ -106,7 +106,7 @@ def add_options(parser: Parser, output: str) -> None:
     )
     search.add_argument(
         "--constraint-handling",
-        choices=stated("hybrid_opt.metaheuristics.problem.ConstraintHandling"),
+        choices=stated("hybrid_opt.metaheuristics.run.ConstraintHandling"),
         default=_stated("constraint_handling"),
         help="how the search learns of infeasibility: by the paper's penalised objectives, or by "
         "constraint domination",
@@ -183,7 +183,7 @@ def add_options(parser: Parser, output: str) -> None:
     add(work, "--jobs", type=int)
     work.add_argument(
         "--executor",
-        choices=stated("hybrid_opt.campaign.execution.ExecutorName"),
+        choices=stated("hybrid_opt.campaign.folder.ExecutorName"),
         default="processes",
         help="where the work is done: on this machine or on a Dask cluster",
     )

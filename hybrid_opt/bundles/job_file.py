@@ -19,9 +19,8 @@ import numpy as np
 import pinocchio as pin
 
 from hybrid_opt.bundles.arms import prefixes
-from hybrid_opt.bundles.holding import Efforts, Stop, efforts
 from hybrid_opt.bundles.programs.carry_job import Limits
-from hybrid_opt.bundles.steps import Gap
+from hybrid_opt.bundles.steps import Efforts, Gap, Stop, efforts
 from hybrid_opt.job.compliance import HELD, largest_skew, require_delay, require_stiffness
 from hybrid_opt.job.records import Job, SampledJob
 from symbolic.array import Array

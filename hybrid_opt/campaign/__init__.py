@@ -1,7 +1,6 @@
 """Campaigns: algorithms times replicas with equal budgets, stored so that nothing is lost."""
 
-from hybrid_opt.campaign.execution import ExecutionSettings, executor_for
-from hybrid_opt.campaign.folder import CampaignFolder, open_folder
+from hybrid_opt.campaign.folder import CampaignFolder, ExecutionSettings, executor_for, open_folder
 from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Progress, Stage, check_stages, run_stages

@@ -8,8 +8,7 @@ import numpy as np
 
 from hybrid_opt.branches import BranchCompetition, search_branches
 from hybrid_opt.campaign.documents import BRANCHES
-from hybrid_opt.campaign.execution import ExecutionSettings
-from hybrid_opt.campaign.folder import require_usable
+from hybrid_opt.campaign.folder import ExecutionSettings, require_usable
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.cell import Cell
 from hybrid_opt.store.files import write_json

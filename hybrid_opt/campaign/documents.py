@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from hybrid_opt.campaign.settings import FirstGeneration
-from hybrid_opt.metaheuristics.problem import ConstraintHandling
+from hybrid_opt.metaheuristics.run import ConstraintHandling
 from symbolic.array import Count, Range
 
 Seconds = Annotated[float, Range(0.0, 1e12)]

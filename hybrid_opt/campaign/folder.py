@@ -1,25 +1,156 @@
-"""The results folder of a campaign, held by one process while it works."""
+"""How a campaign is carried out, and its results folder: held by one process while it works, and
+made from one workcell, with one set of settings and one version of the software."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any, Literal, get_args
 
+from codegen.cache import source_digest
 from hybrid_opt.campaign.documents import CONFIGURATION, STAGES, WORKCELL
-from hybrid_opt.campaign.execution import ExecutionSettings
-from hybrid_opt.campaign.identity import identity, require_equal
-from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.campaign.settings import CampaignSettings, require_whole
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import LOCK, locked, read_json, storing, write_json
+from hybrid_opt.version import own_version
+from hybrid_opt.work.dask_cluster import DaskExecutor
+from hybrid_opt.work.processes import local_executor
+from hybrid_opt.work.service import Executor
+from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.read.cell_files import CellFiles, collect_cell, unpack_cell
 from symbolic.records import Workcell
 from symbolic.replacing import sync_folder
+
+ExecutorName = Literal["processes", "dask"]
+
+
+@dataclass(frozen=True)
+class ExecutionSettings:
+    """How a campaign is carried out; nothing here changes its results.
+
+    Attributes:
+        output: the results folder.
+        jobs: worker processes, 0 for one per core that this process may use.
+        executor: 'processes' of this machine, or 'dask' for a cluster.
+        scheduler: address of the Dask scheduler, only with 'dask'.
+        resume: continue what the results folder holds.
+        overwrite: remove what a study left in the results folder, and begin anew.
+    """
+
+    output: Path
+    jobs: int = 0
+    executor: ExecutorName = "processes"
+    scheduler: str | None = None
+    resume: bool = False
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            SettingsError: with the value, and what is allowed.
+        """
+        require_whole("jobs", self.jobs, 0, 4096)
+        if self.resume and self.overwrite:
+            raise SettingsError("--resume keeps results and --overwrite removes them: give one")
+        if self.executor not in get_args(ExecutorName):
+            raise SettingsError(
+                f"executor {self.executor!r}; known are {', '.join(get_args(ExecutorName))}"
+            )
+        if (self.executor == "dask") != bool(self.scheduler):
+            raise SettingsError(
+                "the executor 'dask' needs a scheduler's address, and only it takes one: "
+                "--executor dask --scheduler tcp://HOST:8786"
+            )
+
+
+def executor_for(execution: ExecutionSettings) -> Executor:
+    """The executor that the settings ask for."""
+    if execution.executor == "dask":
+        assert execution.scheduler is not None
+        return DaskExecutor(execution.scheduler, environment(), environment)
+    return local_executor(execution.jobs)
+
+
+FORMAT = "dual-arm-carry campaign"
+VERSION = 1
+
+_PACKAGES = ("casadi", "moocore", "numpy", "pin", "pymoo", "python-fcl", "scipy", "trimesh")
+
+
+@cache
+def environment() -> Mapping[str, str]:
+    """Versions of everything that takes part in a search, and a digest of our own sources."""
+    versions = {name: version(name) for name in _PACKAGES}
+    versions["dual-arm-carry"] = own_version()  # beside the digest of the sources
+    versions["sources"] = source_digest("symbolic", "codegen", "hybrid_opt")
+    versions["python"] = platform.python_version()
+    versions["machine"] = platform.machine()
+    return versions
+
+
+def identity(settings: CampaignSettings, root: Path, workcell: Workcell) -> dict[str, Any]:
+    """The identity as JSON values.
+
+    Args:
+        settings: the campaign's.
+        root: the results folder.
+        workcell: the folder's copy.
+    """
+    file = workcell.source.relative_to(root.resolve()).as_posix()
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "workcell": {"name": workcell.name, "file": file, "digest": workcell.digest},
+        "settings": settings.effective(),
+        "environment": dict(environment()),
+    }
+
+
+def replica_identity(campaign: Mapping[str, Any], algorithm: str, replica: int) -> bytes:
+    """32 bytes that identify one replica of a campaign."""
+    text = json.dumps([campaign, algorithm, replica], sort_keys=True)
+    return hashlib.sha256(text.encode()).digest()
+
+
+def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:
+    """Refuse to continue a campaign of another identity.
+
+    Raises:
+        ResultsError: with every value that differs.
+    """
+    listed = "\n".join(
+        f"  - {key}: stored {json.dumps(old)}, now {json.dumps(new)}"
+        for key, old, new in differences(stored, dict(wanted))
+    )
+    if listed:
+        raise ResultsError(
+            f"{where}: holds results of something else, and they are never mixed; choose another "
+            "--output, remove them with --overwrite, or repeat the command with what they were "
+            f"made with:\n{listed}"
+        )
+
+
+def differences(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Where two trees of JSON values differ: keys joined by points, and both values, None where one
+    has none."""
+    if isinstance(first, dict) and isinstance(second, dict):
+        for name in dict.fromkeys((*first, *second)):
+            inner = f"{key}.{name}" if key else name
+            yield from differences(first.get(name), second.get(name), inner)
+    elif first != second:
+        yield key, first, second
 
 
 @dataclass(frozen=True)

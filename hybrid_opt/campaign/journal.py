@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.campaign.documents import JOURNAL
-from hybrid_opt.campaign.identity import replica_identity
+from hybrid_opt.campaign.folder import replica_identity
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.store.files import read_bytes, storing

@@ -18,9 +18,7 @@ import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.documents import JOURNAL, POLISH, polished_folder
-from hybrid_opt.campaign.execution import executor_for
-from hybrid_opt.campaign.folder import CampaignFolder
-from hybrid_opt.campaign.identity import identity
+from hybrid_opt.campaign.folder import CampaignFolder, executor_for, identity
 from hybrid_opt.campaign.journal import ReplicaLedger
 from hybrid_opt.campaign.results import Replica, read_campaign, read_polished
 from hybrid_opt.campaign.settings import CampaignSettings

@@ -26,8 +26,8 @@ from hybrid_opt.campaign.documents import (
     replica_folder,
 )
 from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode
-from hybrid_opt.campaign.identity import FORMAT, VERSION
-from hybrid_opt.campaign.replica import front_rows
+from hybrid_opt.campaign.folder import FORMAT, VERSION
+from hybrid_opt.campaign.search_stage import front_rows
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError

@@ -10,7 +10,7 @@ import numpy as np
 
 from hybrid_opt import metaheuristics
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, select_objectives
-from hybrid_opt.metaheuristics.problem import ConstraintHandling
+from hybrid_opt.metaheuristics.run import ConstraintHandling
 from symbolic.errors import SettingsError
 
 FirstGeneration = Literal["initial", "random"]

@@ -13,17 +13,21 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from tqdm import tqdm
 
-from hybrid_opt.campaign.documents import STAGES, StageMark, StageStatus
-from hybrid_opt.campaign.folder import CampaignFolder
+from hybrid_opt.campaign.documents import CONFIGURATION, DRIVABLE, STAGES, StageMark, StageStatus
+from hybrid_opt.campaign.folder import CampaignFolder, open_folder
+from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.objectives import force_kind
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
+from symbolic.read.cell_files import drivable_files, unpack_cell
 
 
 @dataclass(frozen=True)
@@ -162,3 +166,31 @@ class Progress:
         """A line of its own."""
         if self.shown:
             tqdm.write(text, file=sys.stderr)
+
+
+def drivable_settings(settings: CampaignSettings) -> CampaignSettings:
+    """Settings of the drivable experiment beside another one: the same but for the objectives,
+    durations and forces of the kind that the other one minimises."""
+    return replace(settings, objectives=force_kind(settings.objectives).drivable)
+
+
+def drivable_stage(stages: Sequence[Stage]) -> Stage:
+    """The stage that searches for carries as robots drive them, in the folder `drivable/`.
+
+    The folder is a campaign like any other, of the drivable variant of the study's cell.
+
+    Args:
+        stages: of that campaign.
+    """
+
+    def run(folder: CampaignFolder, progress: Progress) -> None:
+        root = folder.root / DRIVABLE
+        resume = (root / CONFIGURATION).exists()
+        execution = replace(folder.execution, output=root, resume=resume, overwrite=False)
+        with TemporaryDirectory() as files:
+            workcell = unpack_cell(drivable_files(folder.files), Path(files))
+            settings = drivable_settings(folder.settings)
+            with open_folder(settings, execution, workcell) as inner:
+                run_stages(inner, stages, Progress(progress.shown, DRIVABLE))
+
+    return Stage(DRIVABLE, run, {stage.name: dict(stage.settings) for stage in stages})

@@ -20,17 +20,21 @@ from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.collisions import JobCollisions
-from hybrid_opt.job.forces import EXCESS, holding, phase_use, pressing, without_force
 from hybrid_opt.job.motions import (
+    EXCESS,
     SAMPLES,
     Straight,
     carry_motion,
     followed,
     held_at,
+    holding,
     lines_around,
+    phase_use,
+    pressing,
     rise,
     standing_still,
     timed,
+    without_force,
 )
 from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
 from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, without_jumps

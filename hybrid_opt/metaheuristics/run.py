@@ -1,19 +1,126 @@
-"""Run an algorithm on a problem and keep every point that it evaluated."""
+"""A search among a cell's carries: the problem that pymoo's algorithms see, the run that spends the
+evaluations, and the record of what they evaluated."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pymoo.core.algorithm import Algorithm
 from pymoo.core.problem import Problem
 
+from hybrid_opt.evaluate.evaluations import NOT_FINITE, REASONS, Evaluations, concatenated
 from hybrid_opt.metaheuristics.guarded import violation_of
+from hybrid_opt.metaheuristics.registry import make
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+
+ConstraintHandling = Literal["penalty", "constraints"]
+"""How a search learns of infeasibility: by the paper's penalised objectives, or by objectives
+and violations as inequality constraints."""
+
+WORST_PENALTY = 1.0 + len(REASONS)
+"""Penalised objective of a candidate whose figures are not finite: as if every constraint were
+violated all the time."""
+
+
+class Evaluator(Protocol):
+    """Interface of an evaluator for the search, see
+    `hybrid_opt.evaluate.evaluation.CandidateEvaluator`."""
+
+    objective_names: tuple[str, ...]
+    n_var: int
+    lower: Array
+    upper: Array
+
+    def evaluate(self, x: Array) -> Evaluations:
+        """Verdicts on decision vectors (n, n_var)."""
+
+    def certified(self, evaluations: Evaluations) -> Evaluations:
+        """The evaluations with their feasible front proven free between the samples."""
+
+
+def disarmed(evaluations: Evaluations) -> Evaluations:
+    """The evaluations with every candidate that has a figure that is not finite made infeasible.
+
+    The last line of defence: whatever an evaluator returns, no NaN or infinity can look like a
+    good candidate. Such candidates get `WORST_PENALTY` and the reason `NOT_FINITE`.
+    """
+    finite = np.isfinite(evaluations.violation).all(axis=1)
+    finite &= np.isfinite(evaluations.violation_time).all(axis=1)
+    finite &= np.isfinite(evaluations.penalised).all(axis=1)
+    # Infeasible candidates may lack objectives: a lost arm has no joint torque.
+    finite &= np.isfinite(evaluations.objectives).all(axis=1) | ~evaluations.feasible
+    if finite.all():
+        return evaluations
+    broken = ~finite
+    changed = {f.name: getattr(evaluations, f.name).copy() for f in fields(evaluations)}
+    changed["penalised"][broken] = WORST_PENALTY
+    changed["feasible"][broken] = False
+    changed["reason"][broken] = REASONS.index(NOT_FINITE)
+    changed["position"][broken] = 0.0
+    for name in ("violation", "violation_time"):
+        changed[name][broken] = 0.0
+        changed[name][broken, REASONS.index(NOT_FINITE)] = 1.0
+    return replace(evaluations, **changed)
+
+
+class CarryProblem(Problem):  # type: ignore[misc]
+    """A cell's candidates as a vectorised pymoo problem that keeps what it evaluated.
+
+    With handling 'penalty' the objectives are the penalised ones (paper Eq. 60) and there are no
+    constraints; with 'constraints' they are the plain ones, and each of `REASONS` is an
+    inequality constraint with its violation as value. Every figure handed out is finite.
+
+    Attributes:
+        evaluator: what evaluates.
+        handling: see above.
+        evaluated: called with the number of candidates after each batch.
+        batches: the evaluations of each call, in order.
+    """
+
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        handling: ConstraintHandling = "penalty",
+        evaluated: Callable[[int], None] = lambda count: None,
+    ) -> None:
+        if handling not in get_args(ConstraintHandling):
+            raise SettingsError(
+                f"constraint handling {handling!r}; known are "
+                f"{', '.join(get_args(ConstraintHandling))}"
+            )
+        super().__init__(
+            n_var=evaluator.n_var,
+            n_obj=len(evaluator.objective_names),
+            n_ieq_constr=len(REASONS) if handling == "constraints" else 0,
+            xl=evaluator.lower,
+            xu=evaluator.upper,
+        )
+        self.evaluator = evaluator
+        self.handling = handling
+        self.evaluated = evaluated
+        self.batches: list[Evaluations] = []
+
+    @property
+    def evaluations(self) -> Evaluations:
+        """Every evaluated candidate in the order of evaluation; there has to be one."""
+        return concatenated(self.batches)
+
+    def _evaluate(self, x: Array, out: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        batch = disarmed(self.evaluator.evaluate(x))
+        self.batches.append(batch)
+        self.evaluated(len(batch.feasible))
+        if self.handling == "penalty":
+            out["F"] = batch.penalised
+        else:
+            known = np.isfinite(batch.objectives).all(axis=1, keepdims=True)
+            out["F"] = np.where(known, batch.objectives, batch.penalised)
+            out["G"] = batch.violation
 
 
 @dataclass(frozen=True)
@@ -53,13 +160,11 @@ class SearchResult:
     Attributes:
         evaluated: every point, without limit; fronts and metrics are computed from it.
         front: the points of the algorithm's own final front (of limited size), feasible only.
-        evaluation_seconds: wall time inside the problem.
-        algorithm_seconds: wall time outside of it.
+        algorithm_seconds: wall time outside of the problem.
     """
 
     evaluated: Evaluated
     front: Evaluated
-    evaluation_seconds: float
     algorithm_seconds: float
 
 
@@ -68,7 +173,6 @@ def search(
     algorithm: Algorithm,
     evaluations: int,
     rng: np.random.Generator | int,
-    observe: Callable[[Evaluated], None] | None = None,
 ) -> SearchResult:
     """Spend exactly `evaluations` evaluations of `problem`.
 
@@ -78,7 +182,6 @@ def search(
         evaluations: the budget, at least 1.
         rng: the run's only source of randomness, or a seed for it; the same seed gives the
             same result to the bit.
-        observe: called after each generation with that generation's points.
 
     Raises:
         SettingsError: no budget, or an algorithm that already ran.
@@ -102,31 +205,67 @@ def search(
         number = np.full(len(violation), len(batches) + 1, dtype=np.int64)
         batches.append(Evaluated(decisions, objectives, violation, number))
         algorithm.tell(infills=candidates)
-        if observe is not None:
-            observe(batches[-1])
-    evaluated = _join(batches)
-    return SearchResult(
-        evaluated,
-        _final_front(algorithm, problem),
-        inside,
-        time.perf_counter() - start - inside,
-    )
-
-
-def _join(batches: list[Evaluated]) -> Evaluated:
-    return Evaluated(
-        np.concatenate([batch.decisions for batch in batches]),
-        np.concatenate([batch.objectives for batch in batches]),
-        np.concatenate([batch.violation for batch in batches]),
-        np.concatenate([batch.generation for batch in batches]),
-    )
-
-
-def _final_front(algorithm: Algorithm, problem: Problem) -> Evaluated:
+    columns = zip(*(vars(batch).values() for batch in batches), strict=True)
+    evaluated = Evaluated(*map(np.concatenate, columns))
     members = list(algorithm.opt)
-    return Evaluated(
+    front = Evaluated(
         np.array([m.X for m in members]).reshape(-1, problem.n_var),
         np.array([m.F for m in members]).reshape(-1, problem.n_obj),
         np.zeros(len(members)),
         np.array([m.get("n_gen") for m in members], dtype=np.int64),
     )
+    return SearchResult(evaluated, front, time.perf_counter() - start - inside)
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How a search is done.
+
+    Attributes:
+        algorithm: values that differ from the algorithm's defaults, see
+            `hybrid_opt.metaheuristics.settings`.
+        constraint_handling: 'penalty' (the paper's) or 'constraints'.
+        initial: (k, n_var) decision vectors that the first generation starts with, the rest being
+            uniformly random; None for what the caller starts from by default.
+    """
+
+    algorithm: Mapping[str, object] = field(default_factory=dict)
+    constraint_handling: ConstraintHandling = "penalty"
+    initial: Array | None = None
+
+
+@dataclass(frozen=True)
+class SearchedCarries:
+    """All candidates of a search, in order, with its front certified.
+
+    Attributes:
+        evaluations: every candidate.
+        generation: (n,) the generation of each, from 1.
+    """
+
+    evaluations: Evaluations
+    generation: NDArray[np.int64]
+
+
+def search_carries(
+    evaluator: Evaluator,
+    algorithm: str,
+    evaluations: int,
+    rng: np.random.Generator,
+    settings: SearchSettings,
+    evaluated: Callable[[int], None] = lambda count: None,
+) -> SearchedCarries:
+    """Spend exactly that many evaluations and certify the front of all of them.
+
+    Args:
+        algorithm: one of `hybrid_opt.metaheuristics.names()`.
+        evaluated: called with the number of candidates after each batch.
+
+    Raises:
+        SettingsError: an unknown algorithm or a value that is not allowed.
+    """
+    problem = CarryProblem(evaluator, settings.constraint_handling, evaluated)
+    search(problem, make(algorithm, settings.algorithm, settings.initial), evaluations, rng)
+    sizes = [len(batch) for batch in problem.batches]
+    generation = np.repeat(np.arange(1, len(sizes) + 1), sizes)
+    return SearchedCarries(evaluator.certified(problem.evaluations), generation)

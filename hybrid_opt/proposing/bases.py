@@ -14,12 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.proposing.document import merged
-from hybrid_opt.proposing.holding import Hold, HoldQuery, find_holds
-from hybrid_opt.proposing.judge import BoxAlone
-from hybrid_opt.proposing.kinematics import ArmKinematics, box_to_last_joint, shoulders, spun
-from hybrid_opt.proposing.problem import Problem
+from hybrid_opt.proposing.holding import (
+    ArmKinematics,
+    Hold,
+    HoldQuery,
+    box_to_last_joint,
+    find_holds,
+    shoulders,
+    spun,
+)
+from hybrid_opt.proposing.problem import Problem, merged
 from hybrid_opt.proposing.setup import redundancy
+from hybrid_opt.proposing.trial import BoxAlone
 from symbolic.array import Array
 from symbolic.geometry.bodies import WORLD, MeshReader, collision_bodies, shape_pieces
 from symbolic.geometry.pairs import coal_distance

@@ -1,11 +1,12 @@
-"""The problem file: a workcell file in which a person has left out what is to be proposed."""
+"""The problem file: a workcell file in which a person has left out what is to be proposed; and the
+text of the workcell file that completes it, comments and order as they were."""
 
 from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.proposing.document import completed, merged
-from hybrid_opt.proposing.kinematics import shoulders
+from hybrid_opt.proposing.bounds import Bounds
+from hybrid_opt.proposing.holding import shoulders
 from symbolic import outside
 from symbolic.array import Array
-from symbolic.errors import OutsideError, WorkcellError
+from symbolic.errors import OutsideError, SettingsError, WorkcellError
 from symbolic.read.cell import load
 from symbolic.read.descriptions import PACKAGE_SCHEME
-from symbolic.records import Workcell
+from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import Orientation, box_placement, rotation_from_rpy
 
 UPRIGHT = 0.7
@@ -132,7 +133,7 @@ class Problem:
         """The workcell with one free waypoint halfway where nothing else is said.
 
         Args:
-            changes: as for `hybrid_opt.proposing.document.completed`.
+            changes: as for `hybrid_opt.proposing.problem.completed`.
 
         Raises:
             WorkcellError: with all problems of the file.
@@ -163,7 +164,7 @@ class Problem:
         """The file's text, completed, for a folder that paths are then relative to.
 
         Args:
-            changes: as for `hybrid_opt.proposing.document.completed`.
+            changes: as for `hybrid_opt.proposing.problem.completed`.
 
         Raises:
             SettingsError: the file is written in a way that cannot be completed.
@@ -296,3 +297,272 @@ def contact_points(
     point = np.zeros(3)
     point[axis] = side * size[axis] / 2.0
     return [point.tolist(), (-point).tolist()]
+
+
+UNIT = np.array([0.10, 0.10, 0.10, 0.08, 0.08, 0.08])
+"""Half-widths of a pose that are scaled together [m, rad]."""
+
+REDUNDANT_UNIT = 0.15
+"""Half-width of a redundant joint's value [rad or m]."""
+
+LIMITS = np.array([10.0, 10.0, 10.0, 3.14, 1.57, 3.14])
+"""Beyond which no pose of a workcell file may be, or should need to be (angles) [m, rad]."""
+
+ROOM = 0.5
+"""What angles may vary by where a carry itself is beyond these [rad]."""
+
+ANGLE_LIMIT = 6.28
+"""Beyond which no angle of a workcell file may be [rad]."""
+
+VECTOR_LIMIT = 4.99
+"""The same of a rotation vector's length [rad]."""
+
+DRAFTED = 0.01
+"""Half-width of bounds that nothing is known of yet [m, rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What was found.
+
+    Attributes:
+        workcell: the cell that it was found in, with its redundant joints chosen.
+        spins: of both pads, beside those of the file [rad].
+        branches: of both robots, -1 where they are not known yet.
+        waypoints: (n, 6 + m) extended poses, start and goal included.
+        given: what was added to the problem's tables before, such as bases.
+        bounds: of the decision vector, None where they are not known yet.
+    """
+
+    workcell: Workcell
+    spins: tuple[float, float]
+    branches: tuple[int, int]
+    waypoints: Array
+    given: dict[str, Any] = field(default_factory=dict)
+    bounds: Bounds | None = None
+
+    @property
+    def via(self) -> Array:
+        """(n - 2, 6) poses between start and goal."""
+        return self.waypoints[1:-1, :POSE_SIZE]
+
+    def around(self, centre: Array) -> Found:
+        """The same with another decision vector as its carry."""
+        m = len(self.workcell.task.redundant)
+        return replace(self, waypoints=_as_waypoints(centre, self.waypoints, m))
+
+
+def changes(problem: Problem, found: Found) -> dict[str, Any]:
+    """What completes the problem's tables."""
+    lower, upper = _boxes(found)
+    task: dict[str, Any] = {
+        "initial": _plain(found.via),
+        "waypoints": [
+            {"lower": _plain(low), "upper": _plain(high)}
+            for low, high in zip(lower[1:-1, :6], upper[1:-1, :6], strict=True)
+        ],
+    }
+    if found.workcell.task.redundant:
+        task["redundant"] = [
+            {
+                "joint": joint.name,
+                "initial": _plain(found.waypoints[:, POSE_SIZE + k]),
+                "lower": _plain(lower[:, POSE_SIZE + k]),
+                "upper": _plain(upper[:, POSE_SIZE + k]),
+            }
+            for k, joint in enumerate(found.workcell.task.redundant)
+        ]
+    robots: list[dict[str, Any]] = []
+    contacts: list[dict[str, Any]] = []
+    for i, robot in enumerate(found.workcell.robots):
+        entry: dict[str, Any] = {"start_branch": found.branches[i]}
+        if robot.redundant_joints:
+            entry["redundant_joints"] = list(robot.redundant_joints)
+        robots.append(entry)
+        spin = float(problem.data["contacts"][i].get("spin", 0.0)) + found.spins[i]
+        contacts.append(
+            {
+                **found.given.get("contacts", problem.contacts)[i],
+                "spin": round(float(np.remainder(spin + np.pi, 2 * np.pi) - np.pi), 9),
+            }
+        )
+    whole: dict[str, Any] = merged(
+        found.given, {"robots": robots, "contacts": contacts, "task": task}
+    )
+    return whole
+
+
+def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
+    """Half-widths (n_var,) that are scaled together, and limits (2, n_var) of bounds around the
+    workcell's hand-made trajectory."""
+    task, n = workcell.task, len(workcell.task.waypoints)
+    unit = [np.tile(UNIT, len(task.free_indices))]
+    least, most = [], []
+    for pose in task.initial:
+        low, high = _pose_limits(pose, task.orientation.is_vector)
+        least.append(low)
+        most.append(high)
+    for joint in task.redundant:
+        arm = 0 if joint.drives[0] >= 0 else 1
+        robot, index = workcell.robots[arm], joint.drives[arm]
+        unit.append(np.full(n, REDUNDANT_UNIT))
+        # Rounded inwards, because the file holds four decimals.
+        least.append(np.full(n, np.ceil(1e4 * robot.position_lower[index]) / 1e4))
+        most.append(np.full(n, np.floor(1e4 * robot.position_upper[index]) / 1e4))
+    return np.concatenate(unit), np.array([np.concatenate(least), np.concatenate(most)])
+
+
+def _pose_limits(pose: Array, is_vector: bool) -> tuple[Array, Array]:
+    """Limits (6,) of bounds around a pose (6,), which lies between them."""
+    low, high = -LIMITS, LIMITS.copy()
+    if is_vector:  # the farthest corner of such a cube is no longer than allowed
+        room = max((VECTOR_LIMIT - np.linalg.norm(pose[3:])) / np.sqrt(3.0), 1e-3)
+        low[3:], high[3:] = pose[3:] - room, pose[3:] + room
+        return low, high
+    low[3:] = np.maximum(np.minimum(low[3:], pose[3:] - ROOM), -ANGLE_LIMIT)
+    high[3:] = np.minimum(np.maximum(high[3:], pose[3:] + ROOM), ANGLE_LIMIT)
+    return low, high
+
+
+def _boxes(found: Found) -> tuple[Array, Array]:
+    """Bounds (n, 6 + m) of the waypoints."""
+    if found.bounds is None:
+        return found.waypoints - DRAFTED, found.waypoints + DRAFTED
+    m = len(found.workcell.task.redundant)
+    # Bounds go outwards where they are rounded, so that the carry stays inside.
+    lower = _as_waypoints(np.floor(1e4 * found.bounds.lower) / 1e4, found.waypoints, m)
+    upper = _as_waypoints(np.ceil(1e4 * found.bounds.upper) / 1e4, found.waypoints, m)
+    return lower, upper
+
+
+def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
+    """Extended waypoints (n, 6 + m) of a decision vector in which all between the ends, and all
+    values of redundant joints, are free."""
+    n = len(waypoints)
+    placed = waypoints.copy()
+    placed[1:-1, :POSE_SIZE] = x[: POSE_SIZE * (n - 2)].reshape(n - 2, POSE_SIZE)
+    placed[:, POSE_SIZE:] = x[POSE_SIZE * (n - 2) :].reshape(m, n).T
+    return placed
+
+
+def _plain(values: Array) -> Any:
+    """As lists of numbers, to a hundredth of a millimetre."""
+    return np.round(values, 5).tolist()
+
+
+Changes = Mapping[str, Any]
+"""Tables and keys to be set: {'task': {'initial': ...}, 'robots': [{...}, {...}]}; a list of tables
+that is there already is changed entry by entry, a key with the value None is removed."""
+
+INLINE = ("base", "pad")
+"""Tables that are written in one line."""
+
+
+def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
+    """A workcell file's text with values set.
+
+    Args:
+        text: the file; '' to write `data` without comments.
+        data: what the file holds, without what is replaced.
+        changes: what is set.
+
+    Raises:
+        SettingsError: the file is written in a way that cannot be completed, or TOML Kit is not
+            installed.
+    """
+    tomlkit = _library()
+    wanted = merged(data, changes)
+    document = tomlkit.parse(text) if text else tomlkit.document()
+    if not text:
+        for key, value in wanted.items():
+            document[key] = _item(value)
+    else:
+        _apply(document, changes)
+    found: str = tomlkit.dumps(document)
+    try:
+        same = _alike(outside.toml_tables(found.encode()), wanted)
+    except OutsideError:
+        same = False
+    if not same:
+        raise SettingsError(
+            "the file cannot be completed as it is written; begin each section with a heading of "
+            "its own ([task], [[contacts]]) and keep what belongs to one together"
+        )
+    return found
+
+
+def _alike(found: Any, wanted: Any) -> bool:
+    """Whether values are equal; what is no number is like itself, and told by the reader."""
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        return found.keys() == wanted.keys() and all(_alike(found[k], wanted[k]) for k in found)
+    if isinstance(found, list) and isinstance(wanted, list):
+        return len(found) == len(wanted) and all(map(_alike, found, wanted))
+    return bool(found == wanted) or (found != found and wanted != wanted)
+
+
+def merged(data: Any, changes: Any) -> Any:
+    """What a file says after the changes, as plain values; also changes after further ones."""
+    if isinstance(changes, Mapping) and isinstance(data, Mapping):
+        found = dict(data)
+        for key, value in changes.items():
+            if value is None:
+                found.pop(key, None)
+            else:
+                found[key] = merged(found[key], value) if key in found else value
+        return found
+    if _tables(changes) and _tables(data) and len(changes) == len(data):
+        return [merged(old, new) for old, new in zip(data, changes, strict=True)]
+    return changes
+
+
+def _tables(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, Mapping) for entry in value)
+
+
+def _apply(place: Any, changes: Any) -> None:
+    for key, value in changes.items():
+        if value is None:
+            place.pop(key, None)
+        elif isinstance(value, Mapping) and key in place:
+            _apply(place[key], value)
+        elif _tables(value) and key in place and len(value) == len(place[key]):
+            for old, new in zip(place[key], value, strict=True):
+                _apply(old, new)
+        else:
+            place[key] = _item(value)
+
+
+def _item(value: Any) -> Any:
+    """A value as TOML: tables with headings, rows of numbers one below the other."""
+    tomlkit = _library()
+    if isinstance(value, Mapping):
+        table = tomlkit.table()
+        for key, entry in value.items():
+            if key in INLINE and isinstance(entry, Mapping):
+                table[key] = tomlkit.inline_table()
+                table[key].update(entry)
+            else:
+                table[key] = _item(entry)
+        return table
+    if value and _tables(value):
+        tables = tomlkit.aot()
+        for entry in value:
+            tables.append(_item(entry))
+        return tables
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        rows = tomlkit.array()
+        for row in value:
+            rows.append(row)
+        return rows.multiline(True)
+    return value
+
+
+def _library() -> Any:
+    try:
+        import tomlkit
+    except ImportError as error:
+        raise SettingsError(
+            "a proposed file is completed by TOML Kit, which is not installed: "
+            'pip install "dual-arm-carry[propose]"'
+        ) from error
+    return tomlkit

@@ -22,14 +22,10 @@ from hybrid_opt.carry import Judgement
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
-from hybrid_opt.proposing.closed_chain import Place
-from hybrid_opt.proposing.completion import Found, changes, decision_bounds
-from hybrid_opt.proposing.judge import BoxAlone
-from hybrid_opt.proposing.pairing import Pair
-from hybrid_opt.proposing.planner import Stray, freedom, plan, straight_path
-from hybrid_opt.proposing.problem import Problem, read_problem
-from hybrid_opt.proposing.setup import Setup, no_path, prepare
-from hybrid_opt.proposing.trial import BranchLostError, Trial, grasp_blocked
+from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight_path
+from hybrid_opt.proposing.problem import Found, Problem, changes, decision_bounds, read_problem
+from hybrid_opt.proposing.setup import Pair, Setup, no_path, prepare
+from hybrid_opt.proposing.trial import BoxAlone, BranchLostError, Trial, grasp_blocked
 from hybrid_opt.proposing.via_points import MOST_VIA_POINTS, fit, shortened, straightened
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError

@@ -21,10 +21,9 @@ from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
 from studies.program import load_workcell
-from studies.report.data import DrawnCarry
+from studies.report.data import DrawnCarry, reach_map
+from studies.report.drawing import in_style, save, settled
 from studies.report.pictures_cell import environment, meeting, reachable_regions
-from studies.report.reach import reach_map
-from studies.report.style import in_style, save, settled
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, own_pairs
 from symbolic.errors import SettingsError

@@ -42,7 +42,7 @@ from hybrid_opt.witness.reference import (
 )
 from hybrid_opt.witness.scene import LARGEST_STEP, ArmSettings, Pads, SimulationSettings
 from studies.options import DRIVEN, PADS
-from studies.report.animation import Film, write_animation
+from studies.report.looks import Film, write_animation
 from symbolic.array import Array
 from symbolic.records import Workcell
 

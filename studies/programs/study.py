@@ -20,10 +20,9 @@ from hybrid_opt.campaign import (
 )
 from hybrid_opt.campaign.branch_choice import decided_cell, store_branches
 from hybrid_opt.campaign.documents import DRIVABLE, SUMMARY
-from hybrid_opt.campaign.experiment_stage import drivable_settings, drivable_stage
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
-from hybrid_opt.campaign.simulated import read_simulations
+from hybrid_opt.campaign.stages import drivable_settings, drivable_stage
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import counted
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, FORCE_PAIRS, PAPER_OBJECTIVES
@@ -40,12 +39,11 @@ from hybrid_opt.witness.box import mujoco_module
 from studies.options import QUICK_EVALUATIONS, QUICK_REPLICAS
 from studies.program import load_workcell
 from studies.report.stage import PAGE, TABLES, follow_looks, report_stage
-from studies.study.drivable import is_drivable, known_paths, limits_on_jerk
+from studies.study.drivable import is_drivable, known_paths, limits_on_jerk, timing_stage
 from studies.study.recommendation import recommendation_stage, study_words
-from studies.study.simulation import simulation_stage
+from studies.study.simulation import read_simulations, simulation_stage
 from studies.study.summary import summary_stage
 from studies.study.tables import effort, study_tables
-from studies.study.timing import timing_stage
 from symbolic.array import Array
 from symbolic.records import Workcell
 

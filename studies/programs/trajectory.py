@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.bundles import BundleOptions, Origin, export
+from hybrid_opt.bundles.bundle import warnings_of
 from hybrid_opt.bundles.check import as_document, check
 from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
-from hybrid_opt.bundles.manifest import warnings_of
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import number, text_table

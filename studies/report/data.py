@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
 
 from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.branch_choice import read_branches
@@ -21,9 +23,9 @@ from hybrid_opt.campaign.results import (
     read_campaign,
     read_summary,
 )
-from hybrid_opt.campaign.simulated import StoredSimulation, read_simulations
 from hybrid_opt.campaign.summary import CampaignSummary, PolishedFigures, ReplicaFigures
 from hybrid_opt.carry import Carry
+from hybrid_opt.display.scene import joint_placements
 from hybrid_opt.display.table import Table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
@@ -43,15 +45,93 @@ from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.document import TimingDocument, read_timing
 from hybrid_opt.timing.robustness import PayloadSensitivity, payload_sensitivity
 from hybrid_opt.work.service import Emit, Executor, SerialExecutor, Service, answer_all
-from studies.report.jobs import RECOMMENDED_LABEL, DrawnJob, JobRequest, drawn_job
-from studies.report.reach import ReachMap, reach_map
-from studies.study.drivable import drivable_root, is_drivable, limits_on_jerk
-from studies.study.timing import TIMING, shown_files
+from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, JobRequest, drawn_job
+from studies.study.drivable import TIMING, drivable_root, is_drivable, limits_on_jerk, shown_files
+from studies.study.simulation import StoredSimulation, read_simulations
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.read.cell_files import CellFiles, collect_cell
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
+
+STEP = 0.05
+"""Edge of the cubes [m]: what a drawing of two metres shows."""
+
+POSTURES = 300_000
+"""Random postures per arm; some ten per cube of the reach of an arm of 1.3 m."""
+
+_BATCH = 50_000
+
+
+@dataclass(frozen=True)
+class ReachMap:
+    """Where the arms' pads and the box can be, on a grid of cubes, positions only.
+
+    A cube is reached if a sampled posture within the joint limits puts the pad there.
+
+    Attributes:
+        lower: (3,) corner of the grid in the world [m].
+        step: edge of the cubes [m].
+        pads: per arm a boolean (nx, ny, nz).
+        common: boolean (nx, ny, nz), box centres from which a level box has both its pads in
+            cubes that their arms reach.
+    """
+
+    lower: Array
+    step: float
+    pads: tuple[NDArray[Any], NDArray[Any]]
+    common: NDArray[Any]
+
+
+def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
+    """Sample both arms' pads over their joint limits.
+
+    Sampling leaves single cubes out; holes of a few cubes are closed.
+    """
+    clouds = [_pad_points(geometry, i, rng) for i in (0, 1)]
+    both = np.concatenate(clouds)
+    lower = np.floor(both.min(axis=0) / STEP - 3.0) * STEP
+    shape = tuple(np.ceil((both.max(axis=0) - lower) / STEP).astype(int) + 4)
+    pads = []
+    for cloud in clouds:
+        reached = np.zeros(shape, dtype=bool)
+        index = ((cloud - lower) / STEP).astype(int)
+        reached[index[:, 0], index[:, 1], index[:, 2]] = True
+        pads.append(ndimage.binary_closing(reached, iterations=2))
+    return ReachMap(lower, STEP, (pads[0], pads[1]), _common(geometry, pads))
+
+
+def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> Array:
+    """(POSTURES, 3) pad positions in the world, of random postures within the joint limits."""
+    arm, contact = geometry.arms[i], geometry.workcell.contacts[i]
+    pad = (arm.T_joint_box @ contact.T_box_pad)[:3, 3]
+    found = []
+    for _ in range(POSTURES // _BATCH):
+        q = rng.uniform(arm.lower, arm.upper, (_BATCH, arm.joints))
+        T_world_joint = joint_placements(arm, q)[:, -1]
+        found.append(T_world_joint[:, :3, :3] @ pad + T_world_joint[:, :3, 3])
+    return np.concatenate(found)
+
+
+def _common(geometry: CellGeometry, pads: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Box centres for which both shifted pad cubes are reached."""
+    common = np.ones(pads[0].shape, dtype=bool)
+    for reached, contact in zip(pads, geometry.workcell.contacts, strict=True):
+        shift = np.round(contact.T_box_pad[:3, 3] / STEP).astype(int)
+        common &= _shifted(reached, shift)
+    return common
+
+
+def _shifted(mask: NDArray[np.bool_], shift: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """mask[k + shift] at every k, False beyond the grid."""
+    result = np.zeros_like(mask)
+    source = tuple(slice(max(s, 0), n + min(s, 0)) for s, n in zip(shift, mask.shape, strict=True))
+    target = tuple(
+        slice(max(-s, 0), n + min(-s, 0)) for s, n in zip(shift, mask.shape, strict=True)
+    )
+    result[target] = mask[source]
+    return result
+
 
 INITIAL_LABEL = Path(HAND_MADE).stem
 

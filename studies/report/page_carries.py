@@ -1,25 +1,210 @@
-"""The trajectories on the page: what robots drive, what the search assumed, and what is saved.
-
-Each is worked out for itself, in any process.
-"""
+"""The trajectories of a report and the whole jobs around them: what robots drive, what the search
+assumed, and what is saved. Each is worked out for itself, in any process."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import hybrid_opt as ho
+from hybrid_opt.bundles.bundle import phase_documents
 from hybrid_opt.campaign.cell_source import ReadyCell
 from hybrid_opt.display.scene import packed
+from hybrid_opt.display.table import NOTHING, Table, number
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
+from hybrid_opt.job.plan import JobModel
+from hybrid_opt.job.records import Job, Phase, contact_effort
 from hybrid_opt.job.smooth import driven_timing
-from hybrid_opt.timing import drivable_timing, time_path
+from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, drivable_timing, time_path
 from hybrid_opt.work.service import Emit
-from studies.report.jobs import DrawnJob, JobRequest, drawn
 from symbolic.array import Array
+from symbolic.errors import DualArmError
+from symbolic.records.poses import box_rotation
+
+RECOMMENDED_LABEL = "recommended"
+
+CARRY_SAMPLES = 40
+PHASE_SAMPLES = 7
+"""Samples of the carry, and of every other phase, for a motion on the page."""
+
+WITHOUT_JERK = "; its carry without the limits on jerk, which an export keeps"
+
+_TOUCHES = 1e-6
+"""Normal force from which on a pad has a centre of pressure [N]."""
+
+
+@dataclass(frozen=True)
+class JobRequest:
+    """A path to plan the job around.
+
+    Attributes:
+        label: whose it is.
+        x: (n_var,) decision vector of the report's first experiment.
+        limits: within which it is timed.
+        within_jerk: whether also within the cell's limits on jerk, which takes long.
+    """
+
+    label: str
+    x: Array
+    limits: TimingLimits
+    within_jerk: bool = False
+
+
+@dataclass(frozen=True)
+class DrawnJob:
+    """A job as a report shows it, or why there is none.
+
+    Attributes:
+        label: whose it is.
+        problem: why it cannot be planned, '' where it can.
+        duration: [s].
+        remark: how its forces came about, and what its timing leaves out.
+        peaks: (2,) largest commanded normal forces [N].
+        phases: as a bundle's manifest has them, in order.
+        samples: (k, 11 + joints) time, box pose, joints, commanded normal forces and shifts of the
+            centres of pressure.
+        torque_use, contact_torque_use: (joints,) largest use of each joint's torque, of all loads
+            and of the contacts alone [-].
+    """
+
+    label: str
+    problem: str
+    duration: float = 0.0
+    remark: str = ""
+    peaks: tuple[float, float] = (0.0, 0.0)
+    phases: tuple[dict[str, Any], ...] = ()
+    samples: Array | None = None
+    torque_use: Array | None = None
+    contact_torque_use: Array | None = None
+
+
+def drawn_job(model: JobModel, request: JobRequest) -> DrawnJob:
+    """The job around a path, with the forces that an export commands by default."""
+    try:
+        timing = time_path(model.timing, request.x, request.limits)
+    except DualArmError as error:
+        return DrawnJob(request.label, str(error))
+    return drawn(model, request, timing)
+
+
+def drawn(model: JobModel, request: JobRequest, timing: Timing) -> DrawnJob:
+    """The same around a path that is timed already."""
+    try:
+        job = model.plan(timing, within_jerk=request.within_jerk)
+    except DualArmError as error:
+        return DrawnJob(request.label, str(error))
+    limit = np.concatenate([robot.torque_max for robot in job.workcell.robots])
+    contact = [np.abs(contact_effort(p.motion, p.force.wrench)).max(axis=0) for p in job.phases]
+    whole = [np.abs(phase.effort).max(axis=0) for phase in job.phases]
+    bounded = request.within_jerk or JerkLimits.of(job.workcell) is None
+    first, second = job.peak_normal_force.tolist()
+    return DrawnJob(
+        label=request.label,
+        problem="",
+        duration=job.duration,
+        remark=str(job.squeeze) + ("" if bounded else WITHOUT_JERK),
+        peaks=(first, second),
+        phases=tuple(phase_documents(job)),
+        samples=_job_samples(job),
+        torque_use=np.max(whole, axis=0) / limit,
+        contact_torque_use=np.max(contact, axis=0) / limit,
+    )
+
+
+def _job_samples(job: Job) -> Array:
+    """Some samples of each phase, and the peaks of the forces."""
+    parts = []
+    for phase in job.phases:
+        motion, force = phase.motion, phase.force.normal
+        count = CARRY_SAMPLES if phase.name == "carry" else PHASE_SAMPLES
+        rows = _rows(motion.time, count, force.argmax(axis=0))
+        time, shift = phase.begin + motion.time, pressure_shift(job, phase)
+        parts.append(np.column_stack([time, motion.pose, motion.q, force, shift])[rows])
+    return _once(np.concatenate(parts))
+
+
+def _rows(time: Array, count: int, peaks: Iterable[int]) -> NDArray[np.intp]:
+    """Rows of samples evenly spread in time, and those of peaks."""
+    moments = np.linspace(time[0], time[-1], min(len(time), count))
+    even = np.searchsorted(time, moments).clip(max=len(time) - 1)
+    return np.unique([0, *even, *peaks, len(time) - 1])
+
+
+def _once(table: Array) -> Array:
+    """The samples (n, k) without those whose time, their first number, stands twice: where two
+    phases meet, and where an acceleration jumps."""
+    return np.asarray(table[np.concatenate([[True], np.diff(table[:, 0]) > 1e-9])])
+
+
+def pressure_shift(job: Job, phase: Phase) -> Array:
+    """(n, 2) distance of each centre of pressure from its nominal contact point [m]."""
+    rotation = box_rotation(job.workcell.task.orientation, phase.motion.pose)
+    shifts = np.zeros_like(phase.force.normal)
+    for arm, contact in enumerate(job.workcell.contacts):
+        tangents = rotation @ contact.T_box_pad[:3, :2]
+        tilting = np.einsum("nij,ni->nj", tangents, phase.force.wrench[:, arm, 3:])
+        normal = phase.force.normal[:, arm]
+        pressed = normal > _TOUCHES
+        shifts[pressed, arm] = np.linalg.norm(tilting[pressed], axis=1) / normal[pressed]
+    return shifts
+
+
+LIMITS = (
+    "joint velocity",
+    "joint acceleration",
+    "joint torque",
+    "payload velocity",
+    "payload acceleration",
+)
+"""Limits of which every phase states its use."""
+
+
+def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
+    """The phases of whole jobs.
+
+    Args:
+        robots: their names.
+    """
+    rows: list[tuple[str, ...]] = []
+    for job in jobs:
+        if job.problem:
+            rows.append((f"{job.label}: {job.problem}", *[NOTHING] * (4 + len(LIMITS))))
+        rows += [
+            (
+                f"{job.label}: {phase['name'].replace('_', ' ')}",
+                number(phase["begin"]),
+                number(phase["duration"]),
+                *(number(force, 1) for force in phase["peak_normal_force"]),
+                *(number(100.0 * phase["limits"][name], 1) for name in LIMITS),
+            )
+            for phase in job.phases
+        ]
+        if job.phases:
+            forces = [number(force, 1) for force in job.peaks]
+            most = [max(phase["limits"][name] for phase in job.phases) for name in LIMITS]
+            uses = [number(100.0 * value, 1) for value in most]
+            total = number(job.duration)
+            rows.append((f"{job.label}: all, {job.remark}", NOTHING, total, *forces, *uses))
+    return Table(
+        "phases",
+        "Phases of the whole jobs.",
+        (
+            "trajectory and phase",
+            "begins [s]",
+            "takes [s]",
+            *(f"presses, {robot} [N]" for robot in robots),
+            *(f"{name} [%]" for name in LIMITS),
+        ),
+        tuple(rows),
+        "Largest commanded normal forces, and largest uses of the limits with them. The "
+        "recommended carry within its force, the others closest to the reference speed, as an "
+        "export plans them by default; every phase is certified free of collisions.",
+    )
+
 
 MAX_SAMPLES = 60
 """Samples of a trajectory on the page; its force peaks are kept besides."""
@@ -196,19 +381,9 @@ def _values(cell: ho.Cell, judged: ho.Carry, timing: ho.Timing, job: DrawnJob | 
 
 
 def _samples(carry: ho.Carry) -> Array:
-    """(k, 23) time, pose, joints, normal forces and pressure shifts at some of the samples, evenly
-    spread in time."""
-    n = len(carry.time)
-    peaks = [
-        *carry.normal_force.argmax(axis=0),
-        *carry.normal_force.argmin(axis=0),
-        *carry.pressure_shift.argmax(axis=0),
-    ]
-    moments = np.linspace(carry.time[0], carry.time[-1], min(n, MAX_SAMPLES))
-    even = np.clip(np.searchsorted(carry.time, moments), 0, n - 1)
-    rows = np.unique(np.concatenate([even, peaks, [0, n - 1]]))
-    columns = [carry.time[:, None], carry.pose, carry.q, carry.normal_force, carry.pressure_shift]
-    table = np.concatenate(columns, axis=1)[rows]
-    table[:, 0] -= carry.time[0]
-    # A moment may stand twice, once for each side of a jump.
-    return np.asarray(table[np.concatenate([[True], np.diff(table[:, 0]) > 0.0])])
+    """(k, 11 + joints) time, pose, joints, normal forces and pressure shifts at some samples."""
+    force, shift = carry.normal_force, carry.pressure_shift
+    peaks = np.concatenate([force.argmax(axis=0), force.argmin(axis=0), shift.argmax(axis=0)])
+    time = carry.time - carry.time[0]
+    table = np.column_stack([time, carry.pose, carry.q, force, shift])
+    return _once(table[_rows(time, MAX_SAMPLES, peaks)])

@@ -13,7 +13,7 @@ from studies.report import (
     pictures_fronts,
 )
 from studies.report.data import DrawnCarry, ReportData
-from studies.report.style import in_style, settled
+from studies.report.drawing import in_style, settled
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from hybrid_opt.robust.force import RobustPrice
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
 from studies.report.data import DrawnCarry, ReportData
-from studies.report.page_carries import torque_use
-from studies.report.style import (
+from studies.report.drawing import (
     FULL_WIDTH,
     HAND_MADE,
     MARKED,
@@ -28,6 +27,7 @@ from studies.report.style import (
     series,
     shortened,
 )
+from studies.report.page_carries import torque_use
 from symbolic.array import Array
 
 PREDICTED: dict[str, Any] = {"color": "black", "linestyle": (0, (2, 1.5)), "linewidth": 0.8}

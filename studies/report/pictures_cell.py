@@ -11,11 +11,18 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from hybrid_opt.display.scene import motion_points
-from hybrid_opt.display.solids import Solid, cell_solids, extent_points, frame_placements
-from studies.report.data import DrawnCarry
+from hybrid_opt.display.scene import (
+    Solid,
+    cell_solids,
+    extent_points,
+    frame_placements,
+    motion_points,
+)
+from studies.report.data import DrawnCarry, ReachMap
 from studies.report.drawing import (
+    ARMS,
     FRONT,
+    FULL_WIDTH,
     ISOMETRIC,
     SIDE,
     CutCell,
@@ -26,10 +33,11 @@ from studies.report.drawing import (
     draw_cell,
     draw_path,
     frame_axes,
+    new_figure,
     oblique,
+    panel_label,
+    shortened,
 )
-from studies.report.reach import ReachMap
-from studies.report.style import ARMS, FULL_WIDTH, new_figure, panel_label, shortened
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 

@@ -11,15 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from hybrid_opt.campaign.recommended import StoredRecommendation
+from hybrid_opt.campaign.summary import StoredRecommendation
 from hybrid_opt.display.table import counted
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
 from hybrid_opt.indicators.metrics import best_so_far, front_of
 from hybrid_opt.indicators.statistics import attainment_surfaces
 from studies.report.data import AlgorithmRuns, Experiment, ReportData
-from studies.report.page_data import curves
-from studies.report.page_plots import drive_look, limits
-from studies.report.style import (
+from studies.report.drawing import (
     FULL_WIDTH,
     MARKED,
     legend_below,
@@ -28,6 +26,7 @@ from studies.report.style import (
     rest_line,
     series,
 )
+from studies.report.page_data import curves, drive_look, limits
 from symbolic.array import Array
 
 QUARTILES = (25.0, 75.0)

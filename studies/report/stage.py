@@ -40,11 +40,11 @@ def follow_looks(root: Path, options: argparse.Namespace) -> None:
         DualArmError: the results or an optional library are missing.
     """
     if options.animation:
-        from studies.report.animation import animate
+        from studies.report.looks import animate
 
         animate(root, options.animation)
     if options.view:
-        from studies.report.live import watch
+        from studies.report.looks import watch
 
         watch(root, options.port)
 

@@ -16,7 +16,7 @@ from hybrid_opt.display.table import counted
 from hybrid_opt.evaluate.evaluation import LockedEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.indicators.metrics import front_rows, hypervolume
-from hybrid_opt.metaheuristics.carries import SearchSettings, search_carries
+from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
 from studies.program import load_workcell
 from symbolic.errors import SettingsError
 from symbolic.records import Task

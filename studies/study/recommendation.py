@@ -14,16 +14,16 @@ import hybrid_opt as ho
 from codegen.function import available_cores
 from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Progress, Stage
 from hybrid_opt.campaign.documents import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
-from hybrid_opt.campaign.recommended import (
+from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.campaign.stages import Advance
+from hybrid_opt.campaign.summary import (
+    CampaignSummary,
     ForceTable,
     NoRecommendation,
     StoredDurations,
     StoredRecommendation,
     stored_recommendation,
 )
-from hybrid_opt.campaign.results import CampaignResults, read_campaign
-from hybrid_opt.campaign.stages import Advance
-from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.evaluate.evaluations import concatenated
 from hybrid_opt.evaluate.explanation import explain

@@ -1,12 +1,17 @@
-"""The stage that has selected carries driven in the simulated cell, and its table."""
+"""The stage that has selected carries driven in the simulated cell, and their
+records (`simulated/*.json`)."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import numpy as np
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
 from hybrid_opt.campaign.documents import (
@@ -18,16 +23,132 @@ from hybrid_opt.campaign.documents import (
     selected_file,
 )
 from hybrid_opt.campaign.results import read_summary
-from hybrid_opt.campaign.simulated import StoredSimulation, stored_simulation
 from hybrid_opt.errors import ResultsError, WitnessError
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
-from hybrid_opt.witness.arms import CellWitness, account_of
+from hybrid_opt.witness.arms import Account, CellWitness, account_of
 from hybrid_opt.witness.reference import Control, driven_carry
 from hybrid_opt.work.service import Emit, ListLedger, Service
+from symbolic.array import Array, Figure, Row, Shape
 from symbolic.errors import SettingsError
+
+MOST_SAMPLES = 240
+"""Most samples of the forces that are stored."""
+
+
+@dataclass(frozen=True)
+class StoredSimulation:
+    """One carry in the simulated cell.
+
+    Attributes:
+        label: of the carry.
+        trajectory: SHA-256 of its file.
+        controller: of the arms.
+        problem: why there is no threshold, or no simulation, and nothing else then.
+        duration: [s].
+        slips, holds: multiples of the planned forces right below and above the threshold, null
+            where there is none.
+        pad, begins: where it slips first, 0 for nowhere, and when [s].
+        robust: whether the run that is shown presses with robust forces.
+        factor: there of the planned squeeze, null with robust forces.
+        arrives: whether the box held and ended at its goal.
+        slip, misses: largest slip, and distance from the goal [m].
+        time: (n,) [s].
+        predicted, simulated: (n, 2) normal force of each robot: reference, and measured [N].
+    """
+
+    label: str
+    trajectory: str
+    controller: str
+    problem: str
+    duration: Figure = math.nan
+    slips: Figure = math.nan
+    holds: Figure = math.nan
+    pad: int = 0
+    begins: Figure = math.nan
+    robust: bool = False
+    factor: Figure = math.nan
+    arrives: bool = False
+    slip: Figure = math.nan
+    misses: Figure = math.nan
+    time: Row = field(default_factory=lambda: np.zeros(0))
+    predicted: Annotated[Array, Shape((None, 2))] = field(default_factory=lambda: np.zeros((0, 2)))
+    simulated: Annotated[Array, Shape((None, 2))] = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def __post_init__(self) -> None:
+        """Refuse curves of different lengths."""
+        if not len(self.time) == len(self.predicted) == len(self.simulated):
+            raise ValueError("its curves have different lengths")
+
+    @property
+    def threshold(self) -> float:
+        """Middle of both multiples, NaN where there is none."""
+        return (self.slips + self.holds) / 2.0
+
+    @property
+    def peaks(self) -> Array:
+        """(2, 2) largest predicted and simulated force of each robot [N], NaN without any."""
+        if not len(self.time):
+            return np.full((2, 2), np.nan)
+        return np.stack([self.predicted.max(axis=0), self.simulated.max(axis=0)])
+
+    @property
+    def largest_error(self) -> float:
+        """Largest difference of both forces of either robot over the reference, NaN without any."""
+        if not len(self.time):
+            return float("nan")
+        return float(np.abs(self.simulated / self.predicted - 1.0).max())
+
+
+def stored_simulation(
+    found: Account, label: str, trajectory: str, controller: str
+) -> StoredSimulation:
+    """An account as a study stores it: from the beginning of the carry on."""
+    threshold, shown, squeeze, motion = (
+        found.threshold,
+        found.shown,
+        found.squeeze,
+        found.reference.motion,
+    )
+    begin = float(motion.time[2])
+    rows = np.flatnonzero(shown.time >= begin)
+    even = np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).round().astype(int)
+    rows = rows[even] if len(rows) else np.array([len(shown.time) - 1])
+    slipped: dict[str, Any] = {}
+    if threshold is not None:
+        slips, holds = threshold.slips, threshold.holds
+        slipped = {"slips": slips.factor, "holds": holds.factor, "begins": slips.time[-1]}
+        slipped["pad"] = slips.pad + 1
+    return StoredSimulation(
+        label=label,
+        trajectory=trajectory,
+        controller=controller,
+        problem=found.problem,
+        duration=float(motion.time[-1] - begin),
+        robust=squeeze.factor is None,
+        factor=math.nan if squeeze.factor is None else squeeze.factor,
+        arrives=shown.arrives,
+        slip=float(shown.slip.max()),
+        misses=shown.misses,
+        time=shown.time[rows] - begin,
+        predicted=shown.normal_force_reference[rows],
+        simulated=shown.normal_force[rows],
+        **slipped,
+    )
+
+
+def read_simulations(root: Path) -> tuple[StoredSimulation, ...]:
+    """Simulations of a study's carries, in the order of their files.
+
+    Raises:
+        ResultsError: a file is damaged.
+    """
+    files = sorted((root / SIMULATED).glob("*.json"))
+    remedy = "delete it and continue with --resume --simulate"
+    return tuple(read_record(StoredSimulation, path, remedy) for path in files)
+
 
 CONTROL: Control = "leader"
 

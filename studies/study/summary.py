@@ -21,13 +21,13 @@ from hybrid_opt.campaign.documents import (
     reference_front_file,
     selected_file,
 )
-from hybrid_opt.campaign.recommended import NoRecommendation
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign
 from hybrid_opt.campaign.summary import (
     AlgorithmFigures,
     Bounds,
     CampaignSummary,
     FrontFigures,
+    NoRecommendation,
     PolishedFigures,
     PolishedStatistics,
     ReplicaFigures,

@@ -9,14 +9,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hybrid_opt.campaign.recommended import StoredRecommendation
-from hybrid_opt.campaign.simulated import StoredSimulation
 from hybrid_opt.campaign.summary import (
     AlgorithmFigures,
     Bounds,
     CampaignSummary,
     FrontFigures,
     SelectedEntry,
+    StoredRecommendation,
 )
 from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number
 from hybrid_opt.indicators.statistics import summarise
@@ -25,6 +24,7 @@ from hybrid_opt.robust.force import RobustPrice
 from hybrid_opt.timing.analysis import ForceCurve
 from hybrid_opt.timing.document import StoredTiming, TimingDocument
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
+from studies.study.simulation import StoredSimulation
 
 FORCE = Quantity("normal force", "N")
 DURATION = Quantity("duration", "s")

@@ -14,7 +14,7 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.bundles.bundle import read_manifest
-from hybrid_opt.campaign.replica import ReplicaRequest, run_replica
+from hybrid_opt.campaign.search_stage import ReplicaRequest, run_replica
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics

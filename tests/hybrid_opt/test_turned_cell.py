@@ -11,8 +11,7 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.cell import Cell
-from hybrid_opt.display.scene import scene_data
-from hybrid_opt.display.solids import frame_placements
+from hybrid_opt.display.scene import frame_placements, scene_data
 from symbolic.functions import candidate_function
 from symbolic.geometry.bodies import Frame
 from symbolic.records.poses import box_rotation

@@ -11,12 +11,12 @@ import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
 from hybrid_opt.campaign.results import ReplicaFront, read_campaign
-from hybrid_opt.campaign.simulated import StoredSimulation
 from hybrid_opt.campaign.summary import PolishedFigures
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.polishing.records import PolishEffort
 from studies.programs.study import StudySettings, run_study
 from studies.report.data import ReportData, Run, gather
+from studies.study.simulation import StoredSimulation
 from studies.study.summary import front_indicators
 from symbolic.read.cell import load
 from tests.symbolic.cells import ROOT

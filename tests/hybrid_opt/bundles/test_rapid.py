@@ -12,9 +12,9 @@ from rapidchecker.check import check_format
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.bundles import TARGETS, BundleOptions
+from hybrid_opt.bundles.abb import rapid_files, require_rapid
 from hybrid_opt.bundles.arms import ABB, UR, require_maker
 from hybrid_opt.bundles.bundle import prepared
-from hybrid_opt.bundles.rapid import rapid_files, require_rapid
 from hybrid_opt.bundles.steps import pad_places
 from hybrid_opt.job.compliance import HELD
 from symbolic.array import Array

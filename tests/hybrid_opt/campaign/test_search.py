@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress, open_folder
-from hybrid_opt.campaign.identity import replica_identity
+from hybrid_opt.campaign.folder import replica_identity
 from hybrid_opt.campaign.journal import Journal, encode_generation
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
-from hybrid_opt.campaign.experiment_stage import drivable_settings
+from hybrid_opt.campaign.stages import drivable_settings
 from symbolic.errors import SettingsError
 
 

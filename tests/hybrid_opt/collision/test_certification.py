@@ -22,7 +22,7 @@ from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import BETWEEN_SAMPLES, REASONS
 from hybrid_opt.indicators.metrics import non_dominated
-from hybrid_opt.metaheuristics.problem import CarryProblem
+from hybrid_opt.metaheuristics.run import CarryProblem
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.records.cell import box_flange

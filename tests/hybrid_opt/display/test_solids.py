@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.display.solids import cell_solids, joint_placements
+from hybrid_opt.display.scene import cell_solids, joint_placements
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load

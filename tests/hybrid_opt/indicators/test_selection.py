@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.campaign.replica import front_rows
 from hybrid_opt.campaign.results import Replica
+from hybrid_opt.campaign.search_stage import front_rows
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators.selection import (

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_opt.job.forces import unit_squeeze
+from hybrid_opt.job.motions import unit_squeeze
 from hybrid_opt.robust.squeeze import pressed_together
 from symbolic.read.cell import load
 from symbolic.records.poses import box_rotation

@@ -160,14 +160,6 @@ def test_search_beats_random(name: str) -> None:
     assert median(name) > median("random")
 
 
-def test_observer_sees_every_point_once() -> None:
-    seen: list[Any] = []
-    result = search(Counting(), make("nsga2"), 90, 1, observe=seen.append)
-    np.testing.assert_array_equal(
-        np.concatenate([batch.decisions for batch in seen]), result.evaluated.decisions
-    )
-
-
 def test_violation_sums_what_is_exceeded() -> None:
     objectives = np.array([[0.0, 1.0], [0.0, 1.0], [np.nan, 1.0], [0.0, -np.inf], [1e30, 0.0]])
     constraints = np.array([[-1.0, -2.0], [0.5, 0.25], [-1.0, -1.0], [-1.0, -1.0], [-1.0, -1.0]])

@@ -10,7 +10,7 @@ import pytest
 import hybrid_opt as ho
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.evaluations_file import decode
-from hybrid_opt.campaign.replica import CellEvaluatorSource, ReplicaRequest, run_replica
+from hybrid_opt.campaign.search_stage import CellEvaluatorSource, ReplicaRequest, run_replica
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.work.processes import ProcessExecutor

@@ -11,8 +11,14 @@ from pymoo.problems.multi.osy import OSY
 from pymoo.problems.multi.zdt import ZDT1
 
 from hybrid_opt.metaheuristics import make, search
-from hybrid_opt.metaheuristics.hypercube_archive import HypercubeArchive, hypercubes, thin
-from hybrid_opt.metaheuristics.mopso import reflect, replaces_best, turbulence
+from hybrid_opt.metaheuristics.mopso import (
+    HypercubeArchive,
+    hypercubes,
+    reflect,
+    replaces_best,
+    thin,
+    turbulence,
+)
 from studies.research.analytic import compare
 from symbolic.array import Array
 from symbolic.errors import SettingsError

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.evaluate.evaluations import FEASIBLE, NOT_FINITE, REASONS, Evaluations
-from hybrid_opt.metaheuristics.problem import WORST_PENALTY, CarryProblem, disarmed
+from hybrid_opt.metaheuristics.run import WORST_PENALTY, CarryProblem, disarmed
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts

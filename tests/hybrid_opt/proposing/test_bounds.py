@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hybrid_opt.proposing.bounds import Sampling, find_bounds
-from hybrid_opt.proposing.completion import decision_bounds
+from hybrid_opt.proposing.problem import decision_bounds
 from symbolic.array import Array
 from tests.symbolic.cells import hand_cell, with_task
 from tests.turned_cells import turned_cell

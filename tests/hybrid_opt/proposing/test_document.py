@@ -4,7 +4,7 @@ import tomllib
 
 import pytest
 
-from hybrid_opt.proposing.document import completed, merged
+from hybrid_opt.proposing.problem import completed, merged
 from symbolic.errors import SettingsError
 
 TEXT = """# A cell.

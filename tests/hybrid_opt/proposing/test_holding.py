@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid_opt.proposing.holding import HoldQuery, HoldSearch, find_holds
-from hybrid_opt.proposing.kinematics import ArmKinematics, box_to_last_joint, spun
+from hybrid_opt.proposing.holding import (
+    ArmKinematics,
+    HoldQuery,
+    HoldSearch,
+    box_to_last_joint,
+    find_holds,
+    spun,
+)
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.records import Workcell

@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hybrid_opt.proposing.kinematics import (
+from hybrid_opt.proposing.holding import (
     ArmKinematics,
     box_to_last_joint,
     possible_spins,

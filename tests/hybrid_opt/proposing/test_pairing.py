@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybrid_opt.proposing.holding import Hold
-from hybrid_opt.proposing.kinematics import ArmKinematics, box_to_last_joint
-from hybrid_opt.proposing.pairing import Agreement
+from hybrid_opt.proposing.holding import ArmKinematics, Hold, box_to_last_joint
+from hybrid_opt.proposing.setup import Agreement
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.records import Workcell

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid_opt.proposing.closed_chain import Place, straight
-from hybrid_opt.proposing.judge import BoxAlone
-from hybrid_opt.proposing.kinematics import ArmKinematics, box_to_last_joint, spun
-from hybrid_opt.proposing.planner import Stray, freedom, plan, straight_path
+from hybrid_opt.proposing.holding import ArmKinematics, box_to_last_joint, spun
+from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight, straight_path
 from hybrid_opt.proposing.problem import read_problem
 from hybrid_opt.proposing.setup import Setup, prepare
+from hybrid_opt.proposing.trial import BoxAlone
 from hybrid_opt.proposing.via_points import fit, free_share, joint_length, shortened, straightened
 from symbolic.path.spline import path_basis
 from symbolic.records.poses import pose_matrix

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from hybrid_opt.proposing.document import completed
-from hybrid_opt.proposing.problem import Problem, contact_points, read_problem
+from hybrid_opt.proposing.problem import Problem, completed, contact_points, read_problem
 from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
 from symbolic.records.poses import rotation_from_rpy

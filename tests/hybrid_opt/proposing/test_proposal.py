@@ -16,7 +16,7 @@ import pytest
 import hybrid_opt as ho
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing import setup
-from hybrid_opt.proposing.document import completed, merged
+from hybrid_opt.proposing.problem import completed, merged
 from hybrid_opt.proposing.proposal import worked
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.read.cell import load

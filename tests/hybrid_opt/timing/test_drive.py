@@ -16,7 +16,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import non_dominated
-from hybrid_opt.metaheuristics.problem import CarryProblem
+from hybrid_opt.metaheuristics.run import CarryProblem
 from hybrid_opt.polishing.drive_front import AGREEMENT
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing import PathTimer, TimingLimits, drivable_timing, time_path

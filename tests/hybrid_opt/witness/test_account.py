@@ -9,13 +9,13 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from hybrid_opt.campaign.simulated import MOST_SAMPLES, stored_simulation
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.force import soft_model
 from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.witness.arms import Account, CellWitness
 from hybrid_opt.witness.reference import driven_carry, pressed_reference
+from studies.study.simulation import MOST_SAMPLES, stored_simulation
 from symbolic.array import Array
 from symbolic.records import Uncertainty
 from symbolic.records.task import initial_decision

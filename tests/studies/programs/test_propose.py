@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid_opt.proposing.document import completed
+from hybrid_opt.proposing.problem import completed
 from studies.program import BAD_INPUT
 from studies.propose import main
 

@@ -14,9 +14,15 @@ from PIL import Image, ImageSequence
 
 from studies.errors import ReportError
 from studies.report.__main__ import main
-from studies.report.animation import FRAMES_PER_SECOND, Film, frames, write_animation
 from studies.report.data import DrawnCarry, ReportData
-from studies.report.live import page_of, page_server
+from studies.report.looks import (
+    FRAMES_PER_SECOND,
+    Film,
+    frames,
+    page_of,
+    page_server,
+    write_animation,
+)
 from studies.report.stage import PAGE
 
 

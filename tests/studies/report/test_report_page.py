@@ -24,8 +24,7 @@ from hybrid_opt.robust.squeeze import SqueezeSettings
 from studies.report import page_carries, page_data
 from studies.report.data import ReportData
 from studies.report.generate import write_report
-from studies.report.jobs import DrawnJob, pressure_shift
-from studies.report.page_carries import Shown, page_trajectory
+from studies.report.page_carries import DrawnJob, Shown, page_trajectory, pressure_shift
 from studies.report.page_data import page_document
 from studies.study.recommendation import recommendation_text
 

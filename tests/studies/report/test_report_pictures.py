@@ -19,9 +19,9 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from studies.report.data import ReportData, Run
+from studies.report.drawing import ARMS, HAND_MADE, SERIES, in_style, save
 from studies.report.pictures import ReportPicture, report_pictures
 from studies.report.pictures_cell import planes
-from studies.report.style import ARMS, HAND_MADE, SERIES, in_style, save
 from symbolic.array import Array
 
 NAMES = (

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybrid_opt.display.solids import frame_placements
-from studies.report.data import ReportData
+from hybrid_opt.display.scene import frame_placements
+from studies.report.data import ReportData, reach_map
 from studies.report.drawing import FRONT, SIDE, oblique
-from studies.report.reach import reach_map
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.read.cell import load

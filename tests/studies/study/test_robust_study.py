@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
-from hybrid_opt.campaign.recommended import StoredRecommendation
 from hybrid_opt.campaign.results import read_campaign, read_summary
+from hybrid_opt.campaign.summary import StoredRecommendation
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from hybrid_opt.campaign import ExecutionSettings, Progress, Stage, open_folder, run_stages
-from hybrid_opt.campaign.recommended import StoredRecommendation
 from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.campaign.summary import StoredRecommendation
 from studies import recommend, run
 from studies.programs.study import campaign_settings
 from studies.study.recommendation import read_recommendation

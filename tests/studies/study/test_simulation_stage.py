@@ -10,13 +10,19 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign.documents import SIMULATED
-from hybrid_opt.campaign.simulated import StoredSimulation, read_simulations
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.work.service import SerialExecutor, Service
 from studies import run
-from studies.study.simulation import Simulated, Written, is_done, wanted_carries
+from studies.study.simulation import (
+    Simulated,
+    StoredSimulation,
+    Written,
+    is_done,
+    read_simulations,
+    wanted_carries,
+)
 from studies.study.tables import simulated
 from tests.studies.conftest import simulation
 from tests.symbolic.cells import RACK
