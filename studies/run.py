@@ -148,6 +148,13 @@ def add_options(parser: Parser, output: str) -> None:
         help="also search for carries as robots drive them, of least duration and force, and "
         "recommend one",
     )
+    after.add_argument(
+        "--drivable-replicas",
+        type=int,
+        metavar="N",
+        help="independent runs per algorithm of that search (default: as --replicas, at most "
+        f"{stated('hybrid_opt.campaign.stages.DRIVABLE_REPLICAS')})",
+    )
     add_wishes(after)
     after.add_argument(
         "--simulate",

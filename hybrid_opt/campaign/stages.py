@@ -168,19 +168,35 @@ class Progress:
             tqdm.write(text, file=sys.stderr)
 
 
-def drivable_settings(settings: CampaignSettings) -> CampaignSettings:
+DRIVABLE_REPLICAS = 3
+"""Most replicas per algorithm of a drivable experiment beside another one: it answers one question,
+which carry to run, and its replicas' fronts differ by about one per cent."""
+
+
+def drivable_settings(settings: CampaignSettings, replicas: int | None = None) -> CampaignSettings:
     """Settings of the drivable experiment beside another one: the same but for the objectives,
-    durations and forces of the kind that the other one minimises."""
-    return replace(settings, objectives=force_kind(settings.objectives).drivable)
+    durations and forces of the kind that the other one minimises, and for the replicas.
+
+    Args:
+        replicas: per algorithm; None for as many, at most `DRIVABLE_REPLICAS`.
+
+    Raises:
+        SettingsError: there are none, or too many.
+    """
+    if replicas is None:
+        replicas = min(settings.replicas, DRIVABLE_REPLICAS)
+    objectives = force_kind(settings.objectives).drivable
+    return replace(settings, objectives=objectives, replicas=replicas)
 
 
-def drivable_stage(stages: Sequence[Stage]) -> Stage:
+def drivable_stage(stages: Sequence[Stage], replicas: int | None = None) -> Stage:
     """The stage that searches for carries as robots drive them, in the folder `drivable/`.
 
     The folder is a campaign like any other, of the drivable variant of the study's cell.
 
     Args:
         stages: of that campaign.
+        replicas: as for `drivable_settings`.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
@@ -189,8 +205,9 @@ def drivable_stage(stages: Sequence[Stage]) -> Stage:
         execution = replace(folder.execution, output=root, resume=resume, overwrite=False)
         with TemporaryDirectory() as files:
             workcell = unpack_cell(drivable_files(folder.files), Path(files))
-            settings = drivable_settings(folder.settings)
+            settings = drivable_settings(folder.settings, replicas)
             with open_folder(settings, execution, workcell) as inner:
                 run_stages(inner, stages, Progress(progress.shown, DRIVABLE))
 
-    return Stage(DRIVABLE, run, {stage.name: dict(stage.settings) for stage in stages})
+    inside = {stage.name: dict(stage.settings) for stage in stages}
+    return Stage(DRIVABLE, run, {"replicas": replicas, **inside})

@@ -1,5 +1,5 @@
-"""How box and arms move and press in the phases of a job: in straight lines, not at all, in the timed
-carry; and how far each phase uses its limits.
+"""How box and arms move and press in the phases of a job: in straight lines, not at all, in the
+timed carry; and how far each phase uses its limits.
 
 Every phase beside the carry takes a smooth way from 0 to 1, h(t/T) with
 

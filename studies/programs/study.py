@@ -62,6 +62,7 @@ class StudySettings:
     Attributes:
         polish: how fronts are polished, None for not at all.
         drivable: whether carries are also searched for as robots drive them.
+        drivable_replicas: of that search per algorithm, see `drivable_settings`.
         drivable_polish: how their fronts are polished, None for not at all.
         wish: what is asked of the recommended one of them.
         simulate: whether the selected carries are driven in the simulated cell.
@@ -73,6 +74,7 @@ class StudySettings:
 
     polish: PolishSettings | None = None
     drivable: bool = True
+    drivable_replicas: int | None = None
     drivable_polish: PolishSettings | None = None
     wish: Wish = field(default_factory=Wish)
     simulate: bool = False
@@ -97,7 +99,7 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
             beside = _paths_beside if study.polish is not None else None
             inner.append(polish_stage(study.drivable_polish, beside))
         driven = [search_stage(), *inner, summary_stage(), timing_stage(last=True, curves=False)]
-        every.append(drivable_stage(driven))
+        every.append(drivable_stage(driven, study.drivable_replicas))
     if study.drivable:
         every.append(recommendation_stage(study.wish))
     every.append(summary_stage("" if study.drivable else NOT_ASKED))
@@ -233,6 +235,7 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
     study = StudySettings(
         polish=polish_settings(options, polishable, usual_settings(cell.task.time_law)),
         drivable=options.drivable,
+        drivable_replicas=options.drivable_replicas,
         drivable_polish=polish_settings(options, True, usual_settings("optimal")),
         wish=Wish(options.duration, options.force_limit, options.payload),
         simulate=options.simulate,
@@ -280,7 +283,8 @@ def campaign_settings(
         first_generation=options.first_generation,
         populations=tuple(options.population or ()),
     )
-    return drivable_settings(settings) if options.recommend_only else settings
+    beside = drivable_settings(settings, options.drivable_replicas)  # told before any work
+    return replace(beside, replicas=settings.replicas) if options.recommend_only else settings
 
 
 def polish_settings(

@@ -62,7 +62,11 @@ def test_the_drivable_experiment_is_about_the_same_forces(
     objectives: tuple[str, ...], drivable: tuple[str, ...]
 ) -> None:
     settings = CampaignSettings(objectives=objectives, seed=5)
-    assert drivable_settings(settings) == replace(settings, objectives=drivable)
+    assert drivable_settings(settings) == replace(settings, objectives=drivable, replicas=3)
+    assert drivable_settings(replace(settings, replicas=2)).replicas == 2
+    assert drivable_settings(settings, 7).replicas == 7
+    with pytest.raises(SettingsError, match="replicas is 0"):
+        drivable_settings(settings, 0)
 
 
 def test_random_search_stays_random() -> None:
