@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
+
+from symbolic.errors import SettingsError
 
 Array = NDArray[np.float64]
 """Floating-point numbers; shape, unit and frame stand beside every use."""
@@ -46,3 +49,34 @@ Vector = Annotated[Array, Shape((3,))]
 
 Row = Annotated[Array, Shape((None,))]
 """(n,) numbers."""
+
+
+def require_allowed(settings: object, whose: str = "") -> None:
+    """Refuse a record of settings with a value that its annotations do not allow: another one than
+    a `Literal` names, or no number of a `Range`. None is allowed where the annotation has it.
+
+    Args:
+        whose: the settings are, in front of the message.
+
+    Raises:
+        SettingsError: with the value, and what is allowed.
+    """
+    for name, kind in get_type_hints(type(settings), include_extras=True).items():
+        value: Any = getattr(settings, name)
+        if get_origin(kind) in (Union, UnionType):
+            if value is None:
+                continue
+            (kind,) = (choice for choice in get_args(kind) if choice is not type(None))
+        if get_origin(kind) is Literal and value not in get_args(kind):
+            known = ", ".join(get_args(kind))
+            raise SettingsError(f"{whose}{name.replace('_', ' ')} {value!r}; known are {known}")
+        allowed = [mark for mark in getattr(kind, "__metadata__", ()) if isinstance(mark, Range)]
+        whole = get_args(kind)[:1] == (int,)
+        numbers = int if whole else int | float
+        for mark in allowed:
+            is_number = isinstance(value, numbers) and not isinstance(value, bool)
+            if not (is_number and mark.low <= value <= mark.high):
+                kind_of = "are whole numbers" if whole else "is"
+                raise SettingsError(
+                    f"{whose}{name} is {value!r}; allowed {kind_of} {mark.low} to {mark.high}"
+                )

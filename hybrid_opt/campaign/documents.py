@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from hybrid_opt.campaign.settings import FirstGeneration
+from hybrid_opt.campaign.settings import Budget, FirstGeneration, Runs, Seed
 from hybrid_opt.metaheuristics.run import ConstraintHandling
 from symbolic.array import Count, Range
 
@@ -36,9 +36,9 @@ class StoredSettings:
     """`CampaignSettings.effective` as it was stored; the algorithms' own settings by name."""
 
     algorithms: Mapping[str, Mapping[str, Any]]
-    evaluations: Annotated[int, Range(1, 10**9)]
-    replicas: Annotated[int, Range(1, 10_000)]
-    seed: Annotated[int, Range(0, 2**63 - 1)]
+    evaluations: Budget
+    replicas: Runs
+    seed: Seed
     objectives: tuple[str, ...]
     constraint_handling: ConstraintHandling
     first_generation: FirstGeneration

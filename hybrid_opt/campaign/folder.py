@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from codegen.cache import source_digest
 from hybrid_opt.campaign.documents import CONFIGURATION, STAGES, WORKCELL
-from hybrid_opt.campaign.settings import CampaignSettings, require_whole
+from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import LOCK, locked, read_json, storing, write_json
@@ -26,6 +26,7 @@ from hybrid_opt.version import own_version
 from hybrid_opt.work.dask_cluster import DaskExecutor
 from hybrid_opt.work.processes import local_executor
 from hybrid_opt.work.service import Executor
+from symbolic.array import Range, require_allowed
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.read.cell_files import CellFiles, collect_cell, unpack_cell
@@ -49,7 +50,7 @@ class ExecutionSettings:
     """
 
     output: Path
-    jobs: int = 0
+    jobs: Annotated[int, Range(0, 4096)] = 0
     executor: ExecutorName = "processes"
     scheduler: str | None = None
     resume: bool = False
@@ -61,13 +62,9 @@ class ExecutionSettings:
         Raises:
             SettingsError: with the value, and what is allowed.
         """
-        require_whole("jobs", self.jobs, 0, 4096)
+        require_allowed(self)
         if self.resume and self.overwrite:
             raise SettingsError("--resume keeps results and --overwrite removes them: give one")
-        if self.executor not in get_args(ExecutorName):
-            raise SettingsError(
-                f"executor {self.executor!r}; known are {', '.join(get_args(ExecutorName))}"
-            )
         if (self.executor == "dask") != bool(self.scheduler):
             raise SettingsError(
                 "the executor 'dask' needs a scheduler's address, and only it takes one: "

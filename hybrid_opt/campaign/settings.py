@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from hybrid_opt import metaheuristics
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, select_objectives
 from hybrid_opt.metaheuristics.run import ConstraintHandling
+from symbolic.array import Range, require_allowed
 from symbolic.errors import SettingsError
 
 FirstGeneration = Literal["initial", "random"]
 """'initial': uniformly random but for the workcell's hand-made trajectory; 'random': all."""
+
+Budget = Annotated[int, Range(1, 10**9)]
+Runs = Annotated[int, Range(1, 10_000)]
+Seed = Annotated[int, Range(0, 2**63 - 1)]
 
 SIZE_KEYS = ("population", "swarm", "batch")
 """How the algorithms' settings call the candidates of one generation."""
@@ -36,9 +41,9 @@ class CampaignSettings:
     """
 
     algorithms: tuple[str, ...] = ("nsga2", "mopso")
-    evaluations: int = 1000
-    replicas: int = 10
-    seed: int = 1
+    evaluations: Budget = 1000
+    replicas: Runs = 10
+    seed: Seed = 1
     objectives: tuple[str, ...] = PAPER_OBJECTIVES
     constraint_handling: ConstraintHandling = "penalty"
     first_generation: FirstGeneration = "initial"
@@ -50,20 +55,8 @@ class CampaignSettings:
         Raises:
             SettingsError: with the value, and what is allowed.
         """
-        require_whole("evaluations", self.evaluations, 1, 10**9)
-        require_whole("replicas", self.replicas, 1, 10_000)
-        require_whole("seed", self.seed, 0, 2**63 - 1)
+        require_allowed(self)
         select_objectives(self.objectives)
-        if self.constraint_handling not in get_args(ConstraintHandling):
-            raise SettingsError(
-                f"constraint handling {self.constraint_handling!r}; known are "
-                f"{', '.join(get_args(ConstraintHandling))}"
-            )
-        if self.first_generation not in get_args(FirstGeneration):
-            raise SettingsError(
-                f"first generation {self.first_generation!r}; known are "
-                f"{', '.join(get_args(FirstGeneration))}"
-            )
         if not self.algorithms or len(set(self.algorithms)) != len(self.algorithms):
             raise SettingsError(f"algorithms {self.algorithms}: name at least one, each once")
         sized = [name for name, _ in self.populations]
@@ -107,13 +100,3 @@ class CampaignSettings:
         """
         key = (zlib.crc32(algorithm.encode()), replica)
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
-
-
-def require_whole(name: str, value: object, low: int, high: int) -> None:
-    """Refuse what is no whole number between two bounds.
-
-    Raises:
-        SettingsError: with the value, and what is allowed.
-    """
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise SettingsError(f"{name} is {value!r}; allowed are whole numbers {low} to {high}")

@@ -132,10 +132,7 @@ def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> Set
         raise SettingsError(
             f"{name}: unknown setting {', '.join(unknown)}; known are {', '.join(known)}"
         )
-    try:
-        return dataclasses.replace(defaults, **dict(overrides or {}))  # type: ignore[arg-type]
-    except TypeError as error:
-        raise SettingsError(f"{name}: a setting has a value of the wrong type ({error})") from error
+    return dataclasses.replace(defaults, **dict(overrides or {}))  # type: ignore[arg-type]
 
 
 def make(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from pymoo.core.problem import Problem
 from hybrid_opt.evaluate.evaluations import NOT_FINITE, REASONS, Evaluations, concatenated
 from hybrid_opt.metaheuristics.guarded import violation_of
 from hybrid_opt.metaheuristics.registry import make
-from symbolic.array import Array
+from symbolic.array import Array, require_allowed
 from symbolic.errors import SettingsError
 
 ConstraintHandling = Literal["penalty", "constraints"]
@@ -89,11 +89,6 @@ class CarryProblem(Problem):  # type: ignore[misc]
         handling: ConstraintHandling = "penalty",
         evaluated: Callable[[int], None] = lambda count: None,
     ) -> None:
-        if handling not in get_args(ConstraintHandling):
-            raise SettingsError(
-                f"constraint handling {handling!r}; known are "
-                f"{', '.join(get_args(ConstraintHandling))}"
-            )
         super().__init__(
             n_var=evaluator.n_var,
             n_obj=len(evaluator.objective_names),
@@ -232,6 +227,9 @@ class SearchSettings:
     algorithm: Mapping[str, object] = field(default_factory=dict)
     constraint_handling: ConstraintHandling = "penalty"
     initial: Array | None = None
+
+    def __post_init__(self) -> None:
+        require_allowed(self)
 
 
 @dataclass(frozen=True)

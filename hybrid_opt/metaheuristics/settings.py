@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from symbolic.errors import SettingsError
+from symbolic.array import Range, require_allowed
 
-
-def _require(algorithm: str, name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise SettingsError(f"{algorithm}: {name} is {value}; allowed is {low:g} to {high:g}")
-
-
-def _require_whole(algorithm: str, name: str, value: int, low: int, high: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise SettingsError(f"{algorithm}: {name} is {value!r}; allowed are whole numbers")
-    _require(algorithm, name, value, low, high)
+Share = Annotated[float, Range(0.0, 1.0)]
+Index = Annotated[float, Range(1.0, 1000.0)]
+Pull = Annotated[float, Range(0.0, 4.0)]
+Points = Annotated[int, Range(1, 100_000)]
 
 
 @dataclass(frozen=True)
@@ -30,21 +25,14 @@ class GeneticSettings:
         mutation_eta: its distribution index.
     """
 
-    population: int = 40
-    crossover_probability: float = 0.9
-    crossover_eta: float = 15.0
-    mutation_probability: float | None = None
-    mutation_eta: float = 20.0
+    population: Annotated[int, Range(4, 100_000)] = 40
+    crossover_probability: Share = 0.9
+    crossover_eta: Index = 15.0
+    mutation_probability: Share | None = None
+    mutation_eta: Index = 20.0
 
     def __post_init__(self) -> None:
-        _require_whole("genetic algorithm", "population", self.population, 4, 100_000)
-        _require("genetic algorithm", "crossover_probability", self.crossover_probability, 0.0, 1.0)
-        _require("genetic algorithm", "crossover_eta", self.crossover_eta, 1.0, 1000.0)
-        _require("genetic algorithm", "mutation_eta", self.mutation_eta, 1.0, 1000.0)
-        if self.mutation_probability is not None:
-            _require(
-                "genetic algorithm", "mutation_probability", self.mutation_probability, 0.0, 1.0
-            )
+        require_allowed(self, "genetic algorithm: ")
 
 
 @dataclass(frozen=True)
@@ -64,32 +52,24 @@ class MopsoSettings:
         horizon: evaluations of the whole run, None to take them from the termination.
     """
 
-    swarm: int = 40
-    archive: int = 100
-    divisions: int = 30
-    inertia: float = 0.4
-    cognitive: float = 1.0
-    social: float = 1.0
-    mutation_share: float = 0.5
-    horizon: int | None = None
+    swarm: Points = 40
+    archive: Points = 100
+    divisions: Annotated[int, Range(1, 1000)] = 30
+    inertia: Share = 0.4
+    cognitive: Pull = 1.0
+    social: Pull = 1.0
+    mutation_share: Share = 0.5
+    horizon: Annotated[int, Range(1, 10**9)] | None = None
 
     def __post_init__(self) -> None:
-        _require_whole("mopso", "swarm", self.swarm, 1, 100_000)
-        _require_whole("mopso", "archive", self.archive, 1, 100_000)
-        _require_whole("mopso", "divisions", self.divisions, 1, 1000)
-        _require("mopso", "inertia", self.inertia, 0.0, 1.0)
-        _require("mopso", "cognitive", self.cognitive, 0.0, 4.0)
-        _require("mopso", "social", self.social, 0.0, 4.0)
-        _require("mopso", "mutation_share", self.mutation_share, 0.0, 1.0)
-        if self.horizon is not None:
-            _require_whole("mopso", "horizon", self.horizon, 1, 1_000_000_000)
+        require_allowed(self, "mopso: ")
 
 
 @dataclass(frozen=True)
 class RandomSettings:
     """Settings of uniform random search. batch: points per evaluation call."""
 
-    batch: int = 100
+    batch: Points = 100
 
     def __post_init__(self) -> None:
-        _require_whole("random", "batch", self.batch, 1, 100_000)
+        require_allowed(self, "random: ")

@@ -28,7 +28,7 @@ from symbolic.errors import SettingsError
         ({"first_generation": "lucky"}, "'lucky'; known are initial, random"),
         ({"populations": (("random", 10),)}, r"of the campaign \(nsga2, mopso\)"),
         ({"populations": (("nsga2", 10), ("nsga2", 20))}, "at most once"),
-        ({"populations": (("nsga2", 1),)}, "population is 1; allowed is 4 to"),
+        ({"populations": (("nsga2", 1),)}, "population is 1; allowed are whole numbers 4 to"),
     ],
 )
 def test_wrong_settings_are_told(change: dict[str, Any], message: str) -> None:

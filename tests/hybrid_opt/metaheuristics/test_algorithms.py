@@ -175,11 +175,11 @@ def test_violation_sums_what_is_exceeded() -> None:
     [
         ("nsga3", None, "unknown algorithm 'nsga3'; known are nsga2, mopso"),
         ("mopso", {"swarn": 4}, "unknown setting swarn; known are swarm, archive"),
-        ("mopso", {"swarm": 0}, "swarm is 0; allowed is 1 to"),
+        ("mopso", {"swarm": 0}, "swarm is 0; allowed are whole numbers 1 to"),
         ("mopso", {"inertia": float("nan")}, "inertia is nan"),
         ("mopso", {"swarm": "many"}, "swarm is 'many'; allowed are whole"),
         ("mopso", {"swarm": 12.5}, "swarm is 12.5; allowed are whole"),
-        ("mopso", {"inertia": "much"}, "wrong type"),
+        ("mopso", {"inertia": "much"}, "mopso: inertia is 'much'; allowed is 0.0 to 1.0"),
         ("nsga2", {"population": 2}, "population is 2"),
         ("nsga2", {"mutation_probability": 1.5}, "mutation_probability is 1.5"),
         ("random", {"batch": 0}, "batch is 0"),

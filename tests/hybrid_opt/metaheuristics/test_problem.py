@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.evaluate.evaluations import FEASIBLE, NOT_FINITE, REASONS, Evaluations
-from hybrid_opt.metaheuristics.run import WORST_PENALTY, CarryProblem, disarmed
+from hybrid_opt.metaheuristics.run import WORST_PENALTY, CarryProblem, SearchSettings, disarmed
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
@@ -105,4 +105,4 @@ def test_every_candidate_is_kept_in_order(sizes: list[int]) -> None:
 
 def test_unknown_handling_is_told() -> None:
     with pytest.raises(SettingsError, match="'hope'; known are penalty, constraints"):
-        CarryProblem(Stub(), "hope")  # type: ignore[arg-type]
+        SearchSettings(constraint_handling="hope")  # type: ignore[arg-type]
