@@ -26,8 +26,8 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.bundles.arms import ABB, SEVEN, SIX, comment, require_axes, require_maker
-from hybrid_opt.bundles.job_file import BundleOptions, Export, job_text
+from hybrid_opt.bundles.arms import SEVEN, SIX, comment
+from hybrid_opt.bundles.job_file import Export, job_text
 from hybrid_opt.bundles.programs import program
 from hybrid_opt.bundles.steps import pad_places
 from hybrid_opt.job.compliance import HELD
@@ -91,10 +91,8 @@ def require_force_control(job: Job, target: str) -> None:
         )
 
 
-def require_rapid(job: Job, options: BundleOptions) -> None:
-    """Refuse a job for arms that are not ABB's, without Force Control, or that turns the box."""
-    require_maker(job.workcell, ABB, "RAPID", options.any_arm)
-    require_axes(job.workcell, "RAPID", (SIX, SEVEN))
+def require_rapid(job: Job) -> None:
+    """Refuse a job of arms without Force Control, or that turns the box."""
     require_force_control(job, "abb-rapid")
     turned = _turned(job)
     if turned > MOST_TURN:
@@ -342,10 +340,8 @@ MOST_SPEED_DEVIATION = 20.0
 """By which EGM may exceed the speed of its references [degrees/s]."""
 
 
-def require_egm(job: Job, options: BundleOptions) -> None:
-    """Refuse a job for arms that are not ABB's, whose lag nobody states, or without a sensor."""
-    require_maker(job.workcell, ABB, "EGM", options.any_arm)
-    require_axes(job.workcell, "EGM", (SIX, SEVEN))
+def require_egm(job: Job) -> None:
+    """Refuse a job of arms whose lag nobody states, or without a sensor."""
     require_force_control(job, "abb-egm")
     for robot in job.workcell.robots:
         if not robot.driver.lag > 0.0:

@@ -72,7 +72,7 @@ def require_maker(workcell: Workcell, maker: str, language: str, any_arm: bool) 
             )
 
 
-def require_axes(workcell: Workcell, language: str, allowed: Sequence[int] = (SIX,)) -> None:
+def require_axes(workcell: Workcell, language: str, allowed: Sequence[int]) -> None:
     """Refuse a language for arms whose joints its targets cannot hold.
 
     Args:

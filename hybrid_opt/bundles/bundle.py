@@ -16,17 +16,26 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_opt.bundles.abb import egm_files, rapid_files, require_egm, require_rapid
+from hybrid_opt.bundles.arms import (
+    ABB,
+    FRANKA,
+    SEVEN,
+    SIX,
+    UR,
+    require_address,
+    require_axes,
+    require_maker,
+)
 from hybrid_opt.bundles.job_file import BundleOptions, Contents, Export, csv_text, json_files
 from hybrid_opt.bundles.mcap_file import mcap_files
 from hybrid_opt.bundles.ros2 import (
     control_files,
     franka_files,
     require_franka,
-    require_ur,
     ur_files,
 )
 from hybrid_opt.bundles.steps import Interpolation, chosen_step, gap_of, stop_of
-from hybrid_opt.bundles.urscript import require_urscript, urscript_files
+from hybrid_opt.bundles.urscript import urscript_files
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.job.compliance import (
     SKEWS,
@@ -129,7 +138,10 @@ class Target:
         reaction: who carries out a stop, in words; '' for data that nobody runs.
         start: how both arms start together, in words.
         skew: between their starts, which a job has to survive [s]; None where nobody asks.
-        require: refuses a job before it is sampled.
+        maker: whose arms it is for, one of those of `hybrid_opt.bundles.arms`; '' for all.
+        axes: numbers of turning joints that a maker's targets can hold.
+        has_address: whether it has to know where the controllers are.
+        require: refuses a job before it is sampled, for further reasons.
     """
 
     files: Callable[[Export], Contents]
@@ -139,7 +151,26 @@ class Target:
     reaction: str = ""
     start: str = "up to what plays the file"
     skew: float | None = None
-    require: Callable[[Job, BundleOptions], None] = lambda job, options: None
+    maker: str = ""
+    axes: tuple[int, ...] = (SIX,)
+    has_address: bool = False
+    require: Callable[[Job], None] = lambda job: None
+
+    def refuse(self, job: Job, name: str, any_arm: bool) -> None:
+        """Refuse a job that is not for this target of a name, before it is sampled.
+
+        Args:
+            any_arm: whether the user wants a maker's language for arms of others.
+
+        Raises:
+            SettingsError: the arms are not those that the target is for, or lack what it needs.
+        """
+        if self.maker:
+            require_maker(job.workcell, self.maker, name, any_arm)
+            require_axes(job.workcell, name, self.axes)
+        if self.has_address:
+            require_address(job.workcell, name)
+        self.require(job)
 
 
 STATES = {
@@ -341,7 +372,10 @@ TARGETS: Mapping[str, Target] = {
         RUN,
         "the goals of both controllers bear one start time of one computer's clock",
         0.002,
-        require_franka,
+        FRANKA,
+        (SEVEN,),
+        has_address=True,
+        require=require_franka,
     ),
     "ur-ros2": Target(
         ur_files,
@@ -353,7 +387,8 @@ TARGETS: Mapping[str, Target] = {
         "their goals; force mode presses on",
         "both controllers get their goals at once and begin when they have them",
         SKEW,
-        require_ur,
+        UR,
+        has_address=True,
     ),
     "ur-script": Target(
         urscript_files,
@@ -366,7 +401,7 @@ TARGETS: Mapping[str, Target] = {
         "both programs meet before the job over a digital line each way: what remains is a cycle "
         "and the lines' latency",
         SKEW,
-        require_urscript,
+        UR,
     ),
     "abb-rapid": Target(
         rapid_files,
@@ -379,7 +414,9 @@ TARGETS: Mapping[str, Target] = {
         "both tasks meet before every phase (WaitSyncTask): what remains is the difference of "
         "two planners within a phase",
         SKEW,
-        require_rapid,
+        ABB,
+        (SIX, SEVEN),
+        require=require_rapid,
     ),
     "abb-egm": Target(
         egm_files,
@@ -390,7 +427,9 @@ TARGETS: Mapping[str, Target] = {
         "run_egm.py streams both arms from one clock and lets it stand still",
         "one clock streams the positions of both arms",
         0.004,
-        require_egm,
+        ABB,
+        (SIX, SEVEN),
+        require=require_egm,
     ),
     "mcap": Target(
         mcap_files,
@@ -441,7 +480,7 @@ def export(
     options, origin = options or BundleOptions(), origin or Origin()
     found = TARGETS[target]
     whole = job if isinstance(job, Job) else plan_job(job)
-    found.require(whole, options)
+    found.refuse(whole, target, options.any_arm)
     skew = found.skew if options.skew is None else options.skew
     if skew is not None:
         require_skew(whole, skew, options.stiffness)

@@ -17,17 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.bundles.arms import (
     COMMANDS,
-    FRANKA,
-    SEVEN,
-    UR,
     described,
     description,
     prefixes,
-    require_address,
-    require_axes,
-    require_maker,
 )
-from hybrid_opt.bundles.job_file import BundleOptions, Export, job_text
+from hybrid_opt.bundles.job_file import Export, job_text
 from hybrid_opt.bundles.programs import program
 from hybrid_opt.job.records import Job, contact_effort
 from symbolic.array import Array
@@ -133,11 +127,8 @@ def _trajectory_controller(
 # --- Franka ---
 
 
-def require_franka(job: Job, options: BundleOptions) -> None:
-    """Refuse a job for arms that are not Franka's, or whose controllers have no address."""
-    require_maker(job.workcell, FRANKA, "franka_ros2", options.any_arm)
-    require_axes(job.workcell, "franka_ros2", (SEVEN,))
-    require_address(job.workcell, "franka-ros2")
+def require_franka(job: Job) -> None:
+    """Refuse joints that franka_ros2 does not know."""
     for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
         if not _franka_type(joints):
             raise SettingsError(
@@ -249,13 +240,6 @@ def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
 
 
 # --- UR ---
-
-
-def require_ur(job: Job, options: BundleOptions) -> None:
-    """Refuse a job for arms that are not UR's e-series, or whose controllers have no address."""
-    require_maker(job.workcell, UR, "ur_robot_driver with force mode", options.any_arm)
-    require_axes(job.workcell, "ur_robot_driver")
-    require_address(job.workcell, "ur-ros2")
 
 
 def ur_files(export: Export) -> dict[str, str | bytes]:

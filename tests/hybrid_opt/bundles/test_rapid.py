@@ -222,7 +222,7 @@ def test_a_box_that_turns_is_refused() -> None:
     turned = replace(carry, motion=replace(carry.motion, pose=pose))
     phases = tuple(turned if p.name == "carry" else p for p in rack_job().phases)
     with pytest.raises(SettingsError, match="the box turns by 29 degrees"):
-        require_rapid(replace(rack_driven(), phases=phases), BundleOptions())
+        require_rapid(replace(rack_driven(), phases=phases))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 
 from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.bundle import prepared
-from hybrid_opt.bundles.urscript import require_urscript, urscript_files
+from hybrid_opt.bundles.urscript import urscript_files
 from hybrid_opt.job.compliance import HELD
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import contents, exported, rack_driven
@@ -335,7 +335,7 @@ def test_an_arm_elsewhere_is_not_moved_unasked() -> None:
 
 def test_other_arms_and_steps_are_refused() -> None:
     with pytest.raises(SettingsError, match="UR e-series"):
-        require_urscript(rack_job(), BundleOptions())
+        TARGETS["ur-script"].refuse(rack_job(), "ur-script", any_arm=False)
     options = BundleOptions(step=0.05, any_arm=True)
     with pytest.raises(SettingsError, match="time step"):
         urscript_files(prepared(rack_driven(), TARGETS["ur-script"], options))
