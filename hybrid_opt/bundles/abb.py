@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from string import Template
 
 import numpy as np
 import pinocchio as pin
@@ -324,9 +325,6 @@ def _numbers(values: Array) -> str:
 PORTS = (6511, 6512)
 """Of this computer, that the controller writes to for each arm."""
 
-SAMPLE_RATE = 4
-"""Of EGM's messages [ms]."""
-
 CROSSOVER = 0.3
 """Of the force loop: its gain times its lag."""
 
@@ -335,9 +333,6 @@ LEAST_LAG = 0.01
 
 MOST_WAY, PRESS_SPEED = 1.5, 0.05
 """Of the pressing pad beyond its plan: over what its largest force needs, and [m/s]."""
-
-MOST_SPEED_DEVIATION = 20.0
-"""By which EGM may exceed the speed of its references [degrees/s]."""
 
 
 def require_egm(job: Job) -> None:
@@ -372,10 +367,7 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
         .tolist(),
     }
     tasks = tasks_of(export)
-    modules = {
-        f"{tasks[arm]}/CarryEgm{arm + 1}.mod": "\r\n".join(_egm_module(export, arm)) + "\r\n"
-        for arm in (0, 1)
-    }
+    modules = {f"{tasks[arm]}/CarryEgm{arm + 1}.mod": _egm_module(export, arm) for arm in (0, 1)}
     return {
         "job.json": job_text(export),
         "config/egm.json": json.dumps(config, allow_nan=False) + "\n",
@@ -400,38 +392,18 @@ def inward(workcell: Workcell, arm: int, q: Array) -> Array:
     return found
 
 
-def _egm_module(export: Export, arm: int) -> Iterator[str]:
-    robot, tasks = export.workcell.robots[arm], tasks_of(export)
+def _egm_module(export: Export, arm: int) -> str:
+    robot, axes = export.workcell.robots[arm], range(1, SIX + 1)
     first = np.rad2deg(export.sampled.arm(arm, export.sampled.q)[0])
-    axes = range(1, SIX + 1)
-    yield f"MODULE CarryEgm{arm + 1}"
-    yield f"  ! {comment(export.workcell.name)}"
-    yield f"  ! Robot {comment(robot.name)} in task {tasks[arm]}, UdpUc device CarryUc{arm + 1}"
-    yield f"  PERS tooldata carryPad := {tool_data(export, arm)};"
-    yield f"  CONST jointtarget carryFirst := {target_text(first)};"
-    yield "  CONST egm_minmax carryClose := [-0.001,0.001];"
-    yield "  VAR egmident carryEgm;"
-    yield ""
-    yield "  PROC CarryEgm()"
-    yield "    CarryCheckStart;"
-    yield "    EGMReset carryEgm;"
-    yield "    EGMGetId carryEgm;"
-    yield f'    EGMSetupUC ROB_{arm + 1}, carryEgm, "default", "CarryUc{arm + 1}" \\Joint'
-    yield "      \\CommTimeout:=1;"
-    criteria = " ".join(f"\\J{axis}:=carryClose" for axis in axes)
-    yield f"    EGMActJoint carryEgm \\Tool:=carryPad {criteria}"
-    yield f"      \\LpFilter:=0 \\SampleRate:={SAMPLE_RATE}"
-    yield f"      \\MaxSpeedDeviation:={MOST_SPEED_DEVIATION:g};"
-    moved = " ".join(f"\\J{axis}" for axis in axes)
-    yield "    ! For a day: a job that is held stands still for as long as it takes."
-    yield f"    EGMRunJoint carryEgm, EGM_STOP_HOLD {moved} \\CondTime:=86400;"
-    yield "    EGMReset carryEgm;"
-    yield "  ERROR"
-    yield "    IF ERRNO = ERR_UDPUC_COMM THEN"
-    yield '      TPWrite "Carry: run_egm.py is silent; the arm holds its place.";'
-    yield "      EXIT;"
-    yield "    ENDIF"
-    yield "  ENDPROC"
-    yield ""
-    yield from checked_start(len(first))
-    yield "ENDMODULE"
+    text = Template(program("carry_egm.mod")).substitute(
+        number=arm + 1,
+        cell=comment(export.workcell.name),
+        robot=comment(robot.name),
+        task=tasks_of(export)[arm],
+        tool=tool_data(export, arm),
+        first=target_text(first),
+        criteria=" ".join(f"\\J{axis}:=carryClose" for axis in axes),
+        moved=" ".join(f"\\J{axis}" for axis in axes),
+        check="\n".join(checked_start(len(first))),
+    )
+    return text.replace("\n", "\r\n")
