@@ -59,7 +59,7 @@ def _per_robot(
 
 
 def normal_forces(data: ReportData) -> Figure:
-    """Normal force of each robot along the carries (paper Figure 9)."""
+    """Normal contact forces along the selected trajectories (paper Figure 9)."""
 
     def draw(axes: Axes, i: int) -> None:
         for carry, look in styled(data):
@@ -73,7 +73,8 @@ def normal_forces(data: ReportData) -> Figure:
 
 
 def pressure_shift(data: ReportData) -> Figure:
-    """Shift of the centres of pressure and the patch radius (paper Figure 11)."""
+    """Shift of the centres of pressure that balances the moments, and the radius of the contact
+    patch (paper Figure 11)."""
 
     def draw(axes: Axes, i: int) -> None:
         for carry, look in styled(data):
@@ -86,7 +87,8 @@ def pressure_shift(data: ReportData) -> Figure:
 
 
 def payload(data: ReportData) -> Figure:
-    """Largest force of each robot against the payload's mass (paper Figure 12)."""
+    """Largest contact force of each robot against the payload's mass, for unchanged motion (paper
+    Figure 12)."""
     reference = data.workcell.task.reference_force / KILOGRAM_FORCE
     limits = np.concatenate([c.sensitivity.mass_by_resultant for c, _ in styled(data)])
     masses = np.array([0.75 * limits.min(), 1.1 * limits.max()])
@@ -125,7 +127,8 @@ def _kilograms(force: Any) -> Any:
 
 
 def simulated_forces(data: ReportData) -> Figure:
-    """Normal force of each robot: reference dashed, measured in the simulated cell solid."""
+    """Normal forces in the simulated cell, arms under force control, beside those that were
+    predicted for how the carries were pressed there."""
     looks, number = [], 0
     for found in data.simulations:
         # The hand-made trajectory looks as everywhere, the others by their order.
@@ -147,7 +150,8 @@ def simulated_forces(data: ReportData) -> Figure:
 
 
 def joint_torques(data: ReportData) -> Figure:
-    """Largest joint torque over its maximum, contact wrench alone and with the arm (Figure 10)."""
+    """Largest joint torque over its maximum: of the contact wrench alone, and with the arm's own
+    weight and motion (paper Figure 10)."""
     figure = new_figure(FULL_WIDTH, 0.98 * FULL_WIDTH)
     panels = figure.subplots(2, 2, subplot_kw={"projection": "polar"})
     split = [len(data.workcell.robots[0].torque_max)]
@@ -189,7 +193,8 @@ def _label_rings(axes: Axes, most: Array, top: float) -> None:
 
 
 def residual_moments(data: ReportData) -> Figure:
-    """Moment missing with point contacts; in the legend, with the centres of pressure shifted."""
+    """Moment that is missing with forces at the nominal contact points, and with the centres of
+    pressure shifted."""
     figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
     axes = figure.subplots()
     for carry, look in styled(data):

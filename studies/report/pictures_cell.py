@@ -26,6 +26,7 @@ from studies.report.drawing import (
     ISOMETRIC,
     SIDE,
     CutCell,
+    LineStyle,
     View,
     aspect,
     box_corners,
@@ -52,7 +53,8 @@ SHARES = (0.0, 0.33, 0.66, 1.0)
 
 
 def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) -> Figure:
-    """Both arms' reach, the common region and the restricted workspace (paper Figure 4)."""
+    """Reach of both pads (positions, sampled within the joint limits), the common region of the box
+    centre, and the bounds of the free waypoints (paper Figure 4)."""
     figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
     corners = box_corners(*_reach_bounds(reach))
     left, right = figure.subplots(1, 2, width_ratios=[aspect(v, corners) for v in (FRONT, SIDE)])
@@ -88,7 +90,7 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry
 
 
 def environment(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
-    """The cell with the payload at its start: front, side and oblique (paper Figure 5)."""
+    """The cell at the start of the carry (paper Figure 5)."""
     figure = new_figure(FULL_WIDTH, 0.34 * FULL_WIDTH)
     solids = cell_solids(geometry)
     cell = CutCell.of(geometry, solids)
@@ -148,15 +150,11 @@ def motion_sequence(geometry: CellGeometry, carry: DrawnCarry, columns: int = 2)
     return figure
 
 
-def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, str, object], ...]) -> Figure:
-    """Paths of the box centre (paper Figure 13): in the two planes of the world in which they are
-    largest, so that a plane that they hardly leave is seen edge-on once, and obliquely.
-
-    Args:
-        carries: trajectory, colour and line style of each.
-    """
+def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, LineStyle], ...]) -> Figure:
+    """Paths of the box centre (paper Figure 13)."""
+    # A plane that they hardly leave is seen edge-on once.
     cell = _fixed(geometry)
-    points = np.concatenate([carry.timed.pose[:, :3] for carry, _, _ in carries])
+    points = np.concatenate([carry.timed.pose[:, :3] for carry, _ in carries])
     half = geometry.workcell.payload.size / 2.0
     near = box_corners(points.min(axis=0) - half, points.max(axis=0) + half)
     chosen = planes(points)
@@ -166,10 +164,8 @@ def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, str, object],
     texts = (*(text for _, text in chosen), "oblique")
     for axes, view, letter, text in zip(panels, views, "abc", texts, strict=True):
         draw_cell(axes, cell, view, *_start(carries[0][0]), hidden=("box", "link"))
-        for carry, colour, line in carries:
-            draw_path(
-                axes, view, carry.timed.pose[:, :3], color=colour, linestyle=line, label=carry.label
-            )
+        for carry, look in carries:
+            draw_path(axes, view, carry.timed.pose[:, :3], **look.drawn, label=carry.label)
         ends = view.flat(carries[0][0].timed.pose[[0, -1], :3])
         axes.plot(*ends[0], "o", color="black", zorder=5, label="start")
         axes.plot(*ends[1], "*", color="black", markersize=7, zorder=5, label="goal")

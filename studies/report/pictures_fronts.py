@@ -34,7 +34,8 @@ QUARTILES = (25.0, 75.0)
 
 
 def fronts(data: ReportData) -> Figure:
-    """Feasible points and fronts of each algorithm's representative run (paper Figure 7)."""
+    """Feasible candidates and non-dominated ones of each algorithm's run with the largest
+    hypervolume (paper Figure 7). The cross is the level payload at rest."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     panels = figure.subplots(1, 2)
     found = [a.shown.front.objectives for a in data.solved]
@@ -59,7 +60,8 @@ def fronts(data: ReportData) -> Figure:
 
 
 def attainment(data: ReportData) -> Figure:
-    """Median and quartile attainment surfaces over the replicas."""
+    """Empirical attainment surfaces: what a quarter, half and three quarters of the replicas
+    reached or bettered."""
     figure = new_figure(FULL_WIDTH, 0.48 * FULL_WIDTH)
     groups = {"search": [[run.front.objectives for run in a.runs] for a in data.algorithms]}
     if data.has_hybrid:
@@ -97,7 +99,7 @@ def _attained(title: str, percentile: float) -> str:
 
 
 def polish(data: ReportData) -> Figure:
-    """Fronts of the representative runs before and after the polish, and the hypervolumes."""
+    """Fronts before and after the polish, and the hypervolume of every replica."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     left, right = figure.subplots(1, 2)
     drawn = []
@@ -219,7 +221,8 @@ LATE = 0.5
 
 
 def histories(data: ReportData) -> Figure:
-    """Best-so-far objectives of the representative runs, late part enlarged (paper Figure 8)."""
+    """Best feasible value of each objective so far, in the same runs; the inset enlarges the second
+    half (paper Figure 8)."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     axes = figure.subplots()
     inset = axes.inset_axes((0.42, 0.47, 0.56, 0.46))
@@ -265,7 +268,8 @@ def histories(data: ReportData) -> Figure:
 
 
 def infeasibility(data: ReportData) -> Figure:
-    """Reasons of infeasible candidates: the share of every constraint, and where on the path."""
+    """What made candidates infeasible: the constraint violated first, over all replicas, and where
+    on the path."""
     figure = new_figure(FULL_WIDTH, 0.46 * FULL_WIDTH)
     left, right = figure.subplots(1, 2)
     pooled = []
@@ -315,7 +319,7 @@ def infeasibility(data: ReportData) -> Figure:
 
 
 def indicators(data: ReportData) -> Figure:
-    """Hypervolume, IGD, spacing and feasible share of every replica."""
+    """Indicators of every replica, with medians and quartiles."""
     figure = new_figure(FULL_WIDTH, 0.36 * FULL_WIDTH)
     shown = (
         ("hypervolume", "hypervolume [-]"),
