@@ -120,8 +120,8 @@ class _Pair:
         known = concatenated(self._parts)
         order = np.argsort(known.penalised.mean(axis=1), kind="stable")
         settings = SearchSettings(initial=known.x[order[: min(BEST, evaluations)]])
-        found = search_carries(self.evaluator, algorithm, evaluations, rng, settings)
-        self._parts.append(found.evaluations)
+        found, _ = search_carries(self.evaluator, algorithm, evaluations, rng, settings)
+        self._parts.append(found)
         self.rounds += 1
 
     def try_out(self, x: Array) -> bool:

@@ -53,8 +53,8 @@ def search(
     if settings.initial is None and algorithm != "random":
         settings = replace(settings, initial=cell.initial[None])
     with counted(progress, algorithm, evaluations) as advance:
-        found = search_carries(cell.evaluator, algorithm, evaluations, rng, settings, advance)
-    return Front.of_search(cell, algorithm, found.evaluations)
+        found, _ = search_carries(cell.evaluator, algorithm, evaluations, rng, settings, advance)
+    return Front.of_search(cell, algorithm, found)
 
 
 def polish(

@@ -69,28 +69,22 @@ class ReadyCell:
         return cls(cell, JobModel(cell.compiled, cell.timing_model))
 
 
-@dataclass(frozen=True)
-class CellsSource:
-    """Makes the cells of a study ready for work, in any process.
+Cells = tuple[tuple[PackedCell, tuple[str, ...]], ...]
+"""Cells of a study, each with its objectives; the last one is the cell that robots drive."""
 
-    Attributes:
-        cells: each with its objectives; the last one is the cell that robots drive.
+
+def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cells:
+    """An experiment's own cell, and the drivable variant of it, whose contact model may differ.
+
+    Args:
+        driven: whether robots drive the experiment's own cell.
     """
+    own = (PackedCell.of(files), objectives)
+    if driven:
+        return (own,)
+    return (own, (PackedCell.of(drivable_files(files)), force_kind(objectives).drivable))
 
-    cells: tuple[tuple[PackedCell, tuple[str, ...]], ...]
 
-    @classmethod
-    def of(cls, files: CellFiles, objectives: tuple[str, ...], driven: bool) -> CellsSource:
-        """An experiment's own cell, and the drivable variant of it, whose contact model may differ.
-
-        Args:
-            driven: whether robots drive the experiment's own cell.
-        """
-        own = (PackedCell.of(files), objectives)
-        if driven:
-            return cls((own,))
-        return cls((own, (PackedCell.of(drivable_files(files)), force_kind(objectives).drivable)))
-
-    def __call__(self) -> tuple[ReadyCell, ...]:
-        """Load the compiled functions, or build them where they are missing."""
-        return tuple(cell.make(partial(ReadyCell.of, names)) for cell, names in self.cells)
+def ready_cells(cells: Cells) -> tuple[ReadyCell, ...]:
+    """Load the cells' compiled functions, or build them where they are missing; in any process."""
+    return tuple(cell.make(partial(ReadyCell.of, names)) for cell, names in cells)

@@ -14,17 +14,26 @@ import struct
 import time
 import zlib
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from hybrid_opt.campaign.documents import JOURNAL
-from hybrid_opt.campaign.folder import replica_identity
+from hybrid_opt.campaign.folder import (
+    CampaignFolder,
+    executor_for,
+    identity,
+    replica_identity,
+)
+from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.campaign.stages import Advance, Progress
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.store.files import read_bytes, storing
+from hybrid_opt.work.service import Ledger, Service, give_up
+from symbolic.array import Array
 
 _MAGIC = b"DACARRY1"
 _FRAME = struct.Struct("<II")
@@ -169,33 +178,96 @@ Key = tuple[str, int]
 """Algorithm and number of a replica."""
 
 
+@dataclass(frozen=True)
+class ReplicaRequest:
+    """A replica to search, or one whose front is to be polished.
+
+    Attributes:
+        settings: the campaign's.
+        algorithm, replica: which one.
+        x: (k, n_var) the workcell's hand-made trajectory alone, or the front.
+        recorded: the journal's blocks of an earlier, interrupted attempt.
+        paths: (m, n_path) known beside a front, see `Polisher.polish`; None for none.
+    """
+
+    settings: CampaignSettings
+    algorithm: str
+    replica: int
+    x: Array
+    recorded: tuple[bytes, ...] = ()
+    paths: Array | None = None
+
+
 class ReplicaLedger:
     """The replicas that are not done, and the journals of those that are being worked on: what
-    ledgers (`hybrid_opt.work.service`) of the search and of the polish have alike."""
+    ledgers (`hybrid_opt.work.service`) of the search and of the polish have alike.
 
-    def __init__(self, folders: Mapping[Key, Path], identity: Mapping[str, Any]) -> None:
+    Attributes:
+        folder: of the campaign.
+        left: the replicas that are left, with their folders.
+    """
+
+    def __init__(
+        self, folder: CampaignFolder, left: Mapping[Key, Path], **further: Mapping[str, Any]
+    ) -> None:
         """Nothing is opened yet.
 
         Args:
-            folders: of the replicas that are left, for their journals.
-            identity: of what is done with them.
+            further: what decides the answers beside the campaign.
         """
-        self._left, self._folders = list(folders), list(folders.values())
-        self._identity = identity
+        self.folder, self.left = folder, list(left.items())
+        campaign = identity(folder.settings, folder.root, folder.workcell)
+        self._identity = {"campaign": campaign, **further}
         self._journals: dict[int, Journal] = {}
 
     def __len__(self) -> int:
-        return len(self._left)
+        return len(self.left)
+
+    def work(
+        self,
+        service: Service[Any, ReplicaRequest, Any],
+        progress: Progress,
+        stage: tuple[str, str],
+        total: int,
+        done: int,
+    ) -> None:
+        """Have all requests answered.
+
+        Args:
+            stage: title of what is being done, and what is counted.
+            total, done: so much in all, and before.
+        """
+        if len(self):
+            # Compiles what is missing here, once, instead of in every worker.
+            service.make_context()
+        title, unit = stage
+        with progress.stage(title, total, unit, done) as self.advance:
+            ledger = cast("Ledger[ReplicaRequest, Any]", self)
+            executor_for(self.folder.execution).run(service, ledger)
+
+    advance: Advance
+
+    def replica_request(self, index: int, x: Array, paths: Array | None = None) -> ReplicaRequest:
+        """The request of a replica; see `ReplicaRequest`."""
+        key, _ = self.left[index]
+        recorded = tuple(self.journal(index).payloads)
+        return ReplicaRequest(self.folder.settings, *key, x, recorded, paths)
 
     def heard(self, index: int, message: bytes) -> None:
         """See `hybrid_opt.work.service.Ledger`."""
         self.journal(index).append(message)
 
+    def lost(self, index: int, reason: str) -> None:
+        """See `hybrid_opt.work.service.Ledger`."""
+        give_up(reason)
+
     def journal(self, index: int) -> Journal:
         """A replica's journal, opened when it is asked for first."""
         if index not in self._journals:
-            key = replica_identity(self._identity, *self._left[index])
-            self._journals[index] = Journal(self._folders[index] / JOURNAL, key)
+            key, folder = self.left[index]
+            self._journals[index] = Journal(
+                folder / JOURNAL, replica_identity(self._identity, *key)
+            )
         return self._journals[index]
 
     def discard(self, index: int) -> None:

@@ -12,17 +12,17 @@ import warnings
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.documents import JOURNAL, POLISH, polished_folder
-from hybrid_opt.campaign.folder import CampaignFolder, executor_for, identity
-from hybrid_opt.campaign.journal import ReplicaLedger
+from hybrid_opt.campaign.folder import CampaignFolder
+from hybrid_opt.campaign.journal import ReplicaLedger, ReplicaRequest
 from hybrid_opt.campaign.results import Replica, read_campaign, read_polished
-from hybrid_opt.campaign.settings import CampaignSettings
-from hybrid_opt.campaign.stages import Advance, Progress, Stage
+from hybrid_opt.campaign.stages import Progress, Stage
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.front import Lost, use_one_thread
@@ -44,47 +44,16 @@ seen."""
 _ANEW = f"delete {JOURNAL} in its folder of polished fronts to polish it anew"
 
 
-@dataclass(frozen=True)
-class PolisherSource:
-    """Makes a polisher, in any process.
-
-    Attributes:
-        cell: the workcell.
-        objectives: names of the objectives.
-        settings: of the polish.
-    """
-
-    cell: PackedCell
-    objectives: tuple[str, ...]
-    settings: PolishSettings
-
-    def __call__(self) -> Polisher:
-        """Load the compiled functions, or build them where they are missing."""
-        use_one_thread()
-        return self.cell.make(self._polisher)
-
-    def _polisher(self, workcell: Workcell) -> Polisher:
-        return Polisher(CandidateEvaluator(workcell, self.objectives), self.settings)
+def polisher_source(
+    cell: PackedCell, objectives: tuple[str, ...], settings: PolishSettings
+) -> Callable[[], Polisher]:
+    """What makes a polisher, in any process."""
+    return partial(cell.make, partial(_polisher, objectives, settings))
 
 
-@dataclass(frozen=True)
-class PolishRequest:
-    """A front to polish.
-
-    Attributes:
-        settings: the campaign's, for the seed.
-        algorithm, replica: whose front it is.
-        front_x: (k, n_var) its decision vectors.
-        recorded: the journal's blocks of an earlier, interrupted polish.
-        paths: (m, n_path) known beside the front, see `Polisher.polish`; None for none.
-    """
-
-    settings: CampaignSettings
-    algorithm: str
-    replica: int
-    front_x: Array
-    recorded: tuple[bytes, ...]
-    paths: Array | None = None
+def _polisher(objectives: tuple[str, ...], settings: PolishSettings, cell: Workcell) -> Polisher:
+    use_one_thread()
+    return Polisher(CandidateEvaluator(cell, objectives), settings)
 
 
 def polish_stage(
@@ -117,12 +86,12 @@ def _is_polished(folder: CampaignFolder, replica: Replica) -> bool:
 
 
 def polish_replica(
-    polisher: Polisher, request: PolishRequest, emit: Callable[[bytes], None]
+    polisher: Polisher, request: ReplicaRequest, emit: Callable[[bytes], None]
 ) -> PolishedFront:
     """Polish one front; attempts that were recorded are not repeated."""
     rng = request.settings.replica_rng(f"{request.algorithm}/polish", request.replica)
     return polisher.polish(
-        request.front_x,
+        request.x,
         rng,
         recorded=[_from_block(block, request) for block in request.recorded],
         emit=lambda outcome: emit(json.dumps(to_json(outcome)).encode()),
@@ -130,7 +99,7 @@ def polish_replica(
     )
 
 
-def _from_block(block: bytes, request: PolishRequest) -> PolishOutcome | Lost:
+def _from_block(block: bytes, request: ReplicaRequest) -> PolishOutcome | Lost:
     of = f"{request.algorithm} replica {request.replica}: a recorded attempt of the polish"
     values = json_of(block, of, _ANEW)
     if isinstance(values, dict) and "lost" in values:
@@ -147,44 +116,27 @@ class PolishLedger(ReplicaLedger):
         settings: PolishSettings,
         known: Callable[[CampaignFolder], Array] | None,
     ) -> None:
-        self._folder, self._settings = folder, settings
         replicas = read_campaign(folder.root).replicas
-        self._all = len(replicas)
+        self._all, self._settings = len(replicas), settings
         self._open = [replica for replica in replicas if not _is_polished(folder, replica)]
         keys = [(replica.algorithm, replica.replica) for replica in self._open]
-        campaign = identity(folder.settings, folder.root, folder.workcell)
-        super().__init__(
-            {key: polished_folder(folder.root, *key) for key in keys},
-            {"campaign": campaign, "polish": asdict(settings)},
-        )
+        left = {key: polished_folder(folder.root, *key) for key in keys}
+        super().__init__(folder, left, polish=asdict(settings))
         self._losses = Counter[int]()
         self._paths = known(folder) if known is not None and self._open else None
 
     def run(self, progress: Progress) -> None:
         """Polish all open fronts."""
-        cell = PackedCell.of(self._folder.files)
-        service = Service(
-            PolisherSource(cell, self._folder.settings.objectives, self._settings),
-            polish_replica,
-            patience=MOST_SECONDS + JUDGING_SECONDS,
-        )
+        cell, objectives = PackedCell.of(self.folder.files), self.folder.settings.objectives
+        source = polisher_source(cell, objectives, self._settings)
+        service = Service(source, polish_replica, patience=MOST_SECONDS + JUDGING_SECONDS)
         with closing(self):
-            if len(self):
-                # Compiles what is missing here, once, instead of in every worker.
-                service.make_context()
             done = self._all - len(self)
-            with progress.stage("polish", self._all, "fronts", done) as self._advance:
-                executor_for(self._folder.execution).run(service, self)
+            self.work(service, progress, ("polish", "fronts"), self._all, done)
 
-    _advance: Advance
-
-    def request(self, index: int) -> PolishRequest:
+    def request(self, index: int) -> ReplicaRequest:
         """See `hybrid_opt.work.service.Ledger`."""
-        front = np.array(self._open[index].front_x)
-        recorded = tuple(self.journal(index).payloads)
-        return PolishRequest(
-            self._folder.settings, *self._left[index], front, recorded, self._paths
-        )
+        return self.replica_request(index, np.array(self._open[index].front_x), self._paths)
 
     def lost(self, index: int, reason: str) -> None:
         """A solver that crashes or hangs costs the attempt at hand only."""
@@ -196,6 +148,6 @@ class PolishLedger(ReplicaLedger):
 
     def answered(self, index: int, answer: PolishedFront) -> None:
         """See `hybrid_opt.work.service.Ledger`."""
-        write_json(self._folders[index] / POLISH, to_json(answer))
+        write_json(self.left[index][1] / POLISH, to_json(answer))
         self.discard(index)
-        self._advance(1)
+        self.advance(1)

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +22,16 @@ from hybrid_opt.campaign.documents import (
     replica_folder,
 )
 from hybrid_opt.campaign.evaluations_file import EvaluationTable, encode, encode_front
-from hybrid_opt.campaign.folder import CampaignFolder, executor_for, identity
+from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import (
     Key,
     ReplicaLedger,
+    ReplicaRequest,
     candidates_in,
     decode_generation,
     encode_generation,
 )
-from hybrid_opt.campaign.settings import CampaignSettings
-from hybrid_opt.campaign.stages import Advance, Progress, Stage
+from hybrid_opt.campaign.stages import Progress, Stage
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations
@@ -39,7 +39,7 @@ from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.run import Evaluator, SearchSettings, disarmed, search_carries
 from hybrid_opt.store.files import read_bytes, sha256, write_atomically, write_json
 from hybrid_opt.store.json_records import read_record, to_json
-from hybrid_opt.work.service import Service, give_up
+from hybrid_opt.work.service import Service
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
 
@@ -47,63 +47,10 @@ EvaluatorSource = Callable[[], Evaluator]
 """Makes the evaluator, in any process; can be pickled and hashed."""
 
 
-@dataclass(frozen=True)
-class CellEvaluatorSource:
-    """Makes a workcell's evaluator from nothing but this value.
-
-    Attributes:
-        cell: the workcell.
-        objectives: names of the objectives.
-    """
-
-    cell: PackedCell
-    objectives: tuple[str, ...]
-
-    def __call__(self) -> CandidateEvaluator:
-        """Load the compiled functions, or build them where they are missing."""
-        return self.cell.make(lambda workcell: CandidateEvaluator(workcell, self.objectives))
-
-
-@dataclass(frozen=True)
-class ReplicaRequest:
-    """A replica to run.
-
-    Attributes:
-        settings: the campaign's.
-        algorithm, replica: which one.
-        initial: (n_var,) the workcell's hand-made trajectory.
-        recorded: the journal's blocks of an earlier, interrupted attempt.
-    """
-
-    settings: CampaignSettings
-    algorithm: str
-    replica: int
-    initial: Array
-    recorded: tuple[bytes, ...] = ()
-
-
-@dataclass(frozen=True)
-class ReplicaOutcome:
-    """A finished replica.
-
-    Attributes:
-        evaluations: content of its file of candidates, see `evaluations_file`.
-        front: content of its file of non-dominated candidates.
-        count: evaluated candidates.
-        seconds: time that the search and the certification of its front took, without what was
-            repeated from a journal.
-    """
-
-    evaluations: bytes
-    front: bytes
-    count: int
-    seconds: float
-
-
 def run_replica(
     evaluator: Evaluator, request: ReplicaRequest, emit: Callable[[bytes], None]
-) -> ReplicaOutcome:
-    """Run a replica to its end.
+) -> tuple[dict[str, bytes], FinishedReplica]:
+    """Run a replica to its end; returns the content of its files by name, and its record.
 
     The search runs again from its seed; where the journal holds a generation, the evaluations
     are taken from there, so that nothing is evaluated twice.
@@ -116,20 +63,22 @@ def run_replica(
     Raises:
         ResultsError: the journal holds other candidates than the search asks for.
     """
-    settings = request.settings
+    settings, algorithm = request.settings, request.algorithm
     recording = _Recording(evaluator, request, emit)
-    start = request.initial[None] if settings.starts_from_initial(request.algorithm) else None
-    found = search_carries(
+    start = request.x if settings.starts_from_initial(algorithm) else None
+    found, generation = search_carries(
         recording,
-        request.algorithm,
+        algorithm,
         settings.evaluations,
-        settings.replica_rng(request.algorithm, request.replica),
-        SearchSettings(settings.overrides(request.algorithm), settings.constraint_handling, start),
+        settings.replica_rng(algorithm, request.replica),
+        SearchSettings(settings.overrides(algorithm), settings.constraint_handling, start),
     )
+    # Without what was repeated from a journal.
     seconds = sum(recording.seconds) + recording.certification_seconds
-    table = EvaluationTable(found.evaluations, found.generation, evaluator.objective_names)
-    front = front_rows(table.evaluations)
-    return ReplicaOutcome(encode(table), encode_front(table, front), len(found.generation), seconds)
+    table = EvaluationTable(found, generation, evaluator.objective_names)
+    files = {EVALUATIONS: encode(table), FRONT: encode_front(table, front_rows(found))}
+    checksums = {name: sha256(content) for name, content in files.items()}
+    return files, FinishedReplica(algorithm, request.replica, len(found), seconds, checksums)
 
 
 def front_rows(evaluations: Evaluations) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
@@ -200,9 +149,9 @@ def search_stage(source: EvaluatorSource | None = None) -> Stage:
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        cell = PackedCell.of(folder.files)
-        maker = source or CellEvaluatorSource(cell, folder.settings.objectives)
-        _Search(folder).run(maker, progress)
+        cell, objectives = PackedCell.of(folder.files), folder.settings.objectives
+        maker = partial(cell.make, partial(CandidateEvaluator, objectives=objectives))
+        _Search(folder).run(source or maker, progress)
 
     def whole(folder: CampaignFolder) -> bool:
         return all(is_whole(folder.root, *key) for key in _replicas(folder))
@@ -244,53 +193,34 @@ class _Search(ReplicaLedger):
     """The replicas that are not done; see `ReplicaLedger`."""
 
     def __init__(self, folder: CampaignFolder) -> None:
-        self._folder, every = folder, _replicas(folder)
-        left = {
-            key: replica_folder(folder.root, *key)
-            for key in every
-            if not is_whole(folder.root, *key)
-        }
-        self._done = (len(every) - len(left)) * folder.settings.evaluations
-        super().__init__(left, identity(folder.settings, folder.root, folder.workcell))
+        self._every = _replicas(folder)
+        left = [key for key in self._every if not is_whole(folder.root, *key)]
+        super().__init__(folder, {key: replica_folder(folder.root, *key) for key in left})
 
     def run(self, source: EvaluatorSource, progress: Progress) -> None:
         """Run all open replicas."""
-        settings, service = self._folder.settings, Service(source, run_replica)
-        total = len(settings.algorithms) * settings.replicas * settings.evaluations
+        each = self.folder.settings.evaluations
         with closing(self):
-            begun = [k for k, folder in enumerate(self._folders) if (folder / JOURNAL).exists()]
+            begun = [k for k, (_, folder) in enumerate(self.left) if (folder / JOURNAL).exists()]
             recorded = [payload for k in begun for payload in self.journal(k).payloads]
-            if len(self):
-                # Compiles what is missing here, once, instead of in every worker.
-                service.make_context()
-            done = self._done + sum(map(candidates_in, recorded))
-            with progress.stage("search", total, "evaluations", done) as self._advance:
-                executor_for(self._folder.execution).run(service, self)
-
-    _advance: Advance
+            done = (len(self._every) - len(self)) * each + sum(map(candidates_in, recorded))
+            service, stage = Service(source, run_replica), ("search", "evaluations")
+            self.work(service, progress, stage, len(self._every) * each, done)
 
     def request(self, index: int) -> ReplicaRequest:
         """See `hybrid_opt.work.service.Ledger`."""
-        initial = initial_decision(self._folder.workcell.task)
-        recorded = tuple(self.journal(index).payloads)
-        return ReplicaRequest(self._folder.settings, *self._left[index], initial, recorded)
+        return self.replica_request(index, initial_decision(self.folder.workcell.task)[None])
 
     def heard(self, index: int, message: bytes) -> None:
         """See `hybrid_opt.work.service.Ledger`."""
         super().heard(index, message)
-        self._advance(candidates_in(message))
+        self.advance(candidates_in(message))
 
-    def lost(self, index: int, reason: str) -> None:
+    def answered(self, index: int, answer: tuple[dict[str, bytes], FinishedReplica]) -> None:
         """See `hybrid_opt.work.service.Ledger`."""
-        give_up(reason)
-
-    def answered(self, index: int, answer: ReplicaOutcome) -> None:
-        """See `hybrid_opt.work.service.Ledger`."""
-        files = {EVALUATIONS: answer.evaluations, FRONT: answer.front}
+        (_, folder), (files, done) = self.left[index], answer
         for name, content in files.items():
-            write_atomically(self._folders[index] / name, content)
+            write_atomically(folder / name, content)
         # Written last: with it, the replica is done.
-        checksums = {name: sha256(content) for name, content in files.items()}
-        done = FinishedReplica(*self._left[index], answer.count, answer.seconds, checksums)
-        write_json(self._folders[index] / DONE, to_json(done))
+        write_json(folder / DONE, to_json(done))
         self.discard(index)

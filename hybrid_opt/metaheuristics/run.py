@@ -232,19 +232,6 @@ class SearchSettings:
         require_allowed(self)
 
 
-@dataclass(frozen=True)
-class SearchedCarries:
-    """All candidates of a search, in order, with its front certified.
-
-    Attributes:
-        evaluations: every candidate.
-        generation: (n,) the generation of each, from 1.
-    """
-
-    evaluations: Evaluations
-    generation: NDArray[np.int64]
-
-
 def search_carries(
     evaluator: Evaluator,
     algorithm: str,
@@ -252,8 +239,9 @@ def search_carries(
     rng: np.random.Generator,
     settings: SearchSettings,
     evaluated: Callable[[int], None] = lambda count: None,
-) -> SearchedCarries:
-    """Spend exactly that many evaluations and certify the front of all of them.
+) -> tuple[Evaluations, NDArray[np.intp]]:
+    """Spend exactly that many evaluations and certify the front of all of them; returns the
+    candidates in order and the generation (n,) of each, from 1.
 
     Args:
         algorithm: one of `hybrid_opt.metaheuristics.names()`.
@@ -266,4 +254,4 @@ def search_carries(
     search(problem, make(algorithm, settings.algorithm, settings.initial), evaluations, rng)
     sizes = [len(batch) for batch in problem.batches]
     generation = np.repeat(np.arange(1, len(sizes) + 1), sizes)
-    return SearchedCarries(evaluator.certified(problem.evaluations), generation)
+    return evaluator.certified(problem.evaluations), generation

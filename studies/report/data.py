@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.branch_choice import read_branches
-from hybrid_opt.campaign.cell_source import CellsSource, ReadyCell
+from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, ready_cells
 from hybrid_opt.campaign.documents import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
 from hybrid_opt.campaign.results import (
     CampaignResults,
@@ -337,7 +337,8 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     calls += [partial(_job, request) for request in _job_requests(carries, recommended, first)]
     alone = results.workcell.task.time_law == "optimal"
     # Jobs are what robots are told: by the cell that they drive.
-    service = Service(CellsSource.of(first.files, results.objectives, alone), _called)
+    cells = cells_of(first.files, results.objectives, alone)
+    service = Service(partial(ready_cells, cells), _called)
     reach, *jobs = answer_all(executor or SerialExecutor(), service, calls)
     return ReportData(
         **vars(first),

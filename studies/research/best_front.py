@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.campaign.polish_stage import PolisherSource
+from hybrid_opt.campaign.polish_stage import polisher_source
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
@@ -104,7 +104,7 @@ def _polish_service(
     cell: PackedCell, attempts: int, fill: FillSettings
 ) -> Service[Polisher, tuple[Array, np.random.Generator], PolishedFront]:
     settings = PolishSettings(attempts=attempts, rounds=ROUNDS, fill=fill)
-    source = PolisherSource(cell, PAPER_OBJECTIVES, settings)
+    source = polisher_source(cell, PAPER_OBJECTIVES, settings)
     return Service(source, _polished)
 
 

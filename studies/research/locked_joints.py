@@ -61,16 +61,16 @@ def compare(cell: Cell, count: int, replicas: int, evaluations: int, seed: int) 
     for replica in range(replicas):
         start = SearchSettings(initial=cell.initial[None])
         rng = np.random.default_rng([seed, replica])
-        free = search_carries(cell.evaluator, "nsga2", evaluations, rng, start)
+        free, _ = search_carries(cell.evaluator, "nsga2", evaluations, rng, start)
         volumes = []
         for positions in tried:
             rng = np.random.default_rng([seed, replica])
             locked = LockedEvaluator(cell.evaluator, np.array(positions))
             start = SearchSettings(initial=cell.initial[None, : task.n_box])
-            done = search_carries(locked, "nsga2", evaluations, rng, start)
-            volumes.append(_volume(done.evaluations))
+            done, _ = search_carries(locked, "nsga2", evaluations, rng, start)
+            volumes.append(_volume(done))
         best = tried[int(np.argmax(volumes))]
-        found.append(Replica(_volume(free.evaluations), tuple(volumes), best))
+        found.append(Replica(_volume(free), tuple(volumes), best))
     return found
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
-from hybrid_opt.campaign.cell_source import CellsSource, ReadyCell
+from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, ready_cells
 from hybrid_opt.campaign.documents import (
     DRIVABLE,
     HAND_MADE,
@@ -70,7 +71,7 @@ def timing_stage(
             for f in files
         ]
         driven = folder.workcell.task.time_law == "optimal"
-        source = CellsSource.of(folder.files, folder.settings.objectives, driven)
+        source = partial(ready_cells, cells_of(folder.files, folder.settings.objectives, driven))
         with progress.stage(TIMING, len(requests), "trajectories") as advance:
             workers = executor_for(folder.execution)
             found = answer_all(workers, Service(source, _document), requests, lambda: advance(1))

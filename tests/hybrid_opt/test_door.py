@@ -14,7 +14,9 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.bundles.bundle import read_manifest
-from hybrid_opt.campaign.search_stage import ReplicaRequest, run_replica
+from hybrid_opt.campaign.documents import FRONT
+from hybrid_opt.campaign.journal import ReplicaRequest
+from hybrid_opt.campaign.search_stage import run_replica
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
@@ -76,12 +78,11 @@ def test_importing_it_imports_nothing_slow() -> None:
 
 def test_a_search_is_the_one_that_a_campaign_runs() -> None:
     settings = CampaignSettings(algorithms=("nsga2",), evaluations=EVALUATIONS)
-    request = ReplicaRequest(settings, "nsga2", 0, cell().initial)
-    outcome = run_replica(cell().evaluator, request, lambda block: None)
-    rows = outcome.front.decode().splitlines()[1:]
+    request = ReplicaRequest(settings, "nsga2", 0, cell().initial[None])
+    outcome, _ = run_replica(cell().evaluator, request, lambda block: None)
+    rows = outcome[FRONT].decode().splitlines()[1:]
     assert len(rows) == len(front()) > 1
-    again = run_replica(cell().evaluator, request, lambda block: None)
-    assert again.evaluations == outcome.evaluations
+    assert run_replica(cell().evaluator, request, lambda block: None)[0] == outcome
     assert len(front().evaluations) == EVALUATIONS
     for row, objectives in zip(rows, front().objectives, strict=True):
         assert all(repr(float(value)) in row for value in objectives)

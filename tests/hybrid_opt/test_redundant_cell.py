@@ -81,7 +81,7 @@ def test_a_carry_is_timed_and_exported_with_all_joints(cell: Cell) -> None:
         slope = np.diff(arm.q, axis=0)[moving] / steps[moving, None]
         np.testing.assert_allclose(slope, mean, atol=0.02 * np.abs(arm.q_rate).max())
     with pytest.raises(SettingsError, match="7 joints"):
-        require_axes(cell.workcell, "RAPID")
+        require_axes(cell.workcell, "RAPID", (6,))
 
 
 def test_locking_is_a_constant_path(cell: Cell) -> None:

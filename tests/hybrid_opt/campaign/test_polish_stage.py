@@ -21,10 +21,9 @@ from hybrid_opt.campaign import (
     search_stage,
 )
 from hybrid_opt.campaign.documents import JOURNAL, POLISH, polished_folder
-from hybrid_opt.campaign.journal import Journal
+from hybrid_opt.campaign.journal import Journal, ReplicaRequest
 from hybrid_opt.campaign.polish_stage import (
     PolishLedger,
-    PolishRequest,
     polish_replica,
     polish_stage,
 )
@@ -109,7 +108,7 @@ def test_a_polisher_is_given_the_paths_that_are_known_beside(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Polisher, "polish", polish)
-    request = PolishRequest(SETTINGS, "nsga2", 0, np.empty((0, 18)), (), paths)
+    request = ReplicaRequest(SETTINGS, "nsga2", 0, np.empty((0, 18)), (), paths)
     with pytest.raises(KeyboardInterrupt):
         polish_replica(object.__new__(Polisher), request, lambda block: None)
     assert seen == [paths]
@@ -200,7 +199,7 @@ def test_a_damaged_front_is_polished_anew(finished: Path, tmp_path: Path) -> Non
 
 
 def test_a_recorded_attempt_of_nonsense_is_told() -> None:
-    request = PolishRequest(SETTINGS, "nsga2", 0, np.zeros((1, 18)), (b"[]",))
+    request = ReplicaRequest(SETTINGS, "nsga2", 0, np.zeros((1, 18)), (b"[]",))
     for block in (b"[]", b"{}", b"\xff", b'{"x": 1e999}', b"[" * 90):
         with pytest.raises(ResultsError, match=r"nsga2 replica 0: .*; delete journal.bin in its"):
             polish_replica(Repeating(), replace(request, recorded=(block,)), lambda message: None)

@@ -214,7 +214,7 @@ def test_a_journal_of_nonsense_is_told(tmp_path: Path, few: tuple[Path, dict[str
     (output / "stages/search.json").unlink()
     found = read_campaign(whole).of("mopso")[0].evaluations
     stored = json.loads((output / "configuration.json").read_bytes())
-    head = replica_identity(stored, "mopso", 0)
+    head = replica_identity({"campaign": stored}, "mopso", 0)
     for block in (b"\0" * 12, encode_generation(float("nan"), found)):
         journal = Journal(folder / "journal.bin", head)
         journal.append(block)

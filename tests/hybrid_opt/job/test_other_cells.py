@@ -68,9 +68,9 @@ def test_a_seventh_axis_is_an_external_one_to_rapid() -> None:
     """ABB counts the axes of a YuMi 1, 2, 7, 3, 4, 5, 6 along its chain."""
     job, target = driven(planned("pandas")), TARGETS["abb-rapid"]
     with pytest.raises(SettingsError, match=r"panda.urdf, which does not look like an arm of ABB"):
-        target.require(job, BundleOptions())
+        target.refuse(job, "abb-rapid", any_arm=False)
     options = BundleOptions(step=0.1, any_arm=True)
-    target.require(job, options)
+    target.refuse(job, "abb-rapid", any_arm=True)
     sheet = prepared(job, target, options)
     files = target.files(sheet)
     assert set(files) == {"T_ROB_L/Carry1.mod", "T_ROB_R/Carry2.mod"}
@@ -86,15 +86,15 @@ def test_a_seventh_axis_is_an_external_one_to_rapid() -> None:
         check = module.procedures["CarryCheckStart"]
         assert [call.name for call in check].count("EXIT") == 7
         assert "here.extax.eax_a" in text
-    with pytest.raises(SettingsError, match="7 joints; targets of URScript hold 6"):
-        TARGETS["ur-script"].require(job, options)
+    with pytest.raises(SettingsError, match="7 joints; targets of ur-script hold 6"):
+        TARGETS["ur-script"].refuse(job, "ur-script", any_arm=True)
 
 
 def test_franka_takes_the_pandas() -> None:
     job, target = driven(planned("pandas")), TARGETS["franka-ros2"]
-    target.require(job, BundleOptions())
+    target.refuse(job, "franka-ros2", any_arm=False)
     with pytest.raises(SettingsError, match=r"has to know where the controller of 'north' is"):
-        target.require(planned("pandas"), BundleOptions())
+        target.refuse(planned("pandas"), "franka-ros2", any_arm=False)
     sheet = prepared(job, target, BundleOptions(step=0.05))
     files = target.files(sheet)
     config = json.loads(files["config/cell.json"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,12 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.documents import EVALUATIONS as FILE
 from hybrid_opt.campaign.evaluations_file import decode
-from hybrid_opt.campaign.search_stage import CellEvaluatorSource, ReplicaRequest, run_replica
+from hybrid_opt.campaign.journal import ReplicaRequest
+from hybrid_opt.campaign.search_stage import run_replica
 from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.work.processes import ProcessExecutor
 from hybrid_opt.work.service import Service, answer_all
@@ -43,12 +47,13 @@ def test_a_worker_elsewhere_searches_without_the_cells_files(
 ) -> None:
     """With the joint allocation paths are timed one by one, which reads the robots' files."""
     cell = ho.Cell.load(RACK.with_name("drum.toml")).drivable()
-    source = CellEvaluatorSource(PackedCell.of(collect_cell(cell.workcell)), DRIVABLE_OBJECTIVES)
+    packed = PackedCell.of(collect_cell(cell.workcell))
+    source = partial(packed.make, partial(CandidateEvaluator, objectives=DRIVABLE_OBJECTIVES))
     settings = CampaignSettings(("random",), EVALUATIONS, 1, objectives=DRIVABLE_OBJECTIVES)
-    request = ReplicaRequest(settings, "random", 0, cell.initial)
+    request = ReplicaRequest(settings, "random", 0, cell.initial[None])
     monkeypatch.chdir(tmp_path)
-    (answer,) = answer_all(ProcessExecutor(1), Service(source, run_replica), [request])
-    found = decode(answer.evaluations, tmp_path).evaluations
+    ((files, _),) = answer_all(ProcessExecutor(1), Service(source, run_replica), [request])
+    found = decode(files[FILE], tmp_path).evaluations
     assert len(found.x) == EVALUATIONS
     expected = cell.evaluate(found.x)
     np.testing.assert_array_equal(found.objectives, expected.objectives)
