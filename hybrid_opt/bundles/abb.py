@@ -28,9 +28,8 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.bundles.arms import SEVEN, SIX, comment
-from hybrid_opt.bundles.job_file import Export, job_text
+from hybrid_opt.bundles.job_file import Export, job_text, pad_places
 from hybrid_opt.bundles.programs import program
-from hybrid_opt.bundles.steps import pad_places
 from hybrid_opt.job.compliance import HELD
 from hybrid_opt.job.records import Job
 from symbolic.array import Array

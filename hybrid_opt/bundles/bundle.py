@@ -26,7 +26,17 @@ from hybrid_opt.bundles.arms import (
     require_axes,
     require_maker,
 )
-from hybrid_opt.bundles.job_file import BundleOptions, Contents, Export, csv_text, json_files
+from hybrid_opt.bundles.job_file import (
+    BundleOptions,
+    Contents,
+    Export,
+    Interpolation,
+    chosen_step,
+    csv_text,
+    gap_of,
+    json_files,
+    stop_of,
+)
 from hybrid_opt.bundles.mcap_file import mcap_files
 from hybrid_opt.bundles.ros2 import (
     control_files,
@@ -34,7 +44,6 @@ from hybrid_opt.bundles.ros2 import (
     require_franka,
     ur_files,
 )
-from hybrid_opt.bundles.steps import Interpolation, chosen_step, gap_of, stop_of
 from hybrid_opt.bundles.urscript import urscript_files
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.job.compliance import (

@@ -24,7 +24,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.bundles.arms import prefixes
-from hybrid_opt.bundles.steps import pad_errors, pad_places
+from hybrid_opt.bundles.job_file import pad_errors, pad_places
 from hybrid_opt.cell import Cell
 from hybrid_opt.collision.checker import Touch
 from hybrid_opt.display.table import text_table

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.branches import BranchCompetition, search_branches
-from hybrid_opt.campaign.documents import BRANCHES
 from hybrid_opt.campaign.folder import ExecutionSettings, require_usable
-from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.campaign.settings import BRANCHES, CampaignSettings
 from hybrid_opt.cell import Cell
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json

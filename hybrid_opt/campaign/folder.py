@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from codegen.cache import source_digest
-from hybrid_opt.campaign.documents import CONFIGURATION, STAGES, WORKCELL
-from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.campaign.settings import CONFIGURATION, STAGES, WORKCELL, CampaignSettings
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import LOCK, locked, read_json, storing, write_json

@@ -18,10 +18,10 @@ from functools import partial
 import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.campaign.documents import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import ReplicaLedger, ReplicaRequest
 from hybrid_opt.campaign.results import Replica, read_campaign, read_polished
+from hybrid_opt.campaign.settings import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.stages import Progress, Stage
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator

@@ -13,7 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.campaign.documents import (
+from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode
+from hybrid_opt.campaign.folder import FORMAT, VERSION
+from hybrid_opt.campaign.search_stage import front_rows
+from hybrid_opt.campaign.settings import (
     CONFIGURATION,
     DONE,
     EVALUATIONS,
@@ -25,9 +28,6 @@ from hybrid_opt.campaign.documents import (
     polished_folder,
     replica_folder,
 )
-from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode
-from hybrid_opt.campaign.folder import FORMAT, VERSION
-from hybrid_opt.campaign.search_stage import front_rows
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError

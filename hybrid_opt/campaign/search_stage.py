@@ -13,14 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.campaign.documents import (
-    DONE,
-    EVALUATIONS,
-    FRONT,
-    JOURNAL,
-    FinishedReplica,
-    replica_folder,
-)
 from hybrid_opt.campaign.evaluations_file import EvaluationTable, encode, encode_front
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import (
@@ -30,6 +22,14 @@ from hybrid_opt.campaign.journal import (
     candidates_in,
     decode_generation,
     encode_generation,
+)
+from hybrid_opt.campaign.settings import (
+    DONE,
+    EVALUATIONS,
+    FRONT,
+    JOURNAL,
+    FinishedReplica,
+    replica_folder,
 )
 from hybrid_opt.campaign.stages import Progress, Stage
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError

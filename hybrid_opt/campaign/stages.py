@@ -20,9 +20,15 @@ from typing import Any
 
 from tqdm import tqdm
 
-from hybrid_opt.campaign.documents import CONFIGURATION, DRIVABLE, STAGES, StageMark, StageStatus
 from hybrid_opt.campaign.folder import CampaignFolder, open_folder
-from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.campaign.settings import (
+    CONFIGURATION,
+    DRIVABLE,
+    STAGES,
+    CampaignSettings,
+    StageMark,
+    StageStatus,
+)
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.objectives import force_kind
 from hybrid_opt.store.files import write_json

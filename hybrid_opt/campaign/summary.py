@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from hybrid_opt.campaign.documents import Seconds, StoredCell, StoredSettings
+from hybrid_opt.campaign.settings import Seconds, StoredCell, StoredSettings
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ROBUST_FORCE, ForceKind
 from hybrid_opt.indicators.metrics import BindingBound
 from hybrid_opt.indicators.statistics import RankTest, Summary

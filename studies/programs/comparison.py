@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.campaign.documents import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.folder import differences
 from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_summary
+from hybrid_opt.campaign.settings import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.display.table import NOTHING, Quantity, Table, number
 from hybrid_opt.errors import ResultsError

@@ -19,9 +19,9 @@ from hybrid_opt.campaign import (
     search_stage,
 )
 from hybrid_opt.campaign.branch_choice import decided_cell, store_branches
-from hybrid_opt.campaign.documents import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
+from hybrid_opt.campaign.settings import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.stages import drivable_settings, drivable_stage
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import counted

@@ -16,13 +16,13 @@ from scipy import ndimage
 from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.branch_choice import read_branches
 from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, ready_cells
-from hybrid_opt.campaign.documents import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
 from hybrid_opt.campaign.results import (
     CampaignResults,
     ReplicaFront,
     read_campaign,
     read_summary,
 )
+from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
 from hybrid_opt.campaign.summary import CampaignSummary, PolishedFigures, ReplicaFigures
 from hybrid_opt.carry import Carry
 from hybrid_opt.display.scene import joint_placements

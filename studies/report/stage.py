@@ -75,7 +75,7 @@ def rewrite(root: Path, progress: Progress, pdf: bool = False) -> None:
     Raises:
         DualArmError: the folder is not complete.
     """
-    from hybrid_opt.campaign.documents import STAGES
+    from hybrid_opt.campaign.settings import STAGES
     from hybrid_opt.store.files import read_json
 
     marker = root / STAGES / "report.json"

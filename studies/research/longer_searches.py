@@ -19,9 +19,8 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
-from hybrid_opt.campaign.documents import CONFIGURATION
 from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_summary
-from hybrid_opt.campaign.settings import SIZE_KEYS
+from hybrid_opt.campaign.settings import CONFIGURATION, SIZE_KEYS
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.errors import ResultsError

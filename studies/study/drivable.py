@@ -12,7 +12,8 @@ import numpy as np
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
 from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, ready_cells
-from hybrid_opt.campaign.documents import (
+from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_campaign, read_summary
+from hybrid_opt.campaign.settings import (
     DRIVABLE,
     HAND_MADE,
     POLISHED_SUFFIX,
@@ -20,7 +21,6 @@ from hybrid_opt.campaign.documents import (
     polished_selected_file,
     selected_file,
 )
-from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_campaign, read_summary
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator

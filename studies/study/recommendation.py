@@ -13,8 +13,8 @@ import numpy as np
 import hybrid_opt as ho
 from codegen.function import available_cores
 from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Progress, Stage
-from hybrid_opt.campaign.documents import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.campaign.settings import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
 from hybrid_opt.campaign.stages import Advance
 from hybrid_opt.campaign.summary import (
     CampaignSummary,

@@ -14,7 +14,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
-from hybrid_opt.campaign.documents import (
+from hybrid_opt.campaign.results import read_summary
+from hybrid_opt.campaign.settings import (
     HAND_MADE,
     RECOMMENDED,
     SELECTED,
@@ -22,7 +23,6 @@ from hybrid_opt.campaign.documents import (
     polished_selected_file,
     selected_file,
 )
-from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.errors import ResultsError, WitnessError
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.store.files import write_json

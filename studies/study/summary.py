@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage
-from hybrid_opt.campaign.documents import (
+from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign
+from hybrid_opt.campaign.settings import (
     FRONTS,
     HAND_MADE,
     SELECTED,
@@ -21,7 +22,6 @@ from hybrid_opt.campaign.documents import (
     reference_front_file,
     selected_file,
 )
-from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign
 from hybrid_opt.campaign.summary import (
     AlgorithmFigures,
     Bounds,

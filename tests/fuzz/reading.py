@@ -14,10 +14,10 @@ import numpy as np
 
 from codegen.cache import Cache
 from hybrid_opt.bundles.bundle import read_manifest
-from hybrid_opt.campaign.documents import FinishedReplica, StageMark
 from hybrid_opt.campaign.evaluations_file import decode
 from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.campaign.results import read_configuration
+from hybrid_opt.campaign.settings import FinishedReplica, StageMark
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.files import read_bytes

@@ -14,10 +14,9 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.bundles.bundle import read_manifest
-from hybrid_opt.campaign.documents import FRONT
 from hybrid_opt.campaign.journal import ReplicaRequest
 from hybrid_opt.campaign.search_stage import run_replica
-from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.campaign.settings import FRONT, CampaignSettings
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.store.files import sha256

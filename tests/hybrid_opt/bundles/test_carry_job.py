@@ -159,7 +159,7 @@ def test_a_job_begins_only_in_its_first_places() -> None:
 
 def test_distances_are_bounds() -> None:
     """Of a pad's way between two postures, by Pinocchio's kinematics."""
-    from hybrid_opt.bundles.steps import pad_places
+    from hybrid_opt.bundles.job_file import pad_places
 
     found, rng = exported("json"), np.random.default_rng(2)
     for arm in (0, 1):

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hybrid_opt.bundles.steps import between, chosen_step, gap_of, pad_errors, stop_of
+from hybrid_opt.bundles.job_file import between, chosen_step, gap_of, pad_errors, stop_of
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.compliance import HELD, TRACKED
 from hybrid_opt.job.records import Job, sample_job

@@ -15,7 +15,7 @@ from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.abb import rapid_files, require_rapid
 from hybrid_opt.bundles.arms import ABB, UR, require_maker
 from hybrid_opt.bundles.bundle import prepared
-from hybrid_opt.bundles.steps import pad_places
+from hybrid_opt.bundles.job_file import pad_places
 from hybrid_opt.job.compliance import HELD
 from symbolic.array import Array
 from symbolic.errors import SettingsError

@@ -13,7 +13,7 @@ import pinocchio as pin
 import pytest
 import yaml
 
-from hybrid_opt.bundles.steps import pad_places
+from hybrid_opt.bundles.job_file import pad_places
 from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.bundles.bundles import contents, exported, text_of
 from tests.hybrid_opt.job.jobs import rack

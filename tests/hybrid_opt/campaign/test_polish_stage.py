@@ -20,7 +20,6 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
-from hybrid_opt.campaign.documents import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.journal import Journal, ReplicaRequest
 from hybrid_opt.campaign.polish_stage import (
     PolishLedger,
@@ -28,6 +27,7 @@ from hybrid_opt.campaign.polish_stage import (
     polish_stage,
 )
 from hybrid_opt.campaign.results import read_campaign, read_polished
+from hybrid_opt.campaign.settings import JOURNAL, POLISH, polished_folder
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign.documents import POLISH, polished_folder
 from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.campaign.settings import POLISH, polished_folder
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign.documents import SIMULATED
+from hybrid_opt.campaign.settings import SIMULATED
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign.documents import Configuration, StoredCell, StoredSettings
 from hybrid_opt.campaign.results import CampaignResults, Replica
 from hybrid_opt.campaign.search_stage import front_rows
+from hybrid_opt.campaign.settings import Configuration, StoredCell, StoredSettings
 from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures, SelectedEntry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
