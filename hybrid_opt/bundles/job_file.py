@@ -2,6 +2,15 @@
 
 `job.schema.json` describes the file for others; its version rises with every change that breaks a
 reader.
+
+Its time steps are chosen by what they do to the gap between the pads. Between two samples a
+controller makes up the motion: along straight lines of the joints, cubic or quintic ones. Each
+arm's pad then misses its path a little, not both alike, and the gap between the pads changes. Arms
+of a stiffness k at their pads turn a change d of the gap into a force k d / 2.
+
+Controllers differ in who makes up for gravity: efforts are therefore given with gravity, the whole
+torque of a joint, and without it, for controllers that add what bears arm and tool themselves.
+What the pads exert on the box is part of both.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from hybrid_opt.timing import TimingLimits, time_path
 from hybrid_opt.witness.arms import ArmOutcome, CellWitness
 from hybrid_opt.witness.reference import BoxJob, JointMotion, Reference, job_reference
 from symbolic.array import Array
-from tests.hybrid_opt.bundles import test_egm
+from tests.hybrid_opt.bundles import test_abb
 from tests.hybrid_opt.bundles.bundles import contents
 from tests.hybrid_opt.bundles.mock_ros import World, run
 from tests.hybrid_opt.bundles.test_run_job import FAULTS, SETTLED, column
@@ -156,7 +156,7 @@ def test_a_stopped_job_holds_the_box(name: str, tmp_path: Path) -> None:
 
 
 def test_the_egm_program_carries_the_box() -> None:
-    cell = test_egm.Cell()
+    cell = test_abb.Cell()
     cell.run(lambda cell: cell.stream.machine.state == "done")
     time = np.array([row[0] for row in cell.record])
     q = np.array([row[4] for row in cell.record])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -16,17 +17,23 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.branches import BranchCompetition, PairResult
+from hybrid_opt.bundles.bundle import read_manifest
 from hybrid_opt.campaign.cell_source import ReadyCell
 from hybrid_opt.cell import Cell
+from hybrid_opt.display.table import NOTHING, Table
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.indicators.metrics import BindingBound
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.robust.squeeze import SqueezeSettings
+from studies.errors import ReportError
 from studies.report import page_carries, page_data
 from studies.report.data import ReportData
-from studies.report.generate import write_report
+from studies.report.generate import BEGIN, END, insert_tables, report_tables, write_report
 from studies.report.page_carries import DrawnJob, Shown, page_trajectory, pressure_shift
 from studies.report.page_data import page_document
+from studies.study import tables
 from studies.study.recommendation import recommendation_text
+from tests.studies.test_examples import ROOT, SMALL, blocks
 
 HOSTILE = "</title></script><script>window.broken = 1</script><img src=x onerror=alert(1)>\"'&"
 WINNER = PairResult((2, 0), 2, 120, 0.5, 0.4, 0.6)
@@ -311,3 +318,125 @@ def test_every_file_of_the_report_is_written(report: Path, text: str) -> None:
         assert [f"{name}.{suffix}" for suffix in ("csv", "md", "tex")] == [
             entry for entry in tables if entry.startswith(f"{name}.")
         ]
+
+
+def test_the_page_runs_from_its_first_block_to_the_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "studies").symlink_to(ROOT / "studies")
+    monkeypatch.chdir(tmp_path)
+    space: dict[str, object] = {"__name__": "__main__"}
+    code = blocks((ROOT / "docs" / "cell-to-bundle.md").read_text("utf-8"))
+    assert len(code) == 5
+    for block in code:
+        for full, small in SMALL.items():
+            block = block.replace(full, small)
+        exec(compile(block, "docs/cell-to-bundle.md", "exec"), space)
+    out = capsys.readouterr().out
+    assert "approach" in out
+    (folder,) = (tmp_path / "bundles").iterdir()
+    assert folder.name.startswith("rack-nsga2-r00-p0001-")
+    assert {target.name for target in folder.iterdir()} == {"ros2-control", "json", "csv"}
+    for target in folder.iterdir():
+        assert read_manifest(target)["target"] == target.name
+
+
+def named(tables: tuple[Table, ...], name: str) -> Table:
+    return next(table for table in tables if table.name == name)
+
+
+def test_table_1_repeats_the_summary(data: ReportData, study: Path) -> None:
+    table = named(report_tables(data, with_paper=False), "table1_quality")
+    summary = json.loads((study / "summary.json").read_text())
+    assert [row[0] for row in table.rows] == ["NSGA-II", "MOPSO"]
+    for row, name in zip(table.rows, ("nsga2", "mopso"), strict=True):
+        statistics = summary["algorithms"][name]["statistics"]
+        share = statistics["feasible_share"]
+        assert row[2] == f"{100 * share['mean']:.1f} ± {100 * share['std']:.1f}"
+        volume = [entry["hypervolume"] for entry in summary["algorithms"][name]["replicas"]]
+        assert row[4] == f"{np.mean(volume):.4f} ± {np.std(volume, ddof=1):.4f}"
+
+
+def test_table_2_shows_the_selected_trajectories(data: ReportData, study: Path) -> None:
+    table = named(report_tables(data, with_paper=False), "table2_selected")
+    summary = json.loads((study / "summary.json").read_text())
+    rows = {row[0]: row for row in table.rows}
+    for title, name in (("NSGA-II", "nsga2"), ("MOPSO", "mopso")):
+        entry = summary["algorithms"][name]
+        chosen = entry["replicas"][entry["representative"]]["selected"]
+        expected = [*chosen["minimum_normal_force"], *chosen["peak_normal_force"]]
+        assert rows[title][1:5] == tuple(f"{force:.2f}" for force in expected)
+        assert rows[title][7] == f"{chosen['payload_limit']:.2f}"
+    # A level box at rest needs m g / (2 mu) of each pad.
+    assert rows["level payload at rest"][1] == f"{8.0 * 9.81 / 1.6:.2f}"
+
+
+def test_the_papers_figures_are_those_that_it_states(data: ReportData) -> None:
+    with_paper, without = (report_tables(data, with_paper=flag) for flag in (True, False))
+    quality = {row[0]: row for row in named(with_paper, "table1_quality").rows}
+    assert quality["NSGA-II, paper"][1:] == ("694", "69.4", *[NOTHING] * 4)
+    assert quality["MOPSO, paper"][1:] == ("296", "29.6", *[NOTHING] * 4)
+    chosen = {row[0]: row for row in named(with_paper, "table2_selected").rows}
+    assert chosen["NSGA-II, paper"][7] == "16.71"
+    assert chosen["MOPSO, paper"][7] == "16.06"
+    assert not any("paper" in row[0] for table in without for row in table.rows)
+
+
+def test_words_begin_at_the_left_and_figures_end_at_the_right(data: ReportData) -> None:
+    timing = named(report_tables(data, with_paper=False), "timing")
+    assert timing.words == (True, *[False] * 6, True, True)
+    assert tables.bounds(data.summary.bounds).words[1]
+
+
+def test_the_bounds_that_matter_are_listed(data: ReportData) -> None:
+    def bound(k: int) -> BindingBound:
+        return BindingBound(f"waypoint {k}", "upper", 0.1, k)
+
+    many = replace(data.summary.bounds, solutions=40, binding=tuple(map(bound, range(1, 21))))
+    rows = tables.bounds(many).rows
+    assert [row[3] for row in rows[:2]] == ["20 of 40", "19 of 40"]
+    assert len(rows) == tables.MOST_BOUNDS + 1
+    assert rows[-1] == ("search", "and 12 further bounds", NOTHING, "at most 12 of 40")
+
+
+def test_every_row_fits_its_header(data: ReportData) -> None:
+    for table in report_tables(data, with_paper=True):
+        assert all(len(row) == len(table.header) for row in table.rows)
+        assert len(table.rows) > 0
+
+
+def test_an_algorithm_without_a_feasible_candidate_is_told(data: ReportData) -> None:
+    failed = replace(data.summary.algorithms["nsga2"], representative=None)
+    algorithms = {**data.summary.algorithms, "nsga2": failed}
+    table = tables.selected(replace(data.summary, algorithms=algorithms), with_paper=False)
+    rows = [row[0] for row in table.rows]
+    assert rows[:3] == ["hand-made", "NSGA-II: no feasible candidate", "MOPSO"]
+
+
+def test_tables_are_put_between_the_markers_of_a_document(
+    data: ReportData, own_study: Path, tmp_path: Path
+) -> None:
+    document = tmp_path / "page.md"
+    document.write_text(f"before\n{BEGIN}\nformer tables\n{END}\nafter\n")
+    folder = own_study / "tables"
+    folder.mkdir(exist_ok=True)
+    for table in report_tables(data, with_paper=True):
+        (folder / f"{table.name}.md").write_text(table.markdown())
+    insert_tables(own_study, document)
+    text = document.read_text()
+    assert text.startswith(f"before\n{BEGIN}\n")
+    assert text.endswith(f"{END}\nafter\n")
+    assert "former tables" not in text
+    assert "| NSGA-II, paper | 694 | 69.4 |" in text
+    insert_tables(own_study, document)
+    assert document.read_text() == text
+
+
+def test_a_document_without_markers_is_refused(own_study: Path, tmp_path: Path) -> None:
+    (own_study / "tables").mkdir(exist_ok=True)
+    for name in ("table1_quality", "table2_selected"):
+        (own_study / "tables" / f"{name}.md").write_text("x")
+    document = tmp_path / "page.md"
+    document.write_text("no markers")
+    with pytest.raises(ReportError, match="measured: begin"):
+        insert_tables(own_study, document)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import urllib.request
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
+import imageio_ffmpeg  # type: ignore[import-untyped]
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -16,13 +19,29 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
-from PIL import Image
+from PIL import Image, ImageSequence
 
-from studies.report.data import ReportData, Run
-from studies.report.drawing import ARMS, HAND_MADE, SERIES, in_style, save
+from hybrid_opt.display.scene import frame_placements
+from studies.errors import ReportError
+from studies.report.__main__ import main
+from studies.report.data import DrawnCarry, ReportData, Run, reach_map
+from studies.report.drawing import ARMS, FRONT, HAND_MADE, SERIES, SIDE, in_style, oblique, save
+from studies.report.looks import (
+    FRAMES_PER_SECOND,
+    Film,
+    frames,
+    page_of,
+    page_server,
+    write_animation,
+)
 from studies.report.pictures import ReportPicture, report_pictures
 from studies.report.pictures_cell import planes
+from studies.report.stage import PAGE
 from symbolic.array import Array
+from symbolic.geometry.bodies import Frame
+from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.read.cell import load
+from tests.studies.conftest import TRANSFER
 
 NAMES = (
     "fig04_reachable_regions",
@@ -352,3 +371,123 @@ def test_the_papers_two_algorithms_differ_in_grey() -> None:
     first, second = (luminance(look.colour) for look in SERIES[:2])
     assert (second + 0.05) / (first + 0.05) > 2.0
     assert ARMS[0] != ARMS[1]
+
+
+@pytest.fixture(scope="module")
+def geometry() -> CellGeometry:
+    return build_geometry(load(TRANSFER))
+
+
+def test_pads_stay_on_the_box_along_a_carry(data: ReportData) -> None:
+    timed = data.initial.timed
+    placed = frame_placements(data.geometry, timed.pose, timed.q)
+    for i, arm in enumerate(data.geometry.arms):
+        carried = placed[Frame("link", i, 5)] @ arm.T_joint_box
+        np.testing.assert_allclose(carried, placed[Frame("box")], atol=2e-6)
+
+
+@pytest.mark.parametrize("view", [FRONT, SIDE, oblique(0.3, 0.5), oblique(-2.0, -0.4)])
+def test_views_are_rotations(view: object) -> None:
+    assert isinstance(view, type(FRONT))
+    axes = np.array([view.right, view.up, view.towards])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+def test_front_is_seen_from_the_side_of_minus_x() -> None:
+    np.testing.assert_allclose(FRONT.towards, [-1.0, 0.0, 0.0])
+    np.testing.assert_allclose(SIDE.towards, [0.0, -1.0, 0.0])
+
+
+def test_reach_holds_the_carry_and_ends_where_the_arm_does(data: ReportData) -> None:
+    reach = data.reach
+    for pose in data.initial.timed.pose[::10]:
+        cube = tuple(((pose[:3] - reach.lower) / reach.step).astype(int))
+        assert reach.common[cube]
+    for i, arm in enumerate(data.geometry.arms):
+        shoulder = (arm.T_world_root @ arm.origins[0])[:3, 3]
+        cubes = np.argwhere(reach.pads[i])
+        centres = reach.lower + (cubes + 0.5) * reach.step
+        pad = arm.T_joint_box @ data.workcell.contacts[i].T_box_pad
+        stretched = np.linalg.norm(arm.origins[1:, :3, 3], axis=1).sum()
+        longest = stretched + np.linalg.norm(pad[:3, 3]) + 2.0 * reach.step
+        distances = np.linalg.norm(centres - shoulder, axis=1)
+        assert distances.max() <= longest
+        assert distances.max() >= 0.85 * longest
+
+
+def test_reach_repeats_with_its_seed(geometry: CellGeometry) -> None:
+    first, second = (reach_map(geometry, np.random.default_rng(5)) for _ in range(2))
+    np.testing.assert_array_equal(first.common, second.common)
+
+
+@pytest.fixture(scope="module")
+def carry(data: ReportData) -> DrawnCarry:
+    return data.initial
+
+
+def test_a_gif_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
+    path = tmp_path / "made" / "carry.gif"
+    write_animation(data.geometry, Film.of(carry), path)
+    image = Image.open(path)
+    durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
+    # GIF counts hundredths of a second, so a frame of 66.7 ms is written as 60 or 70.
+    assert sum(durations[:-1]) / 1000 == pytest.approx(carry.timed.duration, rel=0.12)
+    assert path.stat().st_size < 5_000_000
+    image.seek(0)
+    first = np.asarray(image.convert("RGB"), dtype=int)
+    image.seek(len(durations) // 2)
+    assert (
+        np.abs(np.asarray(image.convert("RGB"), dtype=int) - first).max(axis=2) > 40
+    ).mean() > 0.01
+
+
+def test_frames_show_the_motion_from_start_to_goal(data: ReportData, carry: DrawnCarry) -> None:
+    pictures = list(frames(data.geometry, Film.of(carry)))
+    assert len(pictures) == round(carry.timed.duration * FRAMES_PER_SECOND) + 1
+    assert {picture.shape for picture in pictures} == {(400, 640, 3)}
+    steps = [np.abs(a.astype(int) - b).mean() for a, b in pairwise(pictures)]
+    assert max(steps) > 0.1
+
+
+def test_an_mp4_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
+    path = tmp_path / "carry.mp4"
+    write_animation(data.geometry, Film.of(carry), path)
+    count, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
+    assert count == round(carry.timed.duration * FRAMES_PER_SECOND) + 1
+    assert seconds == pytest.approx(carry.timed.duration, abs=2.0 / FRAMES_PER_SECOND)
+
+
+def test_another_suffix_is_refused(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
+    with pytest.raises(ReportError, match=r"\.gif or \.mp4"):
+        write_animation(data.geometry, Film.of(carry), tmp_path / "carry.avi")
+
+
+def test_the_program_animates_a_results_folder(study: Path, tmp_path: Path) -> None:
+    path = tmp_path / "chosen.gif"
+    assert main([str(study), "--animation", str(path)]) == 0
+    assert Image.open(path).n_frames > 10  # type: ignore[attr-defined]
+
+
+def test_the_program_tells_what_is_no_results_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(tmp_path)]) == 2
+    assert "configuration.json is missing" in capsys.readouterr().err
+
+
+def test_a_browser_is_given_the_report(study: Path, own_study: Path) -> None:
+    """Or, where there is none, a page that plays a trajectory."""
+    (own_study / PAGE).write_text("<p>the report</p>")
+    for page, words in ((page_of(own_study), "<p>the report</p>"), (page_of(study), "CellScene")):
+        server = page_server(page, 0)
+        Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{server.server_port}") as answer:
+                assert words in answer.read().decode()
+            other = page_server(page, server.server_port)
+            assert other.server_port != server.server_port
+            other.server_close()
+        finally:
+            server.shutdown()
+            server.server_close()

@@ -11,16 +11,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hybrid_opt.campaign import ExecutionSettings, Progress, Stage, open_folder, run_stages
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.campaign.summary import StoredRecommendation
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluations import REASONS
 from studies import recommend, run
 from studies.programs.study import campaign_settings
 from studies.study.recommendation import read_recommendation
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
+from tests.hybrid_opt.cells import shipped
 from tests.studies.study.test_run import CELL, SMALL
 from tests.waiting import HANGS, soon, until
 
@@ -115,3 +119,69 @@ def test_why_carries_are_not_polished_is_told(
     told = capsys.readouterr().err
     assert "are not polished, only searched" in told
     assert 'here it is "soft-finger"' in told
+
+
+@pytest.fixture(scope="module")
+def evaluator() -> CandidateEvaluator:
+    return shipped("rack").evaluator
+
+
+def test_the_hand_made_trajectory_is_feasible(evaluator: CandidateEvaluator) -> None:
+    verdict = evaluator.evaluate(evaluator.workcell.task.initial.reshape(1, -1))
+    assert verdict.feasible.all()
+    # 2.9 % above the static hold, the figure of a trial by another program.
+    static = evaluator.workcell.payload.mass * 9.81 / 2.0
+    excess = verdict.objectives[0] * evaluator.workcell.task.reference_force / static - 1.0
+    np.testing.assert_allclose(excess, 0.029, atol=5e-4)
+
+
+def test_the_straight_line_collides(evaluator: CandidateEvaluator) -> None:
+    task = evaluator.workcell.task
+    share = np.linspace(0.0, 1.0, len(task.waypoints))[1:-1, None]
+    start, goal = task.waypoints[0].lower, task.waypoints[-1].lower
+    verdict = evaluator.evaluate(((1.0 - share) * start + share * goal).reshape(1, -1))
+    assert REASONS[verdict.reason[0]] == "collision"
+
+
+def test_few_random_candidates_are_feasible_and_for_several_reasons(
+    evaluator: CandidateEvaluator,
+) -> None:
+    """20,000 uniform candidates: 2.01 % feasible with this seed when the bounds were chosen."""
+    rng = np.random.default_rng(0)
+    verdict = evaluator.evaluate(
+        rng.uniform(evaluator.lower, evaluator.upper, (20000, evaluator.n_var))
+    )
+    assert 0.02 <= verdict.feasible.mean() <= 0.20
+    violated = {REASONS[k] for k in np.flatnonzero((verdict.violation > 0.0).any(axis=0))}
+    assert {"collision", "reach_1", "reach_2", "joint_limits_1", "pressure_1"} <= violated
+
+
+@pytest.mark.parametrize(
+    ("arguments", "started"),
+    [
+        (["--quick"], True),
+        (["--executor", "processes"], True),
+        (["--executor", "dask", "--scheduler", "tcp://here:8786"], False),
+        (["--executor=dask"], False),
+    ],
+)
+def test_workers_are_started_for_work_on_this_machine(
+    arguments: list[str], started: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded: list[tuple[str, ...]] = []
+    monkeypatch.setattr(run, "warm_up", lambda *modules: loaded.append(modules))
+    assert run.main([str(tmp_path / "none.toml"), *arguments]) == 2
+    assert loaded == ([run.WORKERS_LOAD] if started else [])
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["cell.toml", "-h"], ["cell.toml", "--qick"]])
+def test_none_are_started_without_work(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def start(*modules: str) -> None:
+        raise AssertionError(modules)
+
+    monkeypatch.setattr(run, "warm_up", start)
+    with pytest.raises(SystemExit):
+        run.main(arguments)
+    assert capsys.readouterr()

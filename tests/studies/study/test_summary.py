@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,15 +13,38 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign.results import CampaignResults, Replica
+from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign
 from hybrid_opt.campaign.search_stage import front_rows
-from hybrid_opt.campaign.settings import Configuration, StoredCell, StoredSettings
+from hybrid_opt.campaign.settings import (
+    POLISH,
+    SIMULATED,
+    Configuration,
+    StoredCell,
+    StoredSettings,
+    polished_folder,
+)
 from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures, SelectedEntry
 from hybrid_opt.cell import Cell
+from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.indicators.statistics import rank_test
+from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.static_hold import StaticHold
+from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import from_json, to_json
+from hybrid_opt.timing import closest_to_reference_timing, time_path
+from hybrid_opt.timing.document import read_timing
+from hybrid_opt.work.service import SerialExecutor, Service
+from studies import run
+from studies.study.drivable import known_paths, least_force
+from studies.study.simulation import (
+    Simulated,
+    StoredSimulation,
+    Written,
+    is_done,
+    read_simulations,
+    wanted_carries,
+)
 from studies.study.summary import (
     FIGURES,
     TESTED,
@@ -28,9 +53,11 @@ from studies.study.summary import (
     reference_front,
     replica_figures,
 )
-from studies.study.tables import PAPER, study_tables
+from studies.study.tables import PAPER, simulated, study_tables
 from symbolic.read.cell import load
-from tests.hybrid_opt.campaign.fake import OBJECTIVES, RACK
+from tests.hybrid_opt.campaign.fake import OBJECTIVES
+from tests.studies.conftest import simulation
+from tests.symbolic.cells import RACK
 
 NAN = math.nan
 STATIC = StaticHold(np.array([49.05, 49.05]), np.array([69.4, 69.4]), 16.965)
@@ -215,3 +242,115 @@ def test_the_papers_figures_stand_beside_ours_only_where_it_states_them() -> Non
         assert stated not in without
     assert ", paper" not in told(summary({"random": [entry(0)]}))
     assert set(PAPER) == {"nsga2", "mopso"}
+
+
+def test_ends_and_middle_of_polished_fronts_and_the_balanced_path_are_known(
+    study: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "results"
+    shutil.copytree(study, root)
+    campaign = read_campaign(root)
+    n = campaign.workcell.task.n_path
+    (balanced,) = least_force(campaign).values()
+    np.testing.assert_array_equal(known_paths(root), balanced[None])
+    replica = max(campaign.replicas, key=lambda one: len(one.front))
+    front = PolishedFront(
+        np.array(replica.front_x),
+        np.array(replica.front),
+        np.full(len(replica.front), -1),
+        np.ones(len(replica.front), dtype=bool),
+        (),
+        1.0,
+        1.0,
+        "quadratic",
+    )
+    path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
+    path.parent.mkdir(parents=True)
+    write_json(path, to_json(front))
+    wanted = replica.front_x[[0, len(replica.front) // 2, -1], :n]
+    both = np.unique(np.vstack([balanced, wanted]), axis=0)
+    np.testing.assert_array_equal(known_paths(root), both)
+
+
+def test_paths_are_timed_in_the_cell_that_robots_drive(study: Path) -> None:
+    """Its pads press otherwise than the experiment's; the search's own timing stays its own."""
+    document = read_timing(study / "timing" / "hand-made.json")
+    own, driven = (read_campaign(root).cell for root in (study, study / "drivable"))
+    assert own.workcell.task.allocation != driven.workcell.task.allocation
+    found, curve = document.timings, document.force_curve
+    assert found["search"].duration == pytest.approx(own.carry(own.initial).duration, rel=1e-12)
+    assert curve is not None
+    k = len(curve.force) // 2
+    limits = driven.timing_model.drive_limits(float(curve.force[k]))
+    timing = time_path(driven.timing_model, own.initial, limits)
+    assert curve.duration[k] == pytest.approx(timing.duration, rel=1e-9)
+    closest = closest_to_reference_timing(driven.timing_model, own.initial)
+    assert found["closest to reference"].duration == pytest.approx(closest.duration, rel=1e-9)
+
+
+def same(_: None, one: Simulated, emit: object) -> StoredSimulation:
+    return replace(simulation(one.label), trajectory=one.digest)
+
+
+def test_every_answer_is_kept_and_not_asked_for_again(own_study: Path) -> None:
+    wanted = wanted_carries(own_study)
+    assert [one.label for one in wanted] == ["hand-made", "NSGA-II", "MOPSO", "recommended"]
+    assert not any(is_done(own_study, one) for one in wanted)
+    told: list[int] = []
+    ledger = Written(wanted[:3], own_study, lambda: told.append(1))
+    SerialExecutor().run(Service(lambda: None, same), ledger)
+    assert len(told) == 3
+    assert [is_done(own_study, one) for one in wanted] == [True, True, True, False]
+    changed = replace(wanted[0], digest="another trajectory")
+    assert not is_done(own_study, changed)
+    found = read_simulations(own_study)
+    assert [one.label for one in found] == [one.label for one in wanted[:3]]
+    np.testing.assert_array_equal(found[0].simulated, simulation("").simulated)
+
+
+def test_a_damaged_file_is_told_and_simulated_anew(own_study: Path) -> None:
+    one = wanted_carries(own_study)[0]
+    (own_study / SIMULATED).mkdir()
+    path = own_study / SIMULATED / f"{one.name}.json"
+    document = to_json(replace(simulation(one.label), trajectory=one.digest))
+    write_json(path, document)
+    assert is_done(own_study, one)
+    write_json(path, document | {"time": [0.0]})
+    assert not is_done(own_study, one)
+    with pytest.raises(ResultsError, match="different lengths"):
+        read_simulations(own_study)
+
+
+def test_the_table_tells_threshold_forces_and_what_became_of_the_box() -> None:
+    nan, lost = float("nan"), "the box slips at 1.5 times the force; give other factors"
+    slips = replace(
+        simulation("slippery"), slips=nan, holds=nan, problem=lost, pad=0, arrives=False
+    )
+    first, second = simulated((simulation("good"), slips)).text().splitlines()[3:5]
+    assert "1.000 to 1.004" in first
+    assert "pad 2 at 0.50 s" in first
+    assert "50.50 / 50.00" in first
+    assert first.split()[-1] == "yes"
+    assert lost in second
+    assert second.split()[-1] == "NO"
+
+
+def test_what_cannot_be_simulated_is_told_and_kept(own_study: Path) -> None:
+    one = wanted_carries(own_study)[0]
+    lost = StoredSimulation(one.label, one.digest, "leader", "joint 'lift' moves both arms")
+    (own_study / SIMULATED).mkdir()
+    write_json(own_study / SIMULATED / f"{one.name}.json", to_json(lost))
+    assert is_done(own_study, one)
+    (row,) = simulated(read_simulations(own_study)).text().splitlines()[3:4]
+    assert "joint 'lift' moves both arms" in row
+    assert row.split()[-1] == "NO"
+
+
+def test_without_the_simulator_it_is_told_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    output = tmp_path / "results"
+    assert run.main([str(RACK), "--simulate", "--output", str(output)]) == 2
+    assert "MuJoCo is not installed" in capsys.readouterr().err
+    assert not output.exists()

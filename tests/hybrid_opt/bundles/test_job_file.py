@@ -1,0 +1,347 @@
+"""CSV and JSON read back, by others too, and the samples that they hold."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pinocchio as pin
+import pytest
+from mcap.exceptions import EndOfFile, McapError
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from hybrid_opt.bundles.job_file import between, chosen_step, gap_of, pad_errors, stop_of
+from hybrid_opt.bundles.mcap_file import message_of
+from hybrid_opt.errors import JobError
+from hybrid_opt.job.compliance import HELD, TRACKED
+from hybrid_opt.job.records import Job, SampledJob, sample_job
+from symbolic.errors import SettingsError
+from tests.hybrid_opt.bundles.bundles import contents, exported, text_of
+from tests.hybrid_opt.job.jobs import rack, rack_job
+
+
+def sampled() -> SampledJob:
+    return exported("csv").sampled
+
+
+def test_samples_lie_on_the_job() -> None:
+    found = sampled()
+    assert found.time[0] == 0.0
+    assert found.time[-1] == pytest.approx(rack_job().duration)
+    assert (np.diff(found.time) > 0.0).all()
+    assert np.diff(found.time).max() <= 0.05 + 1e-12
+    for index, phase in enumerate(rack_job().phases):
+        span = found.span(index)
+        begin, end = found.time[span.start], found.time[span.stop - 1]
+        assert begin == pytest.approx(phase.begin)
+        assert end == pytest.approx(phase.begin + phase.duration)
+        np.testing.assert_allclose(found.q_rate[[span.start, span.stop - 1]], 0.0, atol=1e-9)
+        np.testing.assert_allclose(found.q_second[span.stop - 1], 0.0, atol=1e-9)
+        for k in range(span.start, span.stop, 7):
+            near = int(np.argmin(np.abs(phase.motion.time + phase.begin - found.time[k])))
+            offset = found.time[k] - phase.begin - phase.motion.time[near]
+            expected = phase.motion.q[near] + offset * phase.motion.q_rate[near]
+            np.testing.assert_allclose(found.q[k], expected, atol=5e-5)
+            np.testing.assert_allclose(found.effort[k], phase.effort[near], atol=1.0)
+
+
+def test_samples_are_consistent_with_their_derivatives() -> None:
+    fine = sample_job(rack_job(), 0.002)
+    slope = (fine.q[2:] - fine.q[:-2]) / (fine.time[2:] - fine.time[:-2])[:, None]
+    np.testing.assert_allclose(slope, fine.q_rate[1:-1], atol=5e-4)
+
+
+def test_csv_read_back() -> None:
+    rows = list(csv.DictReader(io.StringIO(text_of("csv", "job.csv"))))
+    job = sampled()
+    assert len(rows) == len(job.time)
+    assert len(rows[0]) == 2 + 6 + 60 + 2 + 12
+    for k, row in enumerate(rows):
+        assert float(row["time [s]"]) == job.time[k]
+        assert row["phase"] == job.phase_names[k]
+        assert float(row["right/joint_4 position [rad]"]) == job.q[k, 9]
+        assert float(row["left/joint_1 velocity [rad/s]"]) == job.q_rate[k, 0]
+        assert float(row["right/joint_6 acceleration [rad/s^2]"]) == job.q_second[k, 11]
+        assert float(row["left/joint_2 effort with gravity [N m]"]) == job.effort[k, 1]
+        less = job.effort[k, 1] - exported("csv").efforts.gravity[k, 1]
+        assert float(row["left/joint_2 effort without gravity [N m]"]) == less
+        assert float(row["box z [m]"]) == job.pose[k, 2]
+        assert float(row["left normal force [N]"]) == job.normal_force[k, 0]
+        assert float(row["right wrench fy [N]"]) == job.wrench[k, 1, 1]
+    names = [row["phase"] for row in rows]
+    assert list(dict.fromkeys(names)) == [phase.name for phase in rack_job().phases]
+
+
+def test_json_read_back() -> None:
+    document, job = json.loads(text_of("json", "job.json")), sampled()
+    assert document["format"] == "dual-arm-carry job"
+    np.testing.assert_array_equal(document["time"], job.time)
+    np.testing.assert_array_equal(document["box"]["pose"], job.pose)
+    assert [phase["name"] for phase in document["phases"]] == [p.name for p in rack_job().phases]
+    for phase, planned in zip(document["phases"], rack_job().phases, strict=True):
+        assert job.time[phase["first"]] == pytest.approx(planned.begin)
+    for i, robot in enumerate(document["robots"]):
+        assert robot["name"] == rack_job().workcell.robots[i].name
+        assert robot["joints"] == [f"joint_{k}" for k in range(1, 7)]
+        columns = slice(6 * i, 6 * i + 6)
+        np.testing.assert_array_equal(robot["position"], job.q[:, columns])
+        np.testing.assert_array_equal(robot["velocity"], job.q_rate[:, columns])
+        np.testing.assert_array_equal(robot["acceleration"], job.q_second[:, columns])
+        np.testing.assert_array_equal(robot["effort_with_gravity"], job.effort[:, columns])
+        np.testing.assert_array_equal(robot["normal_force"], job.normal_force[:, i])
+
+
+def test_the_schema_describes_the_file() -> None:
+    schema = json.loads(text_of("json", "job.schema.json"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    document = json.loads(text_of("json", "job.json"))
+    jsonschema.validate(document, schema, jsonschema.Draft202012Validator)
+    broken: list[Callable[[Any], object]] = [
+        lambda d: d.update(version=1),
+        lambda d: d.pop("machine"),
+        lambda d: d["robots"].pop(),
+        lambda d: d["robots"][0].pop("effort_without_gravity"),
+        lambda d: d["robots"][0].update(effort=[[0.0]]),
+        lambda d: d["robots"][1]["normal_force"].__setitem__(0, -1.0),
+        lambda d: d["phases"][0].update(name="lunch"),
+        lambda d: d["machine"]["limits"].update(stop_time=0.0),
+        lambda d: d["box"]["pose"][3].pop(),
+        lambda d: d["time"].__setitem__(0, "0"),
+    ]
+    for each in broken:
+        damaged = json.loads(text_of("json", "job.json"))
+        each(damaged)
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(damaged, schema, jsonschema.Draft202012Validator)
+
+
+@pytest.mark.parametrize("step", [0.0, -1.0, math.nan, math.inf, 2.0])
+def test_time_steps_are_checked(step: float) -> None:
+    with pytest.raises(SettingsError, match="time step"):
+        sample_job(rack_job(), step)
+
+
+def test_gravity_is_that_of_the_description() -> None:
+    """The bundle's own URDF, read by Pinocchio."""
+    model = pin.buildModelFromXML(text_of("ros2-control", "description/cell.urdf"))
+    data, found = model.createData(), exported("ros2-control")
+    for k in range(0, len(found.sampled.time), 20):
+        gravity = pin.computeGeneralizedGravity(model, data, found.sampled.q[k])
+        np.testing.assert_allclose(found.efforts.gravity[k], gravity, atol=1e-2)
+
+
+def test_holding_bears_half_of_the_box_each_and_presses() -> None:
+    """Virtual work: what holding efforts beside gravity do along each joint is what the pad's
+    wrench does along the pad's way; both wrenches together bear the box."""
+    found = exported("ros2-control")
+    sampled, cell = found.sampled, rack().workcell
+    load = found.efforts.holding - found.efforts.gravity
+    model = pin.buildModelFromXML(text_of("ros2-control", "description/cell.urdf"))
+    data = model.createData()
+    span = sampled.span([p.name for p in sampled.job.phases].index("carry"))
+    for k in range(span.start, span.stop, 15):
+        total = np.zeros(3)
+        for arm, name in enumerate(("left_contact_pad", "right_contact_pad")):
+            frame = model.getFrameId(name)
+            J = pin.computeFrameJacobian(model, data, sampled.q[k], frame, pin.LOCAL_WORLD_ALIGNED)
+            pin.framesForwardKinematics(model, data, sampled.q[k])
+            part = slice(6 * arm, 6 * arm + 6)
+            wrench = np.linalg.solve(J[:, part].T, load[k, part])
+            normal = data.oMf[frame].rotation[:, 2]
+            assert wrench[:3] @ normal == pytest.approx(sampled.normal_force[k, arm], rel=0.02)
+            total += wrench[:3]
+        np.testing.assert_allclose(total, [0.0, 0.0, 9.81 * cell.payload.mass], atol=0.2)
+
+
+def test_at_rest_holding_is_moving() -> None:
+    found = exported("ros2-control")
+    last = np.array(found.sampled.last)
+    np.testing.assert_allclose(found.efforts.moving[last], found.efforts.holding[last], atol=1e-6)
+
+
+def test_a_stop_keeps_the_squeeze() -> None:
+    job = rack_job()
+    stop = stop_of(job)
+    assert stop.force_use <= 1.0
+    weak = [replace(p, force=replace(p.force, normal=0.4 * p.force.normal)) for p in job.phases]
+    with pytest.raises(JobError, match="of the commanded forces: press more"):
+        stop_of(replace(job, phases=tuple(weak)))
+
+
+def test_a_stop_needs_the_force_of_its_deceleration() -> None:
+    """The worst stop of the job by hand: F = m (a - g), least forces with a Coulomb cone."""
+    job, cell = rack_job(), rack().workcell
+    stop = stop_of(job)
+    mu = min(contact.friction for contact in cell.contacts)
+    worst = 0.0
+    for phase in job.phases:
+        if phase.name not in HELD:
+            continue
+        motion = phase.motion
+        # A bound: full speed and the largest slope of the rate at once, whole planned acceleration.
+        slope = 1.875 / stop.time
+        second = np.abs(motion.second_rate[:, :3]) + slope * np.abs(motion.rate[:, :3])
+        size = np.linalg.norm(second, axis=1) + 9.81
+        worst = max(worst, float((cell.payload.mass * size / (2.0 * mu)).max()))
+    commanded = min(float(p.force.normal.min()) for p in job.phases if p.name in HELD)
+    # Soft fingers and moments ask for more than the cone alone.
+    assert stop.force_use <= 1.6 * worst / commanded
+
+
+def independent_gap(job: Job, step: float, kind: str) -> float:
+    """Largest change of the gap [m] by polynomials of our own between the samples."""
+    sampled = sample_job(job, step)
+    worst = 0.0
+    for index, phase in enumerate(job.phases):
+        if phase.name not in HELD:
+            continue
+        span = sampled.span(index)
+        for k in range(span.start, span.stop - 1, 3):
+            h = sampled.time[k + 1] - sampled.time[k]
+            ends = [
+                [sampled.q[i], sampled.q_rate[i] * h, sampled.q_second[i] * h * h]
+                for i in (k, k + 1)
+            ]
+            n = {"linear": 1, "cubic": 2, "quintic": 3}[kind]
+            rows, values = [], []
+            for x, known in zip((0.0, 1.0), ends, strict=True):
+                for d in range(n):
+                    p = np.polynomial.polynomial
+                    row = [p.polyval(x, p.polyder(np.eye(2 * n)[c], d)) for c in range(2 * n)]
+                    rows.append(row)
+                    values.append(known[d])
+            c = np.linalg.solve(np.array(rows), np.array(values))
+            q = np.array([sum(c[j] * 0.5**j for j in range(2 * n))])
+            along, _ = pad_errors(job.workcell, q)
+            worst = max(worst, float(np.abs(along).max()))
+    return worst
+
+
+@pytest.mark.parametrize(("kind", "step"), [("linear", 0.2), ("cubic", 0.2), ("quintic", 0.2)])
+def test_the_gap_is_that_of_an_independent_interpolation(kind: str, step: float) -> None:
+    found = gap_of(sample_job(rack_job(), step), kind, 1e4)  # type: ignore[arg-type]
+    expected = independent_gap(rack_job(), step, kind)
+    assert found.along == pytest.approx(expected, rel=0.5, abs=1e-9)
+    assert found.force == pytest.approx(1e4 / 2.0 * found.along)
+
+
+def test_the_step_follows_from_the_stiffness() -> None:
+    steps = (0.2, 0.1, 0.05, 0.02)
+    soft = chosen_step(rack_job(), steps, "linear", 2e3)
+    stiff = chosen_step(rack_job(), steps, "linear", 1e5)
+    assert soft > stiff
+    assert gap_of(sample_job(rack_job(), stiff), "linear", 1e5).share <= TRACKED
+    longer = steps[steps.index(stiff) - 1]
+    assert gap_of(sample_job(rack_job(), longer), "linear", 1e5).share > TRACKED
+    with pytest.raises(SettingsError, match="the gap of the pads is wrong by"):
+        chosen_step(rack_job(), (0.2,), "linear", 1e6)
+
+
+def test_samples_themselves_hold_the_box() -> None:
+    sampled = exported("ros2-control").sampled
+    for kind in ("linear", "cubic", "quintic"):
+        q = between(sampled, kind, sampled.time)
+        np.testing.assert_allclose(q, sampled.q, atol=1e-12)
+
+
+def recorded() -> SampledJob:
+    return exported("mcap").sampled
+
+
+def recording() -> io.BytesIO:
+    content = contents("mcap")["job.mcap"]
+    assert isinstance(content, bytes)
+    return io.BytesIO(content)
+
+
+def decoded() -> dict[str, list[tuple[int, Any]]]:
+    """Messages by topic with their times, by mcap's own decoder."""
+    found = defaultdict(list)
+    reader = make_reader(recording(), decoder_factories=[DecoderFactory()])
+    for _, channel, message, content in reader.iter_decoded_messages():
+        found[channel.topic].append((message.log_time, content))
+    return found
+
+
+def test_every_message_is_one_of_ros2() -> None:
+    """Both readers agree on every message, whose types are ROS 2's own."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    reader = make_reader(recording())
+    assert reader.get_header().profile == "ros2"
+    counts: dict[str, int] = defaultdict(int)
+    for schema, channel, message in reader.iter_messages():
+        assert schema is not None
+        assert schema.encoding == "ros2msg"
+        found: Any = store.deserialize_cdr(message.data, schema.name)
+        assert channel.message_encoding == "cdr"
+        counts[schema.name] += 1
+        if schema.name == "sensor_msgs/msg/JointState":
+            k = counts[schema.name] - 1
+            np.testing.assert_array_equal(found.position, recorded().q[k])
+    assert set(counts) == {
+        "sensor_msgs/msg/JointState",
+        "geometry_msgs/msg/PoseStamped",
+        "geometry_msgs/msg/WrenchStamped",
+        "tf2_msgs/msg/TFMessage",
+        "std_msgs/msg/String",
+    }
+
+
+def test_the_job_is_read_back() -> None:
+    found, job = decoded(), recorded()
+    assert [message.data for _, message in found["/phase"]] == [p.name for p in rack_job().phases]
+    assert found["/robot_description"][0][1].data == text_of(
+        "ros2-control", "description/cell.urdf"
+    )
+    assert len(found["/joint_states"]) == len(job.time)
+    for k, (stamp, state) in enumerate(found["/joint_states"]):
+        assert stamp == pytest.approx(1e9 * job.time[k], abs=1.0)
+        assert list(state.name[:2]) == ["left_joint_1", "left_joint_2"]
+        np.testing.assert_array_equal(state.velocity, job.q_rate[k])
+        np.testing.assert_array_equal(state.effort, job.effort[k])
+    for k, (_, pose) in enumerate(found["/box_pose"]):
+        at, turn = pose.pose.position, pose.pose.orientation
+        np.testing.assert_array_equal([at.x, at.y, at.z], job.pose[k, :3])
+        expected = Rotation.from_euler("xyz", job.pose[k, 3:])
+        read = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+        assert (read * expected.inv()).magnitude() < 1e-9
+    wrenches = found["/right_contact_pad/wrench_reference"]
+    forces = [message.wrench.force.z for _, message in wrenches]
+    np.testing.assert_allclose(forces, job.normal_force[:, 1], atol=1e-9)
+
+
+def test_frames_hang_together() -> None:
+    """In the middle of the carry both pads' frames lie on the box."""
+    job = recorded()
+    k = job.span(3).start + 20
+    _, message = decoded()["/tf"][k]
+    frames = {each.child_frame_id: each.transform for each in message.transforms}
+    assert all(each.header.frame_id == "world" for each in message.transforms)
+    box, pad = frames["box"].translation, frames["left_contact_pad"].translation
+    distance = np.linalg.norm([box.x - pad.x, box.y - pad.y, box.z - pad.z])
+    assert distance == pytest.approx(np.hypot(0.2, 0.055), abs=1e-5)
+    assert {"left_base_link", "right_link_6"} <= set(frames)
+
+
+def test_a_damaged_recording_is_refused() -> None:
+    content = recording().getvalue()
+    for damaged in (content[:-40], b"x" + content, content[:200] + b"damage" + content[206:]):
+        with pytest.raises((McapError, EndOfFile, ValueError)):
+            list(make_reader(io.BytesIO(damaged), validate_crcs=True).iter_messages())
+
+
+def test_messages_have_all_fields() -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with pytest.raises(KeyError):
+        message_of(store, {"force": {"x": 0.0, "y": 0.0}}, "geometry_msgs/msg/Wrench")
