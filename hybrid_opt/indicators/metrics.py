@@ -167,25 +167,6 @@ def best_so_far(objectives: ArrayLike, feasible: ArrayLike) -> Array:
     return np.asarray(np.where(np.isinf(history), np.nan, history))
 
 
-def hypervolume_history(
-    objectives: ArrayLike, feasible: ArrayLike, reference: ArrayLike = REFERENCE_POINT
-) -> Array:
-    """(n,) hypervolume of the feasible points up to each evaluation."""
-    values = np.asarray(objectives, dtype=np.float64)
-    corner = np.asarray(reference, dtype=np.float64)
-    usable = np.asarray(feasible, dtype=bool) & np.isfinite(values).all(axis=1)
-    history = np.zeros(len(values))
-    front = np.empty((0, values.shape[1]))
-    current = 0.0
-    for index, point in enumerate(values):
-        counts = usable[index] and (point < corner).all()
-        if counts and not (front <= point).all(axis=1).any():
-            front = np.vstack([front[~(point <= front).all(axis=1)], point])
-            current = hypervolume(front, corner)
-        history[index] = current
-    return history
-
-
 def excess_above_static(objectives: ArrayLike, static: ArrayLike) -> Array:
     """How far peak forces lie above the force of holding the payload still, in percent.
 

@@ -173,27 +173,14 @@ def _exact_with_ties(ranks: Array, count: int) -> tuple[float, float]:
     return (observed / 2.0) - count * (count + 1) / 2.0, float(p)
 
 
-@dataclass(frozen=True)
-class AttainmentSurface:
-    """The goals that at least `percentile` percent of the fronts attain.
-
-    Attributes:
-        percentile: in (0, 100].
-        points: (k, n_obj) the corners of the surface, by increasing first objective; empty
-            where fewer fronts than that hold any point.
-    """
-
-    percentile: float
-    points: Array
-
-
 def attainment_surfaces(
     fronts: Sequence[ArrayLike], percentiles: Sequence[float] = (25.0, 50.0, 75.0)
-) -> tuple[AttainmentSurface, ...]:
-    """Attainment surfaces of replicas' fronts.
+) -> dict[float, Array]:
+    """Attainment surfaces of replicas' fronts by percentile: the goals that so many percent attain.
 
-    A surface belongs to the least number of fronts that makes up its percentile. An empty
-    front counts as a replica that attains nothing.
+    Each is given by its corners (k, n_obj), by increasing first objective; it is empty where fewer
+    fronts than that hold any point. A surface belongs to the least number of fronts that makes up
+    its percentile. An empty front counts as a replica that attains nothing.
 
     Args:
         fronts: one (k_i, n_obj) front per replica, n_obj 2 or 3.
@@ -210,7 +197,7 @@ def attainment_surfaces(
     sets = [np.asarray(front, dtype=np.float64) for front in fronts]
     filled = [points for points in sets if len(points) > 0]
     width = filled[0].shape[1] if filled else 2
-    surfaces = []
+    surfaces = {}
     for percentile in percentiles:
         # Rounded first, so that 30 % of 10 fronts is 3 in spite of binary fractions.
         needed = max(1, int(np.ceil(np.round(percentile / 100.0 * len(sets), 9))))
@@ -223,5 +210,5 @@ def attainment_surfaces(
             points = levels[:, :-1]
             points = points[np.lexsort(points.T[::-1])]
         points.setflags(write=False)
-        surfaces.append(AttainmentSurface(float(percentile), points))
-    return tuple(surfaces)
+        surfaces[float(percentile)] = points
+    return surfaces

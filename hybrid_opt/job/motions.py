@@ -263,15 +263,21 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     q_second = both("q_second") * w + both("q_first") * a
     rate, second_rate = v * way, a * way
     third = CubicSpline(unit.time, q_second).derivative()(unit.time)
-    limits = _Limits.of(model.workcell)
+    payload = model.workcell.payload
+    joint_speed, joint_acceleration = (
+        np.concatenate([getattr(robot, name) for robot in model.workcell.robots])
+        for name in ("velocity_max", "acceleration_max")
+    )
+    jerk = JerkLimits.of(model.workcell) or JerkLimits(np.full(q.shape[1], np.inf))
+    gentle = min(payload.acceleration_max, LIFTING_ACCELERATION)
     duration = max(
         PEAK_RATE * line.length / line.speed,
-        float((np.abs(q_rate) / limits.joint_velocity).max()),
-        float((np.abs(q_second) / limits.joint_acceleration).max()) ** 0.5,
-        float(np.linalg.norm(rate[:, :3], axis=1).max()) / limits.velocity,
-        (float(np.linalg.norm(second_rate[:, :3], axis=1).max()) / limits.acceleration) ** 0.5,
-        float((np.abs(third) / limits.jerk.joints).max()) ** (1.0 / 3.0),
-        (float(np.abs(unit.third).max()) * line.box_length / limits.jerk.payload) ** (1.0 / 3.0),
+        float((np.abs(q_rate) / joint_speed).max()),
+        float((np.abs(q_second) / joint_acceleration).max()) ** 0.5,
+        float(np.linalg.norm(rate[:, :3], axis=1).max()) / payload.velocity_max,
+        (float(np.linalg.norm(second_rate[:, :3], axis=1).max()) / gentle) ** 0.5,
+        float((np.abs(third) / jerk.joints).max()) ** (1.0 / 3.0),
+        (float(np.abs(unit.third).max()) * line.box_length / jerk.payload) ** (1.0 / 3.0),
     )
     T = max(at_even_steps(duration, TICK), TICK)
     moving = both("torque_by_acceleration") * a + both("torque_by_speed") * w
@@ -299,26 +305,6 @@ def standing_still(motion: PhaseMotion, sample: int, duration: float) -> PhaseMo
     arrays |= {name: np.zeros_like(arrays[name]) for name in _MOVING}
     arrays["time"] = np.linspace(0.0, duration, SAMPLES)
     return PhaseMotion(motion.first, **arrays)
-
-
-@dataclass(frozen=True)
-class _Limits:
-    joint_velocity: Array
-    joint_acceleration: Array
-    velocity: float
-    acceleration: float
-    jerk: JerkLimits
-
-    @classmethod
-    def of(cls, workcell: Workcell) -> _Limits:
-        joints = [
-            np.concatenate([getattr(robot, name) for robot in workcell.robots])
-            for name in ("velocity_max", "acceleration_max")
-        ]
-        payload = workcell.payload
-        jerk = JerkLimits.of(workcell) or JerkLimits(np.full(len(joints[0]), np.inf))
-        gentle = min(payload.acceleration_max, LIFTING_ACCELERATION)
-        return cls(joints[0], joints[1], payload.velocity_max, gentle, jerk)
 
 
 def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:

@@ -75,6 +75,7 @@ class PoseJudge:
     Attributes:
         geometry: the cell's bodies and pairs.
         margin: clearance beyond the cell's tolerance that counts as a collision [m].
+        checker: that it asks.
         met: how often each pair was in the way since it was emptied.
     """
 
@@ -83,7 +84,7 @@ class PoseJudge:
         self.geometry = geometry
         self.margin = margin
         self.met: Counter[tuple[str, str]] = Counter()
-        self._checker = checker
+        self.checker = checker
         self._others = [
             np.setdiff1d(np.arange(len(geometry.active)), own_pairs(geometry, arm))
             for arm in (0, 1)
@@ -95,28 +96,24 @@ class PoseJudge:
         collision = workcell.collision
         wider = replace(collision, tolerance=collision.tolerance - self.margin + margin)
         geometry = replace(self.geometry, workcell=replace(workcell, collision=wider))
-        checker = CollisionChecker(geometry, self._checker.functions)
+        checker = CollisionChecker(geometry, self.checker.functions)
         return PoseJudge(geometry, checker, margin)
 
     def colliding(self, pose: Array, q_1: Array, q_2: Array) -> NDArray[np.bool_]:
         """(n,) of box poses (n, 6) and both arms' joints (n, joints)."""
-        found = self._checker.check(pose, q_1, q_2, np.arange(len(pose), dtype=float))
+        found = self.checker.check(pose, q_1, q_2, np.arange(len(pose), dtype=float))
         if found.first_touch is not None:
             self.met[found.first_touch.first, found.first_touch.second] += 1
         return found.colliding
-
-    def without_screening(self, pose: Array, q_1: Array, q_2: Array) -> NDArray[np.bool_]:
-        """The same by FCL alone, for every pair."""
-        return np.asarray(self._checker.collision_mask(pose, q_1, q_2).any(axis=1))
 
     def arm_colliding(self, arm: int, pose: Array, q: Array) -> NDArray[np.bool_]:
         """(n,) of one arm and the box, as if the other arm were not there."""
         absent = np.zeros((len(q), self.geometry.arms[1 - arm].joints))
         q_1, q_2 = (q, absent) if arm == 0 else (absent, q)
-        bounds = self._checker.bounds(pose, q_1, q_2)
+        bounds = self.checker.bounds(pose, q_1, q_2)
         bounds[:, self._others[arm]] = np.inf
         times = np.arange(len(pose), dtype=float)
-        return self._checker.check(pose, q_1, q_2, times, bounds).colliding
+        return self.checker.check(pose, q_1, q_2, times, bounds).colliding
 
     def resting(self, pose: Array) -> list[tuple[str, bool]]:
         """What stands where the box (6,) is to be: environment bodies, and whether the box enters
@@ -127,10 +124,10 @@ class PoseJudge:
         found = []
         for number, pair in names:
             other = next(name for name in pair if name != PAYLOAD)
-            if other in standing and self._checker.collisions(
+            if other in standing and self.checker.collisions(
                 pose[None], joints[0], joints[1], [0], [number]
             ) == [True]:
-                found.append((other, self._checker.enters(pose, number)))
+                found.append((other, self.checker.enters(pose, number)))
         return found
 
     def first_pair(
@@ -138,10 +135,10 @@ class PoseJudge:
     ) -> tuple[str, str] | None:
         """The first pair that collides in one configuration, of one arm or of all."""
         pose, q_1, q_2 = (np.atleast_2d(part) for part in (pose, q_1, q_2))
-        bounds = self._checker.bounds(pose, q_1, q_2)
+        bounds = self.checker.bounds(pose, q_1, q_2)
         if arm is not None:
             bounds[:, self._others[arm]] = np.inf
-        touch = self._checker.check(pose, q_1, q_2, np.zeros(1), bounds).first_touch
+        touch = self.checker.check(pose, q_1, q_2, np.zeros(1), bounds).first_touch
         return None if touch is None else (touch.first, touch.second)
 
 

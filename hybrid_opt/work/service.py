@@ -173,6 +173,15 @@ def answer_all(
     return ledger.answers
 
 
+def called(context: Context, call: Callable[[Context], Answer], emit: Emit) -> Answer:
+    """The work of a service whose requests are calls on its context."""
+    return call(context)
+
+
+def nothing() -> None:
+    """The context of work that needs none."""
+
+
 @dataclass(frozen=True)
 class Attempted:
     """Outcome of a request on a worker; failures are texts, as not every exception can be

@@ -55,36 +55,6 @@ class Optimum:
 
 
 @dataclass(frozen=True)
-class InspectionSettings:
-    """Settings of an inspection.
-
-    Attributes:
-        candidates: random ones to judge, at least 1.
-        seed: of their randomness.
-        output: folder for the pictures, None to draw none.
-        polish: whether to polish the hand-made trajectory shortly, to see which bounds bind.
-        view: file for a page that shows the hand-made trajectory, None for none.
-        pairs: whether every pair of bodies is listed as text.
-    """
-
-    candidates: int
-    seed: int
-    output: Path | None = None
-    polish: bool = False
-    view: Path | None = None
-    pairs: bool = False
-
-    def __post_init__(self) -> None:
-        """Refuse no candidates.
-
-        Raises:
-            SettingsError: there are none.
-        """
-        if self.candidates < 1:
-            raise SettingsError(f"--candidates is {self.candidates}; at least 1 is needed")
-
-
-@dataclass(frozen=True)
 class Part:
     """One finding of an inspection.
 
@@ -98,15 +68,31 @@ class Part:
 
 
 def inspected(
-    workcell: Workcell, settings: InspectionSettings, progress: Progress | None = None
+    workcell: Workcell,
+    candidates: int,
+    seed: int,
+    output: Path | None = None,
+    *,
+    polish: bool = False,
+    view: Path | None = None,
+    pairs: bool = False,
+    progress: Progress | None = None,
 ) -> Iterator[Part]:
     """All there is to know of a cell, each part worked out when it is asked for.
+
+    Args:
+        candidates: random ones to judge, at least 1.
+        seed: of their randomness.
+        output: folder for the pictures, None to draw none.
+        polish: whether to polish the hand-made trajectory shortly, to see which bounds bind.
+        view: file for a page that shows the hand-made trajectory, None for none.
+        pairs: whether every pair of bodies is listed as text.
 
     Raises:
         DualArmError: the model cannot be built, or a picture cannot be written.
     """
     cell, progress = Cell(workcell), progress or Progress(shown=False)
-    yield Part({"candidates": settings.candidates, "seed": settings.seed})
+    yield Part({"candidates": candidates, "seed": seed})
     facts = _facts(workcell)
     yield Part(
         {"name": workcell.name, "facts": facts},
@@ -114,7 +100,7 @@ def inspected(
     )
     yield _at_rest(cell)
     makers: list[Maker] = [lambda: cell.evaluator]
-    if settings.polish:
+    if polish:
         makers.append(lambda: cell.polish_functions)
     # What cannot be compiled is told by who needs it.
     build_all(makers, progress)
@@ -133,20 +119,18 @@ def inspected(
         yield Part({name: carry.judgement}, (f"{title}: {_judged_text(carry.judgement)}", *told))
     yield Part({"explained": {name: str(why) for name, why in whys.items()}})
     yield _postures(cell)
-    yield from _candidates(cell, settings)
-    yield _pairs(cell, settings.pairs)
-    optimum = _optimum(cell, progress) if settings.polish else None
+    yield from _candidates(cell, candidates, seed)
+    yield _pairs(cell, pairs)
+    optimum = _optimum(cell, progress) if polish else None
     lines = () if optimum is None else ("", *_optimum_lines(optimum))
     yield Part({"optimum": optimum}, lines)
     files: tuple[str, ...] = ()
-    if settings.output is not None:
+    if output is not None:
         progress.note("drawing pictures (--no-pictures leaves them out)")
-        files = draw(cell, carries, whys, settings.output)
+        files = draw(cell, carries, whys, output)
     yield Part({"files": files}, ("", "Pictures: " + ", ".join(files)) if files else ())
-    view = ""
-    if settings.view is not None:
-        view = show(carries["initial"], whys.get("initial"), settings.view)
-    yield Part({"view": view}, ("", f"View: {view} (open it in a browser)") if view else ())
+    shown = "" if view is None else show(carries["initial"], whys.get("initial"), view)
+    yield Part({"view": shown}, ("", f"View: {shown} (open it in a browser)") if shown else ())
 
 
 def _at_rest(cell: Cell) -> Part:
@@ -183,14 +167,13 @@ def _postures(cell: Cell) -> Part:
     return Part({"branches": branches}, tuple(lines))
 
 
-def _candidates(cell: Cell, settings: InspectionSettings) -> Iterator[Part]:
+def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Part]:
     """Random candidates: how many are feasible, and what is in the way of the others."""
-    count, rng = settings.candidates, np.random.default_rng(settings.seed)
-    found = cell.evaluate(cell.random(count, rng))
+    found = cell.evaluate(cell.random(count, np.random.default_rng(seed)))
     share, reasons = float(found.feasible.mean()), found.infeasible_by_reason
     lines = [
         "",
-        f"{count} random candidates within the bounds (seed {settings.seed}): "
+        f"{count} random candidates within the bounds (seed {seed}): "
         f"{100.0 * share:.1f} % feasible",
     ]
     for name, number in reasons.items():
@@ -426,16 +409,17 @@ def inspect(options: argparse.Namespace) -> int:
         DualArmError: the workcell is wrong, or a picture cannot be written.
     """
     output = options.output or Path("inspect") / options.workcell.stem
-    settings = InspectionSettings(
+    values: dict[str, Any] = {}
+    for part in inspected(
+        load_workcell(options.workcell),
         options.candidates,
         options.seed,
         None if options.no_pictures else output,
-        options.polish,
-        output / "view.html" if options.view else None,
-        options.pairs,
-    )
-    values: dict[str, Any] = {}
-    for part in inspected(load_workcell(options.workcell), settings, Progress()):
+        polish=options.polish,
+        view=output / "view.html" if options.view else None,
+        pairs=options.pairs,
+        progress=Progress(),
+    ):
         values |= part.values
         for line in () if options.json else part.lines:
             print(line, flush=True)

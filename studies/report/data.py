@@ -23,7 +23,7 @@ from hybrid_opt.campaign.results import (
     read_summary,
 )
 from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
-from hybrid_opt.campaign.summary import CampaignSummary, PolishedFigures, ReplicaFigures
+from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures
 from hybrid_opt.carry import Carry
 from hybrid_opt.display.scene import joint_placements
 from hybrid_opt.display.table import Table
@@ -44,8 +44,8 @@ from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.document import TimingDocument, read_timing
 from hybrid_opt.timing.robustness import PayloadSensitivity, payload_sensitivity
-from hybrid_opt.work.service import Emit, Executor, SerialExecutor, Service, answer_all
-from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, JobRequest, drawn_job
+from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all, called
+from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, drawn_job
 from studies.study.drivable import TIMING, drivable_root, is_drivable, limits_on_jerk, shown_files
 from studies.study.simulation import StoredSimulation, read_simulations
 from symbolic.array import Array
@@ -178,11 +178,6 @@ class Run:
     front: ReplicaFront
     hybrid: ReplicaFront | None
     figures: ReplicaFigures
-
-    @property
-    def hybrid_figures(self) -> PolishedFigures | None:
-        """Those of the polished front."""
-        return self.figures.polished
 
 
 @dataclass(frozen=True)
@@ -333,12 +328,12 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     if len(timings) != len(carries):
         raise ResultsError(f"{results.root / SUMMARY}: damaged: does not fit the fronts beside it")
     geometry = build_geometry(results.workcell)
-    calls: list[Callable[[ReadyCell], Any]] = [partial(_reach, geometry)]
-    calls += [partial(_job, request) for request in _job_requests(carries, recommended, first)]
+    calls: list[Callable[[Sequence[ReadyCell]], Any]] = [partial(_reach, geometry)]
+    calls += _job_requests(carries, recommended, first)
     alone = results.workcell.task.time_law == "optimal"
     # Jobs are what robots are told: by the cell that they drive.
     cells = cells_of(first.files, results.objectives, alone)
-    service = Service(partial(ready_cells, cells), _called)
+    service: Service[Any, Any, Any] = Service(partial(ready_cells, cells), called)
     reach, *jobs = answer_all(executor or SerialExecutor(), service, calls)
     return ReportData(
         **vars(first),
@@ -420,26 +415,22 @@ def _static(first: Experiment) -> Array:
     return np.array([known.get(name, np.nan) for name in first.objectives])
 
 
-def _called(cells: tuple[ReadyCell, ...], call: Callable[[ReadyCell], Any], emit: Emit) -> Any:
-    return call(cells[-1])
-
-
-def _reach(geometry: CellGeometry, _: ReadyCell) -> ReachMap:
+def _reach(geometry: CellGeometry, _: Sequence[ReadyCell]) -> ReachMap:
     return reach_map(geometry, np.random.default_rng(REACH_SEED))
 
 
-def _job(request: JobRequest, driven: ReadyCell) -> DrawnJob:
-    return drawn_job(driven.jobs, request)
+def _job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyCell]) -> DrawnJob:
+    return drawn_job(cells[-1].jobs, label, x, limits)
 
 
 def _job_requests(
     carries: Sequence[DrawnCarry], recommended: Array | None, first: Experiment
-) -> list[JobRequest]:
+) -> Iterator[Callable[[Sequence[ReadyCell]], DrawnJob]]:
     """The recommended carry's job, then those of hand-made and selected ones."""
-    found = []
     if recommended is not None:
         n_var, force = first.workcell.task.n_var, float(recommended[-1])
         within = TimingLimits(force=force, robust=first.force_kind.robust)
-        found.append(JobRequest(RECOMMENDED_LABEL, recommended[:n_var], within, True))
+        yield partial(_job, RECOMMENDED_LABEL, recommended[:n_var], within)
     limits = TimingLimits(reference_speed=True)
-    return found + [JobRequest(carry.label, carry.x, limits, True) for carry in carries]
+    for carry in carries:
+        yield partial(_job, carry.label, carry.x, limits)

@@ -38,23 +38,6 @@ _TOUCHES = 1e-6
 
 
 @dataclass(frozen=True)
-class JobRequest:
-    """A path to plan the job around.
-
-    Attributes:
-        label: whose it is.
-        x: (n_var,) decision vector of the report's first experiment.
-        limits: within which it is timed.
-        within_jerk: whether also within the cell's limits on jerk, which takes long.
-    """
-
-    label: str
-    x: Array
-    limits: TimingLimits
-    within_jerk: bool = False
-
-
-@dataclass(frozen=True)
 class DrawnJob:
     """A job as a report shows it, or why there is none.
 
@@ -82,28 +65,34 @@ class DrawnJob:
     contact_torque_use: Array | None = None
 
 
-def drawn_job(model: JobModel, request: JobRequest) -> DrawnJob:
-    """The job around a path, with the forces that an export commands by default."""
+def drawn_job(model: JobModel, label: str, x: Array, limits: TimingLimits) -> DrawnJob:
+    """The job around a path x (n_var,) timed within limits, with the forces that an export commands
+    by default, within the cell's limits on jerk, which takes long."""
     try:
-        timing = time_path(model.timing, request.x, request.limits)
+        timing = time_path(model.timing, x, limits)
     except DualArmError as error:
-        return DrawnJob(request.label, str(error))
-    return drawn(model, request, timing)
+        return DrawnJob(label, str(error))
+    return drawn(model, label, timing, within_jerk=True)
 
 
-def drawn(model: JobModel, request: JobRequest, timing: Timing) -> DrawnJob:
-    """The same around a path that is timed already."""
+def drawn(model: JobModel, label: str, timing: Timing, within_jerk: bool = False) -> DrawnJob:
+    """The same around a path that is timed already.
+
+    Args:
+        label: whose it is.
+        within_jerk: whether within the cell's limits on jerk, too.
+    """
     try:
-        job = model.plan(timing, within_jerk=request.within_jerk)
+        job = model.plan(timing, within_jerk=within_jerk)
     except DualArmError as error:
-        return DrawnJob(request.label, str(error))
+        return DrawnJob(label, str(error))
     limit = np.concatenate([robot.torque_max for robot in job.workcell.robots])
     contact = [np.abs(contact_effort(p.motion, p.force.wrench)).max(axis=0) for p in job.phases]
     whole = [np.abs(phase.effort).max(axis=0) for phase in job.phases]
-    bounded = request.within_jerk or JerkLimits.of(job.workcell) is None
+    bounded = within_jerk or JerkLimits.of(job.workcell) is None
     first, second = job.peak_normal_force.tolist()
     return DrawnJob(
-        label=request.label,
+        label=label,
         problem="",
         duration=job.duration,
         remark=str(job.squeeze) + ("" if bounded else WITHOUT_JERK),
@@ -292,15 +281,15 @@ def page_trajectory(
     judged = cell.carry(shown.x)
     assert judged.judgement is not None, "carries of a cell are judged"
     path = shown.x[: cell.workcell.task.n_path]
-    request = JobRequest(shown.label, path, _limits(cell, shown.x))
+    limits = _limits(cell, shown.x)
     if shown.jerk:
         # What is recommended is driven as an export does, others without limits on jerk.
         timing = driven_timing(cell.timing_model, shown.x)
-    elif request.limits.robust:
+    elif limits.robust:
         # Anew, robust forces take long: as the search found it.
         timing = drivable_timing(cell.timing_model, shown.x)
     else:
-        timing = time_path(driving.jobs.timing, path, request.limits)
+        timing = time_path(driving.jobs.timing, path, limits)
     driven = timing.carry
     motions = [] if driven is None else [_motion(DRIVEN, driven)]
     if law != "optimal":
@@ -328,7 +317,7 @@ def page_trajectory(
     elif not shown.has_job:
         found["jobProblem"] = NO_JOB
     elif timing.ok:
-        _with_job(found, drawn(driving.jobs, request, timing))
+        _with_job(found, drawn(driving.jobs, shown.label, timing))
     return found
 
 

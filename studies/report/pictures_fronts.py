@@ -73,15 +73,16 @@ def attainment(data: ReportData) -> Figure:
     for axes, letter, (text, group) in zip(panels, "ab", groups.items(), strict=False):
         for algorithm, found in zip(data.algorithms, group, strict=True):
             look = series(algorithm.index)
-            for surface in attainment_surfaces(found, (*QUARTILES, 50.0)) if found else ():
-                median = surface.percentile not in QUARTILES
+            surfaces = attainment_surfaces(found, (*QUARTILES, 50.0)) if found else {}
+            for percentile, points in surfaces.items():
+                median = percentile not in QUARTILES
                 axes.step(
-                    *surface.points.T,
+                    *points.T,
                     where="post",
                     color=look.colour,
                     linestyle=look.line if median else (0, (1, 1)),
                     linewidth=1.6 if median else 0.8,
-                    label=_attained(algorithm.title, surface.percentile),
+                    label=_attained(algorithm.title, percentile),
                 )
         _objectives(axes, data)
         panel_label(axes, letter, f"{text}, {counted(max(len(f) for f in group), 'replica')}")
@@ -130,8 +131,8 @@ def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
             "markersize": 3.5,
         }
         for run in algorithm.runs:
-            if run.hybrid_figures is not None:
-                values = [run.figures.hypervolume, run.hybrid_figures.hypervolume]
+            if run.figures.polished is not None:
+                values = [run.figures.hypervolume, run.figures.polished.hypervolume]
                 axes.plot([3 * k, 3 * k + 1], values, "-", **style)
         names += [f"{algorithm.title}\nsearch", f"{algorithm.title}\npolished"]
     axes.set_xticks([3 * (k // 2) + k % 2 for k in range(len(names))], names)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.work.processes import ProcessExecutor
-from hybrid_opt.work.service import Emit, Executor, SerialExecutor, Service, answer_all
+from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all, called, nothing
 from studies.study.drivable import (
     DrivableFronts,
     drivable_fronts,
@@ -52,16 +53,20 @@ from studies.study.drivable import (
 )
 from symbolic.array import Array
 
+_Call = Callable[[None], StoredRecommendation | NoRecommendation]
+
 
 def recommendation_stage(wish: ho.Wish) -> Stage:
     """The stage that writes `recommended.json`, a trajectory file, and `recommendation.json`, or
     `no-recommendation.json`."""
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        request = _Request(folder.root, wish, folder.execution.jobs, progress)
-        (found,) = answer_all(
-            _executor(folder.execution), Service(_nothing, _recommended), [request]
-        )
+        # In as many threads as there are workers, which wait meanwhile; the worker itself shows the
+        # progress: it alone knows how much there is to do.
+        call: _Call = partial(_recommended, folder.root, wish, progress, folder.execution.jobs)
+        service: Service[None, _Call, StoredRecommendation | NoRecommendation]
+        service = Service(nothing, called)
+        (found,) = answer_all(_executor(folder.execution), service, [call])
         none = isinstance(found, NoRecommendation)
         written, other = (NO_RECOMMENDATION, RECOMMENDATION)[:: 1 if none else -1]
         # Also after an earlier attempt that was interrupted.
@@ -71,17 +76,6 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
     return Stage("recommendation", run, dict(wish.given))
 
 
-@dataclass(frozen=True)
-class _Request:
-    """A carry to recommend, in so many threads: those of the workers, which wait meanwhile. The
-    worker itself shows the progress: it alone knows how much there is to do."""
-
-    root: Path
-    wish: ho.Wish
-    threads: int
-    progress: Progress
-
-
 def _executor(execution: ExecutionSettings) -> Executor:
     """A worker here, where the folder is: its libraries are loaded already, which takes this
     process a second."""
@@ -89,14 +83,11 @@ def _executor(execution: ExecutionSettings) -> Executor:
     return SerialExecutor() if alone else ProcessExecutor(1)
 
 
-def _nothing() -> None:
-    """A recommendation needs nothing but its folder."""
-
-
-def _recommended(_: None, request: _Request, emit: Emit) -> StoredRecommendation | NoRecommendation:
-    path = request.root / RECOMMENDED
+def _recommended(
+    root: Path, wish: ho.Wish, progress: Progress, threads: int, _: None
+) -> StoredRecommendation | NoRecommendation:
     try:
-        return recommend_from(request.root, request.wish, path, request.progress, request.threads)
+        return recommend_from(root, wish, root / RECOMMENDED, progress, threads)
     except NoCarryError as error:
         return NoRecommendation(str(error))
 

@@ -30,7 +30,7 @@ from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.witness.arms import Account, CellWitness, account_of
 from hybrid_opt.witness.reference import Control, driven_carry
-from hybrid_opt.work.service import Emit, ListLedger, Service
+from hybrid_opt.work.service import Emit, ListLedger, Service, nothing
 from symbolic.array import Array, Figure, Row, Shape
 from symbolic.errors import SettingsError
 
@@ -187,7 +187,7 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
         for _ in range(len(wanted) - len(left)):
             advance(1)
         ledger = Written(left, folder.root, lambda: advance(1))
-        executor_for(folder.execution).run(Service(_nothing, _simulated), ledger)
+        executor_for(folder.execution).run(Service(nothing, _simulated), ledger)
 
 
 class Written(ListLedger[Simulated, StoredSimulation]):
@@ -236,10 +236,6 @@ def wanted_carries(root: Path) -> list[Simulated]:
 
 def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _nothing() -> None:
-    """Every trajectory brings its own cell."""
 
 
 def _simulated(_: None, one: Simulated, emit: Emit) -> StoredSimulation:

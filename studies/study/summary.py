@@ -363,7 +363,9 @@ def _write_points(
 def _write_attainment(folder: CampaignFolder, name: str, results: CampaignResults) -> None:
     surfaces = attainment_surfaces([replica.front for replica in results.of(name)], PERCENTILES)
     rows = [
-        [f"{surface.percentile:g}", *row] for surface in surfaces for row in surface.points.tolist()
+        [f"{percentile:g}", *row]
+        for percentile, points in surfaces.items()
+        for row in points.tolist()
     ]
     path = folder.root / FRONTS / f"{name}-attainment.csv"
     write_atomically(path, csv_bytes(["percentile", *results.objectives], rows))

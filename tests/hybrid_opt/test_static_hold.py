@@ -14,7 +14,7 @@ from hybrid_opt.static_hold import still_load, unheld
 from hybrid_opt.timing.model import TimingModel
 from studies import propose, run
 from studies.program import BAD_INPUT
-from studies.programs.inspection import InspectionSettings, inspected
+from studies.programs.inspection import inspected
 from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
 from symbolic.records import Workcell
@@ -151,7 +151,7 @@ def test_no_study_begins(
 
 
 def test_the_inspection_says_infeasible(slippery: Path) -> None:
-    parts = inspected(load(slippery), InspectionSettings(1, 1))
+    parts = inspected(load(slippery), 1, 1)
     part = next(part for part in parts if "unheld" in part.values)
     unheld = part.values["unheld"]
     assert f"Infeasible, whatever the path: {unheld}" in part.lines

@@ -120,21 +120,6 @@ def test_best_so_far() -> None:
     np.testing.assert_array_equal(history, [[nan, nan], [5, 9], [5, 3], [5, 3], [5, 3]])
 
 
-@given(points, st.data())
-def test_hypervolume_history_is_that_of_each_prefix(front: Array, data: st.DataObject) -> None:
-    feasible = np.array(
-        data.draw(st.lists(st.booleans(), min_size=len(front), max_size=len(front)))
-    )
-    expected = [metrics.hypervolume(front[: k + 1][feasible[: k + 1]]) for k in range(len(front))]
-    history = metrics.hypervolume_history(front, feasible)
-    np.testing.assert_allclose(history, expected, atol=1e-12)
-
-
-def test_hypervolume_history_ignores_what_is_not_finite() -> None:
-    values = [[np.nan, 0.0], [-np.inf, 0.5], [0.1, 0.1]]
-    np.testing.assert_allclose(metrics.hypervolume_history(values, [True] * 3), [0, 0, 1.0])
-
-
 def test_excess_above_static() -> None:
     np.testing.assert_allclose(
         metrics.excess_above_static([[0.55, 0.5], [0.5, 0.75]], [0.5, 0.5]), [[10, 0], [0, 50]]

@@ -121,9 +121,9 @@ def test_attainment_is_its_definition(
     fronts: list[list[tuple[int, int]]], goal: tuple[int, int], percentile: float
 ) -> None:
     sets = [np.array(front, dtype=float).reshape(-1, 2) for front in fronts]
-    (surface,) = attainment_surfaces(sets, [percentile])
+    points = attainment_surfaces(sets, [percentile])[percentile]
     reached = sum(bool((front <= goal).all(axis=1).any()) for front in sets)
-    on_surface = bool((surface.points <= goal).all(axis=1).any())
+    on_surface = bool((points <= goal).all(axis=1).any())
     assert on_surface == (100.0 * reached >= percentile * len(sets) - 1e-9)
 
 

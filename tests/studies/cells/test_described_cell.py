@@ -12,7 +12,7 @@ import pytest
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluations import REASONS
-from studies.programs.inspection import InspectionSettings, inspected
+from studies.programs.inspection import inspected
 from studies.research.plain.verdict import PlainJudge
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
@@ -69,8 +69,8 @@ def test_verdicts_are_those_of_the_plain_cell(described: Cell, plain: CellModel)
 
 @pytest.mark.slow
 def test_an_inspection_tells_of_it(described: Cell, tmp_path: Path) -> None:
-    settings = InspectionSettings(40, 1, view=tmp_path / "view.html", pairs=True)
-    parts = list(inspected(described.workcell, settings))
+    view = tmp_path / "view.html"
+    parts = list(inspected(described.workcell, 40, 1, view=view, pairs=True))
     text = "\n".join(line for part in parts for line in part.lines)
     assert "left/link_1 – left/link_4: disabled in gofa.srdf: Never" in text
     why = {

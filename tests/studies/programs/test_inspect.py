@@ -21,7 +21,6 @@ from hybrid_opt.indicators.metrics import BindingBound
 from studies.inspect import main
 from studies.programs import inspection
 from studies.programs.inspection import (
-    InspectionSettings,
     Optimum,
     inspected,
     show,
@@ -44,7 +43,7 @@ class Found(SimpleNamespace):
 
 
 def find(workcell: Workcell, *given: Any, **more: Any) -> Found:
-    parts = list(inspected(workcell, InspectionSettings(*given, **more)))
+    parts = list(inspected(workcell, *given, **more))
     values = {name: value for part in parts for name, value in part.values.items()}
     return Found(**values, lines=[line for part in parts for line in part.lines])
 
@@ -187,10 +186,10 @@ def test_verdicts_are_told_before_what_takes_longer(monkeypatch: pytest.MonkeyPa
 
     for name in ("_optimum", "draw", "show", "frequent"):
         monkeypatch.setattr(inspection, name, later)
-    settings = InspectionSettings(10, 1, Path("pictures"), polish=True, view=Path("view"))
+    parts = inspected(load(TRANSFER), 10, 1, Path("pictures"), polish=True, view=Path("view"))
     lines: list[str] = []
     with pytest.raises(AssertionError, match="too early"):
-        lines.extend(line for part in inspected(load(TRANSFER), settings) for line in part.lines)
+        lines.extend(line for part in parts for line in part.lines)
     text = "\n".join(lines)
     for words in ("At rest, level", "trajectory: feasible", "Straight line: ", "% feasible"):
         assert words in text
