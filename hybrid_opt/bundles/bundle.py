@@ -32,8 +32,8 @@ from hybrid_opt.bundles.job_file import (
     Export,
     Interpolation,
     chosen_step,
-    csv_text,
     gap_of,
+    job_table,
     json_files,
     stop_of,
 )
@@ -447,7 +447,7 @@ TARGETS: Mapping[str, Target] = {
         "open job.mcap in Foxglove, or play it: ros2 bag play job.mcap",
     ),
     "csv": Target(
-        lambda export: {"job.csv": csv_text(export)},
+        lambda export: {"job.csv": job_table(export)},
         (0.008,),
         "cubic",
         "one row per time step; read it with anything",

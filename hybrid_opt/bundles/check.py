@@ -26,7 +26,6 @@ from scipy.spatial.transform import Rotation
 from hybrid_opt.bundles.arms import prefixes
 from hybrid_opt.bundles.job_file import pad_errors, pad_places
 from hybrid_opt.cell import Cell
-from hybrid_opt.collision.checker import Touch
 from hybrid_opt.display.table import text_table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import read_bytes
@@ -289,22 +288,20 @@ def check(
         np.ascontiguousarray(q[rows, first:]),
         time[rows],
     )
-    force = load["normal_force"]
+    force, touch, collides = load["normal_force"], verdict.first_touch, ""
+    if touch is not None:
+        collides = f"{touch.first} and {touch.second} at {time[rows[0]] + touch.time:.3f} s"
     return Finding(
         held=mask,
         along=float(np.abs(along[rows]).max()),
         across=float(across[rows].max()),
         use=use,
-        collides="" if verdict.first_touch is None else _told(verdict.first_touch, time[rows[0]]),
+        collides=collides,
         normal_force=np.nanmax(force, axis=0),
         rated=rated,
         balanced=bool(np.isfinite(force).all()),
         duration=float(time[-1]),
     )
-
-
-def _told(touch: Touch, begin: float) -> str:
-    return f"{touch.first} and {touch.second} at {begin + touch.time:.3f} s"
 
 
 def _held(along: Array, across: Array) -> Mask:

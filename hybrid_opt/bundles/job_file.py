@@ -15,8 +15,6 @@ What the pads exert on the box is part of both.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -35,6 +33,7 @@ from hybrid_opt.job.compliance import HELD, TRACKED, largest_skew, require_delay
 from hybrid_opt.job.motions import unit_squeeze
 from hybrid_opt.job.records import Job, SampledJob, sample_job
 from hybrid_opt.static_hold import kept_per_workcell
+from hybrid_opt.store.files import csv_text
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -534,10 +533,10 @@ _JOINT_QUANTITIES = (
 """Words for what joints do, units of those that turn and those that slide."""
 
 
-def csv_text(export: Export) -> str:
+def job_table(export: Export) -> str:
     """One row per time step, one column per quantity, named with its unit."""
     job, sampled, torque = export.job, export.sampled, export.efforts
-    rows = (
+    values_of = (
         sampled.q,
         sampled.q_rate,
         sampled.q_second,
@@ -548,7 +547,7 @@ def csv_text(export: Export) -> str:
     names = zip(components(job.workcell.task.orientation), _POSE_UNITS, strict=True)
     header = ["time [s]", "phase", *(f"box {name} [{unit}]" for name, unit in names)]
     columns = [sampled.pose]
-    for (word, unit, sliding), values in zip(_JOINT_QUANTITIES, rows, strict=True):
+    for (word, unit, sliding), values in zip(_JOINT_QUANTITIES, values_of, strict=True):
         for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
             header += [
                 f"{robot.name}/{joint} {word} [{unit if turns else sliding}]"
@@ -558,10 +557,6 @@ def csv_text(export: Export) -> str:
     header += [f"{robot} normal force [N]" for robot in robots]
     header += [f"{robot} wrench {name}" for robot in robots for name in _WRENCH]
     columns += [sampled.normal_force, sampled.wrench.reshape(len(sampled.time), -1)]
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(header)
     table = np.concatenate(columns, axis=1).tolist()
-    for time, phase, row in zip(sampled.time.tolist(), sampled.phase_names, table, strict=True):
-        writer.writerow([repr(time), phase, *map(repr, row)])
-    return file.getvalue()
+    rows = zip(sampled.time.tolist(), sampled.phase_names, table, strict=True)
+    return csv_text(header, ([time, phase, *row] for time, phase, row in rows))

@@ -267,7 +267,11 @@ def ur_files(export: Export) -> dict[str, str | bytes]:
             for arm, each in enumerate(spaces)
             for call in (
                 _payload_call(export, arm, each),
-                _trigger(f"/{each}/io_and_status_controller/zero_ftsensor"),
+                {
+                    "name": f"/{each}/io_and_status_controller/zero_ftsensor",
+                    "kind": "std_srvs/srv/Trigger",
+                    "request": {},
+                },
             )
         ],
         "force": [
@@ -372,10 +376,6 @@ def _payload_call(export: Export, arm: int, space: str) -> dict[str, Any]:
     request = {"mass": mass, "center_of_gravity": dict(zip("xyz", centre.tolist(), strict=True))}
     name = f"/{space}/io_and_status_controller/set_payload"
     return {"name": name, "kind": "ur_msgs/srv/SetPayload", "request": request}
-
-
-def _trigger(name: str) -> dict[str, Any]:
-    return {"name": name, "kind": "std_srvs/srv/Trigger", "request": {}}
 
 
 # --- what all have ---

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
-from hybrid_opt.store.files import csv_bytes
+from hybrid_opt.store.files import csv_text
 from symbolic.array import Array
 
 _LEVEL = 4
@@ -170,7 +170,7 @@ def encode_front(table: EvaluationTable, rows: NDArray[np.intp]) -> bytes:
     names = [*table.objective_names, *(f"x_{k + 1}" for k in range(found.x.shape[1]))]
     numbers = np.hstack([found.objectives[rows], found.x[rows]]).tolist()
     numbered = ([row + 1, *values] for row, values in zip(rows.tolist(), numbers, strict=True))
-    return csv_bytes(["evaluation", *names], numbered)
+    return csv_text(["evaluation", *names], numbered).encode()
 
 
 def _between(names: list[str], prefix: str) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from symbolic.geometry.bodies import ArmGeometry, Frame
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import Hull, Piece
 from symbolic.records import Box, Capsule, Cylinder, Sphere
-from symbolic.records.poses import Orientation, box_placement
+from symbolic.records.poses import box_placement
 
 SECTIONS = 24
 """Facets around a cylinder."""
@@ -154,6 +154,9 @@ def scene_data(
     """
     points = motion_points(geometry, carry.pose, carry.q)
     lower, upper = points.min(axis=0), points.max(axis=0)
+    # How the page reads the last three numbers of a pose; the reference as x y z w.
+    orientation = geometry.workcell.task.orientation
+    reference = Rotation.from_matrix(orientation.reference).as_quat()
     return {
         "arms": [
             {
@@ -164,7 +167,7 @@ def scene_data(
             }
             for arm in geometry.arms
         ],
-        "orientation": _orientation(geometry.workcell.task.orientation),
+        "orientation": {"vector": orientation.is_vector, "reference": reference.tolist()},
         "solids": [_solid(solid, solid.name in marked) for solid in cell_solids(geometry)],
         "view": {
             "centre": ((lower + upper) / 2.0).tolist(),
@@ -202,12 +205,6 @@ def packed(values: NDArray[Any], kind: type[np.generic]) -> str:
     return base64.b64encode(
         np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).tobytes()
     ).decode("ascii")
-
-
-def _orientation(orientation: Orientation) -> dict[str, Any]:
-    """How the page reads the last three numbers of a pose; the reference as x y z w."""
-    reference = Rotation.from_matrix(orientation.reference).as_quat()
-    return {"vector": orientation.is_vector, "reference": reference.tolist()}
 
 
 def _solid(solid: Solid, marked: bool) -> dict[str, Any]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 import math
 import re
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+
+from hybrid_opt.store.files import csv_text
 
 LONG = 30
 """Characters of a cell from which on it takes several lines."""
@@ -99,9 +99,7 @@ class Table:
 
     def csv(self) -> str:
         """Comma-separated values, without title and note."""
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([self.header, *self.rows])
-        return text.getvalue()
+        return csv_text(self.header, self.rows)
 
     def markdown(self) -> str:
         """A Markdown table with title and note."""

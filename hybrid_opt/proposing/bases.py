@@ -133,7 +133,8 @@ def _scored(
 
 def draft_of(problem: Problem) -> Workcell:
     """The cell, its robots somewhere, its redundant joints chosen."""
-    near = [_near(problem, arm) for arm in (0, 1)]
+    sides = [_sideways(problem, arm) for arm in (0, 1)]
+    near = [_base(problem, k, at + 0.4 * out, out) for k, (at, out) in enumerate(sides)]
     if problem.is_machine:
         near = [(near[0] + near[1]) / 2.0] * 2
     given = _standing(problem, near)
@@ -157,11 +158,6 @@ def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
     outwards = (middle - centre) * [1.0, 1.0, 0.0]
     length = float(np.linalg.norm(outwards))
     return middle, outwards / length if length > 1e-9 else np.array([0.0, 1.0 - 2.0 * arm, 0.0])
-
-
-def _near(problem: Problem, arm: int) -> Array:
-    middle, outwards = _sideways(problem, arm)
-    return _base(problem, arm, middle + 0.4 * outwards, outwards)
 
 
 def _base(problem: Problem, arm: int, point: Array, outwards: Array) -> Array:

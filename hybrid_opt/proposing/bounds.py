@@ -145,8 +145,9 @@ def _judged(
     """Candidates (n, n_var) and verdicts (n,): at most so many, fewer where the share of feasible
     ones is surely outside of what is wanted, or the time is up."""
     x, fine = np.empty((0, len(centre))), np.empty(0, dtype=bool)
+    bounds = _box(centre, scale, sampling)
     while len(x) < most:
-        more = _drawn(centre, scale, sampling, min(BATCH, most - len(x)))
+        more = sampling.rng.uniform(*bounds, (min(BATCH, most - len(x)), len(centre)))
         x, fine = np.vstack([x, more]), np.append(fine, sampling.feasible(more))
         found, spread = int(fine.sum()), 2.0 * np.sqrt(fine.sum() + 1.0)
         beyond = found + spread < wanted[0] * len(x) or found - spread > wanted[1] * len(x)
@@ -159,8 +160,3 @@ def _box(centre: Array, scale: float, sampling: Sampling) -> tuple[Array, Array]
     half = scale * sampling.unit
     least, most = np.minimum(sampling.limits[0], centre), np.maximum(sampling.limits[1], centre)
     return np.maximum(centre - half, least), np.minimum(centre + half, most)
-
-
-def _drawn(centre: Array, scale: float, sampling: Sampling, count: int) -> Array:
-    low, high = _box(centre, scale, sampling)
-    return sampling.rng.uniform(low, high, (count, len(centre)))

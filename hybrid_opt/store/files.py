@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import fcntl
 import hashlib
+import io
 import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -67,11 +69,11 @@ def write_json(path: Path, document: Any) -> None:
     write_atomically(path, (text + "\n").encode())
 
 
-def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[str | float]]) -> bytes:
-    """The content of a file of comma-separated values: numbers with as many digits as it takes to
-    get the same bits back."""
-    cells = ((one if isinstance(one, str) else repr(one) for one in row) for row in rows)
-    return "".join(f"{','.join(row)}\n" for row in (header, *cells)).encode()
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[str | float]]) -> str:
+    """Comma-separated values: numbers with as many digits as it takes to get the same bits back."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue()
 
 
 def read_json(path: Path, remedy: str = "") -> Any:

@@ -18,7 +18,7 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
-from hybrid_opt.campaign.branch_choice import decided_cell, store_branches
+from hybrid_opt.campaign.cell_source import decided_cell, store_branches
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.campaign.settings import DRIVABLE, SUMMARY

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from hybrid_opt.branches import BranchCompetition
-from hybrid_opt.campaign.branch_choice import read_branches
-from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, ready_cells
+from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, read_branches, ready_cells
 from hybrid_opt.campaign.results import (
     CampaignResults,
     ReplicaFront,

@@ -141,15 +141,11 @@ def settled(figure: Figure) -> Figure:
         engine = figure.get_layout_engine()
         assert engine is not None
         # Panels that keep their shape shift in the room of the first pass.
-        for _ in range(2 if any(_keeps_shape(axes) for axes in figure.axes) else 1):
+        for _ in range(2 if any(axes.get_aspect() != "auto" for axes in figure.axes) else 1):
             engine.execute(figure)
         # Otherwise every file would be drawn twice, once for the layout alone.
         figure.set_layout_engine(None)
     return figure
-
-
-def _keeps_shape(axes: Axes) -> bool:
-    return axes.get_aspect() != "auto"
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int = 0) -> None:

@@ -241,10 +241,11 @@ def _recommendation(data: ReportData) -> str:
     words = study_words(data.summary, "")
     if words is None:
         return ""
+    told = [(heading, html.escape(text)) for heading, text in words.facts]
     facts = "".join(
         f"<dt>{html.escape(IN_FOLDER.get(heading, heading))}</dt>"
-        f"<dd>{_monospaced(heading, text)}</dd>"
-        for heading, text in words.facts
+        f"<dd>{f'<code>{text}</code>' if heading in IN_FOLDER else text}</dd>"
+        for heading, text in told
     )
     warnings = "".join(
         f"<p class='warning'>Warning: {html.escape(text)}</p>" for text in words.warnings
@@ -253,11 +254,6 @@ def _recommendation(data: ReportData) -> str:
         f"<section class='recommendation'><h2>{html.escape(words.headline)}</h2>"
         f"<dl>{facts}</dl>{warnings}</section>"
     )
-
-
-def _monospaced(heading: str, text: str) -> str:
-    escaped = html.escape(text)
-    return f"<code>{escaped}</code>" if heading in IN_FOLDER else escaped
 
 
 def _facts(data: ReportData) -> str:

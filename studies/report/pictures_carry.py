@@ -116,14 +116,14 @@ def payload(data: ReportData) -> Figure:
 
     figure = _per_robot(data, ("payload mass [kg]", "largest contact force [kgf]"), draw)
     newton = figure.axes[1].secondary_yaxis(
-        "right", functions=(partial(np.multiply, KILOGRAM_FORCE), _kilograms)
+        "right",
+        functions=(
+            partial(np.multiply, KILOGRAM_FORCE),
+            partial(np.multiply, 1.0 / KILOGRAM_FORCE),
+        ),
     )
     newton.set_ylabel("largest contact force [N]")
     return figure
-
-
-def _kilograms(force: Any) -> Any:
-    return force / KILOGRAM_FORCE
 
 
 def simulated_forces(data: ReportData) -> Figure:

@@ -58,7 +58,8 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry
     figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
     corners = box_corners(*_reach_bounds(reach))
     left, right = figure.subplots(1, 2, width_ratios=[aspect(v, corners) for v in (FRONT, SIDE)])
-    middle = _bounds_of_waypoints(geometry).mean(axis=0)
+    lowest, highest = (np.array(corners) for corners in zip(*_free_bounds(geometry), strict=True))
+    middle = (lowest.min(axis=0) + highest.max(axis=0)) / 2.0
     for axes, view, across, letter, text in (
         (left, FRONT, 0, "a", f"front view, slice at x = {_metres(middle[0])}"),
         (right, SIDE, 1, "b", f"side view, slice at y = {_metres(middle[1])}"),
@@ -207,11 +208,6 @@ def _free_bounds(geometry: CellGeometry) -> list[tuple[Array, Array]]:
     task = geometry.workcell.task
     free = [task.waypoints[i] for i in task.free_indices]
     return [(waypoint.lower[:3], waypoint.upper[:3]) for waypoint in free]
-
-
-def _bounds_of_waypoints(geometry: CellGeometry) -> Array:
-    pairs = _free_bounds(geometry)
-    return np.array([np.min([p[0] for p in pairs], axis=0), np.max([p[1] for p in pairs], axis=0)])
 
 
 def _reach_bounds(reach: ReachMap) -> Array:

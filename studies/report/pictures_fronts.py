@@ -244,7 +244,7 @@ def histories(data: ReportData) -> Figure:
                     marker=look.marker,
                     markevery=(k * 17 + m * 41, max(1, len(number) // 12)),
                     markersize=3,
-                    label=f"{algorithm.title}: {_short(title)}",
+                    label=f"{algorithm.title}: {title.split(' / ')[0]}",
                 )
         lines.append(history)
     count = max(len(history) for history in lines)
@@ -359,7 +359,3 @@ def indicators(data: ReportData) -> Figure:
         axes.set_ylabel(label)
         panel_label(axes, letter, "")
     return figure
-
-
-def _short(title: str) -> str:
-    return title.split(" / ")[0]

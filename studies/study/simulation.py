@@ -3,7 +3,6 @@ records (`simulated/*.json`)."""
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,7 +24,7 @@ from hybrid_opt.campaign.settings import (
 )
 from hybrid_opt.errors import ResultsError, WitnessError
 from hybrid_opt.metaheuristics.registry import title
-from hybrid_opt.store.files import write_json
+from hybrid_opt.store.files import read_bytes, sha256, write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.witness.arms import Account, CellWitness, account_of
@@ -228,14 +227,10 @@ def wanted_carries(root: Path) -> list[Simulated]:
         files[f"{place}-{name}"] = best
     files["9-recommended"] = ("recommended", root / RECOMMENDED)
     return [
-        Simulated(name, label, read_trajectory(path), _digest(path))
+        Simulated(name, label, read_trajectory(path), sha256(read_bytes(path)))
         for name, (label, path) in files.items()
         if path.exists()
     ]
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _simulated(_: None, one: Simulated, emit: Emit) -> StoredSimulation:

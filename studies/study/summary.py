@@ -48,7 +48,7 @@ from hybrid_opt.indicators.statistics import (
 )
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.static_hold import StaticHold
-from hybrid_opt.store.files import csv_bytes, storing, write_atomically, write_json
+from hybrid_opt.store.files import csv_text, storing, write_atomically, write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.study.recommendation import read_recommendation
@@ -357,7 +357,7 @@ def _write_points(
     folder: CampaignFolder, name: str, objectives: Sequence[str], points: Array
 ) -> None:
     path = reference_front_file(folder.root).with_name(f"{name}.csv")
-    write_atomically(path, csv_bytes(objectives, points.tolist()))
+    write_atomically(path, csv_text(objectives, points.tolist()).encode())
 
 
 def _write_attainment(folder: CampaignFolder, name: str, results: CampaignResults) -> None:
@@ -368,4 +368,4 @@ def _write_attainment(folder: CampaignFolder, name: str, results: CampaignResult
         for row in points.tolist()
     ]
     path = folder.root / FRONTS / f"{name}-attainment.csv"
-    write_atomically(path, csv_bytes(["percentile", *results.objectives], rows))
+    write_atomically(path, csv_text(["percentile", *results.objectives], rows).encode())
