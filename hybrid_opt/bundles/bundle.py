@@ -60,7 +60,7 @@ from hybrid_opt.job.compliance import (
 from hybrid_opt.job.plan import plan_job
 from hybrid_opt.job.records import Job, sample_job
 from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
-from hybrid_opt.store.files import AGAIN, read_bytes, read_json, sha256, storing
+from hybrid_opt.store.files import AGAIN, read_bytes, read_document, sha256, storing
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.version import own_version
 from symbolic.errors import SettingsError
@@ -568,11 +568,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         ResultsError: there is none, it is damaged, or was changed since it was written.
     """
     path = folder / MANIFEST
-    document = read_json(path)
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise ResultsError(f"{path}: no manifest of a bundle")
-    if document.get("version") != VERSION:
-        raise ResultsError(f"{path}: version {document.get('version')!r}; known is {VERSION}")
+    document = read_document(path, FORMAT, VERSION)
     files = document.get("files")
     if not isinstance(files, dict) or not all(isinstance(f, str) for f in files.values()):
         raise ResultsError(f"{path}: damaged (files: expected digests by name)")

@@ -34,7 +34,7 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.polishing.records import PolishedFront
-from hybrid_opt.store.files import read_bytes, read_json, sha256
+from hybrid_opt.store.files import read_bytes, read_document, sha256
 from hybrid_opt.store.json_records import from_json, read_record, record_of
 from symbolic.array import Array
 from symbolic.read.cell import load
@@ -201,14 +201,7 @@ def read_configuration(root: str | Path) -> Configuration:
     if not path.exists():
         raise ResultsError(f"{root}: is no results folder, {CONFIGURATION} is missing")
     remedy = "run the study again into another --output"
-    document = read_json(path, remedy)
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise ResultsError(f"{path}: `format` is not {FORMAT!r}; {remedy}")
-    if document.get("version") != VERSION:
-        raise ResultsError(
-            f"{path}: version {document.get('version')!a}; this program reads {VERSION}"
-        )
-    return from_json(Configuration, document, path, remedy)
+    return from_json(Configuration, read_document(path, FORMAT, VERSION, remedy), path, remedy)
 
 
 def read_summary(root: str | Path) -> CampaignSummary:

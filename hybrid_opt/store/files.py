@@ -17,6 +17,7 @@ from typing import Any
 from hybrid_opt.errors import ResultsError
 from symbolic import outside
 from symbolic.errors import OutsideError
+from symbolic.records.problems import shown
 from symbolic.replacing import replace_file
 
 LOCK = ".lock"
@@ -96,6 +97,25 @@ def json_of(content: bytes, path: Path | str, remedy: str = "") -> Any:
     except OutsideError as error:
         told = f"; {remedy}" if remedy else ""
         raise ResultsError(f"{path}: damaged ({error}){told}") from error
+
+
+def read_document(path: Path, form: str, version: int, remedy: str = "") -> dict[str, Any]:
+    """Read a JSON object that names its format and version, which are left in it.
+
+    Args:
+        remedy: what to do where it is damaged, or something else.
+
+    Raises:
+        ResultsError: the file cannot be read, or is of another format or version.
+    """
+    document = read_json(path, remedy)
+    if not isinstance(document, dict) or document.get("format") != form:
+        told = f"; {remedy}" if remedy else ""
+        raise ResultsError(f"{path}: `format` is not {form!r}{told}")
+    if document.get("version") != version:
+        found = shown(document.get("version"))
+        raise ResultsError(f"{path}: version {found}; this program reads {version}")
+    return document
 
 
 def read_bytes(path: Path) -> bytes:

@@ -22,11 +22,10 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
-from hybrid_opt.store.files import AGAIN, storing
+from hybrid_opt.store.files import AGAIN, read_document, storing
 from hybrid_opt.store.json_records import from_json
-from symbolic import outside
 from symbolic.array import Array
-from symbolic.errors import BundleError, OutsideError
+from symbolic.errors import BundleError
 from symbolic.read.cell_files import (
     CellFiles,
     cell_from_json,
@@ -40,7 +39,6 @@ from symbolic.replacing import replace_file
 
 FORMAT = "dual-arm-carry trajectory"
 VERSION = 1
-MAX_FILE_BYTES = 256 * outside.MEBIBYTE
 LARGEST_DECISION = 100.0
 """Largest value of a decision vector and of a start posture [m, rad]: no cell has larger ones."""
 
@@ -173,19 +171,7 @@ def read_trajectory(path: str | Path) -> StoredTrajectory:
         ResultsError: the file cannot be read, or a field is wrong.
     """
     path = Path(path)
-    try:
-        content = outside.read_bytes(path, MAX_FILE_BYTES)
-    except OutsideError as error:
-        raise ResultsError(f"{path}: {error}") from error
-    try:
-        data = outside.json_value(content)
-    except OutsideError as error:
-        raise ResultsError(f"{path}: not a trajectory file: {error}") from error
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise ResultsError(f"{path}: not a trajectory file: `format` is not {FORMAT!r}")
-    if data.get("version") != VERSION:
-        found = shown(data.get("version"))
-        raise ResultsError(f"{path}: version {found}; this program reads {VERSION}")
+    data = read_document(path, FORMAT, VERSION)
     known = {"format", "version", *(field.name for field in fields(_Content))}
     if set(data) != known:
         odd = ", ".join(map(shown, sorted(set(data) ^ known)[:10]))

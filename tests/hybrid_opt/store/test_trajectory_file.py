@@ -103,7 +103,7 @@ def test_writing_replaces_in_one_step_and_refuses_bad_values(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"format": "other"}, "not a trajectory file"),
+        ({"format": "other"}, "`format` is not"),
         ({"version": 2}, "version"),
         ({"more": 1}, "more"),
         ({"decision": "abc"}, "decision"),
@@ -171,7 +171,7 @@ def test_a_missing_file_and_a_folder_are_told(tmp_path: Path) -> None:
 
 
 def test_enormous_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hybrid_opt.store.trajectory_file.MAX_FILE_BYTES", 100)
+    monkeypatch.setattr("hybrid_opt.store.files.MOST_BYTES", 100)
     path = tmp_path / "t.json"
     path.write_text(document(), encoding="utf-8")
     with pytest.raises(ResultsError, match="too large"):
