@@ -25,14 +25,7 @@ if TYPE_CHECKING:
     from hybrid_opt.carry import Carry
     from hybrid_opt.catalogue import algorithms, example, load, objectives, targets
     from hybrid_opt.cell import Cell
-    from hybrid_opt.door import (
-        polish,
-        save,
-        search,
-        time_every_way,
-        time_path,
-        time_with_jerk,
-    )
+    from hybrid_opt.door import polish, save, search, time_every_way, time_path, time_with_jerk
     from hybrid_opt.evaluate.objectives import Objective
     from hybrid_opt.front import Front
     from hybrid_opt.job.plan import plan_job

@@ -15,12 +15,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.bundles.arms import (
-    COMMANDS,
-    described,
-    description,
-    prefixes,
-)
+from hybrid_opt.bundles.arms import COMMANDS, described, description, prefixes
 from hybrid_opt.bundles.job_file import Export, job_text
 from hybrid_opt.bundles.programs import program
 from hybrid_opt.job.records import Job, contact_effort

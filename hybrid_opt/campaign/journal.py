@@ -20,12 +20,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from hybrid_opt.campaign.folder import (
-    CampaignFolder,
-    executor_for,
-    identity,
-    replica_identity,
-)
+from hybrid_opt.campaign.folder import CampaignFolder, executor_for, identity, replica_identity
 from hybrid_opt.campaign.settings import JOURNAL, CampaignSettings
 from hybrid_opt.campaign.stages import Advance, Progress
 from hybrid_opt.errors import ResultsError

@@ -27,12 +27,7 @@ from hybrid_opt.errors import JobError
 from hybrid_opt.job.motions import SAMPLES, followed, lines_around, rise
 from symbolic.array import Array
 from symbolic.geometry.bodies import CollisionBody
-from symbolic.geometry.pairs import (
-    ActivePair,
-    CellGeometry,
-    build_geometry,
-    ignored_pairs,
-)
+from symbolic.geometry.pairs import ActivePair, CellGeometry, build_geometry, ignored_pairs
 from symbolic.geometry.pieces import support
 from symbolic.geometry.screen import screen_of
 from symbolic.records import PAYLOAD, AllowedContact, Waypoint, Workcell

@@ -22,12 +22,7 @@ from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import Force, PhaseMotion, contact_effort
 from hybrid_opt.robust.force import BoxMotion
-from hybrid_opt.robust.squeeze import (
-    Squeeze,
-    SqueezeSettings,
-    pressed_beyond,
-    pressed_together,
-)
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, pressed_beyond, pressed_together
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array

@@ -9,15 +9,7 @@ import cma
 import numpy as np
 
 from hybrid_opt.proposing.holding import JUMP
-from hybrid_opt.proposing.planner import (
-    STEP,
-    ClosedChain,
-    Place,
-    distance,
-    levers,
-    same,
-    straight,
-)
+from hybrid_opt.proposing.planner import STEP, ClosedChain, Place, distance, levers, same, straight
 from symbolic.array import Array
 from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE

@@ -15,12 +15,7 @@ from scipy import ndimage
 
 from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, read_branches, ready_cells
-from hybrid_opt.campaign.results import (
-    CampaignResults,
-    ReplicaFront,
-    read_campaign,
-    read_summary,
-)
+from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_campaign, read_summary
 from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
 from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures
 from hybrid_opt.carry import Carry

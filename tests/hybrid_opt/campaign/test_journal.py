@@ -11,12 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.campaign.journal import (
-    Journal,
-    candidates_in,
-    decode_generation,
-    encode_generation,
-)
+from hybrid_opt.campaign.journal import Journal, candidates_in, decode_generation, encode_generation
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import Evaluations
 from tests.hybrid_opt.campaign.fake import verdicts

@@ -21,11 +21,7 @@ from hybrid_opt.campaign import (
     search_stage,
 )
 from hybrid_opt.campaign.journal import Journal, ReplicaRequest
-from hybrid_opt.campaign.polish_stage import (
-    PolishLedger,
-    polish_replica,
-    polish_stage,
-)
+from hybrid_opt.campaign.polish_stage import PolishLedger, polish_replica, polish_stage
 from hybrid_opt.campaign.results import read_campaign, read_polished
 from hybrid_opt.campaign.settings import JOURNAL, POLISH, polished_folder
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError
