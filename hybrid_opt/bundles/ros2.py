@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -302,45 +303,17 @@ def ur_files(export: Export) -> dict[str, str | bytes]:
         driver["type"] = found.group() if found else "ur10e"
     files = dict(_programs(export, config, "ur.launch.py"))
     for arm, each in enumerate(spaces):
-        files[f"config/controllers_{arm + 1}.yaml"] = _yaml(_ur_controllers(export, arm, each))
+        files[f"config/controllers_{arm + 1}.yaml"] = _ur_controllers(export, arm, each)
     return files
 
 
-def _ur_controllers(export: Export, arm: int, space: str) -> dict[str, Any]:
-    prefix, joints = prefixes(export.workcell)[arm], export.ros_joints(arm)
-    scaling = f"{prefix}speed_scaling/speed_scaling_factor"
-    rate = export.workcell.robots[arm].driver.rate or UR_RATE
-    kinds = {
-        BROADCASTER: f"{BROADCASTER}/JointStateBroadcaster",
-        "io_and_status_controller": "ur_controllers/GPIOController",
-        "speed_scaling_state_broadcaster": "ur_controllers/SpeedScalingStateBroadcaster",
-        "force_torque_sensor_broadcaster": (
-            "force_torque_sensor_broadcaster/ForceTorqueSensorBroadcaster"
-        ),
-        "passthrough_trajectory_controller": "ur_controllers/PassthroughTrajectoryController",
-        "force_mode_controller": "ur_controllers/ForceModeController",
-    }
-    manager = {"update_rate": round(rate), **{name: {"type": k} for name, k in kinds.items()}}
-    sensor = {
-        "sensor_name": f"{prefix}tcp_fts_sensor",
-        "state_interface_names": [f"{w}.{a}" for w in ("force", "torque") for a in "xyz"],
-        "frame_id": f"{prefix}tool0_controller",
-        "topic_name": "ft_data",
-    }
-    own = {
-        "controller_manager": manager,
-        "io_and_status_controller": {"tf_prefix": prefix},
-        "speed_scaling_state_broadcaster": {"tf_prefix": prefix, "state_publish_rate": 100.0},
-        "force_torque_sensor_broadcaster": sensor,
-        "passthrough_trajectory_controller": {
-            "tf_prefix": prefix,
-            "joints": joints,
-            "state_interfaces": ["position", "velocity"],
-            "speed_scaling_interface_name": scaling,
-        },
-        "force_mode_controller": {"tf_prefix": prefix},
-    }
-    return {f"/{space}/{name}": {"ros__parameters": values} for name, values in own.items()}
+def _ur_controllers(export: Export, arm: int, space: str) -> str:
+    return Template(program("controllers_ur.yaml")).substitute(
+        space=space,
+        prefix=prefixes(export.workcell)[arm],
+        rate=round(export.workcell.robots[arm].driver.rate or UR_RATE),
+        joints=json.dumps(export.ros_joints(arm)),
+    )
 
 
 def _force_mode(export: Export, arm: int) -> dict[str, Any]:
