@@ -12,7 +12,7 @@ import hashlib
 import html
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -23,7 +23,7 @@ from hybrid_opt.display.scene import embedded_json, scene_js, three_js
 from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.store.files import write_atomically
 from hybrid_opt.store.json_records import to_json
-from hybrid_opt.work.service import Emit, Executor, SerialExecutor, Service, answer_all
+from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all, called
 from studies.errors import ReportError
 from studies.report.data import ReportData
 from studies.report.drawing import files_of
@@ -61,9 +61,10 @@ def write_report(
         ResultsError: the folder cannot be written.
         ReportError: the page cannot be made.
     """
-    listed = list(report_pictures(data))
-    service = Service(DrawingBoard(data, pdf), _drawn)
-    drawn = answer_all(executor or SerialExecutor(), service, range(len(listed)), done)
+    listed = _listed(data)
+    service: Service[Any, Any, dict[str, bytes]] = Service(partial(_listed, data), called)
+    calls = [partial(_drawn, k, pdf) for k in range(len(listed))]
+    drawn = answer_all(executor or SerialExecutor(), service, calls, done)
     pictures = []
     for picture, made in zip(listed, drawn, strict=True):
         for suffix, content in made.items():
@@ -128,26 +129,13 @@ def insert_tables(root: Path, document: Path) -> None:
     document.write_text(f"{text[:begin]}{body}\n\n{text[end:]}", "utf-8")
 
 
-@dataclass(frozen=True)
-class DrawingBoard:
-    """Makes the pictures of a report, in any process.
-
-    Attributes:
-        data: what they show.
-        pdf: whether also as PDF.
-    """
-
-    data: ReportData
-    pdf: bool
-
-    def __call__(self) -> tuple[list[ReportPicture], bool]:
-        """All pictures, not yet drawn, and whether they are wanted as PDF."""
-        return list(report_pictures(self.data)), self.pdf
+def _listed(data: ReportData) -> list[ReportPicture]:
+    """All pictures, not yet drawn; a context of work, in any process."""
+    return list(report_pictures(data))
 
 
-def _drawn(board: tuple[list[ReportPicture], bool], index: int, emit: Emit) -> dict[str, bytes]:
+def _drawn(index: int, pdf: bool, pictures: list[ReportPicture]) -> dict[str, bytes]:
     """Draw a picture; returns its files by suffix."""
-    pictures, pdf = board
     return files_of(pictures[index].draw(), pdf)
 
 

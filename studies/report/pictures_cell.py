@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -121,7 +119,7 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) ->
     panel_label(left, "a", f"arm {shortened(robot.name)!r} at the start")
     base = robot.T_world_base[:3, 3]
     index = int((base[0] - reach.lower[0]) / reach.step)
-    _draw_slice(right, FRONT, reach, _Layer(reach.pads[0], ARMS[0], HATCHES[0], 0.35), 0, index)
+    _draw_slice(right, FRONT, reach, 0, index, reach.pads[0], ARMS[0], HATCHES[0])
     draw_cell(right, cell, FRONT, pose, q)
     bounds = _reach_bounds(reach)
     occupied = np.flatnonzero(reach.pads[0].any(axis=(0, 2)))
@@ -217,35 +215,29 @@ def _reach_bounds(reach: ReachMap) -> Array:
     return bounds
 
 
-@dataclass(frozen=True)
-class _Layer:
-    """A region of the grid and how its slices look.
-
-    Attributes:
-        mask: (nx, ny, nz) cells of the grid in the region.
-    """
-
-    mask: NDArray[np.bool_]
-    colour: str
-    hatch: str
-    alpha: float
-
-
 def _draw_reach(axes: Axes, reach: ReachMap, view: View, across: int, at: float) -> None:
     """Slices of the reach across a world axis; along the line between the arms only what both
     reach together, because their own regions would hide it."""
     index = int((at - reach.lower[across]) / reach.step)
     if across == 0:
         for pads, colour, hatch in zip(reach.pads, ARMS, HATCHES, strict=True):
-            _draw_slice(axes, view, reach, _Layer(pads, colour, hatch, 0.35), across, index)
-    _draw_slice(axes, view, reach, _Layer(reach.common, "#2a8f4d", "", 0.55), across, index)
+            _draw_slice(axes, view, reach, across, index, pads, colour, hatch)
+    _draw_slice(axes, view, reach, across, index, reach.common, "#2a8f4d", "", 0.55)
 
 
 def _draw_slice(
-    axes: Axes, view: View, reach: ReachMap, layer: _Layer, across: int, index: int
+    axes: Axes,
+    view: View,
+    reach: ReachMap,
+    across: int,
+    index: int,
+    region: NDArray[np.bool_],
+    colour: str,
+    hatch: str,
+    alpha: float = 0.35,
 ) -> None:
-    """A slice of a region across a world axis, filled."""
-    mask = np.take(layer.mask, index, axis=across)
+    """A slice of a region (nx, ny, nz) of the grid across a world axis, filled."""
+    mask = np.take(region, index, axis=across)
     if not mask.any():
         return
     kept = [a for a in range(3) if a != across]
@@ -258,12 +250,12 @@ def _draw_slice(
         centres[1],
         mask.T.astype(float),
         levels=(0.5, 1.5),
-        colors=[layer.colour],
-        alpha=layer.alpha,
-        hatches=[layer.hatch],
+        colors=[colour],
+        alpha=alpha,
+        hatches=[hatch],
         zorder=0.5,
     )
-    filled.set_edgecolor(layer.colour)
+    filled.set_edgecolor(colour)
     filled.set_linewidth(0.0)
 
 
