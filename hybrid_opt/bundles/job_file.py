@@ -505,17 +505,13 @@ def reach(workcell: Workcell, arm: int, q: Array) -> Array:
 
 def json_files(export: Export) -> dict[str, str | bytes]:
     """The job in full precision, and its schema."""
-    return {"job.json": job_text(export), SCHEMA: schema_text()}
+    schema = (files("hybrid_opt.bundles") / SCHEMA).read_text("utf-8")
+    return {"job.json": job_text(export), SCHEMA: schema}
 
 
 def job_text(export: Export) -> str:
     """The text of job.json."""
     return json.dumps(export.document, allow_nan=False, separators=(",", ":")) + "\n"
-
-
-def schema_text() -> str:
-    """The published schema of job.json."""
-    return (files("hybrid_opt.bundles") / SCHEMA).read_text("utf-8")
 
 
 # --- the same as a table ---

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from types import ModuleType
 from typing import Any
 
@@ -87,7 +87,7 @@ class _Recording:
         self._joints = [*export.ros_joints(0), *export.ros_joints(1)]
         self._cell = sampled.job.workcell
         self._prefixes = prefixes(self._cell)
-        self._wrenches = [pad_wrench(sampled, arm).tolist() for arm in (0, 1)]
+        self._wrenches = [pad_wrench(sampled, arm) for arm in (0, 1)]
         phases = enumerate(sampled.job.phases)
         self._begins = {sampled.span(index).start: phase.name for index, phase in phases}
         self._models = [arm_model(robot) for robot in self._cell.robots]
@@ -116,7 +116,9 @@ class _Recording:
         for arm, prefix in enumerate(self._prefixes):
             frame = pad_frame(prefix, arm)
             header = {"stamp": stamp, "frame_id": frame}
-            message = {"header": header, "wrench": wrench_message(self._wrenches[arm][k])}
+            wrench = zip(("force", "torque"), np.split(self._wrenches[arm][k], 2), strict=True)
+            axes = {name: dict(zip("xyz", part.tolist(), strict=True)) for name, part in wrench}
+            message = {"header": header, "wrench": axes}
             yield f"/{frame}/wrench_reference", "geometry_msgs/msg/WrenchStamped", message
         frames = [("box", box), *self._frames(k)]
         transforms = [_transform(world, name, pose) for name, pose in frames]
@@ -163,14 +165,6 @@ def pad_wrench(sampled: SampledJob, arm: int) -> Array:
     R_world_pad = turned @ T_box_pad[:3, :3]
     both = sampled.wrench[:, arm].reshape(-1, 2, 3)
     return np.asarray(np.einsum("nji,nkj->nki", R_world_pad, both).reshape(-1, 6))
-
-
-def wrench_message(wrench: Sequence[float]) -> dict[str, Any]:
-    """A geometry_msgs/msg/Wrench of force and moment (6,)."""
-    return {
-        "force": dict(zip("xyz", wrench[:3], strict=True)),
-        "torque": dict(zip("xyz", wrench[3:], strict=True)),
-    }
 
 
 def _packages() -> tuple[ModuleType, Any]:

@@ -109,11 +109,6 @@ class Straight:
         ways = np.concatenate([self.box[None], self.held])
         return float(np.linalg.norm((ways[:, 1] - ways[:, 0])[:, :3], axis=1).max())
 
-    @property
-    def box_length(self) -> float:
-        """Length of the box's way [m]."""
-        return float(np.linalg.norm((self.box[1] - self.box[0])[:3]))
-
     def at(self, share: Array) -> tuple[Array, Array, Array]:
         """Poses (n, 6) at shares (n,) of the way: box, and those that either pad holds."""
         ways = np.concatenate([self.box[None], self.held])
@@ -265,6 +260,7 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     )
     jerk = JerkLimits.of(model.workcell) or JerkLimits(np.full(q.shape[1], np.inf))
     gentle = min(payload.acceleration_max, LIFTING_ACCELERATION)
+    most = float(np.abs(unit.third).max())
     duration = max(
         PEAK_RATE * line.length / line.speed,
         float((np.abs(q_rate) / joint_speed).max()),
@@ -272,7 +268,7 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
         float(np.linalg.norm(rate[:, :3], axis=1).max()) / payload.velocity_max,
         (float(np.linalg.norm(second_rate[:, :3], axis=1).max()) / gentle) ** 0.5,
         float((np.abs(third) / jerk.joints).max()) ** (1.0 / 3.0),
-        (float(np.abs(unit.third).max()) * line.box_length / jerk.payload) ** (1.0 / 3.0),
+        (most * float(np.linalg.norm(way[:3])) / jerk.payload) ** (1.0 / 3.0),
     )
     T = max(at_even_steps(duration, TICK), TICK)
     moving = both("torque_by_acceleration") * a + both("torque_by_speed") * w

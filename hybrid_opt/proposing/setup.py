@@ -266,9 +266,9 @@ def prepare(
     for arm in (0, 1):
         redundant = tuple(joint for joint, _ in workcell.task.redundant_of(arm))
         searches.append(find_holds(query, arm, ArmKinematics.of(workcell, arm, redundant), rng))
-    missing = holds_missing(query, searches)
-    if missing:
-        raise ProposalError(missing)
+    told = [_arm_missing(query, arm, one) for arm, one in enumerate(searches) if not one.holds]
+    if told:
+        raise ProposalError("; ".join(told))
     pairs = ranked_pairs(workcell, judge, [found.holds for found in searches], (start, goal))
     if not pairs:
         raise ProposalError(no_pair(query, judge, searches))
@@ -354,14 +354,6 @@ def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -
         )
         if missing > MISSING:
             found.append(f"{robot.name} lacks {missing:.3f} m to its contact at the {name}")
-    return "; ".join(found)
-
-
-def holds_missing(query: HoldQuery, searches: Sequence[HoldSearch]) -> str:
-    """Why an arm has no way to hold the box, '' where both have one."""
-    found = [
-        _arm_missing(query, arm, search) for arm, search in enumerate(searches) if not search.holds
-    ]
     return "; ".join(found)
 
 

@@ -339,11 +339,6 @@ def torque_use(carry: ho.Carry, torque: Array) -> Array:
     return np.asarray(100.0 * np.abs(torque).max(axis=0) / limit)
 
 
-def driven_point(trajectory: Mapping[str, Any]) -> tuple[float, float]:
-    """Largest limited force [N] and duration [s] of a trajectory as its robots drive it."""
-    return trajectory["force"], trajectory["motions"][0]["duration"]
-
-
 def _limits(cell: ho.Cell, x: Array) -> ho.TimingLimits:
     if cell.workcell.task.time_law == "optimal":
         return cell.timing_model.drive_limits(float(x[-1]))

@@ -21,7 +21,6 @@ from studies.report.page_carries import (
     RECOMMENDED_LABEL,
     DrawnJob,
     Shown,
-    driven_point,
     page_trajectory,
 )
 from symbolic.array import Array
@@ -416,7 +415,9 @@ def _traces(groups: Sequence[Numbered], found: Sequence[dict[str, Any]]) -> Iter
             continue
         at = group.points
         if at is None:
-            at = np.array([driven_point(found[k]) for k in members])
+            # The largest limited force [N] and the duration [s] as robots drive it.
+            driven = [(found[k]["force"], found[k]["motions"][0]["duration"]) for k in members]
+            at = np.array(driven)
         yield points(group.label, at, members, [found[k]["label"] for k in members], group.look)
 
 

@@ -136,7 +136,9 @@ def motion_sequence(geometry: CellGeometry, carry: DrawnCarry, columns: int = 2)
     cell = CutCell.of(geometry, cell_solids(geometry))
     figure = new_figure(FULL_WIDTH, 0.37 * FULL_WIDTH * rows)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    samples = sample_at(carry, np.array(SHARES))
+    time = carry.timed.time
+    moments = time[0] + np.array(SHARES) * carry.timed.duration
+    samples = [int(np.argmin(np.abs(time - moment))) for moment in moments]
     for axes, share, sample, letter in zip(panels, SHARES, samples, "abcd", strict=True):
         draw_cell(axes, cell, ISOMETRIC, carry.timed.pose[sample], carry.timed.q[sample])
         draw_path(
@@ -181,12 +183,6 @@ def planes(points: Array) -> tuple[tuple[View, str], tuple[View, str]]:
     every = (("y–z plane", FRONT, 0), ("x–z plane", SIDE, 1), ("x–y plane", _PLAN, 2))
     first, second, _ = sorted(every, key=lambda plane: float(extent[plane[2]]))
     return (first[1], first[0]), (second[1], second[0])
-
-
-def sample_at(carry: DrawnCarry, shares: Array) -> list[int]:
-    """The samples nearest to shares of the duration."""
-    moments = carry.timed.time[0] + shares * carry.timed.duration
-    return [int(np.argmin(np.abs(carry.timed.time - moment))) for moment in moments]
 
 
 def _metres(value: float) -> str:

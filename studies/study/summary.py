@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,14 +47,12 @@ from hybrid_opt.indicators.statistics import (
     rank_test,
     summarise,
 )
-from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.store.files import csv_text, storing, write_atomically, write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.study.recommendation import read_recommendation
 from symbolic.array import Array
-from symbolic.records import Workcell
 
 FIGURES = (
     "feasible",
@@ -113,14 +112,6 @@ def front_indicators(
         if selected is None
         else carry_entry(selected.carry, selected.row + 1, file),
     }
-
-
-def polished_figures(
-    polished: PolishedFront, reference: Array, selected: Selected | None, file: str | None
-) -> PolishedFigures:
-    """A polished replica: indicators, selected solution, and effort."""
-    indicators = front_indicators(polished.objectives, reference, selected, file)
-    return PolishedFigures(**indicators, **vars(polished.effort))
 
 
 def replica_figures(
@@ -208,11 +199,6 @@ def campaign_summary(
     )
 
 
-def bounds_of(workcell: Workcell, x: Array) -> Bounds:
-    """Bounds that solutions (k, n_var) of the best fronts lie on."""
-    return Bounds(len(x), binding_bounds(workcell.task, x))
-
-
 def _statistics(rows: Sequence[FrontFigures], names: Sequence[str]) -> dict[str, Summary]:
     return {name: summarise([getattr(row, name) for row in rows]) for name in names}
 
@@ -269,10 +255,7 @@ def summary_stage(not_asked: str = "") -> Stage:
         not_asked: why the study recommends no carry, where it was not asked for one.
     """
 
-    def run(folder: CampaignFolder, progress: Progress) -> None:
-        _run(folder, progress, not_asked)
-
-    return Stage("summary", run)
+    return Stage("summary", partial(_run, not_asked=not_asked))
 
 
 def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
@@ -293,7 +276,8 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
                 chosen = select(evaluator, front.x)
                 path = polished_selected_file(folder.root, *key)
                 file = _store_selected(folder, path, key, chosen)
-                figures = polished_figures(front, reference, chosen, file)
+                found = front_indicators(front.objectives, reference, chosen, file)
+                figures = PolishedFigures(**found, **vars(front.effort))
                 entry, best[-1] = replace(entry, polished=figures), front.x
             entries[replica.algorithm].append(entry)
             advance(1)
@@ -303,15 +287,15 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
         _write_points(folder, name, results.objectives, union)
         if len(results.objectives) in (2, 3):
             _write_attainment(folder, name, results)
-    hand_made = _store_hand_made(folder)
-    found = read_recommendation(folder.root)
-    reason = found.reason if isinstance(found, NoRecommendation) else ""
+    hand_made, members = _store_hand_made(folder), np.concatenate(best)
+    choice = read_recommendation(folder.root)
+    reason = choice.reason if isinstance(choice, NoRecommendation) else ""
     summary = replace(
         campaign_summary(results, reference, folder.cell.static_hold, entries),
         hand_made=hand_made,
-        bounds=bounds_of(folder.workcell, np.concatenate(best)),
-        recommendation=None if isinstance(found, NoRecommendation) else found,
-        no_recommendation=reason if found else not_asked,
+        bounds=Bounds(len(members), binding_bounds(folder.workcell.task, members)),
+        recommendation=None if isinstance(choice, NoRecommendation) else choice,
+        no_recommendation=reason if choice else not_asked,
     )
     write_json(folder.root / SUMMARY, to_json(summary))
 
