@@ -27,6 +27,11 @@ from tests.hybrid_opt.campaign.fake import RACK, run_search
 SETTINGS = CampaignSettings(evaluations=200, replicas=2)
 
 
+def refused(message: str, *given: Any) -> None:
+    with pytest.raises(ResultsError, match=message), open_folder(*given):
+        pytest.fail("was opened")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -44,11 +49,7 @@ def test_other_settings_are_never_mixed(
     execution = ExecutionSettings(tmp_path, 1, resume=True)
     with open_folder(SETTINGS, execution, load(RACK)):
         pass
-    with (
-        pytest.raises(ResultsError, match=message),
-        open_folder(replace(SETTINGS, **change), execution, load(RACK)),
-    ):
-        pytest.fail("was opened")
+    refused(message, replace(SETTINGS, **change), execution, load(RACK))
 
 
 def changed_cell(folder: Path) -> Path:
@@ -63,11 +64,7 @@ def test_other_workcell_is_never_mixed(tmp_path: Path) -> None:
     execution = ExecutionSettings(tmp_path / "a", 1, resume=True)
     with open_folder(SETTINGS, execution, load(RACK)):
         pass
-    with (
-        pytest.raises(ResultsError, match="holds results of another workcell"),
-        open_folder(SETTINGS, execution, load(changed_cell(tmp_path))),
-    ):
-        pytest.fail("was opened")
+    refused("holds results of another workcell", SETTINGS, execution, load(changed_cell(tmp_path)))
 
 
 def test_results_are_overwritten_where_that_is_asked_for(tmp_path: Path) -> None:
@@ -88,14 +85,16 @@ def test_results_are_overwritten_where_that_is_asked_for(tmp_path: Path) -> None
     assert json.loads((root / "configuration.json").read_text())["settings"]["seed"] == 7
 
 
-def test_what_is_no_results_folder_is_not_overwritten(tmp_path: Path) -> None:
+@pytest.mark.parametrize("asked", [{}, {"resume": True}, {"overwrite": True}])
+def test_what_is_no_results_folder_is_not_touched(tmp_path: Path, asked: dict[str, bool]) -> None:
     kept = tmp_path / "thesis.tex"
     kept.write_text("years of work")
-    with (
-        pytest.raises(ResultsError, match=r"is no results folder, but not empty \(thesis.tex\)"),
-        open_folder(SETTINGS, ExecutionSettings(tmp_path, 1, overwrite=True), load(RACK)),
-    ):
-        pytest.fail("was opened")
+    refused(
+        r"is no results folder, but not empty \(thesis.tex\)",
+        SETTINGS,
+        ExecutionSettings(tmp_path, 1, **asked),
+        load(RACK),
+    )
     assert kept.read_text() == "years of work"
 
 
@@ -108,11 +107,7 @@ def test_other_software_is_never_mixed(tmp_path: Path, key: str) -> None:
     stored = json.loads(path.read_text())
     stored["environment"][key] = "0.1"
     path.write_text(json.dumps(stored))
-    with (
-        pytest.raises(ResultsError, match=rf'environment.{key}: stored "0.1", now'),
-        open_folder(SETTINGS, execution, load(RACK)),
-    ):
-        pytest.fail("was opened")
+    refused(rf'environment.{key}: stored "0.1", now', SETTINGS, execution, load(RACK))
 
 
 def test_the_stored_workcell_does_not_follow_the_file(tmp_path: Path) -> None:
@@ -132,23 +127,12 @@ def test_existing_results_are_not_touched_without_resume(tmp_path: Path) -> None
         run_search(replace(SETTINGS, evaluations=40, replicas=1), execution)
 
 
-@pytest.mark.parametrize("resume", [False, True])
-def test_other_folders_are_not_touched(tmp_path: Path, resume: bool) -> None:
-    (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(ResultsError, match=r"not empty \(thesis.tex\)"):
-        run_search(SETTINGS, ExecutionSettings(tmp_path, 1, resume=resume))
-
-
 def test_a_changed_copy_of_the_workcell_is_told(tmp_path: Path) -> None:
     execution = ExecutionSettings(tmp_path, 1, resume=True)
     with open_folder(SETTINGS, execution, load(RACK)) as folder:
         copy = folder.workcell.source
     copy.write_text(copy.read_text().replace("mass = 10.0", "mass = 9.0"))
-    with (
-        pytest.raises(ResultsError, match="was changed after the campaign began"),
-        open_folder(SETTINGS, execution, load(RACK)),
-    ):
-        pytest.fail("was opened")
+    refused("was changed after the campaign began", SETTINGS, execution, load(RACK))
 
 
 def test_a_missing_copy_of_the_workcell_is_made_again(tmp_path: Path) -> None:
