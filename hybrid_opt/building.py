@@ -11,7 +11,7 @@ from codegen.compiler import find_compiler, interruptible
 from codegen.errors import CodegenError
 from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.cell import Cell
-from hybrid_opt.job.collisions import JobCollisions
+from hybrid_opt.job.plan import JobCollisions
 from hybrid_opt.polishing.drive import is_polishable
 from hybrid_opt.polishing.rows import row_library
 from hybrid_opt.polishing.solvers.dense import dense_method

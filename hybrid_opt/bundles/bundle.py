@@ -37,8 +37,13 @@ from hybrid_opt.bundles.job_file import (
     json_files,
     stop_of,
 )
-from hybrid_opt.bundles.mcap_file import mcap_files
-from hybrid_opt.bundles.ros2 import control_files, franka_files, require_franka, ur_files
+from hybrid_opt.bundles.ros2 import (
+    control_files,
+    franka_files,
+    mcap_files,
+    require_franka,
+    ur_files,
+)
 from hybrid_opt.bundles.urscript import urscript_files
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.job.compliance import (

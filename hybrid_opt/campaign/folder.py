@@ -23,8 +23,7 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import LOCK, locked, read_json, storing, write_json
 from hybrid_opt.version import own_version
 from hybrid_opt.work.dask_cluster import DaskExecutor
-from hybrid_opt.work.processes import local_executor
-from hybrid_opt.work.service import Executor
+from hybrid_opt.work.service import Executor, local_executor
 from symbolic.array import Range, require_allowed
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load

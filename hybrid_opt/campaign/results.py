@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode
 from hybrid_opt.campaign.folder import FORMAT, VERSION
+from hybrid_opt.campaign.journal import EvaluationTable, decode
 from hybrid_opt.campaign.search_stage import front_rows
 from hybrid_opt.campaign.settings import (
     CONFIGURATION,

@@ -13,14 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.campaign.evaluations_file import EvaluationTable, encode, encode_front
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import (
+    EvaluationTable,
     Key,
     ReplicaLedger,
     ReplicaRequest,
     candidates_in,
     decode_generation,
+    encode,
+    encode_front,
     encode_generation,
 )
 from hybrid_opt.campaign.settings import (

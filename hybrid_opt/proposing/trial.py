@@ -20,7 +20,7 @@ from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
-from hybrid_opt.job.collisions import JobCollisions, what_blocks
+from hybrid_opt.job.plan import JobCollisions, what_blocks
 from hybrid_opt.static_hold import unheld
 from symbolic.array import Array
 from symbolic.cell_model import (

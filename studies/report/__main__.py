@@ -31,7 +31,7 @@ def _add_options(parser: Parser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     from hybrid_opt.campaign import Progress
-    from hybrid_opt.work.processes import warm_up
+    from hybrid_opt.work.service import warm_up
     from studies.report.stage import follow_looks, rewrite
 
     if options.into:

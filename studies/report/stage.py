@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
-from hybrid_opt.work.processes import local_executor
-from hybrid_opt.work.service import Executor
+from hybrid_opt.work.service import Executor, local_executor
 
 PAGE = "report.html"
 PICTURES = "figures"

@@ -21,8 +21,7 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
-from hybrid_opt.work.processes import local_executor
-from hybrid_opt.work.service import Emit, Service, answer_all
+from hybrid_opt.work.service import Emit, Service, answer_all, local_executor
 from studies.program import load_workcell
 from symbolic import outside
 from symbolic.array import Array

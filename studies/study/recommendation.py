@@ -42,8 +42,15 @@ from hybrid_opt.robust.squeeze import account
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
-from hybrid_opt.work.processes import ProcessExecutor
-from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all, called, nothing
+from hybrid_opt.work.service import (
+    Executor,
+    ProcessExecutor,
+    SerialExecutor,
+    Service,
+    answer_all,
+    called,
+    nothing,
+)
 from studies.study.drivable import (
     DrivableFronts,
     drivable_fronts,

@@ -14,8 +14,7 @@ import numpy as np
 
 from codegen.cache import Cache
 from hybrid_opt.bundles.bundle import read_manifest
-from hybrid_opt.campaign.evaluations_file import decode
-from hybrid_opt.campaign.journal import Journal
+from hybrid_opt.campaign.journal import Journal, decode
 from hybrid_opt.campaign.results import read_configuration
 from hybrid_opt.campaign.settings import FinishedReplica, StageMark
 from hybrid_opt.campaign.summary import CampaignSummary

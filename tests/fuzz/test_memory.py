@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid_opt.campaign.evaluations_file import columns
+from hybrid_opt.campaign.journal import columns
 from symbolic.outside import MEBIBYTE, MESH_BYTES, MOST_VALUES, URDF_BYTES, WORKCELL_BYTES
 from symbolic.read.descriptions import MEMORY_BYTES, MEMORY_PER_BYTE
 from symbolic.read.elements import MOST_ATTRIBUTES

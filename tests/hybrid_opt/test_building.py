@@ -10,7 +10,7 @@ from codegen.compiler import Compiler
 from hybrid_opt.building import build_study
 from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.cell import Cell
-from hybrid_opt.job.collisions import JobCollisions
+from hybrid_opt.job.plan import JobCollisions
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.robust.cases import CaseForces

@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.bundles.job_file import between, chosen_step, gap_of, pad_errors, stop_of
-from hybrid_opt.bundles.mcap_file import message_of
+from hybrid_opt.bundles.ros2 import message_of
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.compliance import HELD, TRACKED
 from hybrid_opt.job.records import Job, SampledJob, sample_job

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from hybrid_opt.campaign.evaluations_file import EvaluationTable, decode, encode, encode_front
+from hybrid_opt.campaign.journal import EvaluationTable, decode, encode, encode_front
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import REASONS, Evaluations
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts

@@ -86,7 +86,7 @@ def test_results_are_overwritten_where_that_is_asked_for(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("asked", [{}, {"resume": True}, {"overwrite": True}])
-def test_what_is_no_results_folder_is_not_touched(tmp_path: Path, asked: dict[str, bool]) -> None:
+def test_what_is_no_results_folder_is_not_touched(tmp_path: Path, asked: dict[str, Any]) -> None:
     kept = tmp_path / "thesis.tex"
     kept.write_text("years of work")
     refused(

@@ -10,15 +10,13 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.campaign.cell_source import PackedCell
-from hybrid_opt.campaign.evaluations_file import decode
-from hybrid_opt.campaign.journal import ReplicaRequest
+from hybrid_opt.campaign.journal import ReplicaRequest, decode
 from hybrid_opt.campaign.search_stage import run_replica
 from hybrid_opt.campaign.settings import EVALUATIONS as FILE
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
-from hybrid_opt.work.processes import ProcessExecutor
-from hybrid_opt.work.service import Service, answer_all
+from hybrid_opt.work.service import ProcessExecutor, Service, answer_all
 from symbolic.read.cell_files import collect_cell
 from tests.symbolic.read.samples import RACK
 

@@ -16,16 +16,18 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from hybrid_opt.errors import WorkerError
-from hybrid_opt.work.processes import LocalExecutor, ProcessExecutor, local_executor
 from hybrid_opt.work.service import (
     KILLED,
     MAX_DEATHS,
     SILENT,
     Executor,
+    LocalExecutor,
+    ProcessExecutor,
     SerialExecutor,
     Service,
     answer_all,
     give_up,
+    local_executor,
 )
 from symbolic.errors import DualArmError
 from tests.hybrid_opt.work import services
@@ -153,7 +155,7 @@ def test_no_worker_is_left_behind() -> None:
 PROGRAM = """
 import sys, time
 from hybrid_opt.work.service import Service
-from hybrid_opt.work.processes import ProcessExecutor, warm_up
+from hybrid_opt.work.service import ProcessExecutor, warm_up
 from tests.hybrid_opt.work import services
 warm_up("tests.hybrid_opt.work.services")
 ledger = services.Kept(["hang", "hang"])
