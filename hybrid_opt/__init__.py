@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from hybrid_opt.recommending.recommendation import Recommendation, recommend
     from hybrid_opt.robust.squeeze import SqueezeSettings
     from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
+    from hybrid_opt.workbench.browser import live
     from symbolic.errors import DualArmError
     from symbolic.records import Workcell
 
@@ -64,6 +65,7 @@ __all__ = [
     "algorithms",
     "example",
     "export",
+    "live",
     "load",
     "objectives",
     "plan_job",
@@ -103,6 +105,7 @@ _HOMES = {
     "algorithms": "hybrid_opt.catalogue",
     "example": "hybrid_opt.catalogue",
     "export": "hybrid_opt.bundles.bundle",
+    "live": "hybrid_opt.workbench.browser",
     "load": "hybrid_opt.catalogue",
     "objectives": "hybrid_opt.catalogue",
     "plan_job": "hybrid_opt.job.plan",

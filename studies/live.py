@@ -1,0 +1,30 @@
+"""A cell in the browser, to be changed by hand: `python -m studies.live WORKCELL`.
+
+Start, goal, bodies around, bases and pads can be dragged; mass, friction and force limit have
+fields. What is changed is judged at once; a button searches for a better carry from the one on the
+screen. The result can be saved as a workcell and exported. Only this machine can open the page.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from studies.options import add, whole
+from studies.program import Parser, Program, later, run_program
+
+
+def _add_options(parser: Parser) -> None:
+    add(parser, "WORKCELL")
+    parser.add_argument(
+        "--port",
+        type=whole(1, 65535),
+        default=8080,
+        help="where to listen; another free one is taken if it is in use",
+    )
+
+
+main = Program("live", __doc__, _add_options, later("studies.programs.live.serve"))
+
+
+if __name__ == "__main__":
+    sys.exit(run_program(main))
