@@ -57,6 +57,7 @@ def key_of(what: str, **parts: object) -> str:
       recipe         a cell's structure and the code of what makes its expressions
                      (`hybrid_opt.compiled_cell`)
       code           packages' sources, for what they do (`Cache.code_digest`)
+      compiler       the processor: which compiler made what is kept (`codegen.build.compiler_of`)
     """
     named = [f"{name}={value}" for name, value in sorted(parts.items())]
     return digest(what, str(FORMAT), *named)

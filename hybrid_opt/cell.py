@@ -118,6 +118,7 @@ class Cell:
                 every problem.
         """
         cell = Cell(changed(self.workcell, changes), self._objectives, self.threads)
+        cell.compiled = self.compiled.of_changed(cell.workcell)
         cell._folder = self._folder
         return cell
 
