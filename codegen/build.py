@@ -442,6 +442,7 @@ def _compiled(
     key = _compiler_key()
     if not all(found for _, found in built.values()) or cache.read_record(key) is None:
         cache.write_record(key, asdict(compiler))
+        cache.trim()
     return built
 
 

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from hybrid_opt.recommending.choice import Wish
     from hybrid_opt.recommending.recommendation import Recommendation, recommend
     from hybrid_opt.robust.squeeze import SqueezeSettings
+    from hybrid_opt.sweeping import Sweep, sweep
     from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
     from symbolic.errors import DualArmError
     from symbolic.records import Workcell
@@ -57,6 +58,7 @@ __all__ = [
     "Recommendation",
     "SearchSettings",
     "SqueezeSettings",
+    "Sweep",
     "Timing",
     "TimingLimits",
     "Wish",
@@ -73,6 +75,7 @@ __all__ = [
     "save",
     "search",
     "search_branches",
+    "sweep",
     "targets",
     "time_every_way",
     "time_path",
@@ -96,6 +99,7 @@ _HOMES = {
     "Recommendation": "hybrid_opt.recommending.recommendation",
     "SearchSettings": "hybrid_opt.metaheuristics.run",
     "SqueezeSettings": "hybrid_opt.robust.squeeze",
+    "Sweep": "hybrid_opt.sweeping",
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",
     "Wish": "hybrid_opt.recommending.choice",
@@ -112,6 +116,7 @@ _HOMES = {
     "save": "hybrid_opt.door",
     "search": "hybrid_opt.door",
     "search_branches": "hybrid_opt.branches",
+    "sweep": "hybrid_opt.sweeping",
     "targets": "hybrid_opt.catalogue",
     "time_every_way": "hybrid_opt.door",
     "time_path": "hybrid_opt.door",

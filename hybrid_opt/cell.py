@@ -207,6 +207,11 @@ class Cell:
         return force_kind(self._objectives)
 
     @property
+    def objectives(self) -> tuple[str | Objective, ...]:
+        """What searches minimise, as it was given."""
+        return self._objectives
+
+    @property
     def objective_names(self) -> tuple[str, ...]:
         """What searches minimise."""
         return self.evaluator.objective_names
