@@ -38,8 +38,7 @@ from hybrid_opt.recommending.choice import (
 from hybrid_opt.recommending.recommendation import recommend
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import from_json, read_record, to_json
-from hybrid_opt.work.processes import local_executor
-from hybrid_opt.work.service import Emit, Service, give_up
+from hybrid_opt.work.service import Emit, Service, give_up, local_executor
 from symbolic.array import Array, Figure, Row
 from symbolic.errors import DualArmError, SettingsError
 from symbolic.records import Workcell

@@ -19,7 +19,7 @@ from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.sweeping import Sweep, stored_sweep, sweep
 from studies.program import load_workcell
-from studies.report.style import FULL_WIDTH, in_style, legend_below, new_figure, save, series
+from studies.report.drawing import FULL_WIDTH, in_style, legend_below, new_figure, save, series
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
