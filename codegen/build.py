@@ -11,10 +11,13 @@ makes neither expressions nor C.
 from __future__ import annotations
 
 import ctypes
+import os
+import platform
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -33,7 +36,7 @@ from codegen.compiler import (
     interruptible,
     stop_if_interrupted,
 )
-from codegen.errors import FormError
+from codegen.errors import CodegenError, FormError
 from codegen.function import NumericFunction, Signature, available_cores
 from codegen.parts import Part, in_parts
 
@@ -143,6 +146,31 @@ class Build:
     functions: dict[str, NumericFunction]
     reports: tuple[FunctionReport, ...]
     keys: dict[str, str]
+
+
+def compiler_of(cache: Cache) -> Compiler:
+    """The C compiler; where there is none, the one that made what the cache holds for this
+    processor, so that it is found.
+
+    Raises:
+        CodegenError: there is none, and CC names one or the cache knows of none.
+    """
+    try:
+        return find_compiler()
+    except CodegenError:
+        known = None if os.environ.get("CC", "").strip() else cache.read_record(_compiler_key())
+        if known is None:
+            raise
+        words = {name: tuple(known[name]) for name in ("command", "machine")}
+        return Compiler(version=known["version"], instructions=known["instructions"], **words)
+
+
+def _compiler_key() -> str:
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith(("flags", "Features")):
+                return key_of("compiler", machine=platform.machine(), features=line)
+    return key_of("compiler", machine=platform.machine())
 
 
 def compile_function(
@@ -349,7 +377,7 @@ def _set_key(key: str, levels: Mapping[str, int] | None, lanes: int, cache: Cach
         recipe=key,
         levels=sorted((levels or {}).items()),
         lanes=lanes,
-        compiler=find_compiler().identity,
+        compiler=compiler_of(cache).identity,
         casadi=library_version("casadi"),
         generator=cache.code_digest("codegen"),
     )
@@ -403,14 +431,19 @@ def _compiled(
 
     Compilers run side by side, and while the sources that follow are made.
     """
-    compiler = find_compiler()
+    compiler = compiler_of(cache)
     with ThreadPoolExecutor(available_cores()) as pool, interruptible():
         with _MAKING:
             stop_if_interrupted()
             futures = {
                 source.name: _begin(source, compiler, cache, pool, rebuild) for source in sources
             }
-        return {name: future.result() for name, future in futures.items()}
+        built = {name: future.result() for name, future in futures.items()}
+    key = _compiler_key()
+    if not all(found for _, found in built.values()) or cache.read_record(key) is None:
+        cache.write_record(key, asdict(compiler))
+        cache.trim()
+    return built
 
 
 def _begin(

@@ -16,6 +16,7 @@ import hashlib
 import importlib.util
 import json
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -45,6 +46,15 @@ Found = TypeVar("Found")
 _STALE_SECONDS = 3600.0
 _MOST_BYTES = 256 * outside.MEBIBYTE
 
+MOST_KEPT = 4 * 2**30
+"""Size from which on a cache loses what was not used for longest [bytes]."""
+
+_NOTED_SECONDS = 3600.0
+"""A use is noted so long after the one before."""
+
+_KEPT = {".so", ".o", ".json", ".lock", ".draft"}
+_KEY_END = re.compile("[-.]")
+
 
 def key_of(what: str, **parts: object) -> str:
     """The key of something in a cache: what it is, and by name all that it is made from.
@@ -57,6 +67,7 @@ def key_of(what: str, **parts: object) -> str:
       recipe         a cell's structure and the code of what makes its expressions
                      (`hybrid_opt.compiled_cell`)
       code           packages' sources, for what they do (`Cache.code_digest`)
+      compiler       the processor: which compiler made what is kept (`codegen.build.compiler_of`)
     """
     named = [f"{name}={value}" for name, value in sorted(parts.items())]
     return digest(what, str(FORMAT), *named)
@@ -115,11 +126,36 @@ def _sources(packages: Sequence[str]) -> Iterator[tuple[str, Path]]:
             yield f"{package}/{file.name}", file
 
 
+def largest_size() -> int:
+    """What a cache may hold [bytes], see `Cache.trim`.
+
+    Raises:
+        CodegenError: the environment variable holds no number.
+    """
+    own = os.environ.get("DUAL_ARM_CACHE_LIMIT", "")
+    try:
+        return int(float(own) * 2**30) if own.strip() else MOST_KEPT
+    except (ValueError, OverflowError):
+        raise CodegenError(
+            f"the environment variable DUAL_ARM_CACHE_LIMIT holds {own[:40]!r}; allowed is a "
+            "number of gibibytes"
+        ) from None
+
+
 def default_folder() -> Path:
     """DUAL_ARM_CACHE if set, otherwise `dual-arm-carry` in the user's cache folder
     (XDG_CACHE_HOME, by default ~/.cache)."""
     own = os.environ.get("DUAL_ARM_CACHE", "")
     return Path(own).expanduser() if own else platformdirs.user_cache_path("dual-arm-carry")
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a cache holds: libraries, and all files with their size together [bytes]."""
+
+    libraries: int
+    files: int
+    size: int
 
 
 @dataclass(frozen=True)
@@ -199,7 +235,13 @@ class Cache:
             intact = stored["sha256"] == digest(_canonical(facts))
         except (OutsideError, KeyError, TypeError):
             return None
-        return facts if intact and isinstance(facts, dict) else None
+        if not intact or not isinstance(facts, dict):
+            return None
+        with suppress(OSError):  # others may own it, or it is gone
+            path = self.folder / f"{key}.json"
+            if time.time() - path.stat().st_mtime > _NOTED_SECONDS:
+                os.utime(path)
+        return facts
 
     def write_record(self, key: str, facts: Mapping[str, Any]) -> None:
         """Store a record with its checksum, in one step."""
@@ -263,6 +305,52 @@ class Cache:
         finally:
             os.close(handle)
 
+    def usage(self) -> Usage:
+        """What it holds."""
+        files = [file for _, _, files in self._by_use() for file in files]
+        return Usage(
+            sum(file.suffix == ".so" for file in files),
+            len(files),
+            sum(size for _, size, _ in self._by_use()),
+        )
+
+    def trim(self, most: int | None = None) -> int:
+        """Remove what was not used for longest until the rest is at most so large [bytes]; None for
+        what DUAL_ARM_CACHE_LIMIT says in gibibytes, by default `MOST_KEPT`. What is removed is made
+        anew when it is needed.
+
+        Returns:
+            The number of libraries removed.
+
+        Raises:
+            CodegenError: the environment variable holds no number.
+        """
+        most = largest_size() if most is None else most
+        kept = self._by_use()
+        size, libraries = sum(each for _, each, _ in kept), 0
+        for _, own, files in kept:
+            if size <= most:
+                break
+            size -= own
+            for path in files:
+                libraries += path.suffix == ".so"
+                path.unlink(missing_ok=True)
+        return libraries
+
+    def _by_use(self) -> list[tuple[float, int, list[Path]]]:
+        """When the files of every key were last used, their size, and they; oldest first."""
+        found: dict[str, tuple[float, int, list[Path]]] = {}
+        if self.folder.exists():
+            self._require_safe()
+            for entry in os.scandir(self.folder):
+                with suppress(OSError):  # another process removed it
+                    if entry.is_file() and Path(entry.name).suffix in _KEPT:
+                        key, own = _KEY_END.split(entry.name, 1)[0], entry.stat()
+                        used, size, files = found.get(key, (0.0, 0, []))
+                        files = [*files, Path(entry.path)]
+                        found[key] = max(used, own.st_mtime), size + own.st_size, files
+        return sorted(found.values(), key=lambda each: each[0])
+
     def clean(self) -> int:
         """Remove everything this cache has stored; the number of libraries removed."""
         if not self.folder.exists():
@@ -273,7 +361,7 @@ class Cache:
             for path in self.folder.iterdir():
                 if path.is_dir() and path.name.startswith("build-"):
                     shutil.rmtree(path, ignore_errors=True)
-                elif path.suffix in {".so", ".o", ".json", ".lock", ".draft"}:
+                elif path.suffix in _KEPT:
                     libraries += path.suffix == ".so"
                     path.unlink(missing_ok=True)
         return libraries

@@ -149,6 +149,8 @@ class Compiler:
         Raises:
             CodegenError: the compiler refused the source, could not write, or was killed.
         """
+        if not os.access(self.command[0], os.X_OK):
+            find_compiler()  # which says what to do
         own = [f"-O{level}", *FLAGS, *self.machine, *flags]
         last = ["-c"] if objects is None else [*map(str, objects), "-lm"]
         command = [*self.command, *own, "-o", str(result), str(source), *last]

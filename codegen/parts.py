@@ -50,9 +50,10 @@ _OWN = {
 }
 """Words of a function that a part knows: those of `codegen/c/part.h` and `codegen/c/lanes.h`."""
 
-LONG = 10_000
-"""Statements from which on a function is cut: shorter ones are evaluated more often, and a seventh
-faster as a whole."""
+LONG = 16_000
+"""Statements from which on a function is cut: shorter ones are evaluated more often, and faster as
+a whole. Of clearances of the rack 12,800 statements took 0.78 us in lanes cut, 11,900 took 0.48 us
+as a whole."""
 
 PIECE = 250
 """Statements of a piece. `force_inner_second` of the rack (45,000 statements, half of them in

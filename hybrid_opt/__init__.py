@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from hybrid_opt.recommending.choice import Wish
     from hybrid_opt.recommending.recommendation import Recommendation, recommend
     from hybrid_opt.robust.squeeze import SqueezeSettings
+    from hybrid_opt.sweeping import Sweep, sweep
     from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
     from hybrid_opt.workbench.browser import live
     from symbolic.errors import DualArmError
@@ -58,6 +59,7 @@ __all__ = [
     "Recommendation",
     "SearchSettings",
     "SqueezeSettings",
+    "Sweep",
     "Timing",
     "TimingLimits",
     "Wish",
@@ -75,6 +77,7 @@ __all__ = [
     "save",
     "search",
     "search_branches",
+    "sweep",
     "targets",
     "time_every_way",
     "time_path",
@@ -98,6 +101,7 @@ _HOMES = {
     "Recommendation": "hybrid_opt.recommending.recommendation",
     "SearchSettings": "hybrid_opt.metaheuristics.run",
     "SqueezeSettings": "hybrid_opt.robust.squeeze",
+    "Sweep": "hybrid_opt.sweeping",
     "Timing": "hybrid_opt.timing.records",
     "TimingLimits": "hybrid_opt.timing.records",
     "Wish": "hybrid_opt.recommending.choice",
@@ -115,6 +119,7 @@ _HOMES = {
     "save": "hybrid_opt.door",
     "search": "hybrid_opt.door",
     "search_branches": "hybrid_opt.branches",
+    "sweep": "hybrid_opt.sweeping",
     "targets": "hybrid_opt.catalogue",
     "time_every_way": "hybrid_opt.door",
     "time_path": "hybrid_opt.door",

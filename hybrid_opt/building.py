@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from importlib.metadata import version
 
+from codegen.build import compiler_of
 from codegen.cache import Cache
-from codegen.compiler import find_compiler, interruptible
+from codegen.compiler import interruptible
 from codegen.errors import CodegenError
 from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.cell import Cell
@@ -42,7 +43,7 @@ def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: b
         drivable: whether carries are also searched for as robots drive them.
     """
     cache = cell.compiled.cache or Cache()
-    what = (str(cell.force_kind), str(polish), str(drivable), find_compiler().identity)
+    what = (str(cell.force_kind), str(polish), str(drivable), compiler_of(cache).identity)
     sources = cache.code_digest("codegen", "hybrid_opt")
     key = cell.compiled.key("study", *what, version("casadi"), sources)
     if key is None or cache.read_record(key) is not None:

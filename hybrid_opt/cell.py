@@ -118,6 +118,7 @@ class Cell:
                 every problem.
         """
         cell = Cell(changed(self.workcell, changes), self._objectives, self.threads)
+        cell.compiled = self.compiled.of_changed(cell.workcell)
         cell._folder = self._folder
         return cell
 
@@ -204,6 +205,11 @@ class Cell:
             SettingsError: an objective is unknown.
         """
         return force_kind(self._objectives)
+
+    @property
+    def objectives(self) -> tuple[str | Objective, ...]:
+        """What searches minimise, as it was given."""
+        return self._objectives
 
     @property
     def objective_names(self) -> tuple[str, ...]:

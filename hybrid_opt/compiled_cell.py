@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from codegen.build import load_or_build
+from codegen.build import compiler_of, load_or_build
 from codegen.cache import Cache, key_of, library_version
-from codegen.compiler import find_compiler
 from codegen.function import NumericFunction
 from symbolic.array import Array
 from symbolic.records import Workcell
+from symbolic.records.task import initial_decision
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from symbolic.geometry.pairs import CellGeometry
     from symbolic.numbers import CellNumbers
     from symbolic.robot.branches import ArmSearch
+
+Loaded = TypeVar("Loaded")
 
 
 class CompiledCell:
@@ -45,12 +47,26 @@ class CompiledCell:
                 as with other start postures than the stated criterion's.
 
         Raises:
-            CodegenError: there is no C compiler.
+            CodegenError: there is no C compiler, and the cache knows of none.
         """
-        find_compiler()
+        compiler_of(cache or Cache())
         self.workcell = workcell
         self.cache = cache
         self._given = model
+        self._loaded: dict[object, Any] = {}
+
+    def of_changed(self, workcell: Workcell) -> CompiledCell:
+        """Another workcell, for which what is loaded for this one is not loaded again."""
+        other = CompiledCell(workcell, self.cache)
+        other._loaded = self._loaded
+        return other
+
+    def once(self, key: object, load: Callable[[], Loaded]) -> Loaded:
+        """What is loaded under a key, for all cells that were changed from one."""
+        if key not in self._loaded:
+            self._loaded[key] = load()
+        found: Loaded = self._loaded[key]
+        return found
 
     @classmethod
     def of(cls, cell: Workcell | CompiledCell) -> CompiledCell:
@@ -82,10 +98,11 @@ class CompiledCell:
             return branch_functions(model)
 
         found = self.functions("branches", make, lanes=0, bodies=False)
-        clearance = self.screening["clearance"]
+        geometry = self.geometry
+        asked = [self.screening[f"{block}clearance"] for block in geometry.asked]
 
         def bounds(poses: Array, q_1: Array, q_2: Array) -> Array:
-            return clearance.batch(poses, q_1, q_2)["clearance"].reshape(len(poses), -1)
+            return geometry.of_active([f.batch(poses, q_1, q_2)["clearance"] for f in asked])
 
         def search(arm: int) -> ArmSearch:
             kinematics, follow = (found[f"{name}_{arm + 1}"] for name in ("kinematics", "follow"))
@@ -98,7 +115,8 @@ class CompiledCell:
             def along(starts: Array, extended: Array) -> Mapping[str, Array]:
                 return follow.batch(starts, extended, np.zeros((len(extended), 6)))
 
-            return ArmSearch(flange, along, own_clearance(self.geometry, arm, bounds))
+            postures = self.once(("postures", arm, self.numbers.digest), dict[bytes, Array])
+            return ArmSearch(flange, along, own_clearance(geometry, arm, bounds), postures)
 
         return search(0), search(1)
 
@@ -140,17 +158,26 @@ class CompiledCell:
         Raises:
             DualArmError: the model cannot be built.
         """
-        if self._given is not None or "model" in vars(self) or not self.workcell.digest:
+        if self._given is not None or "model" in vars(self):
             return self.model.start
-        # Found by a search: kept.
-        cache = self.cache or Cache()
-        key = key_of("start", workcell=self.workcell.digest, expressions=self._expressions)
-        record = cache.read_record(key)
-        if record is None:
-            record = {"joints": [q.tolist() for q in self.model.start]}
-            cache.write_record(key, record)
-        first, second = (np.array(q) for q in record["joints"])
-        return first, second
+        # Found by a search, which does not know what is held: kept.
+        from symbolic.numbers import HELD
+
+        cache, task = self.cache or Cache(), self.workcell.task
+        values = [v for name, v in self.numbers.values.items() if name != HELD]
+        chosen = np.array(self.workcell.start_branch), self.geometry.columns
+        of = [*values, initial_decision(task), *chosen]
+        key = self.key("start", *[value.tobytes().hex() for value in of])
+
+        def find() -> tuple[Array, Array]:
+            record = cache.read_record(key)
+            if record is None:
+                record = {"joints": [q.tolist() for q in self.model.start]}
+                cache.write_record(key, record)
+            first, second = (np.array(q) for q in record["joints"])
+            return first, second
+
+        return self.once(key, find)
 
     def vector(self, group: str) -> Array:
         """The numbers (n,) of a group, see `symbolic.numbers`."""
@@ -158,9 +185,9 @@ class CompiledCell:
 
         return np.concatenate(self.start) if group == START else self.numbers.values[group]
 
-    @cached_property
+    @property
     def _expressions(self) -> str:
-        return (self.cache or Cache()).code_digest("symbolic")
+        return self.once("expressions", lambda: (self.cache or Cache()).code_digest("symbolic"))
 
     def key(self, name: str, *details: str, bodies: bool = True) -> str:
         """A recipe's key: what a set of functions is made from (CasADi is part of every set's).
@@ -201,8 +228,11 @@ class CompiledCell:
             DualArmError: the model or its code cannot be built.
         """
         key = self.key(name, *details, bodies=bodies)
-        built = load_or_build(
-            key, lambda: make(self.symbols), self.cache, lanes=lanes, levels=levels
+        built = self.once(
+            (key, lanes, str(levels)),
+            lambda: load_or_build(
+                key, lambda: make(self.symbols), self.cache, lanes=lanes, levels=levels
+            ),
         )
         return {name: self.bound(function) for name, function in built.items()}
 

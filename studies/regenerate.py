@@ -19,6 +19,12 @@ def _add_options(parser: Parser) -> None:
         "--clean", action="store_true", help="empty the cache first; alone, only that"
     )
     parser.add_argument(
+        "--cache",
+        action="store_true",
+        help="say what the cache holds; alone, only that. Beyond 4 GiB, or the gibibytes in "
+        "DUAL_ARM_CACHE_LIMIT, it loses what was not used for longest",
+    )
+    parser.add_argument(
         "--check",
         action="store_true",
         help="compile anew and compare with the interpreted functions on random inputs, outputs "
@@ -38,8 +44,8 @@ def _add_options(parser: Parser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    if options.workcell is None and not options.clean:
-        main.parser(options.called).error("name a workcell file, or --clean")
+    if options.workcell is None and not (options.clean or options.cache):
+        main.parser(options.called).error("name a workcell file, --cache or --clean")
     from studies.programs.regeneration import regenerate
 
     return regenerate(options)

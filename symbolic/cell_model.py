@@ -166,10 +166,12 @@ Bounds = Callable[[Array, Array, Array], Array]
 
 
 def _interpreted(workcell: Workcell, bodies: CellBodies) -> Searches:
-    clearance = bodies.screening["clearance"]
+    geometry = bodies.geometry
+    asked = [bodies.screening[f"{block}clearance"] for block in geometry.asked]
 
     def bounds(poses: Array, q_1: Array, q_2: Array) -> Array:
-        return np.array(clearance.map(len(poses))(poses.T, q_1.T, q_2.T)).T
+        at, n = (poses.T, q_1.T, q_2.T), len(poses)
+        return geometry.of_active([np.array(function.map(n)(*at)).T for function in asked])
 
     first, second = (
         interpreted_search(workcell, arm, model, own_clearance(bodies.geometry, arm, bounds))

@@ -274,7 +274,8 @@ def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, .
     arms, held = tuple(sx_given(*workcell.robots)), tuple(sx_given(workcell.payload))
     bodies = tuple(sx_given(screen))
     found = {"path": tuple(sx_given(workcell.task)), "start": arms, "predict": arms}
-    found |= {"sample": (*arms, *held), "clearance": bodies, "piece_poses": bodies}
+    found |= {"sample": (*arms, *held)}
+    found |= dict.fromkeys(("clearance", "far_clearance", "piece_poses"), bodies)
     return found | ({"forces": (*arms, *held)} if forces_come_last(workcell) else {})
 
 
@@ -384,7 +385,7 @@ def arm_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def cell_functions(model: CellModel) -> dict[str, ca.Function]:
-    """The functions by name: those of `arm_functions`, and clearance, piece_poses, motion, see
+    """The functions by name: those of `arm_functions`, and those of
     `symbolic.geometry.clearance.screening_functions`."""
     return arm_functions(model) | model.screening
 
@@ -406,9 +407,10 @@ def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
     """What a whole evaluation is put together from, sample by sample.
 
     path, start, predict, sample and, of some cells, forces: see `sample_functions`.
-    clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
+    clearance, far_clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
     """
-    screening = {name: model.screening[name] for name in ("clearance", "piece_poses")}
+    motions = [f"{block}motion" for block in model.geometry.blocks]
+    screening = {name: f for name, f in model.screening.items() if name not in motions}
     return sample_functions(model) | screening
 
 

@@ -13,7 +13,6 @@ file; those that NumPy derives from several keys are named by what they are.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
@@ -29,7 +28,8 @@ from symbolic.cell_model import CellBodies, CellModel
 from symbolic.contact.soft_finger import SoftPatch
 from symbolic.geometry.screen import Base, Bounded, Screen
 from symbolic.records import Contact, RedundantJoint, Robot, Task, Waypoint, Workcell
-from symbolic.records.cell import box_flange, flange_lever, parts
+from symbolic.records.cell import box_flange, flange_lever
+from symbolic.records.content import digest_of_parts
 from symbolic.records.numbered import (
     Group,
     NumberedContact,
@@ -167,7 +167,7 @@ class WorkcellNumbers:
     @cached_property
     def digest(self) -> str:
         """Of the structure without bodies."""
-        return _digest(self.workcell)
+        return digest_of_parts((self.workcell,))
 
     def symbols(self) -> NumberedWorkcell:
         """The cell with symbols instead of numbers."""
@@ -206,12 +206,12 @@ class CellNumbers(WorkcellNumbers):
     @cached_property
     def digest(self) -> str:
         """Of the structure without bodies, the arms' own included."""
-        return _digest(self.workcell, self._arms)
+        return digest_of_parts((self.workcell, self._arms))
 
     @cached_property
     def bodies_digest(self) -> str:
         """Of the whole structure."""
-        return _digest(self.workcell, self.screen, self._arms)
+        return digest_of_parts((self.workcell, self.screen, self._arms))
 
     @property
     def _arms(self) -> tuple[Any, ...]:
@@ -235,13 +235,6 @@ class CellNumbers(WorkcellNumbers):
         model = CellModel(workcell, robots, geometry, ((), ()), (first, second), start)
         vars(model)["screen"] = screen
         return model
-
-
-def _digest(*structure: Any) -> str:
-    total = hashlib.sha256()
-    for part in parts(structure, Path()):
-        total.update(len(part).to_bytes(8, "big") + part)
-    return total.hexdigest()
 
 
 # --- the cell without its bodies ---

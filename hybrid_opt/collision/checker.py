@@ -124,7 +124,7 @@ class CollisionChecker:
         """Prepare FCL's objects.
 
         Args:
-            functions: 'clearance', 'piece_poses' and 'motion' of
+            functions: those of
                 `symbolic.geometry.clearance.screening_functions`, compiled or interpreted.
         """
         self.geometry = geometry
@@ -151,8 +151,8 @@ class CollisionChecker:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, joints) joint positions [rad].
         """
-        found = self.functions["clearance"].batch(pose, q_1, q_2)["clearance"]
-        return found.reshape(len(pose), len(self._pairs))
+        asked = [self.functions[f"{block}clearance"] for block in self.geometry.asked]
+        return self.geometry.of_active([f.batch(pose, q_1, q_2)["clearance"] for f in asked])
 
     def check(
         self,
@@ -248,9 +248,12 @@ class CollisionChecker:
         self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]
     ) -> MotionBounds:
         """Bounds of every pair's motion between configurations (pose, q_1, q_2), each (n, 6)."""
-        bounds = self.functions["motion"].batch(*start, *end)
-        shape = (len(start[0]), len(self._pairs))
-        return MotionBounds(bounds["chord"].reshape(shape), bounds["bend"].reshape(shape))
+        asked = [self.functions[f"{block}motion"] for block in self.geometry.asked]
+        found = [function.batch(*start, *end) for function in asked]
+        of_active = self.geometry.of_active
+        return MotionBounds(
+            *[of_active([part[name] for part in found]) for name in ("chord", "bend")]
+        )
 
     def measure(
         self,

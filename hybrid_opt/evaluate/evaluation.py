@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -109,11 +110,14 @@ class CandidateEvaluator:
         self.lower = workcell.task.lower
         self.upper = workcell.task.upper
         self._needs = _needs(self.objectives)
-        self._kernel: Kernel | None = None
         self._begin: Array | None = None
         self._proofs = KnownProofs()
-        if functions is None and self.driver is None:
-            self._kernel = load_kernel(self.compiled, self.checker, self.outputs)
+        self._in_lanes = functions is None and self.driver is None
+
+    @cached_property
+    def _kernel(self) -> Kernel | None:
+        """The evaluation in lanes, where there is one."""
+        return load_kernel(self.compiled, self.checker, self.outputs) if self._in_lanes else None
 
     def _driver(self, threads: int) -> Driver | None:
         if self.workcell.task.time_law != "optimal":

@@ -16,12 +16,12 @@ typedef struct { long long pair; double place[3], departure; } resting_place;
 /* The cell's shapes: piece k of body b for first_piece[b] <= k < first_piece[b + 1]; a further
    body is the payload that may rest, whose pieces are placed as the payload's. */
 typedef struct {
-  const long long *pairs, *first_piece;
+  const long long *pairs, *columns, *first_piece; /* columns: of each pair among all bounds */
   const shape* shapes;
   const double* vertices;
   const resting_place* resting;
   const double *free_beyond, *tolerance; /* of each pair */
-  long long n_resting, payload_piece, resting_piece;
+  long long n_pairs, has_far, n_resting, payload_piece, resting_piece;
   double apart, overlap;
 } judge_data;
 
@@ -43,7 +43,18 @@ typedef struct {
 #define MOST(a, b) ((a) > (b) ? (a) : (b))
 #define MOST_OF(what)                                                                        \
   MOST(MOST(MOST(path_##what, start_##what), MOST(predict_##what, sample_##what)),           \
-       MOST(clearance_##what, piece_poses_##what))
+       MOST(MOST(clearance_##what, FAR_##what), piece_poses_##what))
+#if N_NEAR < N_PAIRS
+#define FAR_ARG far_clearance_ARG
+#define FAR_RES far_clearance_RES
+#define FAR_IW far_clearance_IW
+#define FAR_W far_clearance_W
+#else
+#define FAR_ARG 0
+#define FAR_RES 0
+#define FAR_IW 0
+#define FAR_W 0
+#endif
 #ifdef FORCES_COME_LAST
 #define MOST_OF_ALL(what) MOST(MOST_OF(what), forces_##what)
 #else
@@ -275,11 +286,18 @@ static int collide(batch_data* batch, const judge_data* judge, long long first, 
     s->res[0] = s->clearance;
     clearance_GIVEN(3);
     if (clearance(s->arg, s->res, s->iw, s->w)) return 1;
+#if N_NEAR < N_PAIRS
+    if (judge->has_far) {
+      s->res[0] = s->clearance + N_NEAR;
+      far_clearance_GIVEN(3);
+      if (far_clearance(s->arg, s->res, s->iw, s->w)) return 1;
+    }
+#endif
     unsigned colliding = 0;
     long long kept = batch->n_open;
-    for (int pair = 0; pair < N_PAIRS; ++pair) {
+    for (long long pair = 0; pair < judge->n_pairs; ++pair) {
       /* Not above: a bound that is not a number stays open. */
-      lanes_mask free = s->clearance[pair] > lanes_all_equal(judge->free_beyond[pair]);
+      lanes_mask free = s->clearance[judge->columns[pair]] > lanes_all_equal(judge->free_beyond[pair]);
       unsigned bits = ~lanes_bits(free) & alive & ~colliding;
       if (__builtin_expect(!bits, 1)) continue;
       if (!placed_already) {

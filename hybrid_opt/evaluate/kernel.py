@@ -136,7 +136,7 @@ class Kernel:
         self._open_pair = open_pair(workcell)
         self._keep = judge_arrays(checker)
         self._judge = judge_data(checker, self._keep)
-        self._room = self.lanes * self._samples * len(checker.geometry.active) + _LEAST_ROOM
+        self._room = self.lanes * self._samples * len(checker.geometry.possible) + _LEAST_ROOM
 
     def evaluate(
         self,
@@ -284,7 +284,10 @@ def load_kernel(
         )
     )
     try:
-        library = load_or_build_program("kernel", key, make, own, compiled.cache, lanes)
+        library = compiled.once(
+            (key, lanes),
+            lambda: load_or_build_program("kernel", key, make, own, compiled.cache, lanes),
+        )
     except FormError as error:
         warn_one_lane("kernel", str(error))
         return None
@@ -324,7 +327,8 @@ def _definitions(geometry: CellGeometry) -> str:
         "POSE_SIZE": workcell.task.extended_size,
         "MOST_JOINTS": max(joints),
         "CONFIGURATION": configuration_size(workcell),
-        "N_PAIRS": len(geometry.active),
+        "N_NEAR": geometry.near,
+        "N_PAIRS": len(geometry.possible),
         "N_PIECES": sum(len(body.pieces) for body in geometry.bodies),
         "N_CONSTRAINTS": len(CONSTRAINTS),
         "N_OUTPUTS": len(sizes),
@@ -396,9 +400,10 @@ class JudgeData(ctypes.Structure):
     """`judge_data` of kernel.c."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("pairs", "first_piece", "shapes", "vertices")),
-        *((name, ctypes.c_void_p) for name in ("resting", "free_beyond", "tolerance")),
-        *((name, ctypes.c_longlong) for name in ("n_resting", "payload_piece", "resting_piece")),
+        *((name, ctypes.c_void_p) for name in ("pairs", "columns", "first_piece", "shapes")),
+        *((name, ctypes.c_void_p) for name in ("vertices", "resting", "free_beyond", "tolerance")),
+        *((name, ctypes.c_longlong) for name in ("n_pairs", "has_far", "n_resting")),
+        *((name, ctypes.c_longlong) for name in ("payload_piece", "resting_piece")),
         *((name, ctypes.c_double) for name in ("apart", "overlap")),
     ]
 
@@ -424,6 +429,7 @@ def judge_arrays(checker: CollisionChecker) -> dict[str, NDArray[Any]]:
     table, vertices = shape_table([*shapes, *checker.judge.resting_shapes])
     return {
         "pairs": np.array([(p.first, p.second) for p in geometry.active], dtype=np.int64),
+        "columns": geometry.columns.astype(np.int64),
         "first_piece": np.cumsum([0] + [len(pieces) for pieces in bodies], dtype=np.int64),
         "shapes": table,
         "vertices": vertices,
@@ -449,6 +455,8 @@ def judge_data(checker: CollisionChecker, arrays: Mapping[str, NDArray[Any]]) ->
     """Pairs, shapes and margins of a cell."""
     first_piece = arrays["first_piece"]
     return JudgeData(
+        n_pairs=len(arrays["pairs"]),
+        has_far=len(checker.geometry.asked) > 1,
         n_resting=len(arrays["resting"]),
         payload_piece=int(first_piece[checker.geometry.index(PAYLOAD)]),
         resting_piece=int(first_piece[-1]),

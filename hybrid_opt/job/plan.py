@@ -13,9 +13,9 @@ them by no more than `RESTING_TOLERANCE`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -54,14 +54,8 @@ from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import CollisionBody
 from symbolic.geometry.pairs import ActivePair, CellGeometry, build_geometry, ignored_pairs
 from symbolic.geometry.pieces import support
-from symbolic.geometry.screen import screen_of
 from symbolic.records import PAYLOAD, AllowedContact, Handling, Waypoint, Workcell
 from symbolic.records.task import extended_waypoints
-
-if TYPE_CHECKING:
-    import casadi as ca
-
-    from symbolic.cell_model import CellModel
 
 LARGEST_DROP = 0.3
 """How far below the carry's ends something to stand on is looked for [m]."""
@@ -103,19 +97,7 @@ class JobCollisions:
         """
         self._workcell = compiled.workcell
         self.geometry = job_geometry(compiled.workcell)
-        job = screen_of(self.geometry)
-        pairs = {name: getattr(job, name) for name in ("active", "own", "slanted")}
-
-        def make(model: CellModel) -> Mapping[str, ca.Function]:
-            # Not imported at the top: a warm start needs no CasADi.
-            from symbolic.geometry.clearance import with_more_pairs
-
-            placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
-            screen = replace(model.screen, **pairs)
-            known = model.screening, model.geometry
-            return with_more_pairs(*known, self.geometry, placements, screen)
-
-        self._functions = compiled.functions("job", make, str(pairs), lanes=0)
+        self._functions = compiled.screening
 
     def standing(self, pose: Array, height: float | None) -> Standing:
         """Where the box stands below a pose (6,).

@@ -150,7 +150,9 @@ def judge_of(geometry: CellGeometry) -> PoseJudge:
     """
     models = [build_robot_model(robot) for robot in geometry.workcell.robots]
     made = screening_functions(geometry, (models[0].joint_placements, models[1].joint_placements))
-    functions = {name: InterpretedFunction(dense(made[name])) for name in made if name != "motion"}
+    functions = {
+        name: InterpretedFunction(dense(made[name])) for name in made if not name.endswith("motion")
+    }
     return PoseJudge(geometry, CollisionChecker(geometry, functions), 0.0)
 
 

@@ -11,7 +11,7 @@ from dataclasses import asdict
 import numpy as np
 
 from codegen.build import Build, FunctionReport, build
-from codegen.cache import Cache
+from codegen.cache import Cache, Usage, largest_size
 from codegen.interpreted import Agreement, compare
 from hybrid_opt.display.table import text_table
 
@@ -62,12 +62,18 @@ def regenerate(options: argparse.Namespace) -> int:
                 compare(function, built.functions[name], bounds, rng, options.samples, cache)
                 for name, function in made.items()
             ]
+    usage = cache.usage() if options.cache else None
     if options.json:
-        _print_json(cache, removed, built, comparisons, seconds)
+        _print_json(cache, removed, built, comparisons, seconds, usage)
     else:
         _print_tables(cache, removed, built, comparisons)
         if seconds is not None:
             print(f"what a study needs is in {cache.folder}, after {seconds:.1f} s")
+        if usage is not None:
+            print(
+                f"{cache.folder} holds {usage.libraries} libraries in {usage.files} files, "
+                f"{usage.size / 2**30:.2f} of {largest_size() / 2**30:g} GiB"
+            )
     return 0 if all(comparison.agrees for comparison in comparisons) else DISAGREES
 
 
@@ -77,8 +83,11 @@ def _print_json(
     built: Build | None,
     comparisons: Sequence[Agreement],
     seconds: float | None,
+    usage: Usage | None,
 ) -> None:
     result: dict[str, object] = {"cache": str(cache.folder)}
+    if usage is not None:
+        result["usage"] = asdict(usage)
     if removed is not None:
         result["removed"] = removed
     if built is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +19,7 @@ from symbolic.read.arms import ArmLinks, arm_links, arm_model, link_frame, one_m
 from symbolic.read.descriptions import resolve_mesh
 from symbolic.read.urdf import UrdfMesh
 from symbolic.records import PAYLOAD, Capsule, Mesh, Robot, Shape, Workcell
+from symbolic.records.content import Known, digest_of_parts
 from symbolic.records.problems import shown
 
 Group = Literal["robot 1", "robot 2", "payload", "environment"]
@@ -45,7 +46,7 @@ BOX = Frame("box")
 
 
 @dataclass(frozen=True)
-class CollisionBody:
+class CollisionBody(Known):
     """A named rigid body.
 
     Attributes:
@@ -69,7 +70,7 @@ class CollisionBody:
 
 
 @dataclass(frozen=True)
-class ArmGeometry:
+class ArmGeometry(Known):
     """The constant geometry of an arm's joints.
 
     Attributes:
@@ -89,6 +90,12 @@ class ArmGeometry:
     T_joint_box: Array
     lower: Array
     upper: Array
+
+    @cached_property
+    def chain(self) -> str:
+        """Digest of its joints, wherever it stands and whatever it holds."""
+        own = self.origins, self.axes, self.turning, self.lower, self.upper
+        return digest_of_parts(own)
 
     @property
     def joints(self) -> int:

@@ -10,8 +10,8 @@ against box cost more than the FCL calls that they save.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -28,27 +28,6 @@ from symbolic.path.rotation import rotation_matrix
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 
 
-def clearance_expressions(
-    screen: Screen,
-    R_box: ca.SX,
-    p_box: ca.SX,
-    placements_1: tuple[ca.SX, ca.SX],
-    placements_2: tuple[ca.SX, ca.SX],
-    softness: Softness = EXACT,
-) -> ca.SX:
-    """Lower bounds (n_pairs,) of the distance of every active pair [m], in the pairs' order.
-
-    Args:
-        R_box, p_box: (3, 3) and (3,), the box in the world.
-        placements_1, placements_2: per robot the rotations (3, 3 n) and positions (3, n) of its
-            joint frames in its root, side by side, as `RobotModel.joint_placements` gives them.
-        softness: `EXACT` for screening; `Softness(width)` for bounds that are smooth, and lower
-            by some multiples of the width [m].
-    """
-    scene = Scene(screen, R_box, p_box, (placements_1, placements_2), softness)
-    return ca.vertcat(*[scene.bound(pair) for pair in range(len(screen.active))])
-
-
 def screening_functions(
     geometry: CellGeometry,
     joint_placements: tuple[ca.Function, ca.Function],
@@ -58,12 +37,15 @@ def screening_functions(
     """The functions that collision checking calls, by name.
 
     The first two take pose (6,), q_1 and q_2 (n,) [m, rad] of one sample.
-    clearance: -> clearance (n_pairs,), see `clearance_expressions`.
+    clearance: -> clearance (n_near,), lower bounds of the distances of the possible pairs that are
+    near [m], in order. far_clearance: likewise of the others, where there are any.
     piece_poses: -> quaternions (4, n_pieces) as w x y z, positions (3, n_pieces) [m]: every
     piece of every body in the world, in the bodies' order.
-    motion: see `symbolic.geometry.motion_bounds.motion_function`.
+    motion, far_motion: see `symbolic.geometry.motion_bounds.motion_function`.
 
     Args:
+        softness: `EXACT` for screening; `Softness(width)` for bounds that are smooth, and lower
+            by some multiples of the width [m].
         joint_placements: of each robot, `RobotModel.joint_placements`.
         screen: of the geometry, or the same with symbols; None to find it.
     """
@@ -72,7 +54,7 @@ def screening_functions(
     q = [ca.SX.sym(f"q_{i}", arm.joints) for i, arm in enumerate(geometry.arms, start=1)]
     R, p = rotation_matrix(geometry.workcell.task.orientation, pose[3:]), pose[:3]
     first, second = (joint_placements[i](q[i]) for i in (0, 1))
-    clearance = clearance_expressions(screen, R, p, first, second, softness)
+    scene = Scene(screen, R, p, (first, second), softness)
     placed = {BOX: (R, p)}
     for i, base in enumerate(screen.bases):
         for j, joint in enumerate(world_placements(base, (first, second)[i])):
@@ -85,46 +67,19 @@ def screening_functions(
     given = sx_given(screen)
     inputs, names = [pose, *q, *given.values()], ["pose", "q_1", "q_2", *given]
     outputs = [ca.horzcat(*column) for column in zip(*poses, strict=True)]
-    return {
-        "clearance": ca.Function(
-            "clearance", inputs, [clearance], names, ["clearance"], {"cse": True}
-        ),
+    found = {
         "piece_poses": ca.Function(
             "piece_poses", inputs, outputs, names, ["quaternions", "positions"], {"cse": True}
-        ),
-        "motion": motion_function(geometry, joint_placements, screen),
+        )
     }
-
-
-def with_more_pairs(
-    known: Mapping[str, ca.Function],
-    geometry: CellGeometry,
-    more: CellGeometry,
-    joint_placements: tuple[ca.Function, ca.Function],
-    screen: Screen | None = None,
-) -> dict[str, ca.Function]:
-    """`screening_functions` of a cell in which further pairs are active, put together from those
-    that are known, so that these are compiled once.
-
-    Args:
-        known: the functions of `geometry`.
-        more: the same bodies; its active pairs are those of `geometry`, then others.
-        screen: of `more`, or the same with symbols; None to find it.
-    """
-    count = len(geometry.active)
-    assert more.active[:count] == geometry.active, "further pairs come last"
-    whole = screen_of(more) if screen is None else screen
-    rest = {name: getattr(whole, name)[count:] for name in ("active", "own", "slanted")}
-    others = screening_functions(more, joint_placements, EXACT, replace(whole, **rest))
-    found = dict(known)
-    for name in ("clearance", "motion"):
-        function = known[name]
-        given = [
-            ca.MX.sym(function.name_in(i), *function.size_in(i)) for i in range(function.n_in())
-        ]
-        both = zip(function.call(given), others[name].call(given), strict=True)
-        results = [ca.vertcat(*values) for values in both]
-        found[name] = ca.Function(name, given, results, function.name_in(), function.name_out())
+    for name, pairs in geometry.blocks.items():
+        bounds = ca.vertcat(*[scene.bound(pair) for pair in pairs])
+        found[f"{name}clearance"] = ca.Function(
+            f"{name}clearance", inputs, [bounds], names, ["clearance"], {"cse": True}
+        )
+        found[f"{name}motion"] = motion_function(
+            geometry, joint_placements, screen, f"{name}motion", pairs
+        )
     return found
 
 
@@ -167,7 +122,14 @@ class Scene:
         placements: tuple[tuple[ca.SX, ca.SX], tuple[ca.SX, ca.SX]],
         softness: Softness,
     ) -> None:
-        """See `clearance_expressions`."""
+        """Nothing is built yet.
+
+        Args:
+            R_box, p_box: (3, 3) and (3,), the box in the world.
+            placements: per robot the rotations (3, 3 n) and positions (3, n) of its joint frames in
+                its root, side by side, as `RobotModel.joint_placements` gives them.
+            softness: see `screening_functions`.
+        """
         self.screen, self.soft = screen, softness
         self._placed: dict[Frame, tuple[ca.SX, ca.SX]] = {
             WORLD: (ca.SX.eye(3), ca.SX.zeros(3)),
@@ -185,12 +147,11 @@ class Scene:
         self._chains: dict[int, list[ca.SX]] = {}
 
     def bound(self, pair: int) -> ca.SX:
-        """Lower bound of the distance between the bodies of a pair."""
-        i, j = self.screen.active[pair]
+        """Lower bound of the distance between the bodies of a possible pair."""
+        i, j = self.screen.pairs[pair]
         first, second = self.screen.bodies[i], self.screen.bodies[j]
         if second.obstacles:
-            slanted = self.screen.slanted[pair]
-            obstacles = [self._obstacle(i, j, k, own) for k, own in enumerate(slanted)]
+            obstacles = [self._obstacle(i, j, k) for k in range(len(second.obstacles))]
             return self.soft.minimum_below(obstacles)
         if first.group == second.group:
             own = self._near_bound if self.screen.own[pair] else self._chain_bound
@@ -206,8 +167,8 @@ class Scene:
         return self.soft.maximum_below(gaps)
 
     def separable(self, pair: int) -> bool:
-        """Whether a pair is the payload and an obstacle of one box."""
-        first, second = (self.screen.bodies[body] for body in self.screen.active[pair])
+        """Whether a possible pair is the payload and an obstacle of one box."""
+        first, second = (self.screen.bodies[body] for body in self.screen.pairs[pair])
         kinds = [obstacle.kind for obstacle in second.obstacles]
         return first.group == "payload" and kinds == [Box]
 
@@ -344,18 +305,14 @@ class Scene:
         # Each of the three ramps may stand half a width above the true one.
         return self._nearest(squared) - radius - 3**0.5 / 2.0 * self.soft.width
 
-    def _obstacle(self, index: int, other: int, k: int, slanted: bool) -> ca.SX:
-        """A moving body against piece k of an obstacle.
-
-        Args:
-            slanted: whether its own axes matter.
-        """
+    def _obstacle(self, index: int, other: int, k: int) -> ca.SX:
+        """A moving body against piece k of an obstacle."""
         body, obstacle = self.screen.bodies[index], self.screen.bodies[other].obstacles[k]
         axes = self._world
         if obstacle.axes is not None:
             axes = Axes(f"obstacle {other} {k}", turned(obstacle.axes))
         pairs = list(zip(self._interval(index, axes), _ends(obstacle.extent, 0), strict=True))
-        if slanted:
+        if body.slanted:
             own = self._own_axes(body.frame)
             still = self._piece_interval(own.A, ca.SX.zeros(3), obstacle.cover)
             pairs += list(zip(self._interval(index, own), still, strict=True))

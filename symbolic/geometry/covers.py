@@ -8,6 +8,7 @@ exact functions of `symbolic.geometry.pieces`.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from itertools import combinations, product
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
-from symbolic.geometry.bodies import ArmGeometry, CollisionBody
+from symbolic.geometry.bodies import CollisionBody
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import (
     Hull,
@@ -27,6 +28,7 @@ from symbolic.geometry.pieces import (
     support,
 )
 from symbolic.records import Box
+from symbolic.records.content import Seen, digest_of_parts
 from symbolic.records.poses import rotation_from_vector
 
 MERGE_SLACK = 0.004
@@ -69,46 +71,52 @@ def slab_cover(body: CollisionBody) -> tuple[Piece, ...]:
 
 def chain_cover(body: CollisionBody) -> SphereChain:
     """A chain of equal spheres that contains the body, along its longest principal side."""
-    return min(
-        (sphere_chain(body.pieces, axes, SLENDERNESS) for axes in _orientations(body.pieces)),
-        key=lambda chain: chain.radius,
-    )
+    return _chain_cover(Seen(body.pieces))
+
+
+@lru_cache(maxsize=256)
+def _chain_cover(seen: Seen) -> SphereChain:
+    (pieces,) = seen.given
+    chains = (sphere_chain(pieces, axes, SLENDERNESS) for axes in _orientations(pieces))
+    return min(chains, key=lambda chain: chain.radius)
 
 
 def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
     """Pairs within an arm whose chains of spheres cannot be told apart in many postures."""
-    rng = np.random.default_rng(0)
-    # Seen from the arms' roots: where they stand does not matter.
-    steps = [
-        _steps(arm, rng.uniform(arm.lower, arm.upper, (POSTURES, arm.joints)))
-        for arm in geometry.arms
-    ]
-    chains: dict[int, SphereChain] = {}
     found = []
-    for pair in geometry.active:
-        bodies = geometry.bodies[pair.first], geometry.bodies[pair.second]
-        if bodies[0].group != bodies[1].group:
+    for pair in geometry.possible:
+        a, b = geometry.bodies[pair.first], geometry.bodies[pair.second]
+        if a.group != b.group:
             continue
-        a, b = (replace(x, pieces=x.root[1]) if x.root else x for x in bodies)
-        for index, body in ((pair.first, a), (pair.second, b)):
-            chains[index] = chains.get(index) or chain_cover(body)
-        T = np.broadcast_to(np.eye(4), (POSTURES, 4, 4))
-        for k in range(a.frame.joint + 1, b.frame.joint + 1):
-            T = T @ steps[b.frame.robot][k]
-        moved = chains[pair.second].centres @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
-        gaps = np.linalg.norm(chains[pair.first].centres[:, None] - moved[:, None], axis=3)
-        reach = chains[pair.first].radius + chains[pair.second].radius
-        touching = gaps.min(axis=(1, 2)) <= reach
-        if a.frame.kind == "world":
-            touching &= ~_apart(a.pieces, b.pieces, T)
-        if np.count_nonzero(touching) > OFTEN * POSTURES:
+        arm = geometry.arms[b.frame.robot]
+        # Where the arm stands does not matter.
+        first = a.content if a.root is None else digest_of_parts(a.root[1])
+        if _often_close(Seen(a, b, arm, known=(first, b.content, arm.chain))):
             found.append((pair.first, pair.second))
     return frozenset(found)
 
 
-def _steps(arm: ArmGeometry, q: Array) -> list[Array]:
-    """Per joint its frame in the one before it (n, 4, 4) at postures q (n, joints)."""
-    found = []
+@lru_cache(maxsize=512)
+def _often_close(seen: Seen) -> bool:
+    a, b, arm = seen.given
+    a = a if a.root is None else replace(a, pieces=a.root[1])
+    steps, chains = _steps(Seen(arm, known=arm.chain)), [chain_cover(body) for body in (a, b)]
+    T = np.broadcast_to(np.eye(4), (POSTURES, 4, 4))
+    for k in range(a.frame.joint + 1, b.frame.joint + 1):
+        T = T @ steps[k]
+    moved = chains[1].centres @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
+    gaps = np.linalg.norm(chains[0].centres[:, None] - moved[:, None], axis=3)
+    touching = gaps.min(axis=(1, 2)) <= chains[0].radius + chains[1].radius
+    if a.frame.kind == "world":
+        touching &= ~_apart(a.pieces, b.pieces, T)
+    return bool(np.count_nonzero(touching) > OFTEN * POSTURES)
+
+
+@lru_cache(maxsize=4)
+def _steps(seen: Seen) -> list[Array]:
+    """Per joint of an arm its frame in the one before it (POSTURES, 4, 4) at random postures."""
+    (arm,), found = seen.given, []
+    q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (POSTURES, arm.joints))
     for k, axis in enumerate(arm.axes):
         moved = np.tile(np.eye(4), (len(q), 1, 1))
         along = q[:, k, None] * axis

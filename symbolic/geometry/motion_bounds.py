@@ -18,6 +18,8 @@ formula, |exp(v)''| = 2 |integral of exp d exp d exp over a triangle of area 1/2
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import casadi as ca
 import numpy as np
 
@@ -30,9 +32,13 @@ from symbolic.path.rotation import rotation_matrix
 
 
 def motion_function(
-    geometry: CellGeometry, joint_placements: tuple[ca.Function, ca.Function], screen: Screen
+    geometry: CellGeometry,
+    joint_placements: tuple[ca.Function, ca.Function],
+    screen: Screen,
+    name: str,
+    pairs: Iterable[int],
 ) -> ca.Function:
-    """`motion`: two configurations -> chord, bend (n_pairs,) [m] of every active pair.
+    """Two configurations -> chord, bend (n_pairs,) [m] of some possible pairs.
 
     They are the sums of both bodies' chords and bends, see the module; of two links of one arm,
     the length of the path of one seen from the other, which needs no bend.
@@ -41,6 +47,8 @@ def motion_function(
 
     Args:
         screen: of the geometry.
+        name: of the function.
+        pairs: among the possible ones.
     """
     ends = []
     for end in ("a", "b"):
@@ -58,7 +66,7 @@ def motion_function(
     steps = [ca.fabs(b - a) for a, b in zip(inputs_a, inputs_b, strict=True)]
     own = [_body_motion(screen, body, placed_a, placed_b, steps) for body in screen.bodies]
     chords, bends = [], []
-    for i, j in screen.active:
+    for i, j in (screen.pairs[pair] for pair in pairs):
         first, second = screen.bodies[i], screen.bodies[j]
         if first.group == second.group:
             chords.append(_between_links(first, second, steps[1 + second.frame.robot]))
@@ -67,9 +75,9 @@ def motion_function(
             chords.append(own[i][0] + own[j][0])
             bends.append(own[i][1] + own[j][1])
     given = sx_given(screen)
-    names = [f"{name}_{end}" for end in ("a", "b") for name in ("pose", "q_1", "q_2")]
+    names = [f"{what}_{end}" for end in ("a", "b") for what in ("pose", "q_1", "q_2")]
     return ca.Function(
-        "motion",
+        name,
         [*inputs_a, *inputs_b, *given.values()],
         [ca.vertcat(*chords), ca.vertcat(*bends)],
         [*names, *given],

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from itertools import combinations, product
 
 import coal
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
@@ -37,6 +38,7 @@ from symbolic.geometry.pieces import (
 from symbolic.read.arms import one_machine
 from symbolic.read.urdf import read_srdf
 from symbolic.records import Box, Capsule, Cylinder, Sphere, Workcell
+from symbolic.records.content import Seen, digest_of_parts
 from symbolic.records.problems import matching
 
 MOST_ENTERED = 1e-3
@@ -48,7 +50,8 @@ POSTURES = 300
 
 @dataclass(frozen=True)
 class ActivePair:
-    """Two bodies, as indices into the cell's bodies, that have to be kept apart."""
+    """Two bodies, as indices into the cell's bodies, that have to be kept apart, or may have to be
+    with other numbers."""
 
     first: int
     second: int
@@ -73,6 +76,11 @@ class CellGeometry:
         arms: the joints of both arms as numbers.
         active: pairs to be checked; the order of every clearance vector.
         excluded: all other pairs, with the reason.
+        possible: pairs that are checked with some numbers of the cell, or while the box is not
+            held, the active ones among them; the order of what is compiled.
+        near: how many of these come first because most cells check some of them. The others are
+            bounded where some are active: what a grasp holds together, and of every arm what comes
+            before its second joint with anything but its own arm and the payload.
     """
 
     workcell: Workcell
@@ -80,6 +88,33 @@ class CellGeometry:
     arms: tuple[ArmGeometry, ArmGeometry]
     active: tuple[ActivePair, ...]
     excluded: tuple[ExcludedPair, ...]
+    possible: tuple[ActivePair, ...]
+    near: int
+
+    @property
+    def blocks(self) -> Mapping[str, range]:
+        """Possible pairs that are bounded together, by what the names of functions begin with."""
+        far = range(self.near, len(self.possible))
+        return {"": range(self.near)} | ({"far_": far} if far else {})
+
+    @cached_property
+    def columns(self) -> NDArray[np.intp]:
+        """(n_active,) where every active pair is among the possible ones."""
+        places = {pair: k for k, pair in enumerate(self.possible)}
+        return np.array([places[pair] for pair in self.active], dtype=np.intp)
+
+    @cached_property
+    def asked(self) -> tuple[str, ...]:
+        """The blocks that are needed: the first one, and those with active pairs."""
+        blocks = self.blocks.items()
+        return tuple(b for b, pairs in blocks if not b or np.isin(self.columns, pairs).any())
+
+    def of_active(self, bounds: Sequence[Array]) -> Array:
+        """(n, n_active) from the bounds (n, n_block) of the blocks that are needed."""
+        sizes = [len(self.blocks[block]) for block in self.asked]
+        parts = [each.reshape(len(each), n) for each, n in zip(bounds, sizes, strict=True)]
+        whole = parts[0] if len(parts) == 1 else np.hstack(parts)
+        return np.asarray(whole.take(self.columns, axis=1))
 
     @cached_property
     def pair_names(self) -> tuple[tuple[str, str], ...]:
@@ -128,24 +163,69 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
     arms = (arm_geometry(workcell, 0), arm_geometry(workcell, 1))
     ignored = ignored_pairs(workcell, bodies)
     _check_tools(bodies, arms)
-    active, excluded = [], []
-    always = _AlwaysTouching(bodies, arms)
+    active: list[ActivePair] = []
+    excluded: list[ExcludedPair] = []
+    near: list[ActivePair] = []
+    far: list[ActivePair] = []
+    order = digest_of_parts(tuple((body.group, body.frame.joint) for body in bodies))
     for i, j in combinations(range(len(bodies)), 2):
         a, b = bodies[i], bodies[j]
-        tolerance = pair_tolerance(workcell, a, b)
-        reason = (
-            ignored.get(frozenset((a.name, b.name)), "")
-            or _rigid(a, b, arms)
-            or _neighbours(a, b, bodies)
-            or out_of_reach(a, b, arms, tolerance)
-            or never_meet(a, b, arms, tolerance)
-            or always.reason(a, b)
-        )
-        if reason:
-            excluded.append(ExcludedPair(i, j, reason))
+        named = ignored.get(frozenset((a.name, b.name)), "")
+        given = a, b, arms, pair_tolerance(workcell, a, b), bodies
+        of_arms = tuple(arms[k].content for k in sorted({*_arms_of(a), *_arms_of(b)}))
+        known = a.content, b.content, of_arms, given[3], order
+        found = _Sorted(named, False) if named else _sorted(Seen(*given, known=known))
+        if found.reason:
+            excluded.append(ExcludedPair(i, j, found.reason))
         else:
             active.append(ActivePair(i, j))
-    return CellGeometry(workcell, bodies, arms, tuple(active), tuple(excluded))
+        if found.possible:
+            (far if found.far else near).append(ActivePair(i, j))
+    pairs = tuple(active), tuple(excluded), (*near, *far)
+    return CellGeometry(workcell, bodies, arms, *pairs, len(near))
+
+
+def _arms_of(body: CollisionBody) -> tuple[int, ...]:
+    """The arms whose joints, or base, say where a body is."""
+    if body.frame.kind == "box":
+        return (0, 1)
+    if body.root is not None:
+        return (body.root[0],)
+    return (body.frame.robot,) if body.frame.kind == "link" else ()
+
+
+@dataclass(frozen=True)
+class _Sorted:
+    """What becomes of a pair: why it is not active, '' where it is; whether it is possible, and
+    not among the near ones."""
+
+    reason: str
+    possible: bool
+    far: bool = False
+
+
+@lru_cache(maxsize=4096)
+def _sorted(seen: Seen) -> _Sorted:
+    a, b, arms, tolerance, bodies = seen.given
+    rigid = _rigid(a, b, arms)
+    fixed = ("" if a.frame != b.frame else rigid) or _neighbours(a, b, bodies)
+    if fixed:
+        return _Sorted(fixed, possible=False)
+    apart = (
+        rigid
+        or out_of_reach(a, b, arms, tolerance)
+        or never_meet(a, b, arms, tolerance)
+        or _always_touching(a, b, arms)
+    )
+    # An arm's own links keep apart, or do not, whatever is held.
+    links = a.group == b.group and not (a.is_tool or b.is_tool)
+    return _Sorted(apart, not (apart and links), bool(rigid) or _is_far(a, b))
+
+
+def _is_far(a: CollisionBody, b: CollisionBody) -> bool:
+    """See `CellGeometry.near`."""
+    still = any(x.root is not None or (x.frame.joint == 0 and not x.is_tool) for x in (a, b))
+    return still and a.group != b.group and "payload" not in (a.group, b.group)
 
 
 def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]) -> None:
@@ -195,31 +275,25 @@ def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody,
     return "neighbours in the arm, they overlap at their joint" if not between else ""
 
 
-class _AlwaysTouching:
-    """Pairs within an arm (the box it holds included) that touch in every sampled posture."""
-
-    def __init__(
-        self, bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]
-    ) -> None:
-        self.arms = arms
-        rng = np.random.default_rng(0)
-        self.postures = [rng.uniform(arm.lower, arm.upper, (POSTURES, arm.joints)) for arm in arms]
-
-    def reason(self, a: CollisionBody, b: CollisionBody) -> str:
-        for robot in (0, 1):
-            left, right = anchor(a, self.arms, robot), anchor(b, self.arms, robot)
-            group = f"robot {robot + 1}"
-            own = {body.group for body in (a, b) if body.carries is None}
-            if group not in own or own - {group, "payload"}:
-                continue
-            low, high = sorted((left, right), key=lambda body: body.frame.joint)
-            for q in self.postures[robot]:
-                T = relative_placement(self.arms[robot], low.frame.joint, high.frame.joint, q)
-                if coal_distance(tuple(p.moved(T) for p in high.pieces), low.pieces) > 0.0:
-                    break
-            else:
-                return f"touch in all of {POSTURES} random postures"
-        return ""
+def _always_touching(
+    a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]
+) -> str:
+    """A pair within an arm (the box it holds included) that touches in every sampled posture."""
+    for robot, arm in enumerate(arms):
+        left, right = anchor(a, arms, robot), anchor(b, arms, robot)
+        group = f"robot {robot + 1}"
+        own = {body.group for body in (a, b) if body.carries is None}
+        if group not in own or own - {group, "payload"}:
+            continue
+        low, high = sorted((left, right), key=lambda body: body.frame.joint)
+        postures = np.random.default_rng(0).uniform(arm.lower, arm.upper, (POSTURES, arm.joints))
+        for q in postures:
+            T = relative_placement(arm, low.frame.joint, high.frame.joint, q)
+            if coal_distance(tuple(p.moved(T) for p in high.pieces), low.pieces) > 0.0:
+                break
+        else:
+            return f"touch in all of {POSTURES} random postures"
+    return ""
 
 
 # --- pairs that files leave out ---
@@ -272,10 +346,15 @@ def anchor(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: in
     """The body with a carried box seen as part of a robot's last link."""
     if body.frame.kind != "box":
         return body
-    pieces = tuple(piece.moved(arms[robot].T_joint_box) for piece in body.pieces)
-    return CollisionBody(
-        body.name, body.group, Frame("link", robot, arms[robot].joints - 1), pieces
-    )
+    known = body.content, arms[robot].content, robot
+    return _anchored(Seen(body, arms[robot], robot, known=known))
+
+
+@lru_cache(maxsize=16)
+def _anchored(seen: Seen) -> CollisionBody:
+    body, arm, robot = seen.given
+    pieces = tuple(piece.moved(arm.T_joint_box) for piece in body.pieces)
+    return CollisionBody(body.name, body.group, Frame("link", robot, arm.joints - 1), pieces)
 
 
 def out_of_reach(
@@ -352,6 +431,12 @@ def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
     One joint that turns between them: the swept cylinder about its axis. Else the ball about the
     first joint's origin whose radius is the stretched chain.
     """
+    return _zone_of(Seen(body, arm, below, known=(body.content, arm.content, below)))
+
+
+@lru_cache(maxsize=256)
+def _zone_of(seen: Seen) -> Piece:
+    body, arm, below = seen.given
     first = below + 1
     T = arm.T_world_root @ arm.origins[0] if first == 0 else arm.origins[first]
     if body.frame.joint == first and arm.turning[first]:

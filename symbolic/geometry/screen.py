@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -35,15 +34,12 @@ from symbolic.geometry.pieces import (
     support,
 )
 from symbolic.records import Box, Capsule, Cylinder, Sphere
-from symbolic.records.cell import parts
+from symbolic.records.content import Known, Seen
 from symbolic.records.numbered import Group
 
 LONG = 0.25
 """Bodies longer than wide by more than this [m] are also compared along their own axes: across
 the world's axes, a slanted body seems wider by up to that much."""
-
-VAST = 2.0
-"""Obstacles this many times as wide as a body is long (a floor) need no such comparison."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +105,7 @@ class Obstacle:
 
 
 @dataclass(frozen=True)
-class Bounded:
+class Bounded(Known):
     """A body.
 
     Attributes:
@@ -124,6 +120,7 @@ class Bounded:
         pieces: of each the pose in its frame: rotation (3, 3), None for the frame's, and centre
             (3,) [m]; of what stands the quaternion (4,) in the world and the centre.
         obstacles: its pieces, of what stands in the environment.
+        slanted: whether its own axes matter to obstacles.
         is_constant: whether it is a link, or a mesh that moves: its numbers follow from files.
     """
 
@@ -135,6 +132,7 @@ class Bounded:
     reach: Reach | None
     pieces: tuple[tuple[Array | None, Array], ...]
     obstacles: tuple[Obstacle, ...]
+    slanted: bool
     is_constant: bool
 
 
@@ -154,9 +152,8 @@ class Screen:
         bases: of both arms.
         turning: which of their joints turn.
         bodies: in the geometry's order.
-        active: the pairs, as indices of bodies.
+        pairs: the possible ones, as indices of bodies.
         own: per pair within an arm whether its bound is the finer one, else None.
-        slanted: per pair with an obstacle whether the body's own axes matter to each piece of it.
         payload: the payload's box.
         payload_is_mesh: whether that follows from a file.
         between: (3, 3) directions as rows of which the first points from one base to the other;
@@ -167,9 +164,8 @@ class Screen:
     bases: tuple[Base, Base]
     turning: tuple[tuple[bool, ...], tuple[bool, ...]]
     bodies: tuple[Bounded, ...]
-    active: tuple[tuple[int, int], ...]
+    pairs: tuple[tuple[int, int], ...]
     own: tuple[bool | None, ...]
-    slanted: tuple[tuple[bool, ...], ...]
     payload: Solid
     payload_is_mesh: bool
     between: Array | None
@@ -177,21 +173,11 @@ class Screen:
 
 
 def screen_of(geometry: CellGeometry) -> Screen:
-    """The screen of a cell's bodies and active pairs."""
+    """The screen of a cell's bodies and possible pairs."""
     bodies, arms = geometry.bodies, geometry.arms
-    pairs = tuple((pair.first, pair.second) for pair in geometry.active)
+    pairs = tuple((pair.first, pair.second) for pair in geometry.possible)
     close = close_pairs(geometry)
-    sizes = [edges(body.pieces) for body in bodies]
-    obstacles = [
-        [edges((piece,)) for piece in body.pieces] if body.group == "environment" else []
-        for body in bodies
-    ]
-    own: list[bool | None] = []
-    slanted = []
-    for i, j in pairs:
-        first, second = bodies[i], bodies[j]
-        own.append((i, j) in close if first.group == second.group else None)
-        slanted.append(tuple(_slanted_matters(first, sizes[i], each) for each in obstacles[j]))
+    own = tuple((i, j) in close if bodies[i].group == bodies[j].group else None for i, j in pairs)
     payload = next(body for body in bodies if body.frame.kind == "box")
     box = payload.pieces[0]
     if len(payload.pieces) > 1 or not isinstance(box.shape, Box):
@@ -200,10 +186,9 @@ def screen_of(geometry: CellGeometry) -> Screen:
     return Screen(
         (bases[0], bases[1]),
         (arms[0].turning, arms[1].turning),
-        tuple(_bounded(_Seen(body, arms)) for body in bodies),
+        tuple(_bounded(_seen(body, arms)) for body in bodies),
         pairs,
-        tuple(own),
-        tuple(slanted),
+        own,
         _solid(box),
         has_hulls(payload),
         _between(bases[0].position, bases[1].position),
@@ -215,29 +200,19 @@ def has_hulls(body: CollisionBody) -> bool:
     return any(isinstance(piece.shape, Hull) for piece in body.pieces)
 
 
-class _Seen:
-    """A body and both arms, known by what they are: cells that are tried out share links."""
-
-    def __init__(self, body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> None:
-        self.body, self.arms = body, arms
-        of: tuple[Any, ...] = (body,)
-        if body.frame.kind == "link":
-            arm = arms[body.frame.robot]
-            of = (body, arm.origins, arm.axes, arm.turning, arm.slides)
-        elif body.root is not None:
-            of = (body, arms[body.root[0]].T_world_root)
-        self._content = b"".join(parts(of, Path()))
-
-    def __hash__(self) -> int:
-        return hash(self._content)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Seen) and self._content == other._content
+def _seen(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> Seen:
+    """A body and what of both arms its bounds are made of."""
+    of: tuple[Any, ...] = (body.content,)
+    if body.frame.kind == "link":
+        of = (body.content, arms[body.frame.robot].chain)
+    elif body.root is not None:
+        of = (body.content, arms[body.root[0]].content)
+    return Seen(body, arms, known=of)
 
 
 @lru_cache(maxsize=256)
-def _bounded(seen: _Seen) -> Bounded:
-    body, arms = seen.body, seen.arms
+def _bounded(seen: Seen) -> Bounded:
+    body, arms = seen.given
     still = body.frame == WORLD
     pieces = tuple(
         (_quaternion(piece.rotation), piece.centre)
@@ -247,7 +222,9 @@ def _bounded(seen: _Seen) -> Bounded:
     )
     if body.group == "environment":
         obstacles = tuple(_obstacle(piece) for piece in body.pieces)
-        return Bounded(body.group, body.frame, (), None, None, None, pieces, obstacles, False)
+        return Bounded(
+            body.group, body.frame, (), None, None, None, pieces, obstacles, False, False
+        )
     frame, is_link = body.frame, body.frame.kind != "box" and not body.is_tool
     if body.root is not None:  # what stands at a base is covered as it is there
         frame = Frame("world", body.root[0])
@@ -265,7 +242,8 @@ def _bounded(seen: _Seen) -> Bounded:
         reach = _reach(body, arms)
     spheres = Chain(clean(centres), np.array([chain.radius]))
     cover, constant = tuple(_solid(piece) for piece in solids), is_link or has_hulls(body)
-    return Bounded(body.group, frame, cover, spheres, extent, reach, pieces, (), constant)
+    slanted = _slanted_matters(body)
+    return Bounded(body.group, frame, cover, spheres, extent, reach, pieces, (), slanted, constant)
 
 
 def _solid(piece: Piece) -> Solid:
@@ -347,14 +325,10 @@ def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
     return reach
 
 
-def _slanted_matters(body: CollisionBody, sizes: Array, obstacle: Array) -> bool:
-    """Whether a body is the payload, or long and the obstacle no plane for it.
-
-    Args:
-        sizes, obstacle: (3,) edges of both, ascending [m].
-    """
-    _, width, length = sizes
-    return body.frame.kind == "box" or bool(length - width > LONG and obstacle[1] < VAST * length)
+def _slanted_matters(body: CollisionBody) -> bool:
+    """Whether a body is the payload, or long."""
+    _, width, length = edges(body.pieces)
+    return body.frame.kind == "box" or bool(length - width > LONG)
 
 
 def _between(first: Array, second: Array) -> Array | None:

@@ -8,7 +8,6 @@ is kept under a digest belongs to another cell.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from symbolic.array import Array, Vector
+from symbolic.records.content import digest_of_parts
 from symbolic.records.poses import inverse
 from symbolic.records.task import Task
 
@@ -420,11 +420,7 @@ def digest_of(workcell: Any, reading: Reading | None) -> str:
 
 def values_digest(workcell: Any) -> str:
     """SHA-256 over every value of the records, files by their place beside the workcell file."""
-    total = hashlib.sha256()
-    for part in parts(workcell, workcell.source.parent):
-        # The length before each part keeps them apart.
-        total.update(len(part).to_bytes(8, "big") + part)
-    return total.hexdigest()
+    return digest_of_parts(workcell, workcell.source.parent)
 
 
 def named(workcell: Any) -> frozenset[str]:
@@ -432,29 +428,6 @@ def named(workcell: Any) -> frozenset[str]:
     description is expanded with."""
     arms = [(r.urdf, r.package_dirs, r.xacro_arguments, r.srdf) for r in workcell.robots]
     return frozenset([*_paths(workcell), *map(repr, arms)])
-
-
-def parts(value: Any, folder: Path) -> Iterator[bytes]:
-    """What a record and its values are, piece by piece; paths as seen from a folder."""
-    if isinstance(value, type):
-        yield value.__name__.encode()
-    elif is_dataclass(value):
-        yield type(value).__name__.encode()
-        for field in fields(value):
-            if field.name not in ("source", "reading", "text"):
-                yield from parts(getattr(value, field.name), folder)
-    elif isinstance(value, tuple):
-        yield f"tuple {len(value)}".encode()
-        for entry in value:
-            yield from parts(entry, folder)
-    elif isinstance(value, np.ndarray):
-        yield f"array {value.dtype} {value.shape}".encode()
-        yield value.tobytes()
-    elif isinstance(value, Path):
-        yield os.path.relpath(value, folder).encode(errors="surrogateescape")
-    else:
-        # Numbers come back from their representation to the bit.
-        yield f"{type(value).__name__} {value!r}".encode(errors="surrogateescape")
 
 
 def _paths(value: Any) -> Iterator[str]:

@@ -9,7 +9,7 @@ joint range, all at once, and the distinct solutions are collected; each one's r
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -87,11 +87,17 @@ Clearance = Callable[[Array, Array], float]
 
 @dataclass(frozen=True)
 class ArmSearch:
-    """What start branches of an arm are found with."""
+    """What start branches of an arm are found with.
+
+    Attributes:
+        kinematics, follow, clearance: see there.
+        found: postures (m, n) by what they were searched for, which others look up.
+    """
 
     kinematics: Kinematics
     follow: Follow
     clearance: Clearance | None = None
+    found: dict[bytes, Array] = field(default_factory=dict)
 
 
 def interpreted_search(
@@ -235,7 +241,13 @@ def start_branches(
     poses = np.ascontiguousarray(extended[:, :POSE_SIZE])
     target = start_flange(workcell, robot, contact)
     start = {joint: float(extended[0, place]) for joint, place in model.redundant}
-    starts = inverse_kinematics(robot, model, target, redundant=start, kinematics=search.kinematics)
+    known = target, robot.position_lower, robot.position_upper, np.array(list(start.values()))
+    key = b"".join(values.tobytes() for values in known)
+    if key not in search.found:
+        search.found[key] = inverse_kinematics(
+            robot, model, target, redundant=start, kinematics=search.kinematics
+        )
+    starts = search.found[key]
     tracked = search.follow(starts, extended) if len(starts) else {}
     branches = []
     for k, q in enumerate(starts):

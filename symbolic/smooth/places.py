@@ -99,8 +99,8 @@ class Place:
 
     def separable(self) -> tuple[int, ...]:
         """The active pairs of the payload and an obstacle of one box."""
-        pairs = range(len(self.model.geometry.active))
-        return tuple(pair for pair in pairs if self.scene.separable(pair))
+        columns = enumerate(self.model.geometry.columns.tolist())
+        return tuple(pair for pair, column in columns if self.scene.separable(column))
 
 
 @dataclass(frozen=True)
@@ -146,25 +146,27 @@ class PlaceConstraint(ABC):
 
 @dataclass(frozen=True, order=True)
 class Clearance(PlaceConstraint):
-    """Smooth lower bound of the distance of an active pair [m]."""
+    """Smooth lower bound of the distance of an active pair [m]. column: among the possible ones,
+    which is the same with other numbers."""
 
     pair: int
+    column: int
 
     scale: ClassVar[float] = 0.01
 
     @property
     def family(self) -> str:
         """Every pair is its own."""
-        return f"clearance_{self.pair}"
+        return f"clearance_{self.column}"
 
     def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
         """The bound of `symbolic.geometry.clearance`, its kinks rounded."""
-        return place.scene.bound(self.pair)
+        return place.scene.bound(self.column)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
         """Those whose links are in the pair."""
         geometry = model.geometry
-        bodies = geometry.active[self.pair]
+        bodies = geometry.possible[self.column]
         frames = [geometry.bodies[body].frame for body in (bodies.first, bodies.second)]
         return tuple(sorted({frame.robot for frame in frames if frame.kind == "link"}))
 

@@ -18,14 +18,14 @@ from tests.waiting import HANGS
 KEY = digest("test")
 
 
-def put(cache: Cache, content: bytes = b"library") -> Path:
+def put(cache: Cache, content: bytes = b"library", key: str = KEY) -> Path:
     """Store a library of this content."""
 
     def make(path: Path) -> Mapping[str, object]:
         path.write_bytes(content)
         return {"note": "made"}
 
-    return cache.store(KEY, make).library
+    return cache.store(key, make).library
 
 
 def test_found_as_stored(cache: Cache) -> None:
@@ -250,3 +250,27 @@ def test_keys_tell_names_and_values_apart() -> None:
     keys += [key_of("set", a="x", b="y"), key_of("set", a="x", b=("y",))]
     assert len(set(keys)) == len(keys)
     assert key_of("set", b=2, a=1) == key_of("set", a=1, b=2)
+
+
+def test_what_was_not_used_for_longest_goes_first(
+    cache: Cache, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = [digest(name) for name in ("first", "second", "third")]
+    now = time.time()
+    for days, key in zip((3.0, 2.0, 1.0), keys, strict=True):
+        put(cache, b"x" * 1000, key)
+        for path in cache.folder.glob(f"{key}*"):
+            os.utime(path, (now - 86400.0 * days,) * 2)
+    assert cache.find(keys[0]) is not None  # which is a use
+    usage = cache.usage()
+    assert (usage.libraries, usage.files) == (3, 6)
+    assert usage.size == sum(path.stat().st_size for path in cache.folder.iterdir())
+    assert cache.trim(usage.size) == 0
+    assert cache.trim(usage.size - 1) == 1
+    assert [cache.find(key) is not None for key in keys] == [True, False, True]
+    monkeypatch.setenv("DUAL_ARM_CACHE_LIMIT", "1e-6")
+    assert cache.trim() == 2
+    assert cache.usage().files == 0
+    monkeypatch.setenv("DUAL_ARM_CACHE_LIMIT", "much")
+    with pytest.raises(CodegenError, match=r"'much'; allowed is a number of gibibytes"):
+        cache.trim()

@@ -80,6 +80,7 @@ MAKERS: dict[str, Callable[[CellModel], ca.Function]] = {
     "limits": sample_limits_function,
     "path force": lambda model: path_force_function(model.workcell),
     "clearance": lambda model: model.screening["clearance"],
+    "far clearance": lambda model: model.screening["far_clearance"],
     "pieces": lambda model: model.screening["piece_poses"],
     "motion": lambda model: model.screening["motion"],
 }

@@ -69,6 +69,7 @@ class DistanceKind(Kind[PlaceRow]):
         # Half of what is wanted beyond the tolerance is left to what solver and FCL round off.
         self.least = tolerance + cell.clearance / 2.0
         self.separable = cell.functions.rows.separable
+        self._columns = cell.evaluator.checker.geometry.columns.tolist()
 
     def required(
         self, carry: PlacedCarry, rows: Sequence[PlaceRow], lenient: bool = False
@@ -123,7 +124,7 @@ class Clearances(DistanceKind):
         for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < BODY_DISTANCE).tolist():
             if pair not in self.separable:
                 for place in lowest(carry.distances.bounds[:, pair], BODY_DISTANCE):
-                    yield PlaceRow(Clearance(pair), place)
+                    yield PlaceRow(Clearance(pair, self._columns[pair]), place)
 
     def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
         """Pairs that come too close: at the lowest place and around it; a dip counts at two
@@ -135,7 +136,7 @@ class Clearances(DistanceKind):
             lows = lowest(distance, float(self.least[pair]))
             for place in sorted({k + beside for k in lows for beside in (0, 1, -width, width)}):
                 if place < carry.reached:
-                    yield PlaceRow(Clearance(pair), place)
+                    yield PlaceRow(Clearance(pair, self._columns[pair]), place)
 
 
 class Separations(DistanceKind):

@@ -23,7 +23,8 @@ def test_a_row_compiled_on_demand_is_the_interpreted_one_and_is_kept(
 ) -> None:
     compiled = CompiledCell(rack_cell(), Cache(tmp_path))
     plain = RowFunctions(compiled.bodies, {})
-    row = Clearance(next(k for k in range(99) if k not in plain.separable))
+    pair = next(k for k in range(99) if k not in plain.separable)
+    row = Clearance(pair, int(compiled.geometry.columns[pair]))
     made = RowFunctions(compiled.bodies, {}, compiled)
     again = RowFunctions(compiled.bodies, {}, CompiledCell(rack_cell(), Cache(tmp_path)))
     rng = np.random.default_rng(0)

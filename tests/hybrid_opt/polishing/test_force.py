@@ -74,6 +74,7 @@ def program_of(judge: CandidateEvaluator) -> tuple[ForceProgram, Array]:
     carry = CarryReader(cell).read(x)
     box, *_ = sorted(cell.functions.rows.separable)
     separable, pairs = cell.functions.rows.separable, carry.distances.bounds.shape[1]
+    columns = cell.evaluator.checker.geometry.columns
     arms = [k for k in range(pairs) if k not in separable]
     rows: list[Row] = [
         ForceRow(robot, branch, sample)
@@ -88,7 +89,7 @@ def program_of(judge: CandidateEvaluator) -> tuple[ForceProgram, Array]:
         PressureRow(0, task.samples - 1),
     ]
     kinds: list[PlaceConstraint] = [
-        Clearance(pair) for pair in (arms[0], arms[len(arms) // 2], arms[-1])
+        Clearance(pair, int(columns[pair])) for pair in (arms[0], arms[len(arms) // 2], arms[-1])
     ]
     kinds += [Separation(box, 3), Passing(box, 5, 0), Reach(0), Reach(1)]
     kinds += [JointLimit(0, 2, "lower"), JointLimit(1, 4, "upper")]

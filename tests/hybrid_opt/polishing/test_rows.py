@@ -63,7 +63,8 @@ def test_values_and_slopes_are_those_of_the_expressions() -> None:
     carry = CarryReader(cell).read(x)
     box, *_ = sorted(cell.functions.rows.separable)
     arm = next(k for k in range(99) if k not in cell.functions.rows.separable)
-    kinds: list[PlaceConstraint] = [Clearance(arm), Reach(1), JointLimit(0, 2, "lower")]
+    column = int(cell.evaluator.checker.geometry.columns[arm])
+    kinds: list[PlaceConstraint] = [Clearance(arm, column), Reach(1), JointLimit(0, 2, "lower")]
     kinds += [JointLimit(1, 4, "upper"), Separation(box, 3), Passing(box, 5, 0)]
     listed: list[Row] = [PlaceRow(kind, place) for kind in kinds for place in (60, 150)]
     layout = Layout(listed)

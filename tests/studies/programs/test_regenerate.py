@@ -122,6 +122,13 @@ source.c_source = lambda f, *more: rounded(plain(f, *more))
     assert "NO: " in done.stdout
 
 
+def test_what_the_cache_holds_is_said(cache: Cache) -> None:
+    cache.write_record("0" * 64, {"kept": True})
+    done = run(["--cache", "--json"])
+    size = (cache.folder / f"{'0' * 64}.json").stat().st_size
+    assert json.loads(done.stdout)["usage"] == {"libraries": 0, "files": 1, "size": size}
+
+
 def test_clean(cache: Cache) -> None:
     run(["cell.toml"])
     assert list(cache.folder.glob("*.so"))
@@ -149,7 +156,7 @@ def test_bad_input_is_one_message_and_code_2(cache: Cache) -> None:
 
 def test_wrong_options_are_told(cache: Cache) -> None:
     for arguments, message in (
-        ([], "name a workcell file, or --clean"),
+        ([], "name a workcell file, --cache or --clean"),
         (["cell.toml", "--samples", "0"], "--samples: found '0'; allowed is a whole number 1 to"),
         (["cell.toml", "--seed", "-1"], "--seed: found '-1'; allowed is a whole number 0 to"),
     ):

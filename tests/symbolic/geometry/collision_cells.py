@@ -102,6 +102,12 @@ def functions_of(geometry: CellGeometry, softness: Softness = EXACT) -> dict[str
     )
 
 
+def whole_geometry_of(name: str, folder: Path = Path()) -> CellGeometry:
+    """The same where every possible pair is active, all in one block."""
+    found = geometry_of(name, folder)
+    return replace(found, active=found.possible, near=len(found.possible))
+
+
 def random_configurations(
     geometry: CellGeometry, n: int, rng: np.random.Generator
 ) -> Configurations:

@@ -17,10 +17,10 @@ from symbolic.path.rotation import rotation_matrix
 from symbolic.records.poses import Orientation, pose_matrix
 from tests.symbolic.geometry.collision_cells import (
     functions_of,
-    geometry_of,
     placed_pieces,
     random_configurations,
     true_distances,
+    whole_geometry_of,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @cache
 def functions(name: str, folder: Path, softness: Softness = EXACT) -> dict[str, ca.Function]:
-    return functions_of(geometry_of(name, folder), softness)
+    return functions_of(whole_geometry_of(name, folder), softness)
 
 
 def bounds(name: str, folder: Path, *at: Array, softness: Softness = EXACT) -> Array:
@@ -49,7 +49,7 @@ def bounds(name: str, folder: Path, *at: Array, softness: Softness = EXACT) -> A
 
 @pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
 def test_bounds_never_exceed_the_distance(name: str, folder: Path) -> None:
-    geometry = geometry_of(name, folder)
+    geometry = whole_geometry_of(name, folder)
     at = random_configurations(geometry, 120, np.random.default_rng(11))
     bound = bounds(name, folder, *at)
     smooth = bounds(name, folder, *at, softness=Softness(WIDTH))
@@ -66,7 +66,7 @@ def test_bounds_never_exceed_the_distance(name: str, folder: Path) -> None:
 
 @given(st.integers(0, 10_000))
 def test_bounds_of_any_posture_are_safe(seed: int) -> None:
-    geometry = geometry_of("rack")
+    geometry = whole_geometry_of("rack")
     at = random_configurations(geometry, 1, np.random.default_rng(seed))
     bound = bounds("rack", Path(), *at)[0]
     distance = np.fmax(true_distances(geometry, *(array[0] for array in at)), 0.0)
@@ -75,7 +75,7 @@ def test_bounds_of_any_posture_are_safe(seed: int) -> None:
 
 def test_flush_boxes_are_measured_exactly() -> None:
     """The payload level above a board: the bound is the gap itself."""
-    geometry = geometry_of("rack")
+    geometry = whole_geometry_of("rack")
     k = geometry.pair_names.index(("payload", "middle board"))
     pose = np.array([[0.0, 0.0, 0.6 + 0.125 + gap, 0.0, 0.0, 0.0] for gap in (-0.01, 0.0, 0.03)])
     bound = bounds("rack", Path(), pose, np.zeros((3, 6)), np.zeros((3, 6)))[:, k]
@@ -84,7 +84,7 @@ def test_flush_boxes_are_measured_exactly() -> None:
 
 @pytest.mark.parametrize("name", ["rack", "obstacles"])
 def test_the_smooth_bound_is_lower_by_few_widths(name: str, folder: Path) -> None:
-    at = random_configurations(geometry_of(name, folder), 400, np.random.default_rng(12))
+    at = random_configurations(whole_geometry_of(name, folder), 400, np.random.default_rng(12))
     exact = bounds(name, folder, *at)
     for width in (1e-2, 1e-3, 1e-4):
         smooth = bounds(name, folder, *at, softness=Softness(width))
@@ -111,7 +111,7 @@ def test_derivatives_are_finite_at_every_kink(softness: Softness) -> None:
 
 
 def test_second_derivatives_of_the_smooth_bound_match_differences() -> None:
-    geometry = geometry_of("rack")
+    geometry = whole_geometry_of("rack")
     f = functions("rack", Path(), Softness(1e-2))["clearance"]
     x = ca.MX.sym("x", 18)
     rows = [
@@ -135,7 +135,7 @@ def test_second_derivatives_of_the_smooth_bound_match_differences() -> None:
 
 @pytest.mark.parametrize("name", ["rack", "ur10"])
 def test_piece_poses_agree_with_numeric_pinocchio(name: str, folder: Path) -> None:
-    geometry = geometry_of(name, folder)
+    geometry = whole_geometry_of(name, folder)
     at = random_configurations(geometry, 5, np.random.default_rng(15))
     f = functions(name, folder)["piece_poses"]
     for row in zip(*at, strict=True):

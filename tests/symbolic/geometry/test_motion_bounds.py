@@ -11,9 +11,9 @@ from symbolic.geometry.pieces import Piece, farthest_from_axis, skeleton
 from symbolic.geometry.screen import reach_about_joints
 from tests.symbolic.geometry.collision_cells import (
     functions_of,
-    geometry_of,
     placed_pieces,
     random_configurations,
+    whole_geometry_of,
 )
 
 STEPS = 16
@@ -26,7 +26,7 @@ def points_of(pieces: list[tuple[Piece, ...]]) -> list[Array]:
 @pytest.mark.parametrize("size", [0.02, 0.2, 0.6])
 def test_no_point_moves_farther_than_the_bound(size: float) -> None:
     """Distances at both ends, chord and bend bound every point's way between."""
-    geometry = geometry_of("rack")
+    geometry = whole_geometry_of("rack")
     motion = functions_of(geometry)["motion"]
     rng = np.random.default_rng(21)
     starts = np.hstack(random_configurations(geometry, 12, rng))
@@ -55,7 +55,7 @@ def test_no_point_moves_farther_than_the_bound(size: float) -> None:
 
 
 def test_links_of_one_arm_approach_no_faster_than_the_bound() -> None:
-    geometry = geometry_of("rack")
+    geometry = whole_geometry_of("rack")
     motion = functions_of(geometry)["motion"]
     rng = np.random.default_rng(22)
     starts = np.hstack(random_configurations(geometry, 15, rng))
@@ -82,7 +82,7 @@ def test_links_of_one_arm_approach_no_faster_than_the_bound() -> None:
 
 
 def test_reach_of_a_link_about_its_own_joint_is_exact_to_its_shape() -> None:
-    geometry = geometry_of("rack")
+    geometry = whole_geometry_of("rack")
     arm = geometry.arms[0]
     for body in geometry.bodies:
         if body.group != "robot 1" or body.frame.joint < 0:
@@ -96,7 +96,7 @@ def test_reach_of_a_link_about_its_own_joint_is_exact_to_its_shape() -> None:
 
 
 def test_standing_still_is_no_motion() -> None:
-    geometry = geometry_of("rack")
+    geometry = whole_geometry_of("rack")
     at = [array[0] for array in random_configurations(geometry, 1, np.random.default_rng(23))]
     chord, bend = functions_of(geometry)["motion"](*at, *at)
     assert np.all(np.array(chord) == 0.0)

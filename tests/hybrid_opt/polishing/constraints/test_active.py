@@ -16,8 +16,8 @@ from symbolic.smooth.places import Clearance
 
 NOTHING = cast(PlacedCarry, None)
 NEAR, FAR, GAP = (
-    PlaceRow(Clearance(0), 3),
-    PlaceRow(Clearance(0), 9),
+    PlaceRow(Clearance(0, 0), 3),
+    PlaceRow(Clearance(0, 0), 9),
     PlaceRow(Separation(1, 2), 5),
 )
 HALF = np.array([0.5, 2.0])

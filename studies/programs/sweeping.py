@@ -1,0 +1,95 @@
+"""What `studies.sweep` does: the first path, every combination, a table and a figure."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from hybrid_opt.cell import Cell
+from hybrid_opt.display.table import Table, number
+from hybrid_opt.door import polish, search
+from hybrid_opt.polishing.settings import usual_settings
+from hybrid_opt.recommending.recommendation import recommend
+from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.trajectory_file import read_trajectory
+from hybrid_opt.sweeping import Sweep, stored_sweep, sweep
+from studies.program import load_workcell
+from studies.report.drawing import FULL_WIDTH, in_style, legend_below, new_figure, save, series
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+
+ATTEMPTS = 4
+"""Of the polish that gives the first path."""
+
+
+def sweep_numbers(options: argparse.Namespace) -> int:
+    """Sweep, and print and write what was found."""
+    cell = Cell(load_workcell(options.workcell)).drivable()
+    file = Path(options.output) / "sweep.json"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    shown = not options.quiet
+    if file.exists():
+        x: Array = stored_sweep(file).x
+    elif options.path is not None:
+        x = _of_file(cell, Path(options.path))
+    else:
+        rng = np.random.default_rng(options.seed)
+        found = search(cell, evaluations=options.evaluations, rng=rng, progress=shown)
+        settings = replace(usual_settings("optimal"), attempts=ATTEMPTS)
+        best = recommend(polish(found, rng=rng, settings=settings, progress=shown))
+        x = np.append(best.x[:-1], best.limit)
+    over = dict(options.over)
+    fixed = options.path is not None
+    done = sweep(cell, x, over, fixed=fixed, file=file, jobs=options.jobs, progress=shown)
+    table = _table(done)
+    file.with_suffix(".csv").write_text(table.csv())
+    with in_style():
+        save(_figure(done), file.parent, "sweep")
+    print(json.dumps(to_json(done), indent=2) if options.json else table.text())
+    return 0
+
+
+def _of_file(cell: Cell, path: Path) -> Array:
+    """The decision vector of a stored carry, of this cell's shape."""
+    x = read_trajectory(path).x
+    n_path = cell.workcell.task.n_path
+    if x.shape == (n_path,):
+        x = np.append(x, cell.workcell.task.force_limit[1])
+    if x.shape != (cell.n_var,):
+        raise SettingsError(f"{path} has {len(x)} variables; this cell has {cell.n_var}")
+    return x
+
+
+def _table(done: Sweep) -> Table:
+    rows = [
+        (*(f"{v:g}" for v in row.values), number(row.duration, 3), number(row.force, 1), row.remark)
+        for row in done.rows
+    ]
+    header = (*done.over, "duration [s]", "force [N]", "remark")
+    return Table("sweep", "The recommended carry of every combination", header, tuple(rows))
+
+
+def _figure(done: Sweep) -> Figure:
+    """Duration and force over the last key, a line per combination of the others."""
+    figure = new_figure(FULL_WIDTH, 0.45 * FULL_WIDTH)
+    panels = figure.subplots(1, 2)
+    *outer, last = done.over
+    heads = list(dict.fromkeys(row.values[:-1] for row in done.rows))
+    for axes, name, label in zip(
+        panels, ("duration", "force"), ("duration [s]", "commanded force [N]"), strict=True
+    ):
+        for k, head in enumerate(heads):
+            own = [row for row in done.rows if row.values[:-1] == head]
+            named = ", ".join(f"{key} {v:g}" for key, v in zip(outer, head, strict=True))
+            values = [row.values[-1] for row in own], [getattr(row, name) for row in own]
+            axes.plot(*values, **series(k).drawn, marker="o", markersize=3, label=named or None)
+        axes.set_xlabel(last)
+        axes.set_ylabel(label)
+    if outer:
+        legend_below(figure, panels[0])
+    return figure

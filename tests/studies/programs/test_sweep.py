@@ -1,0 +1,50 @@
+"""The sweep's options, its table and its figure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybrid_opt.store.files import write_json
+from hybrid_opt.store.json_records import to_json
+from hybrid_opt.sweeping import Combination, Sweep, stored_sweep
+from studies.programs.sweeping import _figure, _table
+from studies.sweep import main
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("payload.mass=6:14:2", (6.0, 8.0, 10.0, 12.0, 14.0)),
+        ("contacts.friction=0.4:1:0.1", (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)),
+        ("task.ramp_time=0.5", (0.5,)),
+        ("payload.mass=6,11,7", (6.0, 11.0, 7.0)),
+    ],
+)
+def test_values_of_a_key(text: str, values: tuple[float, ...]) -> None:
+    options = main.parser().parse_args(["cell.toml", "--over", text])
+    assert options.over == [(text.partition("=")[0], values)]
+
+
+@pytest.mark.parametrize("text", ["payload.mass", "=1:2:1", "m=1:2", "m=2:1:1", "m=1:2:0", "m=x"])
+def test_wrong_values_are_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main.parser().parse_args(["cell.toml", "--over", text])
+    assert "allowed is" in capsys.readouterr().err
+
+
+def test_a_sweep_is_stored_listed_and_drawn(tmp_path: Path) -> None:
+    rows = (
+        Combination((8.0, 0.5), np.nan, np.nan, np.zeros(0), "it cannot be held"),
+        Combination((8.0, 1.0), 2.5, 90.0, np.ones(3)),
+    )
+    done = Sweep("digest", {"mass": (8.0,), "friction": (0.5, 1.0)}, np.zeros(3), rows)
+    write_json(tmp_path / "sweep.json", to_json(done))
+    assert repr(stored_sweep(tmp_path / "sweep.json")) == repr(done)
+    assert "mass 8, friction 0.5: it cannot be held" in repr(done)
+    assert _table(done).rows[1] == ("8", "1", "2.500", "90.0", "")
+    left, right = _figure(done).axes
+    assert left.lines[0].get_ydata()[1] == 2.5
+    assert right.lines[0].get_ydata()[1] == 90.0
