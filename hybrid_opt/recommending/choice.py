@@ -216,10 +216,8 @@ class DrivenPaths:
         rate, second_rate = first * v[:, None], first * a[:, None] + second * v[:, None] ** 2
         motion = BoxMotion(pose, rate, second_rate)
         most = np.argsort(-self._model.nominal(motion).max(axis=1))[:LOOKED_AT]
-        motion = BoxMotion(pose[most], rate[most], second_rate[most])
-        commanded, leading = self._model.hold(motion, self._model.workcell.uncertainty, LEADER)
-        peaks = float(leading.max()), float(commanded.max())
-        return Option(row, limit, timing.duration, np.array(peaks))
+        force = self._model.peak(motion.at(most), self._model.workcell.uncertainty, LEADER)
+        return Option(row, limit, timing.duration, force)
 
     def all_options(self, own: Array | float) -> list[Option]:
         """Every path within its own limit (k,) [N], and, where that takes milliseconds, within

@@ -163,7 +163,7 @@ def pressed_beyond(
         model = pressing_model(workcell)
 
         def needed_for(names: tuple[str, ...]) -> Array:
-            held = [model.hold(box, doubt.only(names), leader)[0] for box in (motion, still)]
+            held = [model.commanded(box, doubt.only(names), leader) for box in (motion, still)]
             return np.maximum(planned, np.maximum(*held))
 
         names: tuple[str, ...] = ()
