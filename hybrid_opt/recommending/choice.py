@@ -305,6 +305,6 @@ def refuse(options: Sequence[Option], wish: Wish, goal: Goal) -> None:
     least = min(option.commanded for option in options)
     asked = ", ".join(f"{name} {value:g} {_UNITS[name]}" for name, value in wish.given.items())
     raise SettingsError(
-        f"{asked}: no carry of the front holds with so little in every case of the cell's "
-        f"uncertainty; the gentlest needs {least:.1f} N commanded"
+        f"{asked}: no carry of the front holds within {goal.hardest.min():.1f} N in every case of "
+        f"the cell's uncertainty; the gentlest needs {least:.1f} N commanded"
     )

@@ -37,11 +37,11 @@ from symbolic.records import Uncertainty, Workcell
 BATCH = 100_000
 """Samples that are evaluated at once."""
 
-FEW = 5
+FEW = 3
 """Samples at which every case is asked first."""
 
-FELT_AT = 8
-"""Samples at which it is asked what the leading arm feels."""
+FELT_AT = 2
+"""Samples of either kind at which it is asked what the leading arm feels."""
 
 BISECTIONS = 30
 DISPLACED = 0.2
@@ -84,8 +84,14 @@ HeldMotion = BoxMotion | Carry
 """What robust forces are asked for."""
 
 
-def _box(motion: HeldMotion) -> BoxMotion:
+def box_motion(motion: HeldMotion) -> BoxMotion:
+    """What of it matters."""
     return BoxMotion(motion.pose, motion.rate, motion.second_rate)
+
+
+def stopped(motion: HeldMotion) -> BoxMotion:
+    """The same poses at rest."""
+    return BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
 
 
 @dataclass(frozen=True)
@@ -191,19 +197,28 @@ class RobustModel:
         force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
         return force[:, follower], force[:, leader]
 
-    def commanded(self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0) -> Array:
+    def commanded(
+        self,
+        motion: HeldMotion,
+        uncertainty: Uncertainty,
+        leader: int = 0,
+        above: Array | float = 0.0,
+    ) -> Array:
         """(n,) the first of `hold`, sooner where many cases are asked.
 
         The cases that ask for most at a few samples say what is needed at least; of most others a
         pressure that is known beforehand shows that they need no more.
+
+        Args:
+            above: (n,) what is commanded anyway, or one for all [N]; less is not told.
         """
         check_set(self.workcell, uncertainty)
         cases, n = worst_cases(self.workcell, uncertainty, leader), len(motion.pose)
         few = np.unique(np.linspace(0, n - 1, min(n, FEW)).round().astype(int))
-        least = self.least_squeeze(_box(motion).at(few), cases, leader)[:, :, 1 - leader]
+        least = self.least_squeeze(box_motion(motion).at(few), cases, leader)[:, :, 1 - leader]
         ruling = np.unique(least.argmax(axis=0))
         needed = self.least_squeeze(motion, cases[ruling], leader)[:, :, 1 - leader]
-        force: Array = needed.max(axis=0)
+        force: Array = np.maximum(needed.max(axis=0), above)
         others, step = np.delete(cases, ruling, axis=0), max(1, BATCH // n)
         for start in range(0, len(others), step):
             some = others[start : start + step]
@@ -217,7 +232,7 @@ class RobustModel:
         felt = force + planned[:, leader] - planned[:, 1 - leader]
         most = np.union1d(*[np.argsort(-each)[:FELT_AT] for each in (force, felt)])
         peaks = np.full(2, force.max())
-        peaks[leader] = self.hold(_box(motion).at(most), uncertainty, leader)[1].max()
+        peaks[leader] = self.hold(box_motion(motion).at(most), uncertainty, leader)[1].max()
         return peaks
 
     def robust_force(
