@@ -89,6 +89,11 @@ def box_motion(motion: HeldMotion) -> BoxMotion:
     return BoxMotion(motion.pose, motion.rate, motion.second_rate)
 
 
+def at_rest() -> BoxMotion:
+    """One sample, level and still."""
+    return BoxMotion(*[np.zeros((1, 6))] * 3)
+
+
 def stopped(motion: HeldMotion) -> BoxMotion:
     """The same poses at rest."""
     return BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
