@@ -219,19 +219,27 @@ class DrivenPaths:
         force = self._model.peak(motion.at(most), self._model.workcell.uncertainty, LEADER)
         return Option(row, limit, timing.duration, force)
 
-    def all_options(self, own: Array | float) -> list[Option]:
+    def all_options(
+        self, own: Array | float, told: Callable[[], None] = lambda: None
+    ) -> list[Option]:
         """Every path within its own limit (k,) [N], and, where that takes milliseconds, within
-        several limits from holding still on."""
-        found = self.options(own)
-        if self._robust or not self._timer.compiled:
-            return found
-        still = np.array([timing.limited_force for timing in self.timings(1e-6)])
-        least = np.where(np.isfinite(still), still, self.highest_force)
-        low = np.minimum((1.0 + LEAST_ABOVE_STILL) * least, self.highest_force)
-        # Closer together where force is least and durations change most.
-        shares = np.linspace(0.0, 1.0, FORCES) ** 2
-        limits = [low + share * (self.highest_force - low) for share in shares]
-        return found + [option for limit in limits for option in self.options(limit)]
+        several limits from holding still on.
+
+        Args:
+            told: called `FORCES` times as the work goes on.
+        """
+        found, limits = self.options(own), []
+        if not self._robust and self._timer.compiled:
+            still = np.array([timing.limited_force for timing in self.timings(1e-6)])
+            least = np.where(np.isfinite(still), still, self.highest_force)
+            low = np.minimum((1.0 + LEAST_ABOVE_STILL) * least, self.highest_force)
+            # Closer together where force is least and durations change most.
+            shares = np.linspace(0.0, 1.0, FORCES) ** 2
+            limits = [low + share * (self.highest_force - low) for share in shares]
+        for k in range(FORCES):
+            found += [option for limit in limits[k : k + 1] for option in self.options(limit)]
+            told()
+        return found
 
 
 @dataclass(frozen=True)

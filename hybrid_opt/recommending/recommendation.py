@@ -23,6 +23,7 @@ from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.progress import Progress, counted
 from hybrid_opt.recommending.advice import Advice, advice, commanded_margins
 from hybrid_opt.recommending.choice import (
+    FORCES,
     LEADER,
     DrivenPaths,
     Goal,
@@ -62,7 +63,7 @@ TRIED = 3
 PRECISE = 1e-3
 """Of the multiple of an uncertainty set that would do."""
 
-STEPS = 5
+STEPS = 4 + FORCES
 """Of a recommendation, and one more per rival."""
 
 
@@ -177,8 +178,7 @@ def _recommended(
     cell, given = front.cell, front.x
     rows = spread_rows(given[:, :-1])
     paths = DrivenPaths.of(cell, given[rows, :-1])
-    options = paths.all_options(given[rows, -1])
-    told()
+    options = paths.all_options(given[rows, -1], told)
     goal = Goal.of(wish, cell.workcell)
     weak = not wish.given and not any((each.force <= goal.hardest).all() for each in options)
     if weak:
