@@ -249,7 +249,8 @@ def _driven(
             if max(late, hard) <= 1.0 + BETTER:
                 found.append((goal.cost(timing.duration, force), option, timing))
                 break
-            reason = f"within the limits on jerk it takes {timing.duration:.3f} s"
+            needs = f"it takes {timing.duration:.3f} s and needs {force:.1f} N commanded"
+            reason = f"without jumps of the acceleration {needs}"
             longest, hardest = asked.longest / max(late, 1.0), asked.hardest / max(hard, 1.0)
             asked = replace(asked, longest=longest, hardest=hardest)
             option = next(best_of_paths(paths, own, asked, 1), None)
