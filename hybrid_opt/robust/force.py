@@ -37,11 +37,8 @@ from symbolic.records import Uncertainty, Workcell
 BATCH = 100_000
 """Samples that are evaluated at once."""
 
-FEW = 3
-"""Samples at which every case is asked first."""
-
-FELT_AT = 2
-"""Samples of either kind at which it is asked what the leading arm feels."""
+FEW, RULING = 3, 4
+"""Samples at which cases that may ask for most are looked for, and how many at each."""
 
 BISECTIONS = 30
 DISPLACED = 0.2
@@ -87,6 +84,11 @@ HeldMotion = BoxMotion | Carry
 def box_motion(motion: HeldMotion) -> BoxMotion:
     """What of it matters."""
     return BoxMotion(motion.pose, motion.rate, motion.second_rate)
+
+
+def _repeated(motion: HeldMotion, times: int) -> tuple[Array, ...]:
+    parts = (motion.pose, motion.rate, motion.second_rate)
+    return tuple(np.tile(values, (times, 1)) for values in parts)
 
 
 def at_rest() -> BoxMotion:
@@ -169,12 +171,12 @@ class RobustModel:
         n = len(motion.pose)
         found = np.empty((len(cases), n, 2))
         step = max(1, BATCH // n)
-        arrays = (motion.pose, motion.rate, motion.second_rate)
         for start in range(0, len(cases), step):
             some = cases[start : start + step]
-            repeated = tuple(np.tile(values, (len(some), 1)) for values in arrays)
             every = np.repeat(some, n, axis=0)
-            forces = self._cases.least(repeated, every, leader, displaced=displaced)
+            forces = self._cases.least(
+                _repeated(motion, len(some)), every, leader, displaced=displaced
+            )
             found[start : start + step] = forces.reshape(len(some), n, 2)
         return found
 
@@ -211,8 +213,8 @@ class RobustModel:
     ) -> Array:
         """(n,) the first of `hold`, sooner where many cases are asked.
 
-        The cases that ask for most at a few samples say what is needed at least; of most others a
-        pressure that is known beforehand shows that they need no more.
+        A pressure that is known beforehand shows which cases ask for most at a few samples, what
+        they need, and of most others that they need no more.
 
         Args:
             above: (n,) what is commanded anyway, or one for all [N]; less is not told.
@@ -220,8 +222,11 @@ class RobustModel:
         check_set(self.workcell, uncertainty)
         cases, n = worst_cases(self.workcell, uncertainty, leader), len(motion.pose)
         few = np.unique(np.linspace(0, n - 1, min(n, FEW)).round().astype(int))
-        least = self.least_squeeze(box_motion(motion).at(few), cases, leader)[:, :, 1 - leader]
-        ruling = np.unique(least.argmax(axis=0))
+        at_few = box_motion(motion).at(few)
+        planned = self.nominal(at_few, leader)[:, 1 - leader]
+        rows, every = _repeated(at_few, len(cases)), np.repeat(cases, len(few), axis=0)
+        slack = self._cases.slack(rows, every, np.tile(planned, len(cases)), leader)
+        ruling = np.unique(slack.reshape(len(cases), -1).argsort(axis=0)[:RULING])
         needed = self.least_squeeze(motion, cases[ruling], leader)[:, :, 1 - leader]
         force: Array = np.maximum(needed.max(axis=0), above)
         others, step = np.delete(cases, ruling, axis=0), max(1, BATCH // n)
@@ -235,7 +240,7 @@ class RobustModel:
         is commanded, or where most is with the plan's difference of both forces."""
         force, planned = self.commanded(motion, uncertainty, leader), self.nominal(motion, leader)
         felt = force + planned[:, leader] - planned[:, 1 - leader]
-        most = np.union1d(*[np.argsort(-each)[:FELT_AT] for each in (force, felt)])
+        most = np.unique([force.argmax(), felt.argmax()])
         peaks = np.full(2, force.max())
         peaks[leader] = self.hold(box_motion(motion).at(most), uncertainty, leader)[1].max()
         return peaks
@@ -301,10 +306,10 @@ class RobustModel:
         """(k, n) share of the commanded forces (n,) that each of k cases needs; `screened` for
         less."""
         n, k = len(motion.pose), len(cases)
-        parts = (motion.pose, motion.rate, motion.second_rate)
-        rows = tuple(np.tile(values, (k, 1)) for values in parts)
+        rows = _repeated(motion, k)
         repeated, commanded = np.repeat(cases, n, axis=0), np.tile(force, k)
-        left = ~self._cases.surely_held(rows, repeated, screened * commanded, leader, threads)
+        slack = self._cases.slack(rows, repeated, screened * commanded, leader, threads)
+        left = ~(slack > 0.0)
         share = np.full(n * k, screened)
         if left.any():
             some, displaced = tuple(values[left] for values in rows), bool(cases[:, 11:15].any())
