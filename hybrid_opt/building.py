@@ -17,7 +17,7 @@ from hybrid_opt.polishing.drive import is_polishable
 from hybrid_opt.polishing.rows import row_library
 from hybrid_opt.polishing.solvers.dense import dense_method
 from hybrid_opt.polishing.solvers.quadratic import quadratic_method
-from hybrid_opt.robust.force import robust_model
+from hybrid_opt.robust.force import at_rest, pressing_model, robust_model
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PATH_INTERVALS
 from symbolic.errors import DualArmError
@@ -102,6 +102,8 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     yield lambda: cell.timing_model
     yield lambda: JobCollisions(compiled)
     yield lambda: robust_model(workcell)
+    if _driven(cell):
+        yield lambda: pressing_model(workcell).nominal(at_rest())  # built when first asked
     if polished:
         yield lambda: (quadratic_method(cache), dense_method(cache))
         yield lambda: row_library(cache)

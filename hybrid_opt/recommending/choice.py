@@ -216,24 +216,30 @@ class DrivenPaths:
         rate, second_rate = first * v[:, None], first * a[:, None] + second * v[:, None] ** 2
         motion = BoxMotion(pose, rate, second_rate)
         most = np.argsort(-self._model.nominal(motion).max(axis=1))[:LOOKED_AT]
-        motion = BoxMotion(pose[most], rate[most], second_rate[most])
-        commanded, leading = self._model.hold(motion, self._model.workcell.uncertainty, LEADER)
-        peaks = float(leading.max()), float(commanded.max())
-        return Option(row, limit, timing.duration, np.array(peaks))
+        force = self._model.peak(motion.at(most), self._model.workcell.uncertainty, LEADER)
+        return Option(row, limit, timing.duration, force)
 
-    def all_options(self, own: Array | float) -> list[Option]:
+    def all_options(
+        self, own: Array | float, told: Callable[[], None] = lambda: None
+    ) -> list[Option]:
         """Every path within its own limit (k,) [N], and, where that takes milliseconds, within
-        several limits from holding still on."""
-        found = self.options(own)
-        if self._robust or not self._timer.compiled:
-            return found
-        still = np.array([timing.limited_force for timing in self.timings(1e-6)])
-        least = np.where(np.isfinite(still), still, self.highest_force)
-        low = np.minimum((1.0 + LEAST_ABOVE_STILL) * least, self.highest_force)
-        # Closer together where force is least and durations change most.
-        shares = np.linspace(0.0, 1.0, FORCES) ** 2
-        limits = [low + share * (self.highest_force - low) for share in shares]
-        return found + [option for limit in limits for option in self.options(limit)]
+        several limits from holding still on.
+
+        Args:
+            told: called `FORCES` times as the work goes on.
+        """
+        found, limits = self.options(own), []
+        if not self._robust and self._timer.compiled:
+            still = np.array([timing.limited_force for timing in self.timings(1e-6)])
+            least = np.where(np.isfinite(still), still, self.highest_force)
+            low = np.minimum((1.0 + LEAST_ABOVE_STILL) * least, self.highest_force)
+            # Closer together where force is least and durations change most.
+            shares = np.linspace(0.0, 1.0, FORCES) ** 2
+            limits = [low + share * (self.highest_force - low) for share in shares]
+        for k in range(FORCES):
+            found += [option for limit in limits[k : k + 1] for option in self.options(limit)]
+            told()
+        return found
 
 
 @dataclass(frozen=True)
@@ -307,6 +313,6 @@ def refuse(options: Sequence[Option], wish: Wish, goal: Goal) -> None:
     least = min(option.commanded for option in options)
     asked = ", ".join(f"{name} {value:g} {_UNITS[name]}" for name, value in wish.given.items())
     raise SettingsError(
-        f"{asked}: no carry of the front holds with so little in every case of the cell's "
-        f"uncertainty; the gentlest needs {least:.1f} N commanded"
+        f"{asked}: no carry of the front holds within {goal.hardest.min():.1f} N in every case of "
+        f"the cell's uncertainty; the gentlest needs {least:.1f} N commanded"
     )

@@ -21,7 +21,7 @@ from hybrid_opt.recommending.choice import (
     duration_alone,
     force_alone,
 )
-from hybrid_opt.robust.force import BoxMotion, robust_model
+from hybrid_opt.robust.force import at_rest, robust_model
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array, Figure
@@ -88,9 +88,7 @@ def level_force(workcell: Workcell, kind: ForceKind) -> float:
     """
     if not kind.robust:
         return float(static_hold(workcell).normal_force.max())
-    still = np.zeros((1, 6))
-    model = robust_model(workcell)
-    return float(np.max(model.hold(BoxMotion(still, still, still), workcell.uncertainty)))
+    return float(np.max(robust_model(workcell).hold(at_rest(), workcell.uncertainty)))
 
 
 def table_forces(workcell: Workcell, kind: ForceKind = PLANNED_FORCE) -> Array:

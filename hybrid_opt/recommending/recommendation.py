@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import brentq
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
@@ -22,6 +23,7 @@ from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.progress import Progress, counted
 from hybrid_opt.recommending.advice import Advice, advice, commanded_margins
 from hybrid_opt.recommending.choice import (
+    FORCES,
     LEADER,
     DrivenPaths,
     Goal,
@@ -32,13 +34,21 @@ from hybrid_opt.recommending.choice import (
     refuse,
 )
 from hybrid_opt.recommending.comparison import BETTER, Rival, rival, spread_rows
-from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
+from hybrid_opt.robust.squeeze import (
+    DOUBTS,
+    Squeeze,
+    SqueezeSettings,
+    commanded_forces,
+    largest_commanded,
+)
 from hybrid_opt.shown import Shown
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from hybrid_opt.timing.use import limited_force
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.records import Uncertainty, Workcell
+from symbolic.records.cell import RANGES
 
 HAND_MADE = "hand-made"
 """Name of the workcell file's own trajectory."""
@@ -50,7 +60,10 @@ and the whole force keep to it as well."""
 TRIED = 3
 """Paths that are driven within limits on jerk before the best of them is chosen."""
 
-STEPS = 5
+PRECISE = 1e-3
+"""Of the multiple of an uncertainty set that would do."""
+
+STEPS = 4 + FORCES
 """Of a recommendation, and one more per rival."""
 
 
@@ -165,23 +178,25 @@ def _recommended(
     cell, given = front.cell, front.x
     rows = spread_rows(given[:, :-1])
     paths = DrivenPaths.of(cell, given[rows, :-1])
-    options = paths.all_options(given[rows, -1])
-    told()
+    options = paths.all_options(given[rows, -1], told)
     goal = Goal.of(wish, cell.workcell)
-    doubts = []
-    if not wish.given and not any((option.force <= goal.hardest).all() for option in options):
+    weak = not wish.given and not any((each.force <= goal.hardest).all() for each in options)
+    if weak:
         goal = replace(goal, hardest=np.full(2, np.inf), cost=force_alone)
-        doubts.append(
-            "no carry of the front holds in every case of the cell's uncertainty within the "
-            "reference forces: this is the gentlest; state what is known better as [uncertainty]"
-        )
     refuse(options, wish, goal)
     option, timing = _driven(cell, paths, options, goal)
     told()
     carry = timing.carry
     assert carry is not None, "what is driven has a carry"
-    commanded, squeeze, job, problem = _job(cell, timing)
-    doubts += problem
+    commanded, squeeze, job, doubts = _job(cell, timing)
+    allowed = cell.workcell.task.reference_force
+    if weak:
+        doubts.insert(0, _too_weak(cell.workcell, carry, commanded))
+    elif (commanded > allowed * (1.0 + BETTER)).any():
+        doubts.append(
+            f"pressing with {commanded.max():.1f} N exceeds the reference force of "
+            f"{allowed.min():.1f} N; wish for a longer carry or less force"
+        )
     told()
     beside = []
     for label, path in named.items():
@@ -227,13 +242,15 @@ def _driven(
             if not timing.ok or timing.carry is None:
                 reason = timing.reason
                 break
-            force = commanded_forces(cell.workcell, timing.carry, SqueezeSettings())[1].force
+            doubt = cell.workcell.uncertainty
+            force = largest_commanded(cell.workcell, timing.carry, doubt, LEADER)
             late = timing.duration / goal.longest
             hard = force / float(goal.hardest[1 - LEADER])
             if max(late, hard) <= 1.0 + BETTER:
                 found.append((goal.cost(timing.duration, force), option, timing))
                 break
-            reason = f"within the limits on jerk it takes {timing.duration:.3f} s"
+            needs = f"it takes {timing.duration:.3f} s and needs {force:.1f} N commanded"
+            reason = f"without jumps of the acceleration {needs}"
             longest, hardest = asked.longest / max(late, 1.0), asked.hardest / max(hard, 1.0)
             asked = replace(asked, longest=longest, hardest=hardest)
             option = next(best_of_paths(paths, own, asked, 1), None)
@@ -261,13 +278,33 @@ def _job(cell: Cell, timing: Timing) -> tuple[Array, Squeeze, Job | None, list[s
             "the squeeze holds pads that choose their pressure; pressing evenly, they do not close "
             "their grasp: turn them towards one another, or raise the friction"
         )
-    allowed = cell.workcell.task.reference_force
-    if (peak > allowed * (1.0 + BETTER)).any():
-        doubts.append(
-            f"pressing with {peak.max():.1f} N exceeds the reference force of "
-            f"{allowed.min():.1f} N; wish for a longer carry or less force"
-        )
     return peak, squeeze, job, doubts
+
+
+def _too_weak(workcell: Workcell, carry: Carry, needed: Array) -> str:
+    """That the reference forces are not enough for what has to be commanded (2,) [N], and what
+    would do."""
+    doubt, allowed = workcell.uncertainty, workcell.task.reference_force.min()
+
+    def share(known: Uncertainty) -> float:
+        """Of the reference force, of the robot that presses harder."""
+        return float(largest_commanded(workcell, carry, known, LEADER) * harder / allowed)
+
+    harder = 1.0
+    harder = needed.max() / (share(doubt) * allowed)
+    ways, least = [f"reference forces of {needed.max():.1f} N"], share(doubt.only(()))
+    if least < 1.0 < share(doubt):
+        most = brentq(lambda factor: share(doubt.scaled(factor)) - 1.0, 0.0, 1.0, xtol=PRECISE)
+        ways.append(f"an [uncertainty] {np.floor(100.0 * most) / 100.0:.2f} times as wide")
+    for name, ranges in DOUBTS.items():
+        others = doubt.only([each for each in RANGES if each not in ranges])
+        if not doubt.only(ranges).is_empty and share(others) <= 1.0:
+            ways.append(f"no doubt about the {name}")
+    return (
+        "no carry of the front holds in every case of the cell's uncertainty within the reference "
+        f"forces of {allowed:.1f} N: this is the gentlest; with nothing uncertain it needs "
+        f"{least * allowed:.1f} N. Any of these would do: {', '.join(ways)}"
+    )
 
 
 def _better(beside: Sequence[Rival], timing: Timing, force: float) -> Iterator[str]:

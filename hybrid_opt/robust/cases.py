@@ -193,20 +193,19 @@ class CaseForces:
             function = self._in_place
         return function.batch(*motion, cases, threads=threads)["normal_force"]
 
-    def surely_held(
+    def slack(
         self,
         motion: tuple[Array, ...],
         cases: Array,
         force: Array,
         leader: int,
         threads: int = 1,
-    ) -> NDArray[np.bool_]:
-        """(m,) whether a pressure that is known beforehand holds under commanded forces (m,) [N];
-        where not, another one still may."""
+    ) -> Array:
+        """(m,) positive where a pressure that is known beforehand holds under commanded forces (m,)
+        [N]; elsewhere another one still may."""
         slack = self._functions(1 - leader)[1]
         arm = (float(1 - leader),) if self._squeezed else ()
-        found = slack.batch(*motion, cases, force, *arm, threads=threads)["slack"]
-        return np.asarray(found.ravel() > 0.0, dtype=np.bool_)
+        return slack.batch(*motion, cases, force, *arm, threads=threads)["slack"].ravel()
 
     def leading_share(self, leader: int) -> float:
         """Rise of the leading robot's force per newton of the commanded one."""

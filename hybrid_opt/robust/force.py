@@ -13,6 +13,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from codegen.cache import Cache
 from hybrid_opt.carry import Carry
@@ -36,13 +37,16 @@ from symbolic.records import Uncertainty, Workcell
 BATCH = 100_000
 """Samples that are evaluated at once."""
 
+FEW, RULING = 3, 4
+"""Samples at which cases that may ask for most are looked for, and how many at each."""
+
 BISECTIONS = 30
 DISPLACED = 0.2
 """Displacement of pads that press evenly, over the least distance of two pads of different robots,
 up to which forces are looked for."""
 
-LARGEST_FACTOR = 20.0
-"""The largest multiple of a set that is looked for."""
+LARGEST_FACTOR, FACTOR_ERROR = 20.0, 1e-6
+"""The largest multiple of a set that is looked for, and how far off one that is found may be."""
 
 SCREENED = 0.97
 """Share of the commanded force that is enough for most cases, as a quick look tells."""
@@ -68,9 +72,33 @@ class BoxMotion:
     rate: Array
     second_rate: Array
 
+    def at(self, rows: NDArray[np.intp]) -> BoxMotion:
+        """At some of the samples."""
+        return BoxMotion(self.pose[rows], self.rate[rows], self.second_rate[rows])
+
 
 HeldMotion = BoxMotion | Carry
 """What robust forces are asked for."""
+
+
+def box_motion(motion: HeldMotion) -> BoxMotion:
+    """What of it matters."""
+    return BoxMotion(motion.pose, motion.rate, motion.second_rate)
+
+
+def _repeated(motion: HeldMotion, times: int) -> tuple[Array, ...]:
+    parts = (motion.pose, motion.rate, motion.second_rate)
+    return tuple(np.tile(values, (times, 1)) for values in parts)
+
+
+def at_rest() -> BoxMotion:
+    """One sample, level and still."""
+    return BoxMotion(*[np.zeros((1, 6))] * 3)
+
+
+def stopped(motion: HeldMotion) -> BoxMotion:
+    """The same poses at rest."""
+    return BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
 
 
 @dataclass(frozen=True)
@@ -143,12 +171,12 @@ class RobustModel:
         n = len(motion.pose)
         found = np.empty((len(cases), n, 2))
         step = max(1, BATCH // n)
-        arrays = (motion.pose, motion.rate, motion.second_rate)
         for start in range(0, len(cases), step):
             some = cases[start : start + step]
-            repeated = tuple(np.tile(values, (len(some), 1)) for values in arrays)
             every = np.repeat(some, n, axis=0)
-            forces = self._cases.least(repeated, every, leader, displaced=displaced)
+            forces = self._cases.least(
+                _repeated(motion, len(some)), every, leader, displaced=displaced
+            )
             found[start : start + step] = forces.reshape(len(some), n, 2)
         return found
 
@@ -175,6 +203,47 @@ class RobustModel:
         follower, share = 1 - leader, self._cases.leading_share(leader)
         force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
         return force[:, follower], force[:, leader]
+
+    def commanded(
+        self,
+        motion: HeldMotion,
+        uncertainty: Uncertainty,
+        leader: int = 0,
+        above: Array | float = 0.0,
+    ) -> Array:
+        """(n,) the first of `hold`, sooner where many cases are asked.
+
+        A pressure that is known beforehand shows which cases ask for most at a few samples, what
+        they need, and of most others that they need no more.
+
+        Args:
+            above: (n,) what is commanded anyway, or one for all [N]; less is not told.
+        """
+        check_set(self.workcell, uncertainty)
+        cases, n = worst_cases(self.workcell, uncertainty, leader), len(motion.pose)
+        few = np.unique(np.linspace(0, n - 1, min(n, FEW)).round().astype(int))
+        at_few = box_motion(motion).at(few)
+        planned = self.nominal(at_few, leader)[:, 1 - leader]
+        rows, every = _repeated(at_few, len(cases)), np.repeat(cases, len(few), axis=0)
+        slack = self._cases.slack(rows, every, np.tile(planned, len(cases)), leader)
+        ruling = np.unique(slack.reshape(len(cases), -1).argsort(axis=0)[:RULING])
+        needed = self.least_squeeze(motion, cases[ruling], leader)[:, :, 1 - leader]
+        force: Array = np.maximum(needed.max(axis=0), above)
+        others, step = np.delete(cases, ruling, axis=0), max(1, BATCH // n)
+        for start in range(0, len(others), step):
+            some = others[start : start + step]
+            force *= self._shares(motion, force, some, 1.0, leader).max(axis=0)
+        return force
+
+    def peak(self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0) -> Array:
+        """(2,) the largest forces of `hold`, sooner: what the leader feels is asked for where most
+        is commanded, or where most is with the plan's difference of both forces."""
+        force, planned = self.commanded(motion, uncertainty, leader), self.nominal(motion, leader)
+        felt = force + planned[:, leader] - planned[:, 1 - leader]
+        most = np.unique([force.argmax(), felt.argmax()])
+        peaks = np.full(2, force.max())
+        peaks[leader] = self.hold(box_motion(motion).at(most), uncertainty, leader)[1].max()
+        return peaks
 
     def robust_force(
         self, motion: HeldMotion, uncertainty: Uncertainty | None = None, leader: int = 0
@@ -217,7 +286,9 @@ class RobustModel:
                 self.workcell, force.uncertainty, min(step, left), rng, force.leader
             )
             # Only what needs more than the closest so far can say more; beyond 1 all are counted.
-            share = self._shares(motion, force, cases, min(closest, 1.0), threads)
+            enough, leader = min(closest, 1.0), force.leader
+            share = self._shares(motion, force.commanded, cases, enough, leader, threads)
+            share = share.max(axis=1)
             failing += int((share > 1.0 + HOLDS).sum())
             closest = max(closest, float(share.max()))
             left -= len(cases)
@@ -226,25 +297,25 @@ class RobustModel:
     def _shares(
         self,
         motion: HeldMotion,
-        force: RobustForce,
+        force: Array,
         cases: Array,
         screened: float,
-        threads: int,
+        leader: int,
+        threads: int = 1,
     ) -> Array:
-        """(k,) largest share of the commanded force that each case needs; `screened` for less."""
+        """(k, n) share of the commanded forces (n,) that each of k cases needs; `screened` for
+        less."""
         n, k = len(motion.pose), len(cases)
-        parts = (motion.pose, motion.rate, motion.second_rate)
-        rows = tuple(np.tile(values, (k, 1)) for values in parts)
-        repeated = np.repeat(cases, n, axis=0)
-        commanded, follower = np.tile(force.commanded, k), 1 - force.leader
-        enough = screened * commanded
-        left = ~self._cases.surely_held(rows, repeated, enough, force.leader, threads)
+        rows = _repeated(motion, k)
+        repeated, commanded = np.repeat(cases, n, axis=0), np.tile(force, k)
+        slack = self._cases.slack(rows, repeated, screened * commanded, leader, threads)
+        left = ~(slack > 0.0)
         share = np.full(n * k, screened)
         if left.any():
-            some = tuple(values[left] for values in rows)
-            needed = self._cases.least(some, repeated[left], force.leader, threads)
-            share[left] = np.maximum(screened, needed[:, follower] / commanded[left])
-        return np.asarray(share.reshape(k, n).max(axis=1))
+            some, displaced = tuple(values[left] for values in rows), bool(cases[:, 11:15].any())
+            needed = self._cases.least(some, repeated[left], leader, threads, displaced)
+            share[left] = np.maximum(screened, needed[:, 1 - leader] / commanded[left])
+        return share.reshape(k, n)
 
     def price(
         self,
@@ -256,7 +327,7 @@ class RobustModel:
         """(k, 2) peak normal forces [N] under a set, by default the workcell's, times each
         factor (k,)."""
         chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
-        return np.array([self.robust_force(motion, chosen.scaled(f), leader).peak for f in factors])
+        return np.array([self.peak(motion, chosen.scaled(f), leader) for f in factors])
 
     def largest_factor(
         self,
@@ -270,19 +341,12 @@ class RobustModel:
         chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
         end = allowed_factor(self.workcell, chosen)
 
-        def within(factor: float) -> bool:
-            peak = self.robust_force(motion, chosen.scaled(factor), leader).peak
-            return bool((peak <= limit).all())
+        def beyond(factor: float) -> float:
+            return 1.0 - float((limit / self.peak(motion, chosen.scaled(factor), leader)).min())
 
-        if not within(0.0):
+        if beyond(0.0) > 0.0:
             return 0.0
-        if within(end):
-            return end
-        low, high = 0.0, end
-        for _ in range(BISECTIONS):
-            middle = (low + high) / 2.0
-            low, high = (middle, high) if within(middle) else (low, middle)
-        return low
+        return end if beyond(end) <= 0.0 else float(brentq(beyond, 0.0, end, xtol=FACTOR_ERROR))
 
 
 def check_set(workcell: Workcell, uncertainty: Uncertainty) -> None:

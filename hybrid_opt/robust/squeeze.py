@@ -20,11 +20,12 @@ from scipy.ndimage import maximum_filter1d
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import (
-    BoxMotion,
     HeldMotion,
+    box_motion,
     closes_evenly,
     pressing_model,
     soft_model,
+    stopped,
 )
 from symbolic.array import Array
 from symbolic.contact.grasp import Grasp
@@ -34,6 +35,9 @@ from symbolic.records import Uncertainty, Workcell
 LARGEST_FACTOR = 10.0
 SMOOTHING = 0.1
 """Half the width of the time window over which commanded forces are smoothed [s]."""
+
+MOST = 16
+"""Samples that ask for most, at which it is told what each doubt adds."""
 
 STEP = 1e-3
 """Time step of the smoothing [s]."""
@@ -158,31 +162,27 @@ def pressed_beyond(
     """
     leader, even = settings.leader, closes_evenly(workcell)
     planned, doubt = least[:, 1 - leader], workcell.uncertainty
-    still = BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
     if settings.factor is None:
-        model = pressing_model(workcell)
-
-        def needed_for(names: tuple[str, ...]) -> Array:
-            held = [model.hold(box, doubt.only(names), leader)[0] for box in (motion, still)]
-            return np.maximum(planned, np.maximum(*held))
-
+        needed = _in_every_case(workcell, doubt, leader, motion, planned)
+        most = np.union1d(np.argsort(-needed)[:MOST], np.argsort(-planned)[:MOST])
+        there, own = box_motion(motion).at(most), planned[most]
         names: tuple[str, ...] = ()
-        needed = needed_for(names)
-        parts, before = [Part("least force", float(needed.max()))], float(needed.max())
+        before = float(_in_every_case(workcell, doubt.only(names), leader, there, own).max())
+        parts = [Part("least force", before)]
         for name, ranges in DOUBTS.items():
             names += ranges
             if not doubt.only(ranges).is_empty:
-                needed = needed_for(names)
-                parts.append(Part(name, float(needed.max()) - before))
-                before = float(needed.max())
+                force = _in_every_case(workcell, doubt.only(names), leader, there, own).max()
+                parts.append(Part(name, float(force) - before))
+                before = float(force)
     else:
-        stopped = np.zeros(len(planned))
+        still = np.zeros(len(planned))
         if even:
             least = np.maximum(least, soft_model(workcell).nominal(motion, leader))
-            stopped = soft_model(workcell).nominal(still, leader)[:, 1 - leader]
+            still = soft_model(workcell).nominal(stopped(motion), leader)[:, 1 - leader]
         held = least[:, 1 - leader]
         own = least.mean(axis=1) if workcell.has_opposite_pads else held
-        needed = np.maximum(held + (settings.factor - 1.0) * own, stopped)
+        needed = np.maximum(held + (settings.factor - 1.0) * own, still)
         parts = [Part("least force", float(held.max()))]
         parts.append(Part("factor", float(needed.max() - held.max())))
     squeeze = Squeeze(
@@ -194,6 +194,33 @@ def pressed_beyond(
         tuple(parts),
     )
     return smooth_above(time, needed, settings.smoothing) - planned, squeeze
+
+
+def _in_every_case(
+    workcell: Workcell,
+    doubt: Uncertainty,
+    leader: int,
+    motion: HeldMotion,
+    planned: Array | float,
+) -> Array:
+    """(n,) what is to be commanded so that a set is held, moving or stopped: at least what is
+    planned [N]."""
+    model = pressing_model(workcell)
+    held = model.commanded(motion, doubt, leader, planned)
+    return model.commanded(stopped(motion), doubt, leader, held)
+
+
+def largest_commanded(workcell: Workcell, carry: Carry, doubt: Uncertainty, leader: int) -> float:
+    """`Squeeze.force` of what holds a carry in every case of a set [N], sooner than by
+    `commanded_forces`.
+
+    Raises:
+        SettingsError: the uncertainty leaves no friction or patch.
+    """
+    planned = carry.normal_force[:, 1 - leader]
+    most = np.argsort(-planned)[:MOST]
+    level = _in_every_case(workcell, doubt, leader, box_motion(carry).at(most), planned[most]).max()
+    return float(_in_every_case(workcell, doubt, leader, carry, level).max())
 
 
 def pressed_together(workcell: Workcell, leader: int) -> Array:

@@ -14,6 +14,7 @@ from hybrid_opt.bundles import BundleOptions, Origin, export
 from hybrid_opt.bundles.bundle import warnings_of
 from hybrid_opt.bundles.check import as_document, check
 from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
+from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import number, text_table
@@ -30,6 +31,7 @@ from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
 from hybrid_opt.robust.force import (
     LARGEST_FACTOR,
+    SCREENED,
     RobustForce,
     RobustModel,
     allowed_factor,
@@ -70,15 +72,16 @@ def replay_file(options: argparse.Namespace) -> int:
     with TemporaryDirectory() as folder:
         replayed = replay(stored, Path(folder))
         document: dict[str, Any] = _replay_json(stored, replayed)
-        text = [_replay_text(stored, replayed)]
+        if not options.json:
+            print(_replay_text(stored, replayed), flush=True)
         asked = (options.force_limit, options.force_curve)
         if options.timing or any(option is not None for option in asked):
+            Progress().note("timing it, which takes some seconds")
             document["timing"], timing = _timings(stored, replayed, options)
-            text += ["", timing]
+            if not options.json:
+                print(f"\n{timing}")
     if options.json:
         print(json.dumps(document, indent=1, allow_nan=False))
-    else:
-        print("\n".join(text))
     return 0 if replayed.reproduced else EXIT_DIFFERENT
 
 
@@ -192,27 +195,28 @@ def robust_forces(options: argparse.Namespace) -> int:
     """Print the forces that hold for a trajectory file; returns the exit code."""
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
-        cell = stored.open_cell(Path(folder))
-        uncertainty = cell.workcell.uncertainty
-        carry = cell.carry(stored.x)
-        limit = options.force_limit
-        timed = [] if limit is None else _timed(cell, stored.x, limit)
-    model, leader = pressing_model(cell.workcell), options.leader - 1
-    held = model.robust_force(carry, uncertainty, leader)
-    squeeze = commanded_forces(cell.workcell, carry, SqueezeSettings(leader=leader))[1]
+        return _robust_forces(stored.open_cell(Path(folder)), stored.x, options)
+
+
+def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
+    workcell, leader = cell.workcell, options.leader - 1
+    uncertainty, carry = workcell.uncertainty, cell.carry(x)
     named = "the workcell's [uncertainty]" if uncertainty.stated else NOT_STATED
-    print(f"{cell.workcell.name}: arm {options.leader} leads, the other's force is commanded")
-    print(f"  the set is {named}: {uncertainty}")
+    print(f"{workcell.name}: arm {options.leader} leads, the other's force is commanded")
+    print(f"  the set is {named}: {uncertainty}", flush=True)
+    model = pressing_model(workcell)
+    held = model.robust_force(carry, uncertainty, leader)
     print(f"  least peak forces, nothing uncertain {_both(held.nominal.max(axis=0))} N")
     print(f"  peak forces that hold in all cases   {_both(held.peak)} N")
-    print(f"  reference forces                     {_both(cell.workcell.task.reference_force)} N")
-    print(f"  commanded: {squeeze.account}")
+    print(f"  reference forces                     {_both(workcell.task.reference_force)} N")
+    squeeze = commanded_forces(workcell, carry, SqueezeSettings(leader=leader))[1]
+    print(f"  commanded: {squeeze.account}", flush=True)
     exit_code = 0
     if uncertainty.is_empty:
         print("  nothing is uncertain, so there is nothing to check: state what may be off")
     else:
         exit_code = _priced(model, carry, held, options)
-    for text in timed:
+    for text in [] if options.force_limit is None else _timed(cell, x, options.force_limit):
         print(f"  {text}")
     return exit_code
 
@@ -235,9 +239,10 @@ def _priced(
     print(f"\n{text_table(rows, left=())}")
     check = model.check(carry, held, options.cases, np.random.default_rng(options.seed), threads=0)
     verdict = "all hold" if check.holds else f"{check.failing} FAIL"
+    most = "at most " if check.closest == SCREENED else ""
     print(
         f"\n  {check.cases} random cases (seed {options.seed}): {verdict}; the hardest needs "
-        f"{100.0 * check.closest:.2f} % of the commanded force"
+        f"{most}{100.0 * check.closest:.2f} % of the commanded force"
     )
     return 0 if check.holds else EXIT_DOES_NOT_HOLD
 

@@ -309,7 +309,8 @@ def case_grasp_function(workcell: Workcell, commanded: int) -> ca.Function:
     needed = force[commanded] + internal * _against_internal(squeeze)(friction, sizes)
     more = needed / (1.0 - tracking[commanded]) - force[commanded]
     normals = squeeze.squeeze_normals()
-    force += more * ca.DM(normals / normals[commanded])
+    # One entry after the other: a scalar times a vector repeats it by a form without lanes.
+    force += ca.vertcat(*[more * share for share in (normals / normals[commanded]).tolist()])
     names = ["pose", "rate", "second_rate", "case"]
     return ca.Function("case_grasp", [*motion, case], [force], names, ["normal_force"])
 

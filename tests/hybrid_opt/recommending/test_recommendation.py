@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,11 +16,12 @@ from hybrid_opt.recommending.comparison import Rival, front_durations, spread_ro
 from hybrid_opt.recommending.recommendation import HAND_MADE, STEPS, Recommendation
 from hybrid_opt.robust.cases import random_cases
 from hybrid_opt.robust.force import BoxMotion, RobustModel, pressing_model
-from hybrid_opt.robust.squeeze import commanded_forces
+from hybrid_opt.robust.squeeze import DOUBTS, commanded_forces, largest_commanded
 from hybrid_opt.timing import force_limited_timing
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.records import USUAL, Contact
+from symbolic.records import USUAL, Contact, Uncertainty
+from symbolic.records.cell import RANGES
 from tests.symbolic.read.samples import RACK
 
 
@@ -196,7 +198,23 @@ def test_where_nothing_holds_it_is_the_gentlest_and_says_so(
     gentle = ho.recommend(ho.Front.of(unsure, front.x[:2]))
     assert "no carry of the front holds in every case" in gentle.warnings[0]
     assert gentle.force > 117.0
-    assert any("exceeds the reference force" in text for text in gentle.warnings)
+    assert "reference forces of 117.7 N: this is the gentlest" in gentle.warnings[0]
+    # Every way that is told does.
+    (ways,) = re.findall(r"Any of these would do: (.*)", gentle.warnings[0])
+    assert ways.startswith(f"reference forces of {gentle.commanded.max():.1f} N, ")
+    share = float(re.findall(r"an \[uncertainty\] ([0-9.]+) times as wide", ways)[0])
+    known = [_without(name) for name in re.findall(r"about the ([^,]+)", ways)]
+    assert known
+    cell, carry = unsure.workcell, gentle.carry
+    for each in (USUAL.scaled(share), *known):
+        assert largest_commanded(cell, carry, each, 0) <= 117.68
+    for each in (USUAL, USUAL.scaled(share + 0.02)):
+        assert largest_commanded(cell, carry, each, 0) > 117.5
+
+
+def _without(name: str) -> Uncertainty:
+    """The usual set without one of its doubts."""
+    return USUAL.only(set(RANGES) - set(DOUBTS[name]))
 
 
 def test_what_a_rival_cannot_is_told_in_words() -> None:

@@ -8,7 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from codegen.lanes import lane_text
+from codegen.source import dense, generated_c
 from hybrid_opt.robust.force import BoxMotion, RobustModel
+from symbolic.contact.worst_cases import case_grasp_function
 from symbolic.read.cell import load
 from symbolic.records import Allocation, Uncertainty
 from tests.hybrid_opt.robust.test_force import at_rest
@@ -34,6 +37,22 @@ def test_pads_that_press_evenly_hold_displaced_too() -> None:
     assert even.check(moved, force, 200, np.random.default_rng(1)).holds
     weaker = replace(force, commanded=0.85 * force.commanded)
     assert not even.check(moved, weaker, 200, np.random.default_rng(1)).holds
+
+
+def test_what_is_commanded_is_known_without_every_case() -> None:
+    even, moved = model("drum", "soft-finger"), motion("drum")
+    commanded, leading = even.hold(moved, SET)
+    np.testing.assert_allclose(even.commanded(moved, SET), commanded, rtol=1e-9)
+    above = float(np.median(commanded))
+    found = even.commanded(moved, SET, above=above)
+    np.testing.assert_allclose(found, np.maximum(commanded, above), rtol=1e-9)
+    np.testing.assert_allclose(even.peak(moved, SET), [leading.max(), commanded.max()], rtol=5e-3)
+
+
+def test_cases_of_pads_anywhere_are_evaluated_in_lanes() -> None:
+    """Of a form without lanes a recommendation would take minutes."""
+    function = dense(case_grasp_function(model("drum", "soft-finger").workcell, 1))
+    assert lane_text(generated_c([function]), "lanes").entry
 
 
 def motion(name: str) -> BoxMotion:

@@ -50,6 +50,8 @@ def test_tells_forces_price_and_check(tmp_path: Path, capsys: pytest.CaptureFixt
     assert lines[10].split()[-2:] == lines[2].split()[-4:-1:2]
     assert lines[11].split()[-2:] == lines[3].split()[-4:-1:2]
     assert "200 random cases (seed 1): all hold" in lines[-1]
+    # What is seen to need no more is not looked at closer.
+    assert ("needs at most " in lines[-1]) == ("97.00 %" in lines[-1])
 
 
 def test_without_uncertainty_a_usual_set_is_taken_and_told(
