@@ -4,7 +4,7 @@ Every attempt is at one force limit. It starts from the path that is driven best
 are known, so that what one attempt finds serves the others, from others in basins of their own and
 from the hand-made one; a few rounds tell which of them goes on. The first attempt is a tournament
 of more starts, because a search's front often lies in one basin. Then come a gentle force, points
-of the given front, evenly spread; the fast end and the widest gaps, and where these are narrow,
+of the given front, evenly spread; both ends and the widest gaps, and where these are narrow,
 points again from other paths. In the end paths between neighbours on the front join them, which
 cost no attempt, and the best of all becomes a point at force limits all over their range: a path
 that tilts the box until standing still uses its limit up cannot be driven within less.
@@ -196,7 +196,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._paths, self._others, self._largest = paths, paths[:0], self._range[0]
 
     def all(self, rng: np.random.Generator) -> None:
-        """A tournament, a gentle force, the front's points, fast end and gaps, other starts, while
+        """A tournament, a gentle force, the front's points, ends and gaps, other starts, while
         attempts last; then the best known paths all over the range of forces."""
         rows = self._archive.rows()
         count = min(len(rows), ceil(self._settings.attempts * OWN_SHARE))
@@ -210,6 +210,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         for force in forces:
             self._at("point", force)
         self._at("extreme", self._range[1])
+        self._at("extreme", self._range[0])
         while self._left() > 0:
             middle = self._widest_gap()
             if middle is None:
