@@ -4,9 +4,10 @@ Every attempt is at one force limit. It starts from the path that is driven best
 are known, so that what one attempt finds serves the others, from others in basins of their own and
 from the hand-made one; a few rounds tell which of them goes on. The first attempt is a tournament
 of more starts, because a search's front often lies in one basin. Then come a gentle force, points
-of the given front, evenly spread; both ends and the widest gaps, and where these are narrow, points
-again from other paths. In the end the best known path becomes a point at force limits all over
-their range.
+of the given front, evenly spread; both ends and the widest gaps, and where these are narrow,
+points again from other paths. In the end paths between neighbours on the front join them, which
+cost no attempt, and the best of all becomes a point at force limits all over their range: a path
+that tilts the box until standing still uses its limit up cannot be driven within less.
 
 Of several starts of one goal, all take few rounds, and only the most promising ones go on
 (successive halving, Jamieson and Talwalkar 2016): the half stays that promises more, by what it has
@@ -61,6 +62,9 @@ level."""
 
 NEARLY = 1e-2
 """Residual of stationarity below which it is."""
+
+BETWEEN = (0.25, 0.5, 0.75)
+"""Shares of the way from one path of the front to the next that are tried as paths, too."""
 
 SAME = 0.25
 """Paths nearer than this to one another lie in one basin, in halves of the variables' ranges."""
@@ -200,7 +204,7 @@ class DriveRun(PolishRun[DriveAttempt]):
             self._force(rows[k]) for k in np.linspace(0, len(rows) - 1, count).round().astype(int)
         ]
         self._largest = max(*map(self._force, rows), self._range[0])
-        self._others = self._leading(np.vstack([self._hand_made, self._paths]))
+        self._others = self._leading(np.vstack([self._hand_made, self._paths]), COMPARED)
         self._tournament(self._range[0] + FAST * (self._largest - self._range[0]))
         self._at("extreme", self._between(self._range[0], self._largest))
         for force in forces:
@@ -281,9 +285,12 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._do([DriveAttempt(aim, -1, x, start, rivals)])
 
     def _spread(self) -> None:
-        """Points of the best known paths at force limits up to the front's largest."""
-        self._most += self._settings.drivable.members
-        for force in self._spread_forces(self._settings.drivable.members):
+        """Points of the best known paths, and of paths between them, at force limits up to the
+        front's largest."""
+        count = self._settings.drivable.members
+        self._most += count
+        self._others = np.vstack([self._others, self._leading(self._blends(), count)])
+        for force in self._spread_forces(count):
             paths, durations = self._driven(force)
             x = np.append(paths[int(np.argmin(durations))], force)
             found = self._evaluator.evaluate(x)
@@ -291,14 +298,21 @@ class DriveRun(PolishRun[DriveAttempt]):
             if found.feasible[0] and not self._archive.dominates(objectives):
                 self._do([DriveAttempt("gap", -1, x, objectives, solved=False)])
 
-    def _leading(self, paths: Array) -> Array:
+    def _blends(self) -> Array:
+        """(m, n_path) paths between neighbours on the front."""
+        known = np.array([self._archive.x[k][: self._n_path] for k in self._archive.rows()])
+        shares = np.array(BETWEEN)[:, None, None]
+        blends = known[:-1] + shares * np.diff(known, axis=0)
+        return np.unique(blends.reshape(-1, self._n_path), axis=0)
+
+    def _leading(self, paths: Array, count: int) -> Array:
         """Of some paths (n, n_path) those that are feasible when pressed hard enough, and of these
-        the fastest within some force."""
+        the fastest within some of so many forces."""
         x = np.hstack([paths, np.full((len(paths), 1), self._range[1])])
         paths = paths[self._evaluator.evaluate(x).feasible]
         if not len(paths):
             return paths
-        durations = [self._way.paths.durations(paths, f) for f in self._spread_forces(COMPARED)]
+        durations = [self._way.paths.durations(paths, f) for f in self._spread_forces(count)]
         return np.asarray(paths[np.unique(np.argmin(durations, axis=1))])
 
     def _spread_forces(self, count: int) -> list[float]:

@@ -16,7 +16,6 @@ from scipy.linalg import block_diag
 
 from hybrid_opt.polishing.cell import PolishFunctions
 from hybrid_opt.polishing.robust import ROBUST_ROWS, RobustForces
-from hybrid_opt.timing.use import STANDING
 from symbolic.array import Array
 from symbolic.path.spline import path_basis
 from symbolic.records.cell import Workcell
@@ -195,8 +194,8 @@ class IntervalValues:
 
     def at_rest(self, force: float) -> tuple[Array, Array]:
         """Shares (rows,) of what standing still uses at every interval's beginning: of the patches,
-        or of what a force limit [N] allows for it where pads press evenly; and their slopes
-        (rows, moving) by the extended pose."""
+        or of a force limit [N] where pads press evenly; and their slopes (rows, moving) by the
+        extended pose."""
         begins = [values[::2] for values in self._inputs]
         still = np.zeros(len(begins[-1]))
         out = self._functions.built[DRIVEN_FIRST].batch(*begins[:-2], still, still)
@@ -204,8 +203,7 @@ class IntervalValues:
         soft = self.grid.workcell.task.allocation == "soft-finger"
         block = self.grid.layout.block("force" if soft else "pressure")
         slope = _followed(self.grid, out["slope"][:, block], follow)[:, :, : self.grid.moving]
-        standing = STANDING if self.grid.robust is None else 1.0
-        whole = standing * force if soft else 1.0
+        whole = force if soft else 1.0
         return out["value"][:, block].reshape(-1) / whole, slope.reshape(
             -1, self.grid.moving
         ) / whole

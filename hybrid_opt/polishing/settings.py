@@ -74,7 +74,7 @@ class DrivableSettings:
     worth: float = 5e-4
     most_rounds: int = 48
     turn: int = 3
-    members: int = 24
+    members: int = 20
 
 
 @dataclass(frozen=True)

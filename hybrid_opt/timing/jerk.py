@@ -60,9 +60,6 @@ SETTLED = 1e-4
 TIGHTENED = 4
 """Times that a timing is found anew with less of the limits where they were exceeded."""
 
-SLOWEST = 0.5
-"""Factor on the speeds below which a timing cannot be mended by slowing it down."""
-
 FIRST_USE = 0.5
 """Largest use of a limit by the slow start that the rounds begin with."""
 
@@ -132,9 +129,7 @@ class _Problem:
                 break
             keep = self._coarse.keep / np.where(excess > 1.0, excess, 1.0)
             self._coarse = replace(self._coarse, keep=keep)
-            factor = self._factor(c)
-            # Slower is not better where standing still needs more force than the limit.
-            c, more = self._settled(factor**2 * c if factor > SLOWEST else c)
+            c, more = self._settled(self._factor(c) ** 2 * c)
             rounds += more
         return replace(self._judged(c), rounds=rounds)
 
@@ -162,21 +157,17 @@ class _Problem:
         return np.asarray(np.maximum(np.append(use[0], between), np.append(between, use[-1])))
 
     def _slow(self, c: Array) -> float:
-        """Factor on the squared speeds at which everything is used little, as at rest; normal
-        forces beyond their limit at rest are left to the rounds."""
-        limits = self._limits
-        if max(self._uses(0.0 * c, limits)) >= 1.0:
-            limits = replace(limits, force=None)
+        """Factor on the squared speeds at which everything is used little, as at rest."""
         factor = 1.0
-        rest = max(self._uses(0.0 * c, limits))
+        rest = max(self._uses(0.0 * c))
         allowed = rest + FIRST_USE * (1.0 - rest)
-        while max(self._uses(factor * c, limits)) > allowed:
+        while max(self._uses(factor * c)) > allowed:
             factor *= 0.5
         return factor
 
-    def _uses(self, c: Array, limits: TimingLimits) -> tuple[float, float, float]:
-        """Largest use of limits, joint jerk and payload jerk at the coarse points."""
-        return self._judge(self._coarse, c, limits)[1:]
+    def _uses(self, c: Array) -> tuple[float, float, float]:
+        """Largest use of the timing's limits, joint jerk and payload jerk at the coarse points."""
+        return self._judge(self._coarse, c)[1:]
 
     def _carry(self, at: Point, c: Array) -> Carry:
         return self._model.carry(at.motion, at.time(c), at.speed(c), at.acceleration(c))
@@ -187,12 +178,9 @@ class _Problem:
         of_joints = (np.abs(joint) / self._jerk.joints).max(axis=1)
         return of_joints, np.linalg.norm(box, axis=1) / self._jerk.payload
 
-    def _judge(
-        self, at: Point, c: Array, limits: TimingLimits | None = None
-    ) -> tuple[Timing, float, float, float]:
+    def _judge(self, at: Point, c: Array) -> tuple[Timing, float, float, float]:
         carry = self._carry(at, c)
-        limits = limits or self._limits
-        use = limit_use(carry, self._model.workcell, limits, self._model.joint_names)
+        use = limit_use(carry, self._model.workcell, self._limits, self._model.joint_names)
         joint, box = (float(jerk.max()) for jerk in self._jerks(at, c))
         excess = worst(use)
         reason = f"{carry.duration:.3f} s; most used: {excess.place}"

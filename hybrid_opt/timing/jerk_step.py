@@ -16,10 +16,6 @@ from symbolic.array import Array
 LEAST_SHARE = 0.05
 """Least share of its last value that a coefficient keeps."""
 
-
-MENDED = 1.001
-"""Excess of a normal force that is left as it is."""
-
 NEAR = 0.6
 """Torques and shifts that stay below this share of their limit get no rows."""
 
@@ -30,7 +26,7 @@ def convex_step(
     """Better coefficients than c (k,), which satisfy all limits at the points; None without any."""
     rows = Rows(len(c))
     _motion_rows(model, at, limits, rows)
-    to_mend = _force_rows(model, at, c, limits, rows)
+    _force_rows(model, at, c, limits, rows)
     _ratio_rows(model, at, c, limits, rows)
     _jerk_rows(at, c, jerk, rows)
     rows.below(-np.ones((len(c), 1)), -LEAST_SHARE * c, np.arange(len(c)))
@@ -39,9 +35,9 @@ def convex_step(
     if answer is None:
         return None
     # The quadratic model promises too much far away: c and the answer are both allowed, and so is
-    # everything between them, unless there is something to mend in c.
+    # everything between them.
     share = 1.0
-    while not to_mend and at.duration(c + share * (answer - c)) > at.duration(c) and share > 1e-3:
+    while at.duration(c + share * (answer - c)) > at.duration(c) and share > 1e-3:
         share *= 0.5
     return np.asarray(c + share * (answer - c))
 
@@ -69,40 +65,30 @@ def _motion_rows(model: TimingModel, at: Point, limits: TimingLimits, rows: Rows
         rows.within(A / most, np.zeros((len(at.s), 3)), none, keep, first_basis)
 
 
-def _force_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, rows: Rows) -> bool:
+def _force_rows(model: TimingModel, at: Point, c: Array, limits: TimingLimits, rows: Rows) -> None:
     """Normal forces below the limit, planned and robust ones, linearised at c: they are convex in
-    (u'', u'^2). Whether c exceeds what may not stay as it is for a round."""
+    (u'', u'^2)."""
     if limits.force is None:
-        return False
+        return
     workcell, m = model.workcell, at.motion
     a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
-    slopes = workcell.has_force_slopes
-    forces = [model.path_force(m, a, w)] if slopes else []
+    forces = [model.path_force(m, a, w)] if workcell.has_force_slopes else []
     if limits.robust:
         path = (m.pose[:, :6], m.pose_first[:, :6], m.pose_second[:, :6])
         force, slope = robust_path(workcell).at(PathPoints(*path, a, w))
         forces.append((force, slope[:, :, BY_TIMING]))
     along = np.stack([at.acceleration_by, at.squared_by], axis=1)[:, None]
-    # Tangents of what is convex leave a way wherever there is one, however far from it c is. Where
-    # slowing down cannot mend what rounds leave out, they have to.
-    standing = model.path_force(m, 0.0 * a, 0.0 * w)[0] if slopes else np.zeros(1)
-    still = bool((standing > limits.force).any())
     for force, slope in forces:
         by = ((slope / limits.force)[..., None] * along).sum(axis=2)
-        _linearised(at, c, force / limits.force, by, rows, strict=still)
-    return still and max(float(force.max()) for force, _ in forces) > MENDED * limits.force
+        _linearised(at, c, force / limits.force, by, rows)
 
 
-def _linearised(
-    at: Point, c: Array, value: Array, by: Array, rows: Rows, strict: bool = False
-) -> None:
+def _linearised(at: Point, c: Array, value: Array, by: Array, rows: Rows) -> None:
     """Values (n, m) at c over their limits, with derivatives (n, m, k), below one.
 
-    What is exceeded between rounds, by what the last one left out, may stay as it is for one,
-    unless they are `strict`.
+    What is exceeded between rounds, by what the last one left out, may stay as it is for one.
     """
-    keep = at.keep[:, None]
-    bound = (keep if strict else np.maximum(keep, value)) - value + by @ c
+    bound = np.maximum(at.keep[:, None], value) - value + by @ c
     A = at.local(by)
     first = np.repeat(at.first_basis, by.shape[1])
     rows.below(A.reshape(-1, A.shape[2]), bound.reshape(-1), first)

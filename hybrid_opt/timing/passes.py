@@ -9,7 +9,6 @@ from codegen.cache import source_digest
 from codegen.function import NumericFunction, Signature
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.records import TimingStatus
-from hybrid_opt.timing.use import STANDING
 from symbolic.records import Workcell
 
 KINDS = (
@@ -60,7 +59,7 @@ def passes_function(
     workcell, cache = compiled.workcell, compiled.cache
     if workcell.has_opposite_pads and not workcell.has_closed_form:
         return None  # among wrenches of the same effort the load function keeps the paper's
-    details = (str(intervals), str(cuts), str(STANDING), source_digest(__name__), _passes_c())
+    details = (str(intervals), str(cuts), source_digest(__name__), _passes_c())
     key = compiled.key("path timing", *details, bodies=False)
     made = load_or_compile(key, lambda: _source(compiled.symbols.workcell, intervals, cuts), cache)
     return compiled.bound(made)
@@ -89,7 +88,6 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
         "RATIOS": layout.joints + 2,
         "CUTS": cuts,
         "HELD": 3 if cuts else 2,
-        "STANDING": 1.0 if cuts else STANDING,
         **{f"AT_{name.upper()}": place for name, place in layout.offsets.items()},
     }
     held = sx_given(workcell.payload)

@@ -26,10 +26,8 @@ from hybrid_opt.timing.refined import refined_carry
 from hybrid_opt.timing.rows import INTERVAL_ENDS, PointRows
 from hybrid_opt.timing.use import (
     RECOMPUTED_TOLERANCE,
-    STANDING,
     limit_ratios,
     limit_use,
-    use_of,
     worst,
 )
 from symbolic.array import Array
@@ -79,30 +77,19 @@ def time_path(
     """
     begin = time.perf_counter()
     motion = model.path_motion(x) if motion is None else motion
-    standing = 1.0 if limits.robust else STANDING
-    timing = path_failure(model, motion) or _failure_at_rest(model, motion, limits, standing)
-    if timing is None:
-        timing = _Problem(model, motion, limits).solve()
-        if timing.status is TimingStatus.SOLVER_FAILED:
-            timing = _failure_at_rest(model, motion, limits) or timing
+    timing = path_failure(model, motion) or _failure_at_rest(model, motion, limits)
+    timing = timing or _Problem(model, motion, limits).solve()
     seconds = time.perf_counter() - begin
     return replace(timing, seconds=seconds, limits=limits)
 
 
-def _failure_at_rest(
-    model: TimingModel, motion: PathMotion, limits: TimingLimits, standing: float = 1.0
-) -> Timing | None:
-    """A limit that is exceeded even standing still, of normal forces between the ends `standing`
-    times it: then the path is not to be driven.
+def _failure_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing | None:
+    """A limit that is exceeded even standing still: then the path is not to be driven.
 
     Where none is exceeded a timing exists: slow enough, every quantity is as close to its value at
     rest as wanted.
     """
-    carry = model.still(motion)
-    ratios = limit_ratios(carry, model.workcell, limits)
-    if "normal force" in ratios:
-        ratios["normal force"][1:-1] /= standing
-    use = use_of(ratios, carry, model.joint_names)
+    use = limit_use(model.still(motion), model.workcell, limits, model.joint_names)
     excess = worst(use)
     if excess.ratio < 1.0 - 1e-6:
         return None

@@ -33,12 +33,6 @@ SPREAD = 20
 AT_A_TIME = 2000
 """Samples of a carry whose cases are held in memory together."""
 
-STANDING = 1.0
-"""Normal force that standing still may need anywhere between a carry's ends, over its force limit,
-of planned forces; robust ones hold it within the limit. Above 1, fronts are up to 7 % faster
-(docs/measured/soft-fingers.md), but their carries tilt the box until none is held wherever it may
-stop, in every case of the rack's uncertainty, with the force that its arms may press with."""
-
 FORCE_FLOOR = 1e-9
 """A contact with less normal force than this carries nothing [N]."""
 

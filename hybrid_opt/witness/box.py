@@ -36,7 +36,7 @@ from symbolic.errors import SettingsError
 from symbolic.records import Contact, Workcell
 from symbolic.records.poses import box_rotation
 
-BEGINS = 0.1
+BEGINS = 0.05
 """Share of the slip that counts as one at which it is said to begin."""
 
 SAME_TIME = 1e-9
@@ -73,7 +73,7 @@ class Outcome:
         return int(self.slip[-1].argmax())
 
     def begins(self, slip: float) -> float:
-        """Time at which the slip first exceeds a tenth of `slip` [s]; infinite where never."""
+        """Time at which the slip first exceeds `BEGINS` times `slip` [s]; infinite where never."""
         beyond = np.flatnonzero(self.slip.max(axis=1) > BEGINS * slip)
         return float(self.time[beyond[0]]) if len(beyond) else float("inf")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,13 +21,17 @@ from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.box import Witness, bisected, drive_of
 from hybrid_opt.witness.scene import SimulationSettings
 from symbolic.array import Array, Figure
+from symbolic.records import Workcell
 
 WORKCELLS = Path(__file__).parents[1] / "workcells"
 
 KINDS = ("hand-made", "fastest", "random", "middle", "random", "gentlest")
 """Candidates of a cell, in turn; all but the hand-made and the random ones of a short search."""
 
-FRICTIONS = (1.0, 0.6, 0.3)
+FRICTIONS, SHARES = (1.0, 0.6, 0.3), (1.0, 0.9, 0.8)
+"""Of pads with opposite normals; of others, which little friction does not close, shares of the
+cell's own."""
+
 SEARCHED = 500
 """Evaluations of the search whose front members are simulated."""
 
@@ -39,10 +44,12 @@ LOW, HIGH, BISECTIONS = 0.97, 1.03, 4
 WIDER, MORE_BISECTIONS = (0.5, 2.0), 9
 """What a threshold beyond them is looked for with."""
 
-PRESSED_SHARE = 0.97
-"""Share of the holding force that is pressed all along to see where the box slips first."""
+PRESSED_SHARE = 0.95
+"""Share of the holding force that is pressed all along to see where the box slips first: a plan
+often asks for its most for some hundredths of a second, in which a box that lacks less force moves
+by less than it creeps in the rest of the time."""
 
-ALLOWED = {"disc": 0.03, "rectangle": 0.05}
+ALLOWED = {"disc": 0.03, "rectangle": 0.05, "fork": 0.05}
 """How far from one a threshold may be, by the kind of pads."""
 
 SAME_PLACE = 0.1
@@ -107,25 +114,21 @@ def thresholds(options: argparse.Namespace) -> int:
             raise WitnessError(
                 f"{path} was begun with seed {done.seed}; give that one or a new file"
             )
-    sources = [_Source(path, options.seed) for path in options.cells or usual_cells()]
+    paths = options.cells or sorted(WORKCELLS.glob("*.toml"))
+    sources = {path.stem: _Source(path, options.seed) for path in paths}
     print("cell      candidate  friction  duration      force  threshold  slips first  planned")
     for slip in done.found:
         print(slip)
     for k in range(len(done.found), options.carries):
-        source = sources[k % len(sources)]
-        slip = slip_of(*source.case(k // len(sources)))
+        have = Counter(slip.cell for slip in done.found)
+        name = min(sources, key=lambda name: have[name])  # the first one of those with fewest
+        slip = slip_of(*sources[name].case(have[name]))
         done = replace(done, found=(*done.found, slip))
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, to_json(done))
         print(slip, f"  {k + 1} of {options.carries}", flush=True)
     print(summary(done.found))
     return 0
-
-
-def usual_cells() -> list[Path]:
-    """The shipped cells whose drivable carries are planned for pads that press evenly."""
-    paths = sorted(WORKCELLS.glob("*.toml"))
-    return [path for path in paths if Cell.load(path).workcell.has_opposite_pads]
 
 
 def summary(found: Sequence[Slip]) -> str:
@@ -163,18 +166,24 @@ def slip_of(name: str, candidate: str, carry: Carry) -> Slip:
         begins = witness.simulate(steady, PRESSED_SHARE * factor).begins(settings.slip)
     except WitnessError:
         pass  # it is told as no number
-    rectangular = any(pad.half_sides is not None for pad in carry.workcell.pads)
     return Slip(
         cell=name,
         candidate=candidate,
         friction=carry.workcell.contacts[0].friction,
-        pads="rectangle" if rectangular else "disc",
+        pads=pads_of(carry.workcell),
         duration=carry.duration,
         force=float(needed.max()),
         threshold=factor,
         begins=begins if np.isfinite(begins) else float("nan"),
         planned=float(carry.time[needed > PRESSED_SHARE * needed.max()][0]),
     )
+
+
+def pads_of(workcell: Workcell) -> str:
+    """A key of `ALLOWED`."""
+    if len(workcell.pads) > 2:
+        return "fork"
+    return "rectangle" if any(pad.half_sides for pad in workcell.pads) else "disc"
 
 
 class _Source:
@@ -199,8 +208,10 @@ class _Source:
             if timing.ok and timing.carry is not None:
                 break
             kind, k = "random", k + len(KINDS) * 10**6
-        friction = np.full(2, FRICTIONS[(k + k // len(FRICTIONS)) % len(FRICTIONS)])
         payload, contacts = cell.workcell.payload, cell.workcell.contacts
+        opposite, own = cell.workcell.has_opposite_pads, contacts[0].friction
+        known = FRICTIONS if opposite else tuple(share * own for share in SHARES)
+        friction = np.full(2, known[(k + k // len(known)) % len(known)])
         load = model.uncertain_load(timing.carry, friction, payload.centre_of_mass)
         rubs = tuple(replace(contact, friction=float(friction[0])) for contact in contacts)
         workcell = replace(cell.workcell, contacts=(rubs[0], rubs[1]))

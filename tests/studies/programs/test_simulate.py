@@ -70,12 +70,16 @@ def test_thresholds_of_many_carries_go_on_from_what_is_stored(
     assert "begun with seed 1" in capsys.readouterr().err
 
 
-@pytest.fixture(scope="module")
-def recommended(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The rack's carry to run, of a small search."""
-    cell = Cell.load(RACK).drivable()
+CELLS = sorted(path.stem for path in RACK.parent.glob("*.toml"))
+
+
+@pytest.fixture(scope="module", params=CELLS)
+def recommended(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A shipped cell's carry to run, of a small search."""
+    name: str = request.param
+    cell = Cell.load(RACK.with_name(f"{name}.toml")).drivable()
     front = search(cell, evaluations=300, rng=np.random.default_rng(1))
-    path = tmp_path_factory.mktemp("rack") / "recommended.json"
+    path = tmp_path_factory.mktemp(name) / "recommended.json"
     write_trajectory(path, cell.workcell, recommend(front).x, {}, {"algorithm": "nsga2"})
     return path
 
