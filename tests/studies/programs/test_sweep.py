@@ -46,5 +46,5 @@ def test_a_sweep_is_stored_listed_and_drawn(tmp_path: Path) -> None:
     assert "mass 8, friction 0.5: it cannot be held" in repr(done)
     assert _table(done).rows[1] == ("8", "1", "2.500", "90.0", "")
     left, right = _figure(done).axes
-    assert left.lines[0].get_ydata()[1] == 2.5
-    assert right.lines[0].get_ydata()[1] == 90.0
+    assert np.ravel(left.lines[0].get_ydata())[1] == 2.5
+    assert np.ravel(right.lines[0].get_ydata())[1] == 90.0
