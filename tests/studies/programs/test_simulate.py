@@ -70,10 +70,7 @@ def test_thresholds_of_many_carries_go_on_from_what_is_stored(
     assert "begun with seed 1" in capsys.readouterr().err
 
 
-CELLS = sorted(path.stem for path in RACK.parent.glob("*.toml"))
-
-
-@pytest.fixture(scope="module", params=CELLS)
+@pytest.fixture(scope="module")
 def recommended(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A shipped cell's carry to run, of a small search."""
     name: str = request.param
@@ -85,7 +82,15 @@ def recommended(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("controller", [*CONTROLS, "pads"])
+@pytest.mark.parametrize(
+    ("recommended", "controller"),
+    [
+        *(("rack", controller) for controller in [*CONTROLS, "pads"]),
+        *((name, how) for name in ("transfer", "pandas") for how in ("leader", "pads")),
+        ("uneven", "pads"),
+    ],
+    indirect=["recommended"],
+)
 def test_the_recommended_carry_is_held_over_the_whole_uncertainty(
     recommended: Path, controller: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
