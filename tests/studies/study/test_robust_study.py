@@ -20,7 +20,6 @@ from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
 from hybrid_opt.timing.document import read_timing
-from hybrid_opt.timing.solve import time_path
 from studies import export
 from studies.programs.study import StudySettings, run_study
 from studies.report.data import ReportData, gather
@@ -102,17 +101,13 @@ def test_what_is_recommended_holds_in_every_case_within_its_limit(
     assert stored.objectives == ROBUST_DRIVABLE_OBJECTIVES
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
-        model = cell.timing_model
-        carry = driven_timing(model, stored.x).carry
-        fastest = time_path(model, stored.x, model.drive_limits(found.force_limit)).carry
+        carry = driven_timing(cell.timing_model, stored.x).carry
     assert carry is not None
-    assert fastest is not None
     assert found.robust_force is not None
     peak = robust_peak(cell.workcell, carry)
     np.testing.assert_allclose(found.robust_force, peak, rtol=1e-6)
-    # Limits on jerk may leave any share of it; without them it is used.
+    # Limits on jerk, and others, may leave any share of it.
     assert peak.max() <= found.force_limit * (1.0 + 5e-3)
-    assert robust_peak(cell.workcell, fastest).max() == pytest.approx(found.force_limit, rel=0.02)
     # A job's carry takes whole ticks.
     assert carry.duration == pytest.approx(found.duration, abs=0.01)
     assert peak.max() > 1.1 * max(found.peak_force)
