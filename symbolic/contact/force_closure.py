@@ -13,8 +13,7 @@ M / (mu r).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -46,6 +45,9 @@ LEAST_SHARE = 0.05
 
 BISECTIONS = 6
 
+PARALLEL = 1.0 - 1e-6
+"""Cosine of the angle between two normals that count as one."""
+
 SPARE_FRICTION = 0.95
 """Share of their friction with which pads still have to close their grasp."""
 
@@ -63,34 +65,31 @@ class Squeeze:
     least_share: float
 
 
-def closing_squeeze(contacts: Sequence[Contact], even: bool = False) -> Squeeze | None:
-    """A squeeze that holds with as little as half the friction (on a logarithmic scale) between
-    the nominal and the least; None where the grasp is not closed with `SPARE_FRICTION`.
-
-    Args:
-        contacts: all pads.
-        even: whether they press evenly.
+def closing_squeeze(workcell: Workcell) -> Squeeze | None:
+    """A squeeze of a workcell's pads that holds with as little as half the friction (on a
+    logarithmic scale) between the nominal and the least; None where the grasp is not closed with
+    `SPARE_FRICTION`.
     """
-    if _balanced_states(contacts, SPARE_FRICTION, even) is None:
+    if _balanced_states(workcell, SPARE_FRICTION) is None:
         return None
     low, high = LEAST_SHARE, SPARE_FRICTION
-    if _balanced_states(contacts, low, even) is not None:
+    if _balanced_states(workcell, low) is not None:
         high = low
     else:
         for _ in range(BISECTIONS):
             middle = float(np.sqrt(low * high))
-            if _balanced_states(contacts, middle, even) is None:
+            if _balanced_states(workcell, middle) is None:
                 low = middle
             else:
                 high = middle
-    states = _balanced_states(contacts, float(np.sqrt(high * SPARE_FRICTION)), even)
+    states = _balanced_states(workcell, float(np.sqrt(high * SPARE_FRICTION)))
     assert states is not None
     return Squeeze(states, high)
 
 
 def has_force_closure(workcell: Workcell) -> bool:
     """Whether a workcell's pads hold its payload whatever the motion asks."""
-    return _balanced_states(workcell.pads, SPARE_FRICTION, presses_evenly(workcell)) is not None
+    return _balanced_states(workcell, SPARE_FRICTION) is not None
 
 
 def presses_evenly(workcell: Workcell) -> bool:
@@ -98,16 +97,54 @@ def presses_evenly(workcell: Workcell) -> bool:
     return workcell.task.allocation == "soft-finger"
 
 
-def _balanced_states(
-    contacts: Sequence[Contact], share: float, even: bool
-) -> tuple[Array, ...] | None:
+def pressed_alike(workcell: Workcell) -> Array:
+    """(k, pads) coefficients of normal forces that are zero: pads side by side on one arm that
+    press evenly press with one pressure, because the arm keeps their common plane's orientation.
+
+    Pads of one arm with different normals press as the motion asks.
+    """
+    pads, robots, rows = workcell.pads, workcell.pad_robots, []
+    for k in range(1, len(pads)) if presses_evenly(workcell) else ():
+        first = robots.index(robots[k])
+        normals = [pads[i].T_box_pad[:3, 2] for i in (first, k)]
+        if first != k and normals[0] @ normals[1] > PARALLEL:
+            row = np.zeros(len(pads))
+            row[first], row[k] = 1.0, -_area(pads[first]) / _area(pads[k])
+            rows.append(row)
+    return np.array(rows).reshape(-1, len(pads))
+
+
+def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
+    """Per pad (6 + k, n), from its state to what is balanced: force and moment about the box
+    frame's origin, along the box's axes, then the rows of `pressed_alike`.
+
+    Args:
+        in_units: for states whose friction and radius are taken out.
+    """
+    even, alike, found = presses_evenly(workcell), pressed_alike(workcell), []
+    for i, pad in enumerate(workcell.pads):
+        if in_units:
+            pad = replace(pad, friction=1.0, patch_radius=1.0, half_sides=None)
+        to_box = state_to_box(pad, even)
+        rows = np.zeros((len(alike), to_box.shape[1]))
+        rows[:, 0] = alike[:, i]
+        found.append(np.vstack([to_box, rows]))
+    return found
+
+
+def _area(pad: Contact) -> float:
+    if pad.half_sides is None:
+        return np.pi * pad.patch_radius**2
+    return 4.0 * pad.half_sides[0] * pad.half_sides[1]
+
+
+def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | None:
     """States within the cones at a share of the friction, whose wrenches cancel.
 
     They are weighted sums of points on the cones' boundaries, all weights positive.
     """
-    generators = [_generators(contact, even) for contact in contacts]
-    lessened = [_with_friction(rows, share) for rows in generators]
-    maps = [state_to_box(contact, even) for contact in contacts]
+    even, maps = presses_evenly(workcell), balance_maps(workcell)
+    lessened = [_with_friction(_generators(pad, even), share) for pad in workcell.pads]
     columns = np.vstack([rows @ A.T for rows, A in zip(lessened, maps, strict=True)])
     weights = _weights(columns / np.abs(columns).max(axis=0))
     if weights is None:
@@ -121,14 +158,14 @@ def _balanced_states(
 
 
 def _weights(columns: Array) -> Array | None:
-    """Positive weights (n,) that sum to one and cancel the rows a_j of `columns` (n, 6), or None.
+    """Positive weights (n,) that sum to one and cancel the rows a_j of `columns` (n, m), or None.
 
     At the analytic centre of the polytope 1 + a_j . y > 0, which exists if and only if such weights
     do, the weights 1 / (1 + a_j . y) are.
     """
-    if np.linalg.matrix_rank(columns) < WRENCH_SIZE:
+    if np.linalg.matrix_rank(columns) < columns.shape[1]:
         return None
-    y = np.zeros(WRENCH_SIZE)
+    y = np.zeros(columns.shape[1])
     for _ in range(NEWTON_STEPS):
         weights = 1.0 / (1.0 + columns @ y)
         scaled = weights[:, None] * columns

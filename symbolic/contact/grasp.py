@@ -14,7 +14,7 @@ normal n = a x b of contact 1. Shifts and arms in m, forces in N.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import accumulate
 from typing import Literal
@@ -34,11 +34,11 @@ from symbolic.contact.even_patch import EvenPatch
 from symbolic.contact.force_closure import (
     EVEN,
     WRENCH_SIZE,
+    balance_maps,
     closing_squeeze,
     presses_evenly,
     scaled_patch,
     size_powers,
-    state_to_box,
     tangential,
 )
 from symbolic.contact.patches import Patch, least
@@ -101,7 +101,7 @@ class Grasp:
             SettingsError: no squeeze holds the payload whatever is asked.
         """
         pads, even = workcell.pads, presses_evenly(workcell)
-        squeeze = closing_squeeze(pads, even)
+        squeeze = closing_squeeze(workcell)
         if squeeze is None:
             raise SettingsError(
                 "the pads do not close their grasp: no internal squeeze lies within their friction "
@@ -115,23 +115,17 @@ class Grasp:
         self._pads = pads
         self._squeeze = squeeze.states
         # The least states that balance a load, whether they lie within the cones or not.
-        spread = np.linalg.pinv(np.hstack([state_to_box(pad, even) for pad in pads]))
+        whole, in_units = (np.hstack(balance_maps(workcell, units)) for units in (False, True))
+        spread = np.linalg.pinv(whole)[:, :LOAD_SIZE]
         ends = np.cumsum([len(state) for state in squeeze.states])[:-1]
         self._spread = tuple(np.split(spread, ends))
-        in_units = np.hstack(
-            [
-                state_to_box(replace(pad, friction=1.0, patch_radius=1.0, half_sides=None), even)
-                for pad in pads
-            ]
-        )
-        # Which six components are what the others leave: all of the last pad's, or those that the
-        # load reaches best.
+        # Which components are what the others leave: all of the last pad's, or those that the load
+        # reaches best.
         n = in_units.shape[1]
-        whole = np.hstack([state_to_box(pad, even) for pad in pads])
         self._left = _reached_best(whole) if even else np.arange(n - 6, n)
         self._free = np.setdiff1d(np.arange(n), self._left)
         to_left = np.asarray(np.linalg.inv(in_units[:, self._left]), dtype=float)
-        self._load_to_left = _sparse(to_left)
+        self._load_to_left = _sparse(to_left[:, :LOAD_SIZE])
         self._free_to_left = _sparse(to_left @ in_units[:, self._free])
 
     @property
@@ -277,11 +271,12 @@ def grasp_wrenches(
 
 
 def _reached_best(to_box: Array) -> NDArray[np.intp]:
-    """Components (6,) of states that a load reaches best, by a QR decomposition with pivots."""
+    """Components (m,) of states that what is balanced (m,) reaches best, by a QR decomposition
+    with pivots."""
     # Not imported at the top: a warm start makes no grasp.
     from scipy.linalg import qr
 
-    return np.sort(qr(to_box, pivoting=True)[2][:LOAD_SIZE])
+    return np.sort(qr(to_box, pivoting=True)[2][: len(to_box)])
 
 
 def _in_newtons(grasp: Grasp) -> ca.Function:

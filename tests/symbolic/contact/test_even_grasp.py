@@ -65,9 +65,15 @@ def points_of(pad: Contact) -> tuple[Array, Array]:
     return pad.patch_radius * at.reshape(-1, 2), r.ravel() / r.sum()
 
 
-def least_on_grids(pads: tuple[Contact, ...], load: Array) -> Array:
+def area_of(pad: Contact) -> float:
+    if pad.half_sides is None:
+        return np.pi * pad.patch_radius**2
+    return 4.0 * pad.half_sides[0] * pad.half_sides[1]
+
+
+def least_on_grids(pads: tuple[Contact, ...], load: Array, fork: bool = False) -> Array:
     """(k, 6) as `wrenches`, of the least effort with friction at every point of a grid and pressure
-    that is the same all over each patch."""
+    that is the same all over each patch; on a fork also all over the first two."""
     size = float(np.linalg.norm(load[:3]) + 10.0 * np.linalg.norm(load[3:]))
     maps, cones, ends = [], [], [0]
     for pad in pads:
@@ -88,7 +94,11 @@ def least_on_grids(pads: tuple[Contact, ...], load: Array) -> Array:
         ends.append(ends[-1] + own.shape[1])
     # The pads' wrenches are unknowns of their own: the effort is theirs.
     k, whole = 6 * len(pads), sparse.block_diag(maps)
-    balance = np.hstack([in_box(pad) for pad in pads])
+    balance, asked = np.hstack([in_box(pad) for pad in pads]), load / size
+    if fork:
+        row = np.zeros(k)
+        row[[2, 8]] = 1.0 / area_of(pads[0]), -1.0 / area_of(pads[1])
+        balance, asked = np.vstack([balance, row]), np.append(asked, 0.0)
     count = sum(len(cone) for cone in cones)
     rows = [
         [sparse.csc_matrix(balance), None],
@@ -101,8 +111,8 @@ def least_on_grids(pads: tuple[Contact, ...], load: Array) -> Array:
         sparse.diags([*np.tile([1.0, 1, 1, 0, 0, 0], len(pads)), *np.zeros(ends[-1])]).tocsc(),
         np.zeros(k + ends[-1]),
         sparse.bmat(rows).tocsc(),
-        np.concatenate([load / size, np.zeros(k + count)]),
-        [clarabel.ZeroConeT(6 + k), *[clarabel.SecondOrderConeT(3)] * (count // 3)],
+        np.concatenate([asked, np.zeros(k + count)]),
+        [clarabel.ZeroConeT(len(asked) + k), *[clarabel.SecondOrderConeT(3)] * (count // 3)],
         options,
     ).solve()
     assert str(solution.status) in ("Solved", "AlmostSolved"), solution.status
@@ -123,6 +133,30 @@ def test_the_least_effort_is_that_of_grids_of_points(kinds: tuple[str, ...]) -> 
         ratio = np.sqrt(effort(found) / effort(expected))
         least, most = (0.985, 1.04) if "rectangle" in kinds else (0.99, 1.01)
         assert least < ratio < most, ratio
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_pads_of_a_fork_press_with_one_pressure(alike: bool) -> None:
+    """Side by side on one arm; with the load nearer to one of them the other could press less, and
+    does where their normals differ."""
+    rng = np.random.default_rng(5)
+    first, second = even_cell().contacts
+    T = first.T_box_pad.copy()
+    T[:3, 3] += T[:3, :3] @ [0.0, 0.08, 0.0]
+    if not alike:
+        T[:3, :3] = T[:3, :3] @ Rotation.from_euler("x", 0.02).as_matrix()
+    pads = (replace(first, patch_radius=0.03), replace(first, T_box_pad=T, patch_radius=0.02))
+    cell = replace(even_cell(), contacts=(replace(pads[0], further=(pads[1],)), second))
+    function = function_of(cell)
+    for _ in range(3):
+        load = random_load(rng) * [1, 1, 1, 0.3, 0.3, 0.3]
+        found = wrenches(cell, load, function)
+        balance = sum(in_box(p) @ w for p, w in zip(cell.pads, found, strict=True))
+        np.testing.assert_allclose(balance, load, atol=1e-9 * np.sqrt(effort(found)))
+        pressures = found[:2, 2] / [area_of(pad) for pad in pads]
+        assert (abs(pressures[0] / pressures[1] - 1.0) < 1e-9) == alike
+        expected = least_on_grids(cell.pads, load, fork=alike)
+        assert 0.985 < np.sqrt(effort(found) / effort(expected)) < 1.01
 
 
 def test_two_opposite_pads_press_as_in_closed_form() -> None:
