@@ -34,6 +34,7 @@ from hybrid_opt.recommending.choice import (
     refuse,
 )
 from hybrid_opt.recommending.comparison import BETTER, Rival, rival, spread_rows
+from hybrid_opt.robust.force import thinned
 from hybrid_opt.robust.squeeze import (
     DOUBTS,
     Squeeze,
@@ -242,8 +243,9 @@ def _driven(
             if not timing.ok or timing.carry is None:
                 reason = timing.reason
                 break
-            doubt = cell.workcell.uncertainty
-            force = largest_commanded(cell.workcell, timing.carry, doubt, LEADER)
+            carry, doubt = timing.carry, cell.workcell.uncertainty
+            planned = carry.normal_force[:, 1 - LEADER]
+            force = largest_commanded(cell.workcell, carry, planned, doubt, LEADER)
             late = timing.duration / goal.longest
             hard = force / float(goal.hardest[1 - LEADER])
             if max(late, hard) <= 1.0 + BETTER:
@@ -285,10 +287,13 @@ def _too_weak(workcell: Workcell, carry: Carry, needed: Array) -> str:
     """That the reference forces are not enough for what has to be commanded (2,) [N], and what
     would do."""
     doubt, allowed = workcell.uncertainty, workcell.task.reference_force.min()
+    rows, motion = thinned(carry)
+    planned = carry.normal_force[rows, 1 - LEADER]
 
     def share(known: Uncertainty) -> float:
         """Of the reference force, of the robot that presses harder."""
-        return float(largest_commanded(workcell, carry, known, LEADER) * harder / allowed)
+        force = largest_commanded(workcell, motion, planned, known, LEADER)
+        return float(force * harder / allowed)
 
     harder = 1.0
     harder = needed.max() / (share(doubt) * allowed)

@@ -210,17 +210,18 @@ def _in_every_case(
     return model.commanded(stopped(motion), doubt, leader, held)
 
 
-def largest_commanded(workcell: Workcell, carry: Carry, doubt: Uncertainty, leader: int) -> float:
-    """`Squeeze.force` of what holds a carry in every case of a set [N], sooner than by
-    `commanded_forces`.
+def largest_commanded(
+    workcell: Workcell, motion: HeldMotion, planned: Array, doubt: Uncertainty, leader: int
+) -> float:
+    """`Squeeze.force` of what holds a motion, planned with forces (n,), in every case of a set [N],
+    sooner than by `commanded_forces`.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
     """
-    planned = carry.normal_force[:, 1 - leader]
-    most = np.argsort(-planned)[:MOST]
-    level = _in_every_case(workcell, doubt, leader, box_motion(carry).at(most), planned[most]).max()
-    return float(_in_every_case(workcell, doubt, leader, carry, level).max())
+    most, box = np.argsort(-planned)[:MOST], box_motion(motion)
+    level = _in_every_case(workcell, doubt, leader, box.at(most), planned[most]).max()
+    return float(_in_every_case(workcell, doubt, leader, box, level).max())
 
 
 def pressed_together(workcell: Workcell, leader: int) -> Array:
