@@ -92,7 +92,7 @@ def test_a_recommendation_alone_makes_nothing_else(
     said = capfd.readouterr()
     assert said.out.startswith("Run this carry: ")
     assert "Report:" not in said.out
-    assert re.search(r"recommendation: \d of \d steps \[", said.err)
+    assert re.search(r"recommendation: \d+ of \d+ steps \[", said.err)
     found = read_recommendation(root)
     assert isinstance(found, StoredRecommendation)
     assert found.force <= 116.0 * (1.0 + 2e-3)
@@ -107,7 +107,7 @@ def test_a_recommendation_alone_makes_nothing_else(
     assert recommend.main([str(root), "--force-limit", "117"]) == 0
     again = capfd.readouterr()
     assert again.out.startswith("Run this carry: ")
-    assert "recommendation: 0 of 9 steps" in again.err
+    assert re.search(r"recommendation: 0 of \d+ steps", again.err)
 
 
 def test_why_carries_are_not_polished_is_told(
