@@ -76,7 +76,8 @@ class Problem:
         """Whether both robots are arms of one machine: other chains of one file at one base, which
         may be missing."""
         first, second = self.data["robots"]
-        same = all(first.get(key) == second.get(key) for key in ("urdf", "xacro_arguments", "base"))
+        keys = ("robot", "urdf", "xacro_arguments", "base")
+        same = all(first.get(key) == second.get(key) for key in keys)
         chains = first.get("chain"), second.get("chain")
         return same and all(chains) and chains[0] != chains[1]
 

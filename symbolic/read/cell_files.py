@@ -28,6 +28,7 @@ from symbolic import outside
 from symbolic.errors import BundleError, DualArmError, OutsideError, RobotModelError
 from symbolic.read.cell import load, with_branches
 from symbolic.read.descriptions import PACKAGE_SCHEME, description_content, is_xacro, resolve_mesh
+from symbolic.read.named_robots import with_paths
 from symbolic.read.urdf import parse_urdf, read_urdf
 from symbolic.records import Robot, Workcell
 from symbolic.records.problems import shown
@@ -259,7 +260,9 @@ class CellCollector:
         """Add every file that the workcell names."""
         text = self._text.encode("utf-8")
         text = with_branches(text, parse_toml(text), workcell.start_branch)
-        self._text, data = outside.text(text), parse_toml(text)
+        names = {entry["robot"] for entry in parse_toml(text)["robots"] if "robot" in entry}
+        self._text = with_paths(outside.text(text), names)
+        data = parse_toml(self._text.encode("utf-8"))
         for robot, entry in zip(workcell.robots, data["robots"], strict=True):
             urdf = self._place(str(entry["urdf"]))
             folders = [self._place(str(folder)) for folder in entry.get("package_dirs", [])]

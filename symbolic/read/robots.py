@@ -31,6 +31,7 @@ from symbolic.read.descriptions import (
     is_xacro,
     resolve_mesh,
 )
+from symbolic.read.named_robots import NamedRobot, named_robot
 from symbolic.read.tables import Table, read_body, read_file, read_inertia, read_pose
 from symbolic.read.urdf import LARGEST_GYRATION, Urdf, read_srdf, read_urdf
 from symbolic.records import SEARCHED, Driver, Robot, ToolLoad
@@ -238,8 +239,13 @@ def read_description(
         stored: whether the cell was unpacked from an archive, see `symbolic.read.cell.load`.
     """
     package_dirs = _read_folders(table, folder)
-    path = _read_described(table, "urdf", folder, package_dirs)
-    arguments = _read_xacro_arguments(table)
+    own = _read_xacro_arguments(table)
+    if table.has("robot"):
+        found = _read_named(table)
+        path, package_dirs = found.path, package_dirs + found.package_dirs
+        arguments = tuple((dict(found.arguments) | dict(own)).items())
+    else:
+        path, arguments = _read_described(table, "urdf", folder, package_dirs), own
     locked = _read_locked(table)
     root, flange = _read_chain(table)
     drop_links = read_texts(table, "drop_links", "names or patterns of links")
@@ -256,8 +262,26 @@ def read_description(
         model = _read_model(table, urdf, locked, (root, flange))
         _check_meshes(table, urdf, path, package_dirs)
     srdf = _read_srdf(table, folder, package_dirs)
-    found = Description(path, arguments, package_dirs, srdf, root, flange, locked, drop_links)
-    return found, model
+    return (
+        Description(path, arguments, package_dirs, srdf, root, flange, locked, drop_links),
+        model,
+    )
+
+
+def _read_named(table: Table) -> NamedRobot:
+    """The description of a robot's name; what is wrong stands at the key that it takes the place
+    of."""
+    name = table.text("robot")
+    if table.has("urdf"):
+        table.problems.add(table.at("urdf"), "found beside 'robot'; give one of the two")
+    elif not name:
+        table.problems.add(table.at("urdf"), "is missing; 'robot' gives none")
+    else:
+        try:
+            return named_robot(name)
+        except OutsideError as error:
+            table.problems.add(table.at("urdf"), f"robot = {shown(name)} {error}")
+    return NamedRobot(Path(), (), ())
 
 
 def _read_folders(table: Table, folder: Path) -> tuple[Path, ...]:
