@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from studies.options import add, number
+from studies.options import add, number, stated
 from studies.program import Parser, Program, later, run_program
 
 
@@ -24,6 +24,12 @@ def _add_options(parser: Parser) -> None:
         metavar=("BEGIN", "END"),
         help="from when to when the pads hold the box [s] (default: the carry that the file names, "
         "else the longest while in which they stand as they hold it)",
+    )
+    parser.add_argument(
+        "--interpolation",
+        choices=stated("hybrid_opt.bundles.job_file.Interpolation"),
+        help="how the controller moves between samples (default: through all that the file tells "
+        "of them: positions, velocities, accelerations)",
     )
     add(parser, "--json")
 

@@ -4,6 +4,9 @@ The trajectory may be a bundle's after someone's post-processing, or another pla
 ROS 2's JointTrajectory in YAML. The first arm's pad says where the box is; the second one's has to
 be where the box then has it (the closed chain). What the box needs in between follows from the
 cell's own forces.
+
+Controllers make up the motion between samples. It is judged as well: chain, limits and forces at
+`BETWEEN` of each step, collisions by a proof along the whole motion.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import csv
 import io
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +23,21 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
+from scipy.interpolate import BPoly, CubicSpline
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.bundles.arms import prefixes
-from hybrid_opt.bundles.job_file import pad_errors, pad_places
+from hybrid_opt.bundles.job_file import (
+    BETWEEN,
+    DERIVATIVES,
+    Interpolation,
+    between,
+    pad_errors,
+    pad_places,
+)
+from hybrid_opt.carry import joints_of
 from hybrid_opt.cell import Cell
+from hybrid_opt.collision.certify import Certificate, certify
 from hybrid_opt.display.table import text_table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import read_bytes
@@ -60,15 +72,19 @@ class JointTrajectory:
 
     Attributes:
         time: (n,) ascending [s].
-        q: (n, joints) both arms side by side [rad, m].
-        q_rate: (n, joints) or None where the file has none [rad/s].
+        known: (n, joints) each, both arms side by side: positions, and velocities and accelerations
+            where the file has them [rad, m, s].
         carry: from when to when it carries, where the file says so [s].
     """
 
     time: Array
-    q: Array
-    q_rate: Array | None
+    known: tuple[Array, ...]
     carry: tuple[float, float] | None = None
+
+    @property
+    def q(self) -> Array:
+        """(n, joints) positions [rad, m]."""
+        return self.known[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +96,13 @@ class Finding:
         along, across: largest change of the pads' places to one another while they hold it, along
             the normal and across it [m].
         use: largest value over its limit by constraint.
-        collides: what collides first while the box is held; '' for nothing.
+        collides: what collides first while the box is held, or cannot be proven free; '' for
+            nothing.
         normal_force: (2,) largest normal force that each arm needs [N].
         rated: (2,) their reference forces [N].
         balanced: whether friction and patches can hold the box everywhere.
         duration: of the trajectory [s].
+        interpolation: how it moves between samples.
     """
 
     held: Mask
@@ -96,6 +114,7 @@ class Finding:
     rated: Array
     balanced: bool
     duration: float
+    interpolation: Interpolation
 
     @property
     def problems(self) -> list[str]:
@@ -126,10 +145,11 @@ class Finding:
         share = float(self.held.mean())
         rows = [
             ["duration", f"{self.duration:.3f} s"],
+            ["between samples", self.interpolation],
             ["the box is held", f"{100.0 * share:.0f} % of the samples"],
             ["closed chain", f"{1e3 * self.along:.3f} mm along, {1e3 * self.across:.3f} mm across"],
             *([f"use of {name}", f"{100.0 * ratio:.1f} %"] for name, ratio in self.use.items()),
-            ["collisions", self.collides or "none at its samples"],
+            ["collisions", self.collides or "none, proven also between samples"],
             ["normal forces", " / ".join(f"{force:.2f} N" for force in self.normal_force)],
         ]
         verdict = "; ".join(self.problems) or "it can be driven"
@@ -159,8 +179,10 @@ def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
         raise ResultsError(f"{path}: no joint trajectory of both arms ({error})") from error
 
 
-Columns = tuple[Array, dict[str, Array], dict[str, Array]]
-"""Times (n,), positions and velocities (n,) by the joint's name."""
+QUANTITIES = ("position", "velocity", "acceleration")
+
+Columns = tuple[Array, dict[str, dict[str, Array]]]
+"""Times (n,); positions, velocities and accelerations (n,) by quantity and the joint's name."""
 
 
 def _csv_columns(text: str) -> Columns:
@@ -172,36 +194,34 @@ def _csv_columns(text: str) -> Columns:
     def column(k: int) -> Array:
         return np.array([float(row[k]) for row in body])
 
-    position, velocity = {}, {}
+    found: dict[str, dict[str, Array]] = {each: {} for each in QUANTITIES}
     for k, word in enumerate(words):
         name, _, what = word.rpartition(" ")
-        if what == "velocity":
-            velocity[name] = column(k)
-        elif what == "position":
-            position[name] = column(k)
+        if what in QUANTITIES:
+            found[what][name] = column(k)
         elif not name and k != at and what != "phase":
-            position[what] = column(k)
-    return column(at), position, velocity
+            found["position"][what] = column(k)
+    return column(at), found
 
 
 def _document_columns(document: Any) -> Columns:
-    position: dict[str, Array] = {}
-    velocity: dict[str, Array] = {}
+    found: dict[str, dict[str, Array]] = {each: {} for each in QUANTITIES}
     if "robots" in document:
         for robot in document["robots"]:
-            for name, kept in (("position", position), ("velocity", velocity)):
-                for joint, values in zip(robot["joints"], np.array(robot[name]).T, strict=True):
+            for what, kept in found.items():
+                for joint, values in zip(robot["joints"], np.array(robot[what]).T, strict=True):
                     kept[f"{robot['name']}/{joint}"] = values.astype(float)
-        return np.array(document["time"], dtype=float), position, velocity
+        return np.array(document["time"], dtype=float), found
     for key in ("goal", "joint_trajectory", "trajectory"):
         document = document.get(key, document)
     names, points = document["joint_names"], document["points"]
     stamps = [point["time_from_start"] for point in points]
     time = np.array([stamp["sec"] + 1e-9 * stamp.get("nanosec", 0) for stamp in stamps])
-    position = _by_name(names, [point["positions"] for point in points])
-    has_rates = all(point.get("velocities") for point in points)
-    velocity = _by_name(names, [point["velocities"] for point in points]) if has_rates else {}
-    return time, position, velocity
+    for what, plural in zip(QUANTITIES, ("positions", "velocities", "accelerations"), strict=True):
+        if what == "position" or all(point.get(plural) for point in points):
+            rows = np.array([point[plural] for point in points], dtype=float)
+            found[what] = dict(zip(names, rows.T, strict=True))
+    return time, found
 
 
 def _carry_of(document: Any) -> tuple[float, float] | None:
@@ -212,13 +232,9 @@ def _carry_of(document: Any) -> tuple[float, float] | None:
     return None
 
 
-def _by_name(names: Sequence[str], rows: Sequence[Sequence[float]]) -> dict[str, Array]:
-    return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
-
-
 def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
     """The cell's joints among named columns, under any of their usual names."""
-    time, position, velocity = columns
+    time, values = columns
     names = [
         (f"{robot.name}/{joint}", f"{prefix}{joint}", joint)
         for robot, prefix in zip(workcell.robots, prefixes(workcell), strict=True)
@@ -229,79 +245,120 @@ def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
     for known in names:
         # A name that both arms have says nothing.
         usable = known if plain.count(known[2]) == 1 else known[:2]
-        found = next((name for name in usable if name in position), None)
+        found = next((name for name in usable if name in values["position"]), None)
         if found is None:
-            raise ValueError(f"there is no joint {usable[1]!r}; it has {', '.join(position)}")
+            has = ", ".join(values["position"])
+            raise ValueError(f"there is no joint {usable[1]!r}; it has {has}")
         picked.append(found)
-    q = np.column_stack([position[name] for name in picked])
-    rates = None
-    if all(name in velocity for name in picked):
-        rates = np.column_stack([velocity[name] for name in picked])
-    if len(time) < SHORTEST or q.shape != (len(time), len(names)):
-        raise ValueError(f"{len(time)} times for {len(q)} postures; at least {SHORTEST} are needed")
-    if not (np.isfinite(q).all() and np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
-        raise ValueError("times have to ascend, all numbers to be finite")
-    return JointTrajectory(time - time[0], q, rates)
+    tables: list[Array] = []
+    for what in QUANTITIES:
+        if not all(name in values[what] for name in picked):
+            break
+        tables.append(np.column_stack([values[what][name] for name in picked]))
+    for rows in tables:
+        if len(time) < SHORTEST or rows.shape != (len(time), len(names)):
+            raise ValueError(
+                f"{len(time)} times for {len(rows)} postures; at least {SHORTEST} are needed"
+            )
+        if not np.isfinite(rows).all():
+            raise ValueError("all numbers have to be finite")
+    if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
+        raise ValueError("times have to ascend")
+    return JointTrajectory(time - time[0], tuple(tables))
 
 
 def check(
-    cell: Cell, trajectory: JointTrajectory, held: tuple[float, float] | None = None
+    cell: Cell,
+    trajectory: JointTrajectory,
+    held: tuple[float, float] | None = None,
+    interpolation: Interpolation | None = None,
 ) -> Finding:
     """What a trajectory does in a cell.
 
     Args:
         held: from when to when the pads hold the box [s]; None for the carry that the file names,
             else for the longest while in which the pads stand to one another as they hold it.
+        interpolation: what the controller does between samples; None for the one that takes all
+            that is known at them, as ROS 2's joint trajectory controller does.
 
     Raises:
-        SettingsError: nothing lies in that time.
+        SettingsError: nothing lies in that time, or the file lacks what the interpolation takes.
     """
-    workcell, time, q = cell.workcell, trajectory.time, trajectory.q
+    workcell, time = cell.workcell, trajectory.time
     held = held or trajectory.carry
-    if trajectory.q_rate is None:
-        spline: Any = CubicSpline(time, q)
-    else:
-        spline = CubicHermiteSpline(time, q, trajectory.q_rate)
-    along, across = pad_errors(workcell, q)
-    mask = _held(along, across)
+    kind = interpolation or tuple(DERIVATIVES)[len(trajectory.known) - 1]
+    if len(trajectory.known) < DERIVATIVES[kind]:
+        raise SettingsError(
+            f"{kind} motion between samples takes {', '.join(QUANTITIES[: DERIVATIVES[kind]])}; "
+            f"the file has {', '.join(QUANTITIES[: len(trajectory.known)])}: choose another one"
+        )
+    joints = between(time, trajectory.known, kind)
+    mask = _held(*pad_errors(workcell, trajectory.q))
     if held is not None:
         mask = np.asarray((time >= held[0]) & (time <= held[1]))
     if held is not None and mask.sum() < SHORTEST:
         raise SettingsError(f"under {SHORTEST} samples lie between {held[0]:g} and {held[1]:g} s")
-    use = _joint_use(workcell, q, spline(time, 1), spline(time, 2))
+    places = _places(time)
+    # Straight lines have no accelerations: those of a smooth motion along them are told.
+    smooth = CubicSpline(time, trajectory.q) if kind == "linear" else joints
+    use = _joint_use(workcell, joints(places), joints(places, 1), smooth(places, 2))
     rated = np.asarray(workcell.task.reference_force, dtype=float)
     if not mask.any():
-        nothing = np.zeros(2)
-        return Finding(mask, np.inf, np.inf, use, "", nothing, rated, False, float(time[-1]))
-    rows = np.flatnonzero(mask)
-    pose = _poses(workcell, q[rows])
-    motion = CubicSpline(time[rows], pose)
-    rate, second = motion(time[rows], 1), motion(time[rows], 2)
-    load = cell.timing_model.load(*(np.ascontiguousarray(v) for v in (pose, rate, second)))
+        nothing, end = np.zeros(2), float(time[-1])
+        return Finding(mask, np.inf, np.inf, use, "", nothing, rated, False, end, kind)
+    carried = time[mask]
+    places = _places(carried)
+    along, across = pad_errors(workcell, joints(places))
+    motion = CubicSpline(carried, _poses(workcell, joints(carried)))
+    pose, rate, second = (np.ascontiguousarray(motion(places, order)) for order in range(3))
+    force = cell.timing_model.load(pose, rate, second)["normal_force"]
     payload = workcell.payload
     use["payload velocity"] = _most(rate[:, :3], payload.velocity_max)
     use["payload acceleration"] = _most(second[:, :3], payload.acceleration_max)
-    first = len(workcell.robots[0].torque_max)
-    verdict = cell.evaluator.checker.check(
-        pose,
-        np.ascontiguousarray(q[rows, :first]),
-        np.ascontiguousarray(q[rows, first:]),
-        time[rows],
-    )
-    force, touch, collides = load["normal_force"], verdict.first_touch, ""
-    if touch is not None:
-        collides = f"{touch.first} and {touch.second} at {time[rows[0]] + touch.time:.3f} s"
     return Finding(
         held=mask,
-        along=float(np.abs(along[rows]).max()),
-        across=float(across[rows].max()),
+        along=float(np.abs(along).max()),
+        across=float(across.max()),
         use=use,
-        collides=collides,
+        collides=_collides(_certificate(cell, joints, carried)),
         normal_force=np.nanmax(force, axis=0),
         rated=rated,
         balanced=bool(np.isfinite(force).all()),
         duration=float(time[-1]),
+        interpolation=kind,
     )
+
+
+def _places(time: Array) -> Array:
+    """Samples at times (n,), and `BETWEEN` them."""
+    steps = np.diff(time)
+    inside = [time[:-1] + share * steps for share in (0.0, *BETWEEN)]
+    return np.append(np.column_stack(inside).ravel(), time[-1])
+
+
+def _certificate(cell: Cell, joints: BPoly, time: Array) -> Certificate:
+    """The continuous verdict on the motion of joints, from the first to the last of times (n,)."""
+    workcell = cell.workcell
+
+    def at(places: Array) -> tuple[Array, Array, Array]:
+        # In order of time: angles are counted on from one place to the next.
+        every = np.union1d(time, places)
+        pose = _poses(workcell, joints(every))[np.searchsorted(every, places)]
+        q_1, q_2 = (np.ascontiguousarray(q) for q in joints_of(workcell, joints(places)))
+        return np.ascontiguousarray(pose), q_1, q_2
+
+    return certify(cell.evaluator.checker, at, time)
+
+
+def _collides(certificate: Certificate) -> str:
+    """What meets what when, in words; '' where all is proven free."""
+    if certificate.is_free:
+        return ""
+    motion = certificate.motion
+    touch = certificate.at_sample if motion is None else motion.touch
+    who = "two bodies" if touch is None else f"{touch.first} and {touch.second}"
+    what = who if motion is None or motion.status == "collision" else f"{who}, too near to tell,"
+    return f"{what} at {certificate.at_parameter:.3f} s"
 
 
 def _held(along: Array, across: Array) -> Mask:
@@ -319,9 +376,8 @@ def _held(along: Array, across: Array) -> Mask:
 
 def _poses(workcell: Workcell, q: Array) -> Array:
     """(n, 6) of the box that the first pad holds, in the task's own numbers."""
-    first = len(workcell.robots[0].torque_max)
     T_pad_box = inverse(workcell.contacts[0].T_box_pad)
-    T = pad_places(workcell, 0, q[:, :first]) @ T_pad_box
+    T = pad_places(workcell, 0, joints_of(workcell, q)[0]) @ T_pad_box
     orientation = workcell.task.orientation
     if orientation.is_vector:
         turned = T[:, :3, :3] @ orientation.reference.T
@@ -351,6 +407,7 @@ def as_document(finding: Finding) -> Mapping[str, Any]:
     """JSON values of a finding."""
     return {
         "duration": finding.duration,
+        "interpolation": finding.interpolation,
         "held": float(finding.held.mean()),
         "closed_chain": {"along": finding.along, "across": finding.across},
         "use": finding.use,

@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
-from scipy.interpolate import BPoly, CubicHermiteSpline
+from scipy.interpolate import BPoly
 
 from hybrid_opt.bundles.arms import prefixes
 from hybrid_opt.bundles.programs.carry_job import Limits
@@ -44,6 +44,9 @@ from symbolic.records.task import components
 from symbolic.robot.model import build_robot_model
 
 Interpolation = Literal["linear", "cubic", "quintic"]
+
+DERIVATIVES: Mapping[Interpolation, int] = {"linear": 1, "cubic": 2, "quintic": 3}
+"""What each takes of a sample: its position, also its velocity, also its acceleration."""
 
 BETWEEN = (0.25, 0.5, 0.75)
 """Shares of a step at which the pads are looked at."""
@@ -109,8 +112,8 @@ def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) 
     starts = starts[:: -(-len(starts) // MOST_INTERVALS)]
     steps = np.diff(time)[starts]
     places = np.concatenate([time[starts] + share * steps for share in BETWEEN])
-    q = between(sampled, interpolation, places)
-    along, across = pad_errors(job.workcell, q)
+    joints = between(time, (sampled.q, sampled.q_rate, sampled.q_second), interpolation)
+    along, across = pad_errors(job.workcell, joints(places))
     least = min(float(sampled.normal_force[span].min()) for span in spans)
     force = stiffness / 2.0 * float(np.abs(along).max())
     return Gap(
@@ -123,15 +126,17 @@ def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) 
     )
 
 
-def between(sampled: SampledJob, interpolation: Interpolation, places: Array) -> Array:
-    """(m, joints) joints at times (m,) as a controller makes them up between the samples."""
-    if interpolation == "linear":
-        columns = sampled.q.T
-        return np.column_stack([np.interp(places, sampled.time, each) for each in columns])
-    if interpolation == "cubic":
-        return np.asarray(CubicHermiteSpline(sampled.time, sampled.q, sampled.q_rate)(places))
-    known = np.stack([sampled.q, sampled.q_rate, sampled.q_second], axis=1)
-    return np.asarray(BPoly.from_derivatives(sampled.time, known)(places))
+def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -> BPoly:
+    """The joints as a controller makes them up between samples: at times, the polynomial of least
+    degree through what is known at both ends.
+
+    Args:
+        time: (n,) ascending [s].
+        known: (n, joints) each: positions, then velocities and accelerations as far as the
+            interpolation takes them [rad, m, s].
+    """
+    taken = np.stack(known[: DERIVATIVES[interpolation]], axis=1)
+    return BPoly.from_derivatives(time, taken)
 
 
 def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:

@@ -186,7 +186,7 @@ def check_file(options: argparse.Namespace) -> int:
     cell = Cell(load_workcell(options.workcell)).drivable()
     trajectory = joint_trajectory(options.trajectory, cell.workcell)
     held = None if options.held is None else (options.held[0], options.held[1])
-    found = check(cell, trajectory, held)
+    found = check(cell, trajectory, held, options.interpolation)
     print(json.dumps(as_document(found), indent=1) if options.json else found)
     return EXIT_DIFFERENT if found.problems else 0
 

@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from hybrid_opt.bundles.check import Finding, check, read_trajectory
+from hybrid_opt.bundles.job_file import Interpolation
 from hybrid_opt.errors import ResultsError
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import exported, text_of
@@ -45,9 +46,14 @@ def message() -> dict[str, Any]:
     return {"joint_names": names, "points": points}
 
 
-def judged(path: Path, content: str, held: tuple[float, float] | None = None) -> Finding:
+def judged(
+    path: Path,
+    content: str,
+    held: tuple[float, float] | None = None,
+    interpolation: Interpolation | None = None,
+) -> Finding:
     path.write_text(content)
-    return check(rack(), read_trajectory(path, rack().workcell), held)
+    return check(rack(), read_trajectory(path, rack().workcell), held, interpolation)
 
 
 def test_our_own_job_passes(tmp_path: Path) -> None:
@@ -112,6 +118,55 @@ def test_what_cannot_be_driven_is_told(tmp_path: Path) -> None:
     assert any(problem.startswith("collides") for problem in found.problems)
 
 
+def thinned(document: dict[str, Any]) -> None:
+    """A sample each 0.2 s."""
+    document["points"] = document["points"][::4] + document["points"][-1:]
+    del document["points"][-2:-1]
+
+
+def ends(document: dict[str, Any]) -> None:
+    """Two samples at either end, on the carry: all that lies between is made up."""
+    document["points"] = document["points"][:2] + document["points"][-2:]
+    for point in document["points"]:
+        point.pop("velocities")
+
+
+def swung(document: dict[str, Any]) -> None:
+    """One sample bears a velocity that is not its own."""
+    document["points"][40]["velocities"][1] += 1.5
+
+
+def test_what_lies_between_samples_counts(tmp_path: Path) -> None:
+    """The same samples, all of them on the carry, under other interpolations."""
+    smooth = judged(tmp_path / "a.yaml", spoilt(thinned), interpolation="cubic")
+    assert not smooth.problems, smooth
+    assert smooth.interpolation == "cubic"
+    straight = judged(tmp_path / "a.yaml", spoilt(thinned), interpolation="linear")
+    (told,) = straight.problems
+    assert "the chain is not closed" in told
+    assert straight.interpolation == "linear"
+    assert "linear" in repr(straight)
+    swings = judged(tmp_path / "b.yaml", spoilt(swung))
+    assert any("chain is not closed" in problem for problem in swings.problems), swings
+    through = judged(tmp_path / "c.yaml", spoilt(ends), (0.0, 9.0))
+    document = json.loads(json.dumps(message()))
+    ends(document)
+    q = np.array([point["positions"] for point in document["points"]])
+    time = np.arange(len(q), dtype=float)
+    at_samples = rack().evaluator.checker.check(*placed(q), time)
+    assert at_samples.is_free
+    assert through.collides
+    with pytest.raises(SettingsError, match=r"quintic motion between samples takes .*acceleration"):
+        judged(tmp_path / "a.yaml", spoilt(thinned), interpolation="quintic")
+
+
+def placed(q: Any) -> tuple[Any, Any, Any]:
+    """The box and both arms of postures, as the first pad holds it."""
+    job = exported("json", 0.05).sampled
+    rows = [int(np.abs(job.q - row).max(axis=1).argmin()) for row in q]
+    return job.pose[rows], *(np.ascontiguousarray(part) for part in (q[:, :6], q[:, 6:]))
+
+
 def renamed(document: dict[str, Any]) -> None:
     document["joint_names"][3] = "elbow"
 
@@ -156,4 +211,4 @@ def test_plain_columns_are_read(tmp_path: Path) -> None:
     path.write_text(file.getvalue())
     found = read_trajectory(path, rack().workcell)
     np.testing.assert_allclose(found.q[3], document["points"][3]["positions"])
-    assert found.q_rate is None
+    assert len(found.known) == 1

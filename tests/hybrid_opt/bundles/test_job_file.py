@@ -251,7 +251,8 @@ def test_the_step_follows_from_the_stiffness() -> None:
 def test_samples_themselves_hold_the_box() -> None:
     sampled = exported("ros2-control").sampled
     for kind in ("linear", "cubic", "quintic"):
-        q = between(sampled, kind, sampled.time)
+        known = (sampled.q, sampled.q_rate, sampled.q_second)
+        q = between(sampled.time, known, kind)(sampled.time)  # type: ignore[arg-type]
         np.testing.assert_allclose(q, sampled.q, atol=1e-12)
 
 
