@@ -38,6 +38,9 @@ little of the coordinate to call an arm late."""
 WAIT = 3.0
 """Longest time for arms to begin to move [s]."""
 
+PRESSED = 0.98
+"""Share of the force with which the box is lifted from which on the pads have to press."""
+
 STRIKES = 3
 """Looks in a row at which something has to be wrong, beside a stop that is asked for."""
 
@@ -124,13 +127,18 @@ class Job:
         return next((name for last, name in self._phases if s <= last), self._phases[-1][1])
 
     def begin(self, name: str) -> float:
-        """The coordinate at which a phase begins; that of its follower where it is left out."""
+        """The coordinate at which a phase begins; the last one where there is none."""
         first = 0.0
         for last, phase in self._phases:
             if phase == name:
                 return first
             first = last
         return self.end
+
+    @cached_property
+    def pressed(self) -> float:
+        """The coordinate from which the pads hold the box alone: the end of its press."""
+        return next(last for last, phase in self._phases if phase == "press")
 
     def _place(self, s: float) -> tuple[int, float, float]:
         """The sample before s, the share of its interval and the interval's length [s]."""
@@ -378,7 +386,11 @@ class Machine:
                 (self.clock.rate > 0.0 and self.clock.s >= self.job.end)
                 or (self.clock.rate < 0.0 and self.clock.s <= 0.0)
             ):
-                self.state = "done"
+                wrong = self._wrong(seen)
+                if wrong:
+                    self.hold(wrong)
+                else:
+                    self.state = "done"
                 return
             wrong = self._wrong(seen)
             self._strikes = self._strikes + 1 if wrong else 0
@@ -461,6 +473,9 @@ class Machine:
     def _wrong(self, seen: Seen) -> str:
         """What speaks against going on, or ''."""
         limits, s = self.job.limits, self.clock.s
+        # Nothing is lifted, and no job done, by an arm that stands elsewhere.
+        stands = self.job.phase(s) == "press" or s in (0.0, self.job.end)
+        most = limits.path / 2.0 if stands else limits.path
         coordinates = []
         direction = 1.0 if self.clock.rate >= 0.0 else -1.0
         told = s - direction * self.lag
@@ -473,7 +488,7 @@ class Machine:
             far, near = -2.0 * direction * limits.behind, direction * limits.behind / 2.0
             at = self.job.coordinate(arm, q, told, (min(far, near), max(far, near)))
             away = self.job.distance(arm, q, at)
-            if away > limits.path:
+            if away > most:
                 return f"{self._name(arm)} has left its path by up to {1e3 * away:.1f} mm"
             if self.job.speed(arm, s) > SLOW * self.job.fastest:
                 if direction * (told - at) > limits.behind:
@@ -488,11 +503,13 @@ class Machine:
         return self._wrong_force(seen)
 
     def _wrong_force(self, seen: Seen) -> str:
-        s = self.clock.s
-        if self.job.phase(s) not in HELD:
-            return ""
+        s, lift = self.clock.s, self.job.pressed
         for arm, measured in enumerate(seen.force):
             wanted = self.job.force(arm, s)
+            # Before the box is lifted the pads have to press.
+            pressed = s <= lift and wanted >= PRESSED * self.job.force(arm, lift)
+            if not pressed and self.job.phase(s) not in HELD:
+                continue
             if measured is not None and abs(measured - wanted) > self.job.limits.force * wanted:
                 return f"{self._name(arm)} presses {measured:.1f} N instead of {wanted:.1f} N"
         return ""

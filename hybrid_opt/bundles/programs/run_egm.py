@@ -214,7 +214,7 @@ def streamed(stream: Stream, sockets: Sequence[socket.socket], check: bool) -> i
     """
 
     def interrupted(*_: object) -> None:
-        if stream.fault == CTRL_C:
+        if stream.machine.state == "held":
             stream.command = "leave"
         stream.fault = stream.fault or CTRL_C
 

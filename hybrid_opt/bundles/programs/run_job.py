@@ -263,7 +263,7 @@ class Cell:
         """Tell the arms what they carry, as the pads take the box over."""
         for load in self.config["payload"]:
             arm = load["arm"]
-            peak = self.job.force(arm, self.job.begin("lift"))
+            peak = self.job.force(arm, self.job.pressed)
             share = min(1.0, self.job.force(arm, s) / peak) if peak > 0.0 else 0.0
             first, second = load["empty"], load["loaded"]
             mass = (1.0 - share) * first["mass"] + share * second["mass"]
@@ -398,11 +398,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         job = Job.read(BUNDLE / "job.json")
         config = json.loads((BUNDLE / "config/cell.json").read_text("utf-8"))
         cell = Cell(node, job, config)
+        run = Run(cell)
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: interrupted(cell))
+            signal.signal(number, lambda *_: interrupted(run))
         cell.prepare()
         cell.spin(cell.now() + SETTLE)
-        run = Run(cell)
         if options.check:
             run.machine.start(cell.seen())
             node.get_logger().info("both arms are at their first places")
@@ -416,11 +416,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rclpy.shutdown()
 
 
-def interrupted(cell: Cell) -> None:
-    """Ctrl-C stops the job; once more, while it is held, ends the program."""
-    if cell.fault == CTRL_C:
-        cell.command = "leave"
-    cell.fault = cell.fault or CTRL_C
+def interrupted(run: Run) -> None:
+    """Ctrl-C stops the job; while it is held, for whatever reason, ends the program."""
+    if run.machine.state == "held":
+        run.cell.command = "leave"
+    run.cell.fault = run.cell.fault or CTRL_C
 
 
 def looked_after(run: Run) -> int:

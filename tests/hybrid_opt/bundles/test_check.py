@@ -164,7 +164,7 @@ def placed(q: Any) -> tuple[Any, Any, Any]:
     """The box and both arms of postures, as the first pad holds it."""
     job = exported("json", 0.05).sampled
     rows = [int(np.abs(job.q - row).max(axis=1).argmin()) for row in q]
-    return job.pose[rows], *(np.ascontiguousarray(part) for part in (q[:, :6], q[:, 6:]))
+    return job.pose[rows], q[:, :6].copy(), q[:, 6:].copy()
 
 
 def renamed(document: dict[str, Any]) -> None:

@@ -252,7 +252,7 @@ def test_samples_themselves_hold_the_box() -> None:
     sampled = exported("ros2-control").sampled
     for kind in ("linear", "cubic", "quintic"):
         known = (sampled.q, sampled.q_rate, sampled.q_second)
-        q = between(sampled.time, known, kind)(sampled.time)  # type: ignore[arg-type]
+        q = between(sampled.time, known, kind)(sampled.time)
         np.testing.assert_allclose(q, sampled.q, atol=1e-12)
 
 
