@@ -51,7 +51,10 @@ MAX_MOVES = 2000
 LEAST_MOVE_TIME = 0.02
 """Shortest time of one move [s]: below it a controller cannot plan ahead."""
 
-ZONE = "z1"
+ZONE = "z15"
+"""A controller rounds corners off within a zone, and within half of the shorter move: so wide a one
+makes a parabola of each corner, and the speed changes without jumps."""
+
 START_TOLERANCE = 1.0
 """How far an arm may be from the first position [degrees]; farther, the program ends."""
 

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
+from operator import sub
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,9 @@ WAIT = 3.0
 
 PRESSED = 0.98
 """Share of the force with which the box is lifted from which on the pads have to press."""
+
+RESTS = 2e-4
+"""Change of a joint from look to look below which an arm stands [rad, m]."""
 
 STRIKES = 3
 """Looks in a row at which something has to be wrong, beside a stop that is asked for."""
@@ -302,12 +306,14 @@ class Seen:
         force: measured normal force of each pad; None where nobody measures it [N].
         silence: time since the last news from each arm [s].
         fault: why to stop; '' for no reason.
+        lost: whether that is an arm that does not do what it is told.
     """
 
     q: list[list[float] | None] = field(default_factory=lambda: [None, None])
     force: list[float | None] = field(default_factory=lambda: [None, None])
     silence: list[float] = field(default_factory=lambda: [0.0, 0.0])
     fault: str = ""
+    lost: bool = False
 
 
 class Machine:
@@ -317,6 +323,7 @@ class Machine:
         state: one of these.
         reason: why it stopped last.
         clock: of the path.
+        stop_time: of the stop that runs, or of the last one [s].
     """
 
     def __init__(self, job: Job, lag: float = 0.0, lead: float = 0.0, waits: bool = False) -> None:
@@ -330,9 +337,10 @@ class Machine:
         """
         self.job, self.lag, self.lead = job, lag, lead
         self.state, self.reason = "ready", ""
-        self.clock = Clock(job.end, job.limits.stop_time)
+        self.clock, self.stop_time = Clock(job.end, job.limits.stop_time), job.limits.stop_time
         self._waits, self._expected = waits, list[Moment]()
         self._strikes, self._waited = 0, 0.0
+        self._stood: list[list[float] | None] = []
 
     def start(self, seen: Seen) -> None:
         """Begin the job.
@@ -395,11 +403,26 @@ class Machine:
             wrong = self._wrong(seen)
             self._strikes = self._strikes + 1 if wrong else 0
             if seen.fault or self._strikes >= STRIKES:
-                self.stop(seen.fault or wrong, quick=not seen.fault)
+                self.stop(seen.fault or wrong, quick=seen.lost or not seen.fault)
         elif self.state == "stopping" and not self.clock.turning:
+            if self._waits and not self._rests(dt, seen):
+                return
             self.state = "held"
             if self._waits:
                 self._locate(seen)
+
+    def _rests(self, dt: float, seen: Seen) -> bool:
+        """Whether arms that stop by themselves have come to rest since the last look."""
+        before, self._stood = self._stood, list(seen.q)
+        self._waited += dt
+        return (
+            self._waited > WAIT
+            or before == self._stood
+            or all(
+                now is not None and then is not None and max(map(abs, map(sub, now, then))) < RESTS
+                for now, then in zip(self._stood, before or [None], strict=False)
+            )
+        )
 
     def _wait(self, rate: float) -> None:
         if self._waits:
@@ -429,9 +452,10 @@ class Machine:
         """Stop along the path and hold; quickly where an arm does not do what it is told."""
         if self.state == "running":
             self.state, self.reason = "stopping", reason
-            self._expected = []
+            self._expected, self._stood, self._waited = [], [], 0.0
             limits = self.job.limits
-            self.clock.turn(0.0, self.lead, limits.quick_stop if quick else limits.stop_time)
+            self.stop_time = limits.quick_stop if quick else limits.stop_time
+            self.clock.turn(0.0, self.lead, self.stop_time)
 
     def told(self) -> str:
         """What has happened, and how to go on."""
@@ -445,13 +469,13 @@ class Machine:
         return f"{self.state} ({where})"
 
     def _locate(self, seen: Seen) -> None:
-        """Stand where arms are that came to rest by themselves."""
-        reach = self.job.limits.stop_time + self.lag
-        found = [
-            self.job.coordinate(arm, q, self.clock.s, (-reach, reach))
-            for arm, q in enumerate(seen.q)
-            if q is not None
-        ]
+        """Stand where arms are that came to rest by themselves, of those that are on the path."""
+        limits, found = self.job.limits, list[float]()
+        reach = limits.stop_time + self.lag
+        for arm, q in enumerate(seen.q):
+            if q is not None and seen.silence[arm] <= limits.silence:
+                at = self.job.coordinate(arm, q, self.clock.s, (-reach, reach))
+                found += [at] if self.job.distance(arm, q, at) <= limits.path else []
         if found:
             s = sum(found) / len(found)
             self.clock = Clock(self.job.end, self.job.limits.stop_time, s)

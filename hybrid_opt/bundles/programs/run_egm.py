@@ -95,7 +95,8 @@ class Stream:
             inward = self._inward(self.machine.clock.s)
             way = self.press.way
             q[self._arm] = [a - way * slope for a, slope in zip(pressing, inward, strict=True)]
-        return Seen(q=q, force=list(self._force), silence=silence, fault=self.fault)
+        lost = self.fault not in ("", CTRL_C)
+        return Seen(q=q, force=list(self._force), silence=silence, fault=self.fault, lost=lost)
 
     def hear(self, arm: int, message: FromRobot, now: float) -> None:
         """Take a message of an arm's controller."""

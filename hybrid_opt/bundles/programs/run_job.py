@@ -65,6 +65,7 @@ class Cell:
         """Subscribe to both arms and find their controllers."""
         self.node, self.job, self.config = node, job, config
         self.fault, self.command = "", ""
+        self.lost = False
         self._q: list[dict[str, float]] = [{}, {}]
         self._news = [-math.inf, -math.inf]
         self._force: list[float | None] = [None, None]
@@ -121,6 +122,7 @@ class Cell:
             force=list(self._force),
             silence=[now - then for then in self._news],
             fault=self.fault,
+            lost=self.lost,
         )
 
     def spin(self, until: float) -> None:
@@ -214,6 +216,7 @@ class Cell:
             if number == self._goals and done.status != GoalStatus.STATUS_SUCCEEDED:
                 told = done.result.error_string or f"status {done.status}"
                 self.fault = self.fault or f"{action} ended: {told}"
+                self.lost = True
 
         return ended
 
@@ -250,11 +253,12 @@ class Cell:
             point["effort"] = [v for arm in arms for v in job.effort(arm, gravity, at.s, r)]
         return point
 
-    def press(self, s: float) -> None:
-        """Tell force controllers what to press from a coordinate on."""
+    def press(self, s: float, rate: float) -> None:
+        """Tell force controllers what to press from a coordinate on, at a rate."""
         for force in self.config["force"]:
             arm, every = force["arm"], force["every"]
-            newton = max(self.job.force(arm, s + 2.0 * every * k / WINDOW) for k in range(WINDOW))
+            ahead = (s + rate * 2.0 * every * k / WINDOW for k in range(WINDOW))
+            newton = max(self.job.force(arm, each) for each in ahead)
             request = json.loads(json.dumps(force["request"]))
             request["wrench"] = {"force": {"z": newton}}
             self.call(force["name"], force["type"], request)
@@ -275,12 +279,12 @@ class Cell:
             request = {"mass": mass, "center_of_gravity": dict(zip("xyz", centre, strict=True))}
             self.call(load["name"], load["type"], request)
 
-    def halt(self) -> None:
-        """Stop arms whose goals cannot be replaced: slow along the path, then whole."""
+    def halt(self, takes: float) -> None:
+        """Stop arms whose goals cannot be replaced: slow along the path for a time [s], then whole."""
         self._goals += 1
         for slider in self.config["sliders"]:
             self.call(slider["name"], slider["type"], {"speed_slider_fraction": SLOWEST})
-        self.spin(self.now() + self.job.limits.stop_time)
+        self.spin(self.now() + takes)
         for handle in self._handles:
             handle.cancel_goal_async()
 
@@ -351,7 +355,10 @@ class Run:
     def _stop(self) -> None:
         cell = self.cell
         if not self._stamped:
-            cell.halt()
+            cell.halt(self.machine.stop_time)
+            return
+        if self.machine.state == "held":
+            # At its end: the controllers hold what they reached.
             return
         # With the start of what is driven now: the new points are a continuation of the old ones,
         # the first of which is over when they arrive, so that nothing is made up in between.
@@ -369,7 +376,7 @@ class Run:
         for force in self.cell.config["force"]:
             if touching and now - self._pressed >= force["every"]:
                 self._pressed, self._presses = now, True
-                self.cell.press(s)
+                self.cell.press(s, self.machine.clock.rate)
                 self.cell.bear(s)
         if self._presses and not touching:
             self._presses = False
@@ -377,7 +384,7 @@ class Run:
 
     def _resume(self, direction: float) -> None:
         cell = self.cell
-        cell.command = cell.fault = ""
+        cell.command, cell.fault, cell.lost = "", "", False
         try:
             self.machine.resume(direction, cell.seen())
             cell.full_speed()

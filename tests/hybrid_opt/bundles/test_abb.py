@@ -33,7 +33,7 @@ from symbolic.errors import SettingsError
 from symbolic.records.poses import inverse
 from symbolic.robot.model import build_robot_model
 from tests.hybrid_opt.bundles.bundles import contents, driven, exported, rack_driven, text_of
-from tests.hybrid_opt.bundles.rapid_parser import Call, Module, RapidError, parse
+from tests.hybrid_opt.bundles.mock_rapid import Call, Controller, Module, RapidError, parse
 from tests.hybrid_opt.job.jobs import rack, rack_job
 from tests.robots import ur10_urdf
 
@@ -123,7 +123,7 @@ def test_the_leader_drives_the_job() -> None:
         np.testing.assert_allclose(np.array(robot, dtype=float), degrees, atol=1e-6)
         step = float(job.time[k] - job.time[k - 1])
         assert float(str(call.optional["T"])) == pytest.approx(step, abs=1e-6)
-        assert call.arguments[2] == ("fine" if k in job.last else "z1")
+        assert call.arguments[2] == ("fine" if k in job.last else "z15")
 
 
 def test_the_other_presses_with_every_move() -> None:
@@ -252,6 +252,77 @@ def test_a_box_that_turns_is_refused() -> None:
 def test_the_parser_refuses_wrong_rapid(text: str) -> None:
     with pytest.raises((RapidError, IndexError)):
         parse(text)
+
+
+def controller(sign: float = 1.0, away: float = 0.0, acts: int = 1) -> Controller:
+    """Both tasks; `sign` as someone wrote it down, `acts` as the robot takes it."""
+    sheet = exported("abb-rapid")
+    q = sheet.sampled.q[0].copy()
+    q[0] += away
+    found = Controller(sheet.workcell, [text_of("abb-rapid", name) for name in NAMES], q, acts)
+    found.tasks[1].set("carrySign", sign)
+    return found
+
+
+def test_both_tasks_carry_out_the_job() -> None:
+    """Both robots are where the job has them, the leader by its own clock, the other by speeds; the
+    pad presses no less than the job asks for."""
+    found, sheet = controller().run(), exported("abb-rapid")
+    assert [task.log for task in found.tasks] == [["done"], ["done"]]
+    job = sheet.sampled
+    time, q, force = (np.array(column) for column in zip(*found.record, strict=True))
+    np.testing.assert_allclose(q[-1], job.q[-1], atol=2e-5)
+    carry = job.span(3)
+    middle = int(np.abs(q - job.q[carry.start + 20]).max(axis=1).argmin())
+    for k in range(carry.start + 5, carry.stop - 5):
+        at = middle + round((job.time[k] - job.time[carry.start + 20]) / CYCLE)
+        # In step to three cycles, although nothing but the phase's beginning is common.
+        near = 3.0 * CYCLE * np.abs(job.q_rate[k]) + 1e-4
+        assert (np.abs(q[at] - job.q[k]) <= near).all(), k
+        assert force[at] >= job.normal_force[k - 1 : k + 2, 1].min() - 1.0
+    assert force[-1] == 0.0
+    assert time[-1] == pytest.approx(job.time[-1], abs=1.0)
+
+
+def test_a_sign_that_nobody_found_out_moves_nothing() -> None:
+    for sign, acts, told in ((0.0, 1, "carrySign first"), (1.0, -1, "PosSupvDist")):
+        found = controller(sign, acts=acts).run()
+        assert any(told in line for line in found.tasks[1].log)
+        assert any("did not come" in line for line in found.tasks[0].log), "and the other gives up"
+        q = np.array([row[1] for row in found.record])
+        job = exported("abb-rapid").sampled
+        most = np.abs(job.q[: job.span(1).stop] - job.q[0]).max()
+        assert np.abs(q - q[0]).max() <= (most + 1e-6 if sign else 0.0), "nothing is lifted"
+    found = controller(away=0.05).run()
+    assert any("jog the robot" in line for line in found.tasks[0].log)
+    assert np.ptp(np.array([row[1] for row in found.record]), axis=0).max() == 0.0
+
+
+@pytest.mark.parametrize("gone", [0, 1])
+@pytest.mark.parametrize(
+    "phase", ["approach", "press", "lift", "carry", "set_down", "release", "retreat"]
+)
+def test_a_task_that_does_not_come_is_not_waited_for(phase: str, gone: int) -> None:
+    """It ends in a phase: the other ends before the next, keeps its place and its force."""
+    whole = sound()
+    begin = whole.begins[f"Carry_{phase}"]
+
+    def end(cell: Controller) -> None:
+        cell.tasks[gone].runs = False
+
+    found = controller().run({begin + 0.2: end})
+    left = found.tasks[1 - gone]
+    assert any("did not come" in line for line in left.log), left.log
+    pressed = found.record[-1][2]
+    if phase in ("lift", "carry", "set_down"):
+        assert pressed > 90.0
+    q = np.array([row[1] for row in found.record[-1000:]])
+    assert np.ptp(q, axis=0).max() < 1e-9
+
+
+@cache
+def sound() -> Controller:
+    return controller().run()
 
 
 CYCLE = 0.004

@@ -1,41 +1,52 @@
 """What programs command drives the simulated cell: the box arrives, or is held where it stops.
 
-`run_job.py` and `run_egm.py` run unedited against their mocks, with faults; what they told the arms
-is then what MuJoCo's arms are told.
+Every target's program runs unedited against its mock, with faults; what it told the arms is then
+what MuJoCo's arms are told, and the force that it told is what the pressing arm controls.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 pytest.importorskip("mujoco")
 
 from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.bundle import prepared
-from hybrid_opt.bundles.job_file import Contents
+from hybrid_opt.bundles.job_file import Contents, pad_errors
 from hybrid_opt.bundles.programs.carry_job import Job
 from hybrid_opt.timing import TimingLimits, time_path
 from hybrid_opt.witness.arms import ArmOutcome, CellWitness
-from hybrid_opt.witness.reference import BoxJob, JointMotion, Reference, job_reference
+from hybrid_opt.witness.reference import (
+    BoxJob,
+    Control,
+    JointMotion,
+    Reference,
+    job_reference,
+    press_torque,
+)
 from symbolic.array import Array
-from tests.hybrid_opt.bundles import test_abb
-from tests.hybrid_opt.bundles.bundles import contents
+from symbolic.robot.model import build_robot_model
+from tests.hybrid_opt.bundles import test_abb, test_urscript
+from tests.hybrid_opt.bundles.bundles import STEPS, contents
 from tests.hybrid_opt.bundles.mock_ros import World, run
-from tests.hybrid_opt.bundles.test_run_job import FAULTS, SETTLED, column
+from tests.hybrid_opt.bundles.test_run_job import FAULTS, begins, column
 from tests.hybrid_opt.job.jobs import rack, rack_jobs
 
 pytestmark = pytest.mark.slow
 
 TRACKED = 0.05
 SLIP = 5e-4
-"""[m]; twice as much where an arm is late."""
+"""[m]."""
 
 MIDDLE_BOARD, LINER = 0.60, 1.012
 """Heights on which the rack's box stands before and after [m]."""
@@ -63,15 +74,41 @@ def witness() -> CellWitness:
     return CellWitness(rack().workcell)
 
 
-def reference(
-    time: Array, q: Array, effort: Array, goal: bool, carried: Job | None = None
-) -> Reference:
-    """What arms were told, at moments; forces are those of the places where they were sent."""
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What a program told the arms at n moments.
+
+    Attributes:
+        time: (n,) [s].
+        q: (n, joints) both arms side by side [rad].
+        effort: (n, joints) whole torques; None where the arms make them up themselves, for what
+            they know to carry [N m].
+        force: (n,) that the second arm is told to press with; None where it follows from the
+            efforts [N].
+    """
+
+    time: Array
+    q: Array
+    effort: Array | None = None
+    force: Array | None = None
+
+
+def reference(told: Told, goal: bool, carried: Job | None = None, delay: float = 0.0) -> Reference:
+    """What the simulated arms are told, the second one a delay later [s]."""
     carried = carried or job()
-    rate = np.gradient(q, time, axis=0)
-    where = coordinates(time, q, carried)
+    workcell, time = rack().workcell, told.time
+    where = coordinates(time, told.q, carried)
     force = np.array([[carried.force(arm, s) for arm in (0, 1)] for s in where])
-    workcell = rack().workcell
+    effort = told.effort
+    if effort is None:
+        rows = [[carried.effort(a, "with_gravity", s, 1.0) for a in (0, 1)] for s in where]
+        effort = np.array(rows).reshape(len(where), -1)
+    if told.force is not None:
+        more = np.repeat((told.force - force[:, 1])[:, None], effort.shape[1], axis=1)
+        effort = effort + more * press_torque(workcell, told.q)
+        force[:, 1] = told.force
+    q, effort = late(time, told.q, delay), late(time, effort, delay)
+    rate = np.gradient(q, time, axis=0)
     start, end = (workcell.task.waypoints[k].lower.copy() for k in (0, -1))
     for pose, board in ((start, MIDDLE_BOARD), (end, LINER)):
         pose[2] = board + workcell.payload.size[2] / 2.0
@@ -105,11 +142,6 @@ def judged(found: ArmOutcome, arrives: bool, slip: float = SLIP) -> None:
     assert found.slip.max() < slip
 
 
-def commanded(world: World) -> tuple[Array, Array, Array]:
-    time, q, effort = (column(world, k) for k in range(3))
-    return time - time[0], q, effort
-
-
 def late(time: Array, rows: Array, delay: float) -> Array:
     """The second arm's columns a delay later [s]."""
     shifted = rows.copy()
@@ -118,59 +150,165 @@ def late(time: Array, rows: Array, delay: float) -> Array:
     return shifted
 
 
-@pytest.mark.parametrize("force", [None, 55.0])
-@pytest.mark.parametrize("delay", [0.0, 0.01])
-def test_the_ros2_program_carries_the_box(
-    force: float | None, delay: float, tmp_path: Path
-) -> None:
-    code, world = run(dict(files_of(force)), tmp_path, lambda world: None, [])
-    assert code == 0
-    time, q, effort = commanded(world)
-    carried = job(force)
-    where = coordinates(time, q, carried)
-    told = reference(time, late(time, q, delay), late(time, effort, delay), True, carried)
-    found = witness().simulate(told, "leader")
-    begin = float(np.interp(carried.begin("carry"), where, time))
-    end = float(np.interp(carried.begin("set_down"), where, time))
-    inside = (found.time > begin) & (found.time < end)
-    ratio = found.normal_force[inside] / found.normal_force_reference[inside]
-    print(f"{end - begin:.2f} s, {delay} s late: forces {ratio.min():.3f} to {ratio.max():.3f}")
-    judged(found, arrives=True, slip=2.0 * SLIP if delay else SLIP)
-    assert np.abs(ratio - 1.0).max() < TRACKED or delay
+def commanded(world: World) -> Told:
+    """Of the program of ROS 2 that tells whole torques."""
+    time, q, torque = (column(world, k) for k in range(3))
+    return Told(time - time[0], q, torque)
 
 
-@pytest.mark.parametrize("name", ["Ctrl-C", "no news"])
-def test_a_stopped_job_holds_the_box(name: str, tmp_path: Path) -> None:
-    fault: Callable[[World], Any] = FAULTS[name][0]
-    when = job().begin("carry") + 2.0
-
-    def prepare(world: World) -> None:
-        world.later(SETTLED + 0.5 + when, lambda: fault(world))
-        for k in range(3):
-            world.later(SETTLED + 0.5 + when + 4.0 + 0.2 * k, world.interrupt)
-
-    code, world = run(dict(contents("ros2-control")), tmp_path, prepare, [])
-    assert code == 1
-    time, q, effort = commanded(world)
-    judged(witness().simulate(reference(time, q, effort, goal=False), "leader"), arrives=False)
+def of_franka(world: World) -> Told:
+    """Its arms bear themselves."""
+    told = commanded(world)
+    assert told.effort is not None
+    own = np.zeros_like(told.q)
+    for arm, robot in enumerate(rack().workcell.robots):
+        model = build_robot_model(robot).model
+        data, part = model.createData(), slice(6 * arm, 6 * arm + 6)
+        own[:, part] = [pin.computeGeneralizedGravity(model, data, q) for q in told.q[:, part]]
+    return replace(told, effort=told.effort + own)
 
 
-def test_the_egm_program_carries_the_box() -> None:
+def of_ur(world: World) -> Told:
+    """Its arms make up their torques themselves, one of them for a force."""
+    force = np.array([row[3][1] for row in world.record])
+    return replace(commanded(world), effort=None, force=force)
+
+
+TOLD = {"ros2-control": commanded, "franka-ros2": of_franka, "ur-ros2": of_ur}
+
+
+def ran(target: str, folder: Path) -> Told:
+    code, world = run(dict(contents(target)), folder, lambda world: None, [])
+    assert code == 0, world.log
+    return TOLD[target](world)
+
+
+def by_urscript(folder: Path) -> Told:
+    arms = test_urscript.pair().run().arms
+    n = min(len(arm.record) for arm in arms)
+    time, first, _ = zip(*arms[0].record[:n], strict=True)
+    _, second, force = zip(*arms[1].record[:n], strict=True)
+    return Told(np.array(time), np.hstack([first, second]), force=np.array(force))
+
+
+def by_rapid(folder: Path) -> Told:
+    time, q, force = test_abb.sound().rounded(STEPS["abb-rapid"])
+    return Told(time, q, force=force)
+
+
+def by_egm(folder: Path) -> Told:
     cell = test_abb.Cell()
     cell.run(lambda cell: cell.stream.machine.state == "done")
-    time = np.array([row[0] for row in cell.record])
-    q = np.array([row[4] for row in cell.record])
+    time, s, _, wanted, q = (np.array(column) for column in zip(*cell.record, strict=True))
     # The way into the box is the simulated force control's own business.
-    s = np.array([row[1] for row in cell.record])
     q[:, 6:] = [job().position(1, each) for each in s]
-    effort = [[job().effort(a, "with_gravity", each, 1.0) for a in (0, 1)] for each in s]
-    rows = np.array(effort).reshape(len(s), -1)
-    found = witness().simulate(reference(time - time[0], q, rows, goal=True), "leader")
+    return Told(time - time[0], q, force=wanted)
+
+
+PROGRAMS: dict[str, tuple[Callable[[Path], Told], Control]] = {
+    "ros2-control": (partial(ran, "ros2-control"), "leader"),
+    "franka-ros2": (partial(ran, "franka-ros2"), "impedance"),
+    "ur-ros2": (partial(ran, "ur-ros2"), "leader"),
+    "ur-script": (by_urscript, "leader"),
+    "abb-rapid": (by_rapid, "leader"),
+    "abb-egm": (by_egm, "leader"),
+}
+"""What runs each target's program, and what its arms control."""
+
+
+@cache
+def told_by(target: str) -> Told:
+    with TemporaryDirectory() as folder:
+        return PROGRAMS[target][0](Path(folder))
+
+
+@pytest.mark.parametrize("target", PROGRAMS)
+@pytest.mark.parametrize("together", [True, False])
+def test_every_program_carries_the_box(target: str, together: bool) -> None:
+    """In step, and with the second arm as late as the target has to reckon with."""
+    skew = TARGETS[target].skew
+    if not together and not skew:
+        pytest.skip("one clock moves both arms")
+    delay = 0.0 if together else float(skew or 0.0)
+    told = told_by(target)
+    aims = reference(told, True, delay=delay)
+    found = witness().simulate(aims, PROGRAMS[target][1])
+    where = coordinates(told.time, told.q, job())
+    within(found, told.time, where, job(), f"{target}, {1e3 * delay:g} ms late")
+    judged(found, arrives=True)
+    along = pad_errors(rack().workcell, told.q[held_rows(where)][::5])[0]
+    print(f"  pads apart by up to {1e3 * np.abs(along).max():.3f} mm")
+
+
+def held_rows(where: Array) -> Any:
+    return np.flatnonzero((where > job().begin("lift")) & (where < job().begin("release")))
+
+
+def within(found: ArmOutcome, time: Array, where: Array, carried: Job, name: str) -> None:
+    """The forces of the carry are what was told in the last 0.1 s, and nowhere less than the job's,
+    to the tracking share."""
+    s = np.interp(found.time, time, where)
+    inside = (s > carried.begin("carry")) & (s < carried.begin("set_down"))
+    force, told = found.normal_force[:, 1], found.normal_force_reference[:, 1]
+    last = np.lib.stride_tricks.sliding_window_view(
+        np.pad(told, (round(0.1 / np.diff(found.time).mean()), 0), mode="edge"),
+        round(0.1 / np.diff(found.time).mean()) + 1,
+    )
+    low, high = (force / last.min(axis=1))[inside], (force / last.max(axis=1))[inside]
+    planned = np.array([carried.force(1, each) for each in s[inside]])
+    print(
+        f"{name}: over what was told {low.min():.3f} to {high.max():.3f}, "
+        f"over the job {(force[inside] / planned).min():.3f} to "
+        f"{(force[inside] / planned).max():.3f}"
+    )
+    assert low.min() > 1.0 - TRACKED
+    assert high.max() < 1.0 + TRACKED
+    assert (force[inside] / planned).min() > 1.0 - TRACKED
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.01])
+def test_a_fast_carry_is_carried_as_well(delay: float, tmp_path: Path) -> None:
+    """Below 55 N planned, 2.8 s."""
+    code, world = run(dict(files_of(55.0)), tmp_path, lambda world: None, [])
+    assert code == 0
+    told, carried = commanded(world), job(55.0)
+    found = witness().simulate(reference(told, True, carried, delay), "leader")
+    where = coordinates(told.time, told.q, carried)
+    within(found, told.time, where, carried, f"ros2-control, fast, {delay} s late")
     judged(found, arrives=True)
 
 
-def test_half_the_force_does_not_hold_the_box(tmp_path: Path) -> None:
-    _, world = run(dict(contents("ros2-control")), tmp_path, lambda world: None, [])
-    time, q, effort = commanded(world)
-    told = reference(time, q, effort, goal=True)
-    assert not witness().simulate(told, "leader", 0.5).arrives
+STOPPED = (
+    ("ros2-control", "Ctrl-C"),
+    ("ros2-control", "no news"),
+    ("ros2-control", "a controller gives up"),
+    ("ros2-control", "one arm stops"),
+    ("franka-ros2", "the other arm stops"),
+    ("ur-ros2", "one arm stops"),
+    ("ur-ros2", "the other arm stops"),
+    ("ur-ros2", "a controller gives up"),
+)
+
+
+@pytest.mark.parametrize(("target", "name"), STOPPED)
+def test_a_stopped_job_holds_the_box(target: str, name: str, tmp_path: Path) -> None:
+    """Also where one arm stands at once, and the other comes to rest 50 mm farther: arms give."""
+    fault: Callable[[World], Any] = FAULTS[name][0]
+    when = begins(target) + job().begin("carry") + 2.5
+
+    def prepare(world: World) -> None:
+        world.later(when, lambda: fault(world))
+        for k in range(3):
+            world.later(when + 4.0 + 0.2 * k, world.interrupt)
+
+    code, world = run(dict(contents(target)), tmp_path, prepare, [])
+    assert code == 1
+    found = witness().simulate(reference(TOLD[target](world), goal=False), PROGRAMS[target][1])
+    judged(found, arrives=False, slip=2.0 * SLIP)
+    apart = pad_errors(rack().workcell, column(world, 1)[-1:])[1]
+    print(f"  {target}, {name}: told to be {1e3 * apart[0]:.0f} mm apart")
+
+
+def test_half_the_force_does_not_hold_the_box() -> None:
+    aims = reference(told_by("ros2-control"), goal=True)
+    assert not witness().simulate(aims, "leader", 0.5).arrives

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -36,14 +37,10 @@ def column(world: World, index: int) -> Array:
     return np.array([row[index] for row in world.record])
 
 
-def coordinate(job: Job, world: World) -> list[float]:
-    """Where along the path either arm stands at the end [s]."""
-    found = []
-    for arm in (0, 1):
-        q = world.q(arm).tolist()
-        places = np.arange(0.0, job.end, 0.002)
-        found.append(float(min(places, key=lambda s: job.distance(arm, q, float(s)))))
-    return found
+def held_at(world: World) -> float:
+    """Where along the path the program says that it holds the job [s]."""
+    found = re.findall(r"held in \w+, ([0-9.]+) s", " ".join(world.log))
+    return float(found[-1])
 
 
 @pytest.mark.parametrize("target", ["ros2-control", "ur-ros2"])
@@ -106,6 +103,10 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "a controller gives up": (abort, "ended: Aborted"),
 }
 
+
+NEAR = {"ros2-control": 1e-3, "franka-ros2": 1e-3, "ur-ros2": 0.02}
+"""How far a held arm may be from where the program says [m]: two URs that slow down by themselves
+meet the same place only about."""
 
 UNSEEN = ("one arm stops", "the other arm stops")
 """Faults that show only where the arms move."""
@@ -176,7 +177,7 @@ def test_both_arms_hold_and_press(
         assert code in (0, 1), text
     else:
         assert code == 1, text
-        assert f"held in {phase}" in text or share > 0.9 or name in UNSEEN, text
+        assert f" in {phase}, " in text or share > 0.9 or name in UNSEEN, text
     if code == 0:
         return
     assert "'back'" in text
@@ -187,16 +188,22 @@ def test_both_arms_hold_and_press(
         moving = np.flatnonzero(np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-9)
         noticed = 0.1 + job.limits.silence + (0.2 if target == "ur-ros2" else 0.0)
         assert time[moving[-1] + 1] <= when + noticed + job.limits.stop_time
-    places = coordinate(job, world)
-    stopped = 0.1 if name in ("Ctrl-C", "no news", "an encoder jumps") else 0.5
-    assert abs(places[0] - places[1]) < stopped
+    s = held_at(world)
+    stopped = {"one arm stops": {0}, "the other arm stops": {1}}.get(name, set())
+    if target == "ur-ros2" and (stopped or name == "a controller gives up"):
+        # What is held is the middle of where two that stop by themselves stand.
+        stopped = {0, 1}
     for arm in (0, 1):
+        away = job.distance(arm, world.q(arm).tolist(), s)
+        # What one that stopped by itself is off: as far as is allowed, and the other's stop.
+        most = job.limits.path + 0.5 * job.fastest * (job.limits.quick_stop + 0.1)
+        assert away < (most if arm in stopped else NEAR[target]), f"{name} at {s}: {away}"
         gravity = {"ros2-control": "with_gravity", "franka-ros2": "without_gravity"}.get(target)
-        if gravity and name not in UNSEEN:
-            held = job.effort(arm, gravity, places[arm], 0.0)
+        if gravity:
+            held = job.effort(arm, gravity, s, 0.0)
             np.testing.assert_allclose(world.effort(arm), held, atol=2.0)
-    if target == "ur-ros2" and job.begin("lift") < places[1] < job.begin("release"):
-        assert world.force[1] == pytest.approx(job.force(1, places[1]), rel=0.1)
+    if target == "ur-ros2":
+        assert world.force[1] == pytest.approx(job.force(1, s), rel=0.1, abs=1.0)
 
 
 @pytest.mark.parametrize(
