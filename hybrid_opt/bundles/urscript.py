@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from hybrid_opt.bundles.arms import comment, robot_prefix
 from hybrid_opt.bundles.job_file import Export
 from hybrid_opt.bundles.programs import program
+from hybrid_opt.bundles.programs.carry_job import PRESSED
 from hybrid_opt.job.compliance import HELD
 from hybrid_opt.job.motions import TICK
 from symbolic.array import Array
@@ -97,7 +98,8 @@ def _phase(export: Export, arm: int, index: int, name: str) -> Iterator[str]:
         ahead = k + every + 3
         newton = float(force[k:ahead].max()) if name in HELD else float(force[k])
         yield f"    go({_list(q[k])}, {newton:.3f})"
-        if name in HELD:
+        # Before the box is lifted the pads have to press.
+        if name in HELD or (name == "press" and newton >= PRESSED * most > 0.0):
             yield f"    feel({newton:.3f})"
         elif most > 0.0 and (k - span.start) % 5 == 0:
             # The box's weight goes over with the squeeze.

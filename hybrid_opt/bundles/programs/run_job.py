@@ -280,7 +280,7 @@ class Cell:
             self.call(load["name"], load["type"], request)
 
     def halt(self, takes: float) -> None:
-        """Stop arms whose goals cannot be replaced: slow along the path for a time [s], then whole."""
+        """Stop arms whose goals cannot be replaced: slow on the path for a time [s], then whole."""
         self._goals += 1
         for slider in self.config["sliders"]:
             self.call(slider["name"], slider["type"], {"speed_slider_fraction": SLOWEST})
