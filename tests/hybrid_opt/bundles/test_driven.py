@@ -45,6 +45,7 @@ from tests.hybrid_opt.job.jobs import rack, rack_jobs
 pytestmark = pytest.mark.slow
 
 TRACKED = 0.05
+STIFFNESS = BundleOptions().stiffness
 SLIP = 5e-4
 """[m]."""
 
@@ -238,6 +239,8 @@ def test_every_program_carries_the_box(target: str, together: bool) -> None:
     judged(found, arrives=True)
     along = pad_errors(rack().workcell, told.q[held_rows(where)][::5])[0]
     print(f"  pads apart by up to {1e3 * np.abs(along).max():.3f} mm")
+    least = min(job().force(1, s) for s in where[held_rows(where)])
+    assert np.abs(along).max() * STIFFNESS / 2.0 < TRACKED * least
 
 
 def held_rows(where: Array) -> Any:

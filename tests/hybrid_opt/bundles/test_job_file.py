@@ -21,13 +21,22 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.bundles.job_file import between, chosen_step, gap_of, pad_errors, stop_of
+from hybrid_opt.bundles import TARGETS, BundleOptions
+from hybrid_opt.bundles.bundle import prepared
+from hybrid_opt.bundles.job_file import (
+    Interpolation,
+    between,
+    chosen_step,
+    gap_of,
+    pad_errors,
+    stop_of,
+)
 from hybrid_opt.bundles.ros2 import message_of
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.compliance import HELD, TRACKED
-from hybrid_opt.job.records import Job, SampledJob, sample_job
+from hybrid_opt.job.records import SampledJob, sample_job
 from symbolic.errors import SettingsError
-from tests.hybrid_opt.bundles.bundles import contents, exported, text_of
+from tests.hybrid_opt.bundles.bundles import contents, exported, rack_driven, text_of
 from tests.hybrid_opt.job.jobs import rack, rack_job
 
 
@@ -199,41 +208,46 @@ def test_a_stop_needs_the_force_of_its_deceleration() -> None:
     assert stop.force_use <= 1.6 * worst / commanded
 
 
-def independent_gap(job: Job, step: float, kind: str) -> float:
-    """Largest change of the gap [m] by polynomials of our own between the samples."""
-    sampled = sample_job(job, step)
-    worst = 0.0
-    for index, phase in enumerate(job.phases):
-        if phase.name not in HELD:
-            continue
-        span = sampled.span(index)
-        for k in range(span.start, span.stop - 1, 3):
-            h = sampled.time[k + 1] - sampled.time[k]
-            ends = [
-                [sampled.q[i], sampled.q_rate[i] * h, sampled.q_second[i] * h * h]
-                for i in (k, k + 1)
-            ]
-            n = {"linear": 1, "cubic": 2, "quintic": 3}[kind]
-            rows, values = [], []
-            for x, known in zip((0.0, 1.0), ends, strict=True):
-                for d in range(n):
-                    p = np.polynomial.polynomial
-                    row = [p.polyval(x, p.polyder(np.eye(2 * n)[c], d)) for c in range(2 * n)]
-                    rows.append(row)
-                    values.append(known[d])
-            c = np.linalg.solve(np.array(rows), np.array(values))
-            q = np.array([sum(c[j] * 0.5**j for j in range(2 * n))])
-            along, _ = pad_errors(job.workcell, q)
-            worst = max(worst, float(np.abs(along).max()))
-    return worst
+def independent_gap(sampled: SampledJob, kind: str) -> float:
+    """Largest change of the gap [m] while the box is held, at samples and fifths of each step, by
+    polynomials of our own: the inverse of what a polynomial's coefficients do to its ends."""
+    job, n = sampled.job, {"linear": 1, "cubic": 2, "quintic": 3}[kind]
+    ends = [
+        [math.perm(c, d) * (x ** (c - d) if c >= d else 0.0) for c in range(2 * n)]
+        for x in (0.0, 1.0)
+        for d in range(n)
+    ]
+    coefficients = np.linalg.inv(np.array(ends))
+    spans = [sampled.span(k) for k, phase in enumerate(job.phases) if phase.name in HELD]
+    starts = np.concatenate([np.arange(span.start, span.stop - 1) for span in spans])[::3]
+    h = np.diff(sampled.time)[starts][:, None]
+    known = [
+        values[starts + end] * h**d
+        for end in (0, 1)
+        for d, values in enumerate((sampled.q, sampled.q_rate, sampled.q_second)[:n])
+    ]
+    c = np.einsum("ce,enj->cnj", coefficients, np.array(known))
+    shares = (0.0, 0.2, 0.4, 0.6, 0.8)
+    rows = [sum(c[k] * x**k for k in range(2 * n)) for x in shares]
+    return float(np.abs(pad_errors(job.workcell, np.concatenate(rows))[0]).max())
 
 
 @pytest.mark.parametrize(("kind", "step"), [("linear", 0.2), ("cubic", 0.2), ("quintic", 0.2)])
-def test_the_gap_is_that_of_an_independent_interpolation(kind: str, step: float) -> None:
-    found = gap_of(sample_job(rack_job(), step), kind, 1e4)  # type: ignore[arg-type]
-    expected = independent_gap(rack_job(), step, kind)
-    assert found.along == pytest.approx(expected, rel=0.5, abs=1e-9)
+def test_the_gap_is_that_of_an_independent_interpolation(kind: Interpolation, step: float) -> None:
+    sampled = sample_job(rack_job(), step)
+    found = gap_of(sampled, kind, 1e4)
+    assert found.along == pytest.approx(independent_gap(sampled, kind), rel=0.5, abs=1e-9)
     assert found.force == pytest.approx(1e4 / 2.0 * found.along)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_every_target_keeps_the_gap(target: str) -> None:
+    """At the step and by the interpolation that it chooses by itself."""
+    found = prepared(rack_driven(), TARGETS[target], BundleOptions())
+    gap = independent_gap(found.sampled, TARGETS[target].interpolation)
+    held = [phase.force.normal.min() for phase in rack_job().phases if phase.name in HELD]
+    assert 1e4 / 2.0 * gap <= TRACKED * min(held)
+    assert found.gap.along == pytest.approx(gap, rel=0.5, abs=1e-6)
 
 
 def test_the_step_follows_from_the_stiffness() -> None:

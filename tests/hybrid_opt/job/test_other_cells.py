@@ -17,7 +17,7 @@ from hybrid_opt.job.records import Job
 from hybrid_opt.timing import TimingLimits, time_path
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import driven
-from tests.hybrid_opt.bundles.rapid_parser import parse
+from tests.hybrid_opt.bundles.mock_rapid import parse
 from tests.hybrid_opt.cells import shipped
 
 CELLS = ["transfer", "pandas"]
