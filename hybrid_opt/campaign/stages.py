@@ -164,6 +164,8 @@ class Progress:
         with bar:
 
             def advance(count: int) -> None:
+                if bar.total is not None and bar.n + count > bar.total:
+                    bar.total = None  # more than was thought: nobody knows how much is left
                 bar.update(count)
 
             yield advance

@@ -19,7 +19,6 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.recommending.choice import LEADER, DrivenPaths, Option
 from hybrid_opt.robust.cases import least_friction, nominal_case, worst_cases
 from hybrid_opt.robust.force import HOLDS, BoxMotion, pressing_model, thinned
-from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array
@@ -64,12 +63,11 @@ class Advice:
         return f"{self.change}: {self.force:+.1f} N, or {self.duration:+.3f} s at the same force"
 
 
-def commanded_margins(carry: Carry) -> tuple[Margin, ...]:
-    """How far friction, mass and centre of mass may be off, each for itself, while what is
-    commanded holds the carry."""
+def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
+    """How far friction, mass and centre of mass may be off, each for itself, while commanded forces
+    (n, 2) [N] hold the carry."""
     workcell, model = carry.workcell, pressing_model(carry.workcell)
     rows, motion = thinned(carry)
-    forces, _ = commanded_forces(workcell, carry, SqueezeSettings())
     enough, nominal = forces[rows, 1 - LEADER] * (1.0 + HOLDS), nominal_case(workcell)
 
     def last(change: Array, end: float) -> tuple[float, str]:

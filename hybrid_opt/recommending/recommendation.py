@@ -30,13 +30,13 @@ from hybrid_opt.recommending.choice import (
     Option,
     Wish,
     best_of_paths,
-    force_alone,
     refuse,
 )
 from hybrid_opt.recommending.comparison import BETTER, Rival, rival, spread_rows
-from hybrid_opt.robust.force import thinned
+from hybrid_opt.robust.force import box_motion, thinned
 from hybrid_opt.robust.squeeze import (
     DOUBTS,
+    MOST,
     Squeeze,
     SqueezeSettings,
     commanded_forces,
@@ -63,6 +63,9 @@ TRIED = 3
 
 PRECISE = 1e-3
 """Of the multiple of an uncertainty set that would do."""
+
+GENTLE = 1.02
+"""Of the least commanded force where no carry keeps to the reference forces, what is taken."""
 
 STEPS = 4 + FORCES
 """Of a recommendation, and one more per rival."""
@@ -182,17 +185,20 @@ def _recommended(
     options = paths.all_options(given[rows, -1], told)
     goal = Goal.of(wish, cell.workcell)
     weak = not wish.given and not any((each.force <= goal.hardest).all() for each in options)
-    if weak:
-        goal = replace(goal, hardest=np.full(2, np.inf), cost=force_alone)
+    if weak and options:
+        # A little more than the gentlest asks for: its last newtons take most of its time.
+        gentle = np.full(2, GENTLE * min(float(each.force.max()) for each in options))
+        goal = replace(goal, hardest=gentle)
     refuse(options, wish, goal)
     option, timing = _driven(cell, paths, options, goal)
     told()
     carry = timing.carry
     assert carry is not None, "what is driven has a carry"
-    commanded, squeeze, job, doubts = _job(cell, timing)
+    forces, squeeze, job, doubts = _job(cell, timing)
+    commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
     allowed = cell.workcell.task.reference_force
     if weak:
-        doubts.insert(0, _too_weak(cell.workcell, carry, commanded))
+        doubts.insert(0, _too_weak(cell.workcell, carry, commanded, forces[:, 1 - LEADER]))
     elif (commanded > allowed * (1.0 + BETTER)).any():
         doubts.append(
             f"pressing with {commanded.max():.1f} N exceeds the reference force of "
@@ -203,7 +209,7 @@ def _recommended(
     for label, path in named.items():
         beside.append(rival(cell, label, path, timing, squeeze.force))
         told()
-    margins = commanded_margins(carry)
+    margins = commanded_margins(carry, forces)
     told()
     hints = advice(cell, paths, option, timing)
     told()
@@ -244,8 +250,9 @@ def _driven(
                 reason = timing.reason
                 break
             carry, doubt = timing.carry, cell.workcell.uncertainty
-            planned = carry.normal_force[:, 1 - LEADER]
-            force = largest_commanded(cell.workcell, carry, planned, doubt, LEADER)
+            known, motion = thinned(carry)
+            planned = carry.normal_force[known, 1 - LEADER]
+            force = largest_commanded(cell.workcell, motion, planned, doubt, LEADER)
             late = timing.duration / goal.longest
             hard = force / float(goal.hardest[1 - LEADER])
             if max(late, hard) <= 1.0 + BETTER:
@@ -262,16 +269,20 @@ def _driven(
 
 
 def _job(cell: Cell, timing: Timing) -> tuple[Array, Squeeze, Job | None, list[str]]:
-    """The largest forces to command (2,) [N], how they came about, the job, and doubts."""
+    """The forces to command along the carry (n, 2) [N], how they came about, the job, and
+    doubts."""
     assert timing.carry is not None, "what is driven has a carry"
     doubts = []
     try:
         job = JobModel(cell.compiled, cell.timing_model).plan(timing)
-        peak, squeeze = job.peak_normal_force, job.squeeze
+        squeeze, carried = job.squeeze, job.phase("carry")
+        along = (carried.motion.time, carried.force.normal)
+        forces = np.column_stack(
+            [np.interp(timing.carry.time, along[0], normal) for normal in along[1].T]
+        )
     except JobError as error:
         job = None
         forces, squeeze = commanded_forces(cell.workcell, timing.carry, SqueezeSettings())
-        peak = np.asarray(forces.max(axis=0))
         doubts.append(f"no job can be planned: {error}")
     if squeeze.uncertainty is not None and squeeze.uncertainty.is_empty:
         doubts.append("the cell states that nothing is uncertain: state what may be off")
@@ -280,15 +291,16 @@ def _job(cell: Cell, timing: Timing) -> tuple[Array, Squeeze, Job | None, list[s
             "the squeeze holds pads that choose their pressure; pressing evenly, they do not close "
             "their grasp: turn them towards one another, or raise the friction"
         )
-    return peak, squeeze, job, doubts
+    return forces, squeeze, job, doubts
 
 
-def _too_weak(workcell: Workcell, carry: Carry, needed: Array) -> str:
-    """That the reference forces are not enough for what has to be commanded (2,) [N], and what
-    would do."""
+def _too_weak(workcell: Workcell, carry: Carry, needed: Array, commanded: Array) -> str:
+    """That the reference forces are not enough for what has to be commanded (2,) [N], along the
+    carry (n,), and what would do."""
     doubt, allowed = workcell.uncertainty, workcell.task.reference_force.min()
-    rows, motion = thinned(carry)
-    planned = carry.normal_force[rows, 1 - LEADER]
+    planned = carry.normal_force[:, 1 - LEADER]
+    rows = np.union1d(np.argsort(-planned)[:MOST], np.argsort(-commanded)[:MOST])
+    motion, planned = box_motion(carry).at(rows), planned[rows]
 
     def share(known: Uncertainty) -> float:
         """Of the reference force, of the robot that presses harder."""
@@ -307,7 +319,7 @@ def _too_weak(workcell: Workcell, carry: Carry, needed: Array) -> str:
             ways.append(f"no doubt about the {name}")
     return (
         "no carry of the front holds in every case of the cell's uncertainty within the reference "
-        f"forces of {allowed:.1f} N: this is the gentlest; with nothing uncertain it needs "
+        f"forces of {allowed:.1f} N: this is among the gentlest; with nothing uncertain it needs "
         f"{least * allowed:.1f} N. Any of these would do: {', '.join(ways)}"
     )
 

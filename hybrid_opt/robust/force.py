@@ -188,7 +188,8 @@ class RobustModel:
     def hold(
         self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
     ) -> tuple[Array, Array]:
-        """Least normal force to command, and the largest that the leader then feels, (n,) [N].
+        """Least normal force to command, and the largest that the leader then feels, (n,) [N];
+        infinite where none is found that holds every case.
 
         Args:
             leader: index of the arm that keeps its place.
@@ -202,6 +203,7 @@ class RobustModel:
         worst = self.least_squeeze(motion, worst_cases(self.workcell, uncertainty, leader), leader)
         follower, share = 1 - leader, self._cases.leading_share(leader)
         force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
+        force[np.isnan(force)] = np.inf
         return force[:, follower], force[:, leader]
 
     def commanded(
@@ -214,7 +216,8 @@ class RobustModel:
         """(n,) the first of `hold`, sooner where many cases are asked.
 
         A pressure that is known beforehand shows which cases ask for most at a few samples, what
-        they need, and of most others that they need no more.
+        they need, and of most others that they need no more. Of more than `SAMPLES` samples, so
+        many are asked all cases, and the others those that rule there.
 
         Args:
             above: (n,) what is commanded anyway, or one for all [N]; less is not told.
@@ -229,10 +232,19 @@ class RobustModel:
         ruling = np.unique(slack.reshape(len(cases), -1).argsort(axis=0)[:RULING])
         needed = self.least_squeeze(motion, cases[ruling], leader)[:, :, 1 - leader]
         force: Array = np.maximum(needed.max(axis=0), above)
-        others, step = np.delete(cases, ruling, axis=0), max(1, BATCH // n)
+        others = np.delete(cases, ruling, axis=0)
+        thin = np.unique(np.linspace(0, n - 1, min(n, SAMPLES)).round().astype(int))
+        held, step, last = force[thin], max(1, BATCH // len(thin)), [others[:0]]
         for start in range(0, len(others), step):
             some = others[start : start + step]
-            force *= self._shares(motion, force, some, 1.0, leader).max(axis=0)
+            share = self._shares(box_motion(motion).at(thin), held, some, 1.0, leader)
+            last.append(some[np.unique(share.argmax(axis=0)[share.max(axis=0) > 1.0])])
+            held *= share.max(axis=0)
+        force[thin], more = held, np.concatenate(last)
+        if n > len(thin) and len(more):
+            needed = self.least_squeeze(motion, more, leader)[:, :, 1 - leader]
+            force = np.maximum(force, needed.max(axis=0))
+        force[np.isnan(force)] = np.inf
         return force
 
     def peak(self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0) -> Array:
@@ -255,10 +267,15 @@ class RobustModel:
             leader: index of the arm that keeps its place.
 
         Raises:
-            SettingsError: the set leaves no friction or patch, or there is no such arm.
+            SettingsError: the set leaves no friction or patch, no force holds all of it, or there
+                is no such arm.
         """
         chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
         commanded, leading = self.hold(motion, chosen, leader)
+        if not np.isfinite(commanded).all():
+            raise SettingsError(
+                f"no force was found that holds every case ({chosen}); make its ranges smaller"
+            )
         nominal = self.least_squeeze(motion, nominal_case(self.workcell)[None], leader)[0]
         return RobustForce(leader, chosen, nominal, commanded, leading)
 
@@ -409,10 +426,13 @@ def pressing_model(workcell: Workcell) -> RobustModel:
     return (soft_model if closes_evenly(workcell) else robust_model)(workcell)
 
 
-def closes_evenly(workcell: Workcell) -> bool:
-    """Whether pads that press evenly hold a workcell's payload whatever the motion asks."""
+def _closes_evenly(workcell: Workcell) -> bool:
     task = replace(workcell.task, allocation="soft-finger")
     return workcell.has_opposite_pads or has_force_closure(replace(workcell, task=task))
+
+
+closes_evenly = kept_per_workcell(_closes_evenly)
+"""Whether pads that press evenly hold a workcell's payload whatever the motion asks."""
 
 
 @dataclass(frozen=True)

@@ -146,10 +146,12 @@ def run_study(
     polish = study.polish if alone else study.drivable_polish
     driven = Cell(cell).drivable().workcell if study.drivable and not alone else cell
     if polish is not None and not is_polishable(driven):
+        allocation = driven.task.allocation
+        found = "pads lie otherwise" if allocation == "soft-finger" else f'it is "{allocation}"'
         progress.note(
             "the drivable carries of this cell are not polished, only searched: the polish of time "
             'and force knows the allocation "paper", and "soft-finger" with two pads of opposite '
-            f'normals; here it is "{driven.task.allocation}"'
+            f"normals; here {found}"
         )
         study = replace(study, drivable_polish=None, polish=None if alone else study.polish)
     with open_folder(settings, execution, cell) as folder:

@@ -317,6 +317,11 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         jerk = limits_on_jerk(place)
     if drivable is not None and first.summary.recommendation is not None:
         recommended = read_trajectory(results.root / RECOMMENDED).x
+    if not (results.root / TIMING).exists():
+        raise ResultsError(
+            f"{results.root}: a study with --recommend-only has no report; its carry is in "
+            f"{RECOMMENDED}. Run the study without it, into another folder, for one"
+        )
     files = shown_files(first.summary).values()
     timings = [read_timing(results.root / TIMING / file) for file in files]
     if len(timings) != len(carries):

@@ -137,19 +137,22 @@ def recommend_from(
     drivable = drivable_fronts(drivable_root(root, campaign.workcell, campaign.objectives))
     threads = threads or available_cores()
     cell = ho.Cell(drivable.results.workcell, drivable.results.objectives, threads)
-    if len(drivable.x) == 0:
+    own = _hand_made(cell)
+    x, sources = np.vstack([drivable.x, own]), [*drivable.sources, *[HAND_MADE] * len(own)]
+    if len(x) == 0:
         raise NoCarryError(_why_none(cell, drivable.results))
     alone = is_drivable(campaign.workcell, campaign.objectives)
     others = {} if alone else least_force(campaign)
     # The choice with its rivals, the table's rows and the price.
     steps = STEPS + 3 + 2 * len(others) + len(drivable.fronts)
     with progress.stage("recommendation", steps, "steps") as advance:
-        front = ho.Front.of(cell, drivable.x)
-        found = ho.recommend(front, wish, others, progress=lambda done, total: advance(1))
+        found = ho.recommend(
+            ho.Front.of(cell, x), wish, others, progress=lambda done, total: advance(1)
+        )
         durations = _force_table(cell, drivable, others, found, advance)
         price = _price(found.carry, campaign.configuration.settings.seed, threads)
         advance(1)
-    source = drivable.sources[found.member]
+    source = sources[found.member]
     provenance = {
         "recommended": str(wish),
         "source": source,
@@ -164,10 +167,18 @@ def recommend_from(
         source=source,
         file=file,
         export=export_command(Path(file), found.limit),
-        considered=len(drivable.x),
+        considered=len(x),
         durations=durations,
         price=price,
     )
+
+
+def _hand_made(cell: ho.Cell) -> Array:
+    """(1, n) the hand-made carry within the largest force limit, none where it is not feasible: a
+    front may lie behind it where the search was short."""
+    x = np.append(cell.initial[:-1], cell.workcell.task.force_limit[1])
+    found = cell.evaluator.certified(cell.evaluate(x))
+    return np.asarray(found.x[found.feasible])
 
 
 def _why_none(cell: ho.Cell, results: CampaignResults) -> str:

@@ -10,8 +10,15 @@ import pytest
 
 from codegen.lanes import lane_text
 from codegen.source import dense, generated_c
-from hybrid_opt.robust.force import BoxMotion, RobustModel
+from hybrid_opt.robust.force import (
+    LARGEST_FACTOR,
+    SAMPLES,
+    BoxMotion,
+    RobustModel,
+    allowed_factor,
+)
 from symbolic.contact.worst_cases import case_grasp_function
+from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.records import Allocation, Uncertainty
 from tests.hybrid_opt.robust.test_force import at_rest
@@ -47,6 +54,29 @@ def test_what_is_commanded_is_known_without_every_case() -> None:
     found = even.commanded(moved, SET, above=above)
     np.testing.assert_allclose(found, np.maximum(commanded, above), rtol=1e-9)
     np.testing.assert_allclose(even.peak(moved, SET), [leading.max(), commanded.max()], rtol=5e-3)
+
+
+def test_a_set_that_no_found_force_holds_is_told() -> None:
+    """Nearly no friction is left: the forces of a fork are not found."""
+    even, moved = model("fork", "soft-finger"), motion("fork")
+    widest = even.largest_factor(moved, np.full(2, 1e9))
+    assert 0.0 < widest < LARGEST_FACTOR
+    lost = SET.scaled(allowed_factor(even.workcell, SET))
+    assert np.isinf(even.peak(moved, lost)).all()
+    with pytest.raises(SettingsError, match="no force was found that holds every case"):
+        even.robust_force(moved, lost)
+
+
+def test_of_many_samples_those_between_are_held_too() -> None:
+    """More than `SAMPLES` of them: cases that rule at some are asked at all."""
+    even, few = model("drum", "soft-finger"), motion("drum")
+    at, share = np.arange(6.0), np.linspace(0.0, 5.0, 2 * SAMPLES)
+    parts = [
+        np.column_stack([np.interp(share, at, column) for column in values.T])
+        for values in vars(few).values()
+    ]
+    moved = BoxMotion(*parts)
+    np.testing.assert_allclose(even.commanded(moved, SET), even.hold(moved, SET)[0], rtol=1e-4)
 
 
 def test_cases_of_pads_anywhere_are_evaluated_in_lanes() -> None:

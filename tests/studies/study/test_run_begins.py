@@ -21,6 +21,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
 from studies import recommend, run
 from studies.programs.study import campaign_settings
+from studies.report import __main__ as report
 from studies.study.recommendation import read_recommendation
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
@@ -108,6 +109,8 @@ def test_a_recommendation_alone_makes_nothing_else(
     again = capfd.readouterr()
     assert again.out.startswith("Run this carry: ")
     assert re.search(r"recommendation: 0 of \d+ steps", again.err)
+    assert report.main([str(root), "--quiet"]) == 2
+    assert "a study with --recommend-only has no report" in capfd.readouterr().err
 
 
 def test_why_carries_are_not_polished_is_told(
@@ -118,7 +121,7 @@ def test_why_carries_are_not_polished_is_told(
     assert run.main([drum, "--output", str(tmp_path)]) == 2
     told = capsys.readouterr().err
     assert "are not polished, only searched" in told
-    assert 'here it is "soft-finger"' in told
+    assert "here pads lie otherwise" in told
 
 
 @pytest.fixture(scope="module")
