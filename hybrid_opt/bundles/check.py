@@ -37,7 +37,7 @@ from hybrid_opt.bundles.job_file import (
 )
 from hybrid_opt.carry import joints_of
 from hybrid_opt.cell import Cell
-from hybrid_opt.collision.certify import Certificate, certify
+from hybrid_opt.collision.certify import certify
 from hybrid_opt.display.table import text_table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import read_bytes
@@ -133,7 +133,7 @@ class Finding:
             if ratio > EXCESS
         ]
         if self.collides:
-            found.append(f"collides: {self.collides}")
+            found.append(f"collisions: {self.collides}")
         if not self.balanced:
             found.append("no forces of the pads balance the box everywhere")
         for arm, (force, most) in enumerate(zip(self.normal_force, self.rated, strict=True), 1):
@@ -320,7 +320,7 @@ def check(
         along=float(np.abs(along).max()),
         across=float(across.max()),
         use=use,
-        collides=_collides(_certificate(cell, joints, carried)),
+        collides=_certificate(cell, joints, carried),
         normal_force=np.nanmax(force, axis=0),
         rated=rated,
         balanced=bool(np.isfinite(force).all()),
@@ -336,8 +336,9 @@ def _places(time: Array) -> Array:
     return np.append(np.column_stack(inside).ravel(), time[-1])
 
 
-def _certificate(cell: Cell, joints: BPoly, time: Array) -> Certificate:
-    """The continuous verdict on the motion of joints, from the first to the last of times (n,)."""
+def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
+    """The continuous verdict on the motion of joints, from the first to the last of times (n,):
+    what meets what; '' where all is proven free."""
     workcell = cell.workcell
 
     def at(places: Array) -> tuple[Array, Array, Array]:
@@ -347,18 +348,8 @@ def _certificate(cell: Cell, joints: BPoly, time: Array) -> Certificate:
         q_1, q_2 = (np.ascontiguousarray(q) for q in joints_of(workcell, joints(places)))
         return np.ascontiguousarray(pose), q_1, q_2
 
-    return certify(cell.evaluator.checker, at, time)
-
-
-def _collides(certificate: Certificate) -> str:
-    """What meets what when, in words; '' where all is proven free."""
-    if certificate.is_free:
-        return ""
-    motion = certificate.motion
-    touch = certificate.at_sample if motion is None else motion.touch
-    who = "two bodies" if touch is None else f"{touch.first} and {touch.second}"
-    what = who if motion is None or motion.status == "collision" else f"{who}, too near to tell,"
-    return f"{what} at {certificate.at_parameter:.3f} s"
+    found = certify(cell.evaluator.checker, at, time)
+    return "" if found.is_free else f"{found.problem} at {found.at_parameter:.3f} s"
 
 
 def _held(along: Array, across: Array) -> Mask:

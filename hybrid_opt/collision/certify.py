@@ -74,11 +74,20 @@ class Certificate:
     def __repr__(self) -> str:
         if self.is_free:
             return f"Certificate: free of collisions along the path ({self.grid_points} places)"
+        return f"Certificate: {self.problem} at u = {self.at_parameter:.4f}"
+
+    @property
+    def problem(self) -> str:
+        """What speaks against the path, in words; '' where it is free."""
+        if self.is_free:
+            return ""
         if self.lost:
-            return f"Certificate: an arm does not follow the path at u = {self.at_parameter:.4f}"
-        touch = self.at_sample or (None if self.motion is None else self.motion.touch)
-        who = f"{touch.first} and {touch.second}" if touch is not None else "undecided"
-        return f"Certificate: not free at u = {self.at_parameter:.4f}, {who}"
+            return "an arm does not follow the path"
+        touch = self.at_sample if self.motion is None else self.motion.touch
+        first, second = ("a body", "another") if touch is None else (touch.first, touch.second)
+        if self.motion is None or self.motion.status == "collision":
+            return f"{first} meets {second}"
+        return f"{first} comes too near to {second} to prove that they do not meet"
 
 
 def certify(

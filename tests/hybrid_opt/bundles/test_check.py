@@ -115,7 +115,7 @@ def test_what_cannot_be_driven_is_told(tmp_path: Path) -> None:
 
     found = judged(tmp_path / "c.yaml", spoilt(through), (0.0, 6.0))
     assert found.collides
-    assert any(problem.startswith("collides") for problem in found.problems)
+    assert any(problem.startswith("collisions") for problem in found.problems)
 
 
 def thinned(document: dict[str, Any]) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import io
 import json
 import math
+from collections.abc import Callable
 from typing import Any
 from xml.etree import ElementTree
 
@@ -12,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
+import yourdfpy
 
 from hybrid_opt.bundles.job_file import pad_places
 from symbolic.records.poses import pose_matrix
@@ -109,6 +112,51 @@ def test_the_description_weighs_what_the_efforts_hold() -> None:
         np.testing.assert_allclose(job.effort[k], torque, atol=0.01)
 
 
+# ros2_control.xsd of hardware_interface: element -> its attributes and children. The schema knows
+# no parameters of state interfaces; the mock hardware's initial values are such.
+HARDWARE = {
+    "ros2_control": ({"name", "type"}, {"hardware", "joint"}),
+    "hardware": (set(), {"plugin", "param"}),
+    "plugin": (set(), set()),
+    "joint": ({"name"}, {"command_interface", "state_interface"}),
+    "command_interface": ({"name"}, {"param"}),
+    "state_interface": ({"name"}, {"param"}),
+    "param": ({"name"}, set()),
+}
+
+
+def judged_hardware(element: ElementTree.Element) -> None:
+    """An element of the description's hardware as the schema judges it."""
+    attributes, children = HARDWARE[element.tag]
+    assert set(element.attrib) == attributes, element.attrib
+    assert {child.tag for child in element} <= children
+    order = [child.tag for child in element]
+    assert order == sorted(order, key=["hardware", *order].index), "what is alike stands together"
+    for child in element:
+        judged_hardware(child)
+
+
+def test_the_hardware_keeps_to_its_schema() -> None:
+    def control() -> ElementTree.Element:
+        root = ElementTree.fromstring(text_of("ros2-control", "description/cell.urdf"))
+        (found,) = root.findall("ros2_control")
+        return found
+
+    judged_hardware(control())
+    broken: list[Callable[[ElementTree.Element], object]] = [
+        lambda c: c.attrib.pop("type"),
+        lambda c: c[1].attrib.pop("name"),
+        lambda c: c[1].set("nam", "x"),
+        lambda c: ElementTree.SubElement(c[1], "limits"),
+        lambda c: c.append(ElementTree.Element("hardware")),
+    ]
+    for change in broken:
+        found = control()
+        change(found)
+        with pytest.raises(AssertionError):
+            judged_hardware(found)
+
+
 def test_mock_hardware_begins_at_the_first_position() -> None:
     root = ElementTree.fromstring(text_of("ros2-control", "description/cell.urdf"))
     control = root.find("ros2_control")
@@ -125,11 +173,35 @@ def test_mock_hardware_begins_at_the_first_position() -> None:
     assert controller["command_interfaces"] == commands == ["position", "effort"]
 
 
+def by_yourdfpy(text: str) -> yourdfpy.URDF:
+    """The description as another reader takes it."""
+    content = io.BytesIO(text.encode())
+    found = yourdfpy.URDF.load(content, load_meshes=False, build_collision_scene_graph=False)
+    if not found.validate():
+        raise ValueError(found.errors)
+    return found
+
+
+def test_another_reader_places_the_pads_as_well() -> None:
+    found = by_yourdfpy(text_of("ros2-control", "description/cell.urdf"))
+    assert list(found.actuated_joint_names) == JOINTS
+    job, cell = exported("ros2-control").sampled, rack().workcell
+    for k in range(job.span(1).start, job.span(5).stop, 40):
+        found.update_cfg(job.q[k])
+        box = pose_matrix(job.pose[k, :3], job.pose[k, 3:])
+        for arm, name in enumerate(("left_contact_pad", "right_contact_pad")):
+            expected = box @ cell.contacts[arm].T_box_pad
+            np.testing.assert_allclose(found.get_transform(name, "world"), expected, atol=1e-5)
+
+
 def test_a_broken_description_is_refused() -> None:
     text = text_of("ros2-control", "description/cell.urdf")
     for broken in (text[:-20], text.replace('link="left_link_2"', 'link="nobody"', 1)):
         with pytest.raises(Exception, match=r".+"):
             assert list(pin.buildModelFromXML(broken).names)[1:] == JOINTS
+    # It mends what is cut off, and refuses what hangs together with nothing.
+    with pytest.raises(ValueError, match="not in list"):
+        by_yourdfpy(broken)
 
 
 def test_efforts_say_whose_gravity_they_hold() -> None:

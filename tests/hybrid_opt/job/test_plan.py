@@ -186,7 +186,10 @@ def changed(**handling: float) -> Job:
 @pytest.mark.parametrize(
     ("handling", "message"),
     [
-        ({"set_down_height": 0.02}, "set down: .*payload and liner"),
+        (
+            {"set_down_height": 0.02},
+            "set down: 50 % along its way payload meets liner, top board; change",
+        ),
         ({"lift_height": 0.03}, "middle board"),
         ({"stand_off": 1.2}, "approach"),
         ({"lift_height": 0.5}, "lift"),
