@@ -467,8 +467,8 @@ def refuse_excess(job: Job) -> None:
         if not found.is_free:
             raise JobError(
                 f"{title}: {100.0 * found.at_parameter:.0f} % along its way {found.problem}; "
-                "change stand_off, lift_height or set_down_height under [handling] (a height of 0 hands "
-                "the box over in the air), or choose another carry"
+                "change stand_off, lift_height or set_down_height under [handling] (a height of 0 "
+                "hands the box over in the air), or choose another carry"
             )
         name, ratio = max(phase.use.items(), key=lambda item: item[1])
         if ratio > EXCESS:
