@@ -138,6 +138,65 @@ def test_what_is_wrong_stops_the_job_on_its_path(name: str) -> None:
     assert (machine.state, machine.clock.s) == ("done", 0.0)
 
 
+def held_after(machine: Machine, seen: Callable[[float], Seen]) -> Machine:
+    """Until it is held, or three seconds have passed."""
+    for _ in range(300):
+        machine.tick(PERIOD, seen(machine.clock.s))
+        if machine.state == "held":
+            break
+    return machine
+
+
+def off(s: float, way: float) -> Seen:
+    """The first arm's pad about so far off its place [m]."""
+    reach = max(job().robots[0]["reach"])
+    q = posture(s)
+    assert q[0] is not None
+    q[0][job().robots[0]["reach"].index(reach)] += way / reach
+    return Seen(q)
+
+
+def test_pads_have_to_press_before_the_box_is_lifted() -> None:
+    """12 mm are allowed on the way, not where the box is gripped; nor is half of the force."""
+    lift = job().pressed
+    early = running(job().begin("press") + 0.2)
+    found = held_after(early, lambda s: off(s, 0.012))
+    assert (found.state, "left its path" in found.reason) == ("held", True)
+    found = held_after(running(job().begin("carry") + 1.0), lambda s: off(s, 0.012))
+    assert found.state == "running"
+    weak = running(job().begin("press") + 0.2)
+    found = held_after(weak, lambda s: Seen(posture(s), force=[None, 0.5 * job().force(1, s)]))
+    assert "presses" in found.reason
+    z = [row[2] for row in job().document["box"]["pose"]]
+    risen = np.interp([found.clock.s, lift], job().time, z)
+    assert risen[0] - risen[1] < 1e-4, "nothing is lifted"
+
+
+def test_an_arm_that_stands_elsewhere_has_not_done_the_job() -> None:
+    found = held_after(running(job().end - 0.5), lambda s: off(s, 0.012))
+    assert (found.state, "left its path" in found.reason) == ("held", True)
+    found = running(job().end - 0.5)
+    for _ in range(60):
+        found.tick(PERIOD, Seen(posture(found.clock.s)))
+    assert found.state == "done"
+
+
+def test_arms_that_stop_by_themselves_are_where_those_on_the_path_are() -> None:
+    """A silent arm's last posture, or one that is off the path, says nothing of the place."""
+    middle = job().begin("carry") + 2.5
+    for wrong in ("silent", "off"):
+        machine = Machine(job(), waits=True)
+        machine.state, machine.clock = "running", Clock(job().end, job().limits.stop_time, middle)
+        machine.stop("asked", quick=True)
+        assert machine.stop_time == job().limits.quick_stop
+        q = posture(middle + 0.1)
+        q[1] = posture(middle - 0.1)[1] if wrong == "silent" else moved(q[1], 0.2)
+        seen = Seen(q, silence=[0.0, 0.3 if wrong == "silent" else 0.0])
+        held_after(machine, lambda _, seen=seen: seen)  # type: ignore[misc]
+        assert machine.state == "held"
+        assert machine.clock.s == pytest.approx(middle + 0.1, abs=5e-3)
+
+
 def test_one_strange_look_stops_nothing() -> None:
     machine = running(job().begin("carry") + 2.0)
     machine.tick(PERIOD, Seen(posture(0.0)))

@@ -11,6 +11,7 @@ import pytest
 
 from codegen.function import NumericFunction
 from hybrid_opt import metaheuristics
+from hybrid_opt.collision.between import MotionVerdict, PassingTouch
 from hybrid_opt.collision.certify import (
     Certificate,
     LostPathError,
@@ -18,7 +19,7 @@ from hybrid_opt.collision.certify import (
     certificates,
     configurations,
 )
-from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.collision.checker import CollisionChecker, Touch
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import BETWEEN_SAMPLES, REASONS
 from hybrid_opt.indicators.metrics import non_dominated
@@ -203,3 +204,16 @@ def test_carries_that_share_a_path_are_certified_once(monkeypatch: pytest.Monkey
     assert [bool(one.feasible[0]) for one in found] == [True] * 3 + [False] * 3
     assert all(one.position[0] == 0.25 for one in found[3:])
     assert len(certified) == 2
+
+
+def test_a_certificate_says_what_speaks_against_the_path() -> None:
+    touch = Touch(3, 0.3, "payload", "shelf")
+    assert Certificate(False, touch, 0.3, None, 10, 0.0).problem == "payload meets shelf"
+    assert "does not follow" in Certificate(False, None, 0.3, None, 10, 0.0, lost=True).problem
+    assert Certificate(True, None, np.nan, None, 10, 0.0).problem == ""
+    passing = PassingTouch(3, 0.5, "payload", "shelf")
+    for status, told in (("collision", "payload meets shelf"), ("undecided", "to prove that")):
+        motion = MotionVerdict(status, passing, np.zeros(9, dtype=bool), 9, 0)  # type: ignore[arg-type]
+        found = Certificate(False, None, 0.35, motion, 10, 0.0)
+        assert told in found.problem
+        assert found.problem in repr(found)
