@@ -17,8 +17,8 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings, usual_settings
 from hybrid_opt.progress import Progress, counted
 from hybrid_opt.store.trajectory_file import write_trajectory
+from hybrid_opt.timing.analysis import TimedTrajectory, timed_trajectory
 from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk
-from hybrid_opt.timing.overview import TimedTrajectory, timed_trajectory
 from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path as solve_timing
 from symbolic.array import Array

@@ -56,7 +56,6 @@ PLAIN = (
     "hybrid_opt/proposing/test_bounds.py",
     "hybrid_opt/proposing/test_problem.py",
     "hybrid_opt/timing/test_adapter.py",
-    "hybrid_opt/timing/test_jerk_program.py",
     "studies/test_options.py",
 )
 """What compiles nothing in rooms where most tests do."""

@@ -17,10 +17,10 @@ import numpy as np
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import JobError
 from hybrid_opt.timing.jerk import time_with_jerk
+from hybrid_opt.timing.limits import limit_ratios, use_of, worst
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Excess, JerkLimits, Timing
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.timing.use import limit_ratios, use_of, worst
 from symbolic.array import Array
 
 WIDTH = 0.05

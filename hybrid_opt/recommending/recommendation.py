@@ -43,9 +43,9 @@ from hybrid_opt.robust.squeeze import (
     largest_commanded,
 )
 from hybrid_opt.shown import Shown
+from hybrid_opt.timing.limits import limited_force
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
-from hybrid_opt.timing.use import limited_force
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell

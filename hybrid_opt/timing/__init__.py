@@ -3,21 +3,20 @@
 from hybrid_opt.timing.analysis import (
     ForceCurve,
     JudgedTiming,
+    TimedTrajectory,
+    TimingReport,
     closest_to_reference_timing,
     drivable_timing,
     duration_against_force_limit,
     fastest_timing,
     force_limited_timing,
     judge_timing,
-)
-from hybrid_opt.timing.jerk import time_with_jerk
-from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.overview import (
-    TimedTrajectory,
-    TimingReport,
     report_timing,
     timed_trajectory,
 )
+from hybrid_opt.timing.given import drive_path
+from hybrid_opt.timing.jerk import time_with_jerk
+from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import (
     Excess,
@@ -28,7 +27,6 @@ from hybrid_opt.timing.records import (
     TimingLimits,
     TimingStatus,
 )
-from hybrid_opt.timing.refined import drive_path
 from hybrid_opt.timing.solve import time_path
 
 __all__ = [

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.store.json_records import read_record
-from hybrid_opt.timing.analysis import ForceCurve
-from hybrid_opt.timing.overview import TimedTrajectory
+from hybrid_opt.timing.analysis import ForceCurve, TimedTrajectory
+from hybrid_opt.timing.limits import joint_use
 from hybrid_opt.timing.records import Excess, JerkTiming, Timing, TimingStatus
 from hybrid_opt.timing.robustness import Margin
-from hybrid_opt.timing.use import joint_use
 from symbolic.array import Array, Count, Figure, Pair, Row
 
 

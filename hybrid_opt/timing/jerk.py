@@ -20,18 +20,27 @@ after some times is slowed down.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.robust.cases import is_squeezed
-from hybrid_opt.timing.jerk_program import Point
-from hybrid_opt.timing.jerk_step import convex_step
-from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.path_check import path_failure
-from hybrid_opt.timing.path_motion import PathMotion
+from hybrid_opt.timing.given import path_failure
+from hybrid_opt.timing.limits import (
+    NEAR,
+    RECOMPUTED_TOLERANCE,
+    PathLimits,
+    limit_ratios,
+    limit_use,
+    squared_speed_limit,
+    worst,
+)
+from hybrid_opt.timing.model import PathMotion, TimingModel
 from hybrid_opt.timing.records import (
     JerkLimits,
     JerkTiming,
@@ -41,8 +50,15 @@ from hybrid_opt.timing.records import (
     TimingStatus,
 )
 from hybrid_opt.timing.solve import LEAST_SPEED, time_path
-from hybrid_opt.timing.use import RECOMPUTED_TOLERANCE, limit_ratios, limit_use, worst
 from symbolic.array import Array
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+Mask = NDArray[np.bool_]
+
+SUPPORT = 4
+"""Functions of a cubic spline's basis that are not zero at a place; they are neighbours."""
 
 PIECES = 60
 """Pieces of the spline of squared speeds."""
@@ -62,6 +78,16 @@ TIGHTENED = 4
 
 FIRST_USE = 0.5
 """Largest use of a limit by the slow start that the rounds begin with."""
+
+KEPT = 1e-4
+"""Share of every limit that the program leaves unused: what the solver rounds off."""
+
+FIRST_ROWS = 0.95
+"""Rows that the last coefficients use to more than this share enter a program at once. With 0.4 in
+its place, under a force limit, which most cones are near, a timing took three times as long."""
+
+LEAST_SHARE = 0.05
+"""Least share of its last value that a coefficient keeps."""
 
 
 def time_with_jerk(
@@ -103,6 +129,7 @@ class _Problem:
         self._knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
         self._motion = motion
         self._coarse = self._points(np.linspace(0.0, 1.0, PIECES * POINTS + 1))
+        self._at = PathLimits(model, self._coarse.motion, limits)
         self._fine = self._points(np.linspace(0.0, 1.0, PIECES * POINTS * FINER + 1))
 
     def _points(self, s: Array) -> Point:
@@ -137,7 +164,7 @@ class _Problem:
         """Rounds from coefficients that keep the limits, and how many."""
         duration = self._coarse.duration(c)
         for rounds in range(1, MAX_ROUNDS + 1):
-            found = convex_step(self._model, self._coarse, c, self._limits, self._jerk)
+            found = self._step(c)
             if found is None:
                 return c, rounds
             c, before = found, duration
@@ -145,6 +172,73 @@ class _Problem:
             if abs(duration / before - 1.0) < SETTLED:
                 break
         return c, rounds
+
+    def _step(self, c: Array) -> Array | None:
+        """Better coefficients than c (k,), which satisfy all limits at the coarse points; None
+        without any."""
+        at, rows = self._coarse, Rows(len(c))
+        self._motion_rows(rows)
+        self._force_rows(c, rows)
+        self._jerk_rows(c, rows)
+        rows.below(-np.ones((len(c), 1)), -LEAST_SHARE * c, np.arange(len(c)))
+        gradient, H = at.objective(c)
+        answer = rows.assembled().minimised(H, gradient - H @ c, c)
+        if answer is None:
+            return None
+        # The quadratic model promises too much far away: c and the answer are both allowed, and so
+        # is everything between them.
+        share = 1.0
+        while at.duration(c + share * (answer - c)) > at.duration(c) and share > 1e-3:
+            share *= 0.5
+        return np.asarray(c + share * (answer - c))
+
+    def _motion_rows(self, rows: Rows) -> None:
+        """Speeds and accelerations of joints and box."""
+        at, first_basis = self._coarse, self._coarse.first_basis
+        squared_by, acceleration_by = at.local(at.squared_by), at.local(at.acceleration_by)
+        most = squared_speed_limit(at.motion, self._model.workcell, self._limits)
+        rows.below(squared_by / np.minimum(most, 1e6)[:, None], at.keep, first_basis)
+        alpha, beta = self._at.joint_accelerations()
+        by = alpha[:, :, None] * acceleration_by[:, None, :]
+        by = by + beta[:, :, None] * squared_by[:, None, :]
+        rows.both_below(by, 0.0, at.keep, first_basis)
+        for first, second, limit in self._at.accelerations():
+            A = first[:, :, None] * acceleration_by[:, None]
+            A = A + second[:, :, None] * squared_by[:, None]
+            none = np.zeros_like(squared_by)
+            rows.within(A / limit, np.zeros((len(at.s), 3)), none, at.keep, first_basis)
+
+    def _force_rows(self, c: Array, rows: Rows) -> None:
+        """Normal forces, planned and robust ones, joint torques and shifts of the pressure,
+        linearised at c."""
+        at = self._coarse
+        a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
+        along = np.stack([at.acceleration_by, at.squared_by], axis=1)[:, None]
+        for force, slope in self._at.forces(a, w):
+            _linearised(at, c, force, (slope[..., None] * along).sum(axis=2), rows)
+        value = self._at.ratios(a, w)
+        near = (np.abs(value) > NEAR).any(axis=0)
+        if not near.any():
+            return
+        slope = self._at.ratio_slopes(value, a, w)[:, near]
+        by = (slope[..., None] * along).sum(axis=2)
+        for sign in (1.0, -1.0):
+            _linearised(at, c, sign * value[:, near], sign * by, rows)
+
+    def _jerk_rows(self, c: Array, rows: Rows) -> None:
+        """Jerk over sqrt(v) below the tangent of the limit over sqrt(v) at c."""
+        at, jerk, v = self._coarse, self._jerk, self._coarse.value @ c
+        # Multiplied by sqrt(v) of the last round, so that rows are of order one.
+        root = np.sqrt(v)
+        level = at.keep * (1.5 / root) * root
+        head = (at.keep * (0.5 * v**-1.5) * root)[:, None] * at.local(at.value)
+        limited = np.isfinite(jerk.joints)
+        joint_jerk_by = at.local(at.joint_jerk_by)[:, limited]
+        by = joint_jerk_by / jerk.joints[limited, None] * root[:, None, None]
+        rows.both_below(by, head[:, None], level, at.first_basis)
+        if np.isfinite(jerk.payload):
+            box = at.local(at.box_jerk_by) / jerk.payload * root[:, None, None]
+            rows.within(box, np.zeros((len(v), 3)), head, level, at.first_basis)
 
     def _excess(self, c: Array) -> Array:
         """(coarse points,) largest use of a limit at the finer points around each."""
@@ -209,3 +303,228 @@ class _Problem:
             place = Place("joint jerk" if joint else "payload jerk", "", "", 0, 0.0)
         timing = replace(timing, status=status, place=place, slowed=factor)
         return JerkTiming(timing, self._jerk, (uses[1], uses[2]), np.nan)
+
+
+@dataclass(frozen=True)
+class Point:
+    """Places along the warped path; all arrays by place.
+
+    Attributes:
+        s: in [0, 1].
+        value: (n, k) basis of v.
+        squared_by, acceleration_by: (n, k) from coefficients to u'^2 and u''.
+        motion: geometry by u.
+        joint_jerk_by, box_jerk_by: (n, joints, k), (n, 3, k) jerk over sqrt(v).
+        keep: (n,) share of every limit that a program may use.
+    """
+
+    s: Array
+    value: Array
+    squared_by: Array
+    acceleration_by: Array
+    motion: PathMotion
+    joint_jerk_by: Array
+    box_jerk_by: Array
+    keep: Array
+
+    @classmethod
+    def of(
+        cls,
+        s: Array,
+        basis: list[Array],
+        warp: tuple[Array, Array, Array],
+        motion: PathMotion,
+        third: tuple[Array, Array],
+    ) -> Point:
+        """basis: of v, v' and v''. warp: rho', rho'', rho'''. third: of joints, box by u."""
+        value, first, second = basis
+        one, two, three = (part[:, None] for part in warp)
+
+        def jerk(by_u: Array, by_uu: Array, by_uuu: Array) -> Array:
+            on_value = by_uuu * one**3 + 3.0 * by_uu * one * two + by_u * three
+            on_first = 1.5 * (by_uu * one**2 + by_u * two)
+            on_second = 0.5 * by_u * one
+            parts = ((on_value, value), (on_first, first), (on_second, second))
+            return np.asarray(sum(a[:, :, None] * b[:, None, :] for a, b in parts))
+
+        box = (motion.pose_first[:, :3], motion.pose_second[:, :3])
+        return cls(
+            s,
+            value,
+            one**2 * value,
+            two * value + one * first / 2.0,
+            motion,
+            jerk(motion.q_first, motion.q_second, third[0]),
+            jerk(*box, third[1]),
+            np.full(len(s), 1.0 - KEPT),
+        )
+
+    @cached_property
+    def first_basis(self) -> NDArray[np.intp]:
+        """(n,) index of the first of the basis functions that are not zero at each place."""
+        first = np.argmax(self.value != 0.0, axis=1)
+        return np.asarray(np.minimum(first, self.value.shape[1] - SUPPORT))
+
+    def local(self, values: Array) -> Array:
+        """(n, ..., SUPPORT) those of values (n, ..., k) that belong to these functions."""
+        columns = self.first_basis[:, None] + np.arange(SUPPORT)
+        shape = (len(columns), *[1] * (values.ndim - 2), SUPPORT)
+        return np.take_along_axis(values, columns.reshape(shape), axis=-1)
+
+    def duration(self, c: Array) -> float:
+        """[s] by Simpson's rule: the places are uniform, an odd number of them."""
+        return float(self._weights() @ (1.0 / np.sqrt(np.maximum(self.value @ c, 1e-300))))
+
+    def _weights(self) -> Array:
+        weights = np.where(np.arange(len(self.s)) % 2 == 1, 4.0, 2.0)
+        weights[[0, -1]] = 1.0
+        return weights / (3.0 * (len(self.s) - 1))
+
+    def time(self, c: Array) -> Array:
+        """(n,) [s]; standing still, places are a second apart in all."""
+        v = self.value @ c
+        if not v.any():
+            return self.s
+        slowness = 1.0 / np.sqrt(v)
+        steps = np.diff(self.s) * (slowness[1:] + slowness[:-1]) / 2.0
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    def speed(self, c: Array) -> Array:
+        """(n,) u' [1/s]."""
+        return np.sqrt(np.maximum(self.squared_by @ c, 0.0))
+
+    def acceleration(self, c: Array) -> Array:
+        """(n,) u'' [1/s^2]."""
+        return np.asarray(self.acceleration_by @ c)
+
+    def jerk(self, c: Array) -> tuple[Array, Array]:
+        """(n, joints) and (n, 3) of the joints and the box's frame [rad/s^3, m/s^3]."""
+        root = np.sqrt(np.maximum(self.value @ c, 0.0))[:, None]
+        return root * (self.joint_jerk_by @ c), root * (self.box_jerk_by @ c)
+
+    def objective(self, c: Array) -> tuple[Array, Array]:
+        """Gradient and Hessian of the duration."""
+        v, weights = self.value @ c, self._weights()
+        gradient = -0.5 * self.value.T @ (weights * v**-1.5)
+        return gradient, 0.75 * (self.value.T * (weights * v**-2.5)) @ self.value
+
+
+class Rows:
+    """Rows b - A c, at least zero or in second-order cones of four, collected.
+
+    A row has few neighbouring coefficients: A holds those alone, from column `first` on.
+    """
+
+    def __init__(self, k: int) -> None:
+        self._k = k
+        self._linear: list[tuple[sparse.csr_array, Array]] = []
+        self._cones: list[tuple[sparse.csr_array, Array]] = []
+
+    def below(self, A: Array, b: Array, first: NDArray[np.intp]) -> None:
+        """A c <= b, (n, width) and (n,), columns from first (n,) on."""
+        self._linear.append((self._placed(A, first), b))
+
+    def both_below(
+        self, A: Array, head: Array | float, bound: Array, first: NDArray[np.intp]
+    ) -> None:
+        """A c + head c and -A c + head c below bound, by (n, m, width), (n, 1, width), (n,)."""
+        _, m, width = A.shape
+        for sign in (1.0, -1.0):
+            each = (sign * A + head).reshape(-1, width)
+            self.below(each, np.repeat(bound, m), np.repeat(first, m))
+
+    def within(
+        self, A: Array, b: Array, head: Array, bound: Array, first: NDArray[np.intp]
+    ) -> None:
+        """|A c + b| <= bound - head c, by (n, 3, width), (n, 3), (n, width), (n,), columns from
+        first (n,) on."""
+        rows = np.concatenate([head[:, None], -A], axis=1).reshape(-1, A.shape[2])
+        placed = self._placed(rows, np.repeat(first, 4))
+        self._cones.append((placed, np.column_stack([bound, b])))
+
+    def _placed(self, A: Array, first: NDArray[np.intp]) -> sparse.csr_array:
+        from scipy import sparse
+
+        n, width = A.shape
+        columns = first[:, None] + np.arange(width)
+        starts = width * np.arange(n + 1)
+        return sparse.csr_array((A.reshape(-1), columns.reshape(-1), starts), shape=(n, self._k))
+
+    def assembled(self) -> Program:
+        """All of them."""
+        from scipy import sparse
+
+        none = sparse.csr_array((0, self._k))
+        linear = sparse.vstack([none, *[A for A, _ in self._linear]], format="csr")
+        cones = sparse.vstack([none, *[A for A, _ in self._cones]], format="csr")
+        return Program(
+            linear,
+            np.concatenate([np.zeros(0), *[b for _, b in self._linear]]),
+            cones,
+            np.concatenate([np.zeros((0, 4)), *[b for _, b in self._cones]]),
+        )
+
+
+@dataclass(frozen=True)
+class Program:
+    """Linear rows (n, k), (n,) and cones (4 m, k), (m, 4), of which few matter at a time."""
+
+    A: sparse.csr_array
+    b: Array
+    cone_A: sparse.csr_array
+    cone_b: Array
+
+    def used(self, c: Array, share: float) -> tuple[Mask, Mask]:
+        """Which linear rows and which cones c uses to more than a share."""
+        inside = self.cone_b - (self.cone_A @ c).reshape(-1, 4)
+        lengths = np.linalg.norm(inside[:, 1:], axis=1)
+        return np.asarray(self.A @ c > share * self.b), np.asarray(lengths > share * inside[:, 0])
+
+    def minimised(self, H: Array, g: Array, about: Array) -> Array | None:
+        """Least c^T H c / 2 + g.c; None without any. Rows that an answer violates are added."""
+        rows, cones = self.used(about, FIRST_ROWS)
+        while True:
+            c = self._solved(H, g, about, rows, cones)
+            if c is None:
+                return None
+            more_rows, more_cones = self.used(c, 1.0 + KEPT / 2.0)
+            fresh = (more_rows & ~rows).any() or (more_cones & ~cones).any()
+            if not fresh:
+                return c
+            rows, cones = rows | more_rows, cones | more_cones
+
+    def _solved(self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask) -> Array | None:
+        """The same with some of the rows; variables are scaled to be around one."""
+        # Not imported at the top: only jerk limits need it.
+        import clarabel
+        from scipy import sparse
+
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        kinds: list[Any] = [clarabel.NonnegativeConeT(int(rows.sum()))]
+        kinds += [clarabel.SecondOrderConeT(4)] * int(cones.sum())
+        A = sparse.vstack([self.A[rows], self.cone_A[np.repeat(cones, 4)]], format="csc")
+        A.data *= np.repeat(scale, np.diff(A.indptr))
+        A.eliminate_zeros()
+        found = clarabel.DefaultSolver(
+            sparse.csc_matrix(np.triu(H * np.outer(scale, scale))),
+            g * scale,
+            sparse.csc_matrix(A),
+            np.concatenate([self.b[rows], self.cone_b[cones].reshape(-1)]),
+            kinds,
+            settings,
+        ).solve()
+        answer = np.array(found.x) * scale
+        solved = str(found.status) in ("Solved", "AlmostSolved") and np.isfinite(answer).all()
+        return answer if solved else None
+
+
+def _linearised(at: Point, c: Array, value: Array, by: Array, rows: Rows) -> None:
+    """Values (n, m) at c over their limits, with derivatives (n, m, k), below one.
+
+    What is exceeded between rounds, by what the last one left out, may stay as it is for one.
+    """
+    bound = np.maximum(at.keep[:, None], value) - value + by @ c
+    A = at.local(by)
+    first = np.repeat(at.first_basis, by.shape[1])
+    rows.below(A.reshape(-1, A.shape[2]), bound.reshape(-1), first)

@@ -16,13 +16,13 @@ import numpy as np
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.robust.path_force import robust_path
+from hybrid_opt.timing.given import LEAST_LENGTH, arm_checks
+from hybrid_opt.timing.limits import limited_force
 from hybrid_opt.timing.model import TimingModel, joint_names
 from hybrid_opt.timing.passes import KINDS, OUTCOMES, passes_function
-from hybrid_opt.timing.path_check import LEAST_LENGTH, arm_checks
 from hybrid_opt.timing.records import Place, TimingLimits, TimingStatus
 from hybrid_opt.timing.robust_timer import CUTS, RestForce, RobustPasses
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.timing.use import limited_force
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell

@@ -13,9 +13,9 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.static_hold import mass_at_reference, static_hold
+from hybrid_opt.timing.limits import limits_pressure
 from hybrid_opt.timing.model import TimingModel, contact_torque
 from hybrid_opt.timing.records import TimingLimits
-from hybrid_opt.timing.use import limits_pressure
 from symbolic.array import Array
 from symbolic.contact.elastic import free_shift, pressure_shifts
 from symbolic.contact.force_closure import presses_evenly

@@ -1,9 +1,11 @@
 """Time-optimal timing of a carry by a sequence of linear problems. docs/timing.md explains it.
 
-Limits that are convex in (u'', u'^2) enter as supporting lines, added where the last timing
-exceeds them: the sequence approaches the exact limit from outside (Kelley's cutting planes).
-Joint torques and pressure shifts depend on the least-effort forces in a way that is not convex;
-they are linearised about the last timing and solved again until recomputed values hold.
+At a point of the path every limit reads alpha u'' + beta u'^2 <= bound. Joint speeds and
+accelerations do so exactly. Limits that are convex in (u'', u'^2) enter as supporting lines, added
+where the last timing exceeds them: the sequence approaches the exact limit from outside (Kelley's
+cutting planes). Joint torques and pressure shifts depend on the least-effort forces in a way that
+is not convex; they are linearised about the last timing and solved again until recomputed values
+hold.
 """
 
 from __future__ import annotations
@@ -12,55 +14,48 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.timing import rows as rows_of
-from hybrid_opt.timing.adapter import SolverFailure, fastest_speed
-from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.path_check import path_failure
-from hybrid_opt.timing.path_motion import PathMotion
-from hybrid_opt.timing.point_limits import POINT_TOLERANCE, PointLimits
-from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
-from hybrid_opt.timing.refined import refined_carry
-from hybrid_opt.timing.rows import INTERVAL_ENDS, PointRows
-from hybrid_opt.timing.use import (
+from hybrid_opt.timing.adapter import SPEED_CEILING, IntervalRows, SolverFailure, fastest_speed
+from hybrid_opt.timing.given import path_failure, refined_carry
+from hybrid_opt.timing.limits import (
+    NEAR,
     RECOMPUTED_TOLERANCE,
+    PathLimits,
+    duration_at_speed_limits,
     limit_ratios,
     limit_use,
+    squared_speed_limit,
     worst,
 )
+from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
+from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
 from symbolic.array import Array
 
 MAX_ITERATIONS = 25
 SETTLED = 2e-4
 """Relative change of duration below which linearised limits count as settled."""
 
-NEAR = 0.6
-"""Torques and shifts that stay below this share of their limit get no rows."""
-
 LEAST_SPEED = 0.98
 """A timing that needs more slowing than this to hold its limits has not converged."""
 
+INTERVAL_ENDS = (0.0, 1.0)
+"""Places within an interval at which limits are imposed, as a share of its length."""
 
-@dataclass
-class _State:
-    """State of the iteration between one linear problem and the next.
+POINT_TOLERANCE = 1e-3
+"""Largest excess at the points where limits are imposed, as a share of the limit."""
 
-    Attributes:
-        cuts: supporting lines of convex limits.
-        tightened: (intervals,) divisor of an interval's bounds, above one where a limit is exceeded
-            between the points at which it is imposed.
-        near: which of the limits that are not convex came near their bound so far.
-        linearised: their rows, about the last timing.
-        duration: of the last timing, in the scaled coordinate.
-    """
+FORCE_SHARPNESS = 0.02
+"""Tolerance of the normal force as a share of `POINT_TOLERANCE`."""
 
-    cuts: list[PointRows]
-    tightened: Array
-    near: NDArray[np.bool_]
-    linearised: PointRows | None = None
-    duration: float = float("inf")
+
+@dataclass(frozen=True)
+class PointRows:
+    """Limits at points of the path: alpha u'' + beta u'^2 <= bound, each (points, k)."""
+
+    alpha: Array
+    beta: Array
+    bound: Array
 
 
 def time_path(
@@ -103,65 +98,145 @@ def _failure_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimit
 
 
 class _Problem:
-    """One path with one set of limits."""
+    """One path with one set of limits: linear problems from one timing to the next.
+
+    `_tightened` (intervals,) divides an interval's bounds, above one where a limit is exceeded
+    between the points at which it is imposed; `_near` says which of the limits that are not convex
+    came near their bound so far.
+    """
 
     def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
-        self._model = model
-        self._motion = motion
-        self._limits = limits
-        self._at = PointLimits(model, motion, limits)
+        self._model, self._motion, self._limits = model, motion, limits
+        intervals = model.intervals
+        offsets = np.array([round(REFINEMENT * share) for share in INTERVAL_ENDS])
+        index = (REFINEMENT * np.arange(intervals)[:, None] + offsets).reshape(-1)
+        self._at = PathLimits(model, motion.at(index), limits)
+        # The solver's path coordinate is scale times u, so that speeds are around one.
+        self._scale = duration_at_speed_limits(model, motion, limits)
+        self._grid = np.linspace(0.0, self._scale, intervals + 1)
+        still = np.zeros(len(index))
+        self._rest = self._at.ratios(still, still)
+        self._cuts = [self._linear_rows(), *self._first_cuts()]
+        self._linearised: list[PointRows] = []
+        self._tightened = np.ones(intervals)
+        self._near = np.zeros(self._rest.shape[1], dtype=bool)
+        self._duration = np.inf
+
+    def _linear_rows(self) -> PointRows:
+        """The limits that are linear by themselves: on speeds, which bound u'^2 alone, and on joint
+        accelerations."""
+        limit = squared_speed_limit(self._at.motion, self._model.workcell, self._limits)
+        limit = np.minimum(limit, SPEED_CEILING / self._scale**2)[:, None]
+        one, alpha, beta = np.ones_like(limit), *self._at.joint_accelerations()
+        return PointRows(
+            np.concatenate([0.0 * one, alpha, -alpha], axis=1),
+            np.concatenate([1.0 / limit, beta, -beta], axis=1),
+            np.repeat(one, 1 + 2 * alpha.shape[1], axis=1),
+        )
+
+    def _first_cuts(self) -> list[PointRows]:
+        """Supporting lines of the convex limits before any timing is known."""
+        still = np.zeros(len(self._rest))
+        return [
+            *[
+                norm_rows(first, second, limit, spanning_directions(first, second))
+                for first, second, limit in self._at.accelerations()
+            ],
+            *[
+                tangent_rows(*force, _pairs(still, still))
+                for force in self._at.forces(still, still)
+            ],
+        ]
 
     def solve(self) -> Timing:
         """Solve linear problems until recomputed limits hold and nothing changes any more."""
-        intervals = self._model.intervals
-        state = _State(
-            [self._at.first_cuts()],
-            np.ones(intervals),
-            np.zeros(self._at.rest.shape[1], dtype=bool),
-        )
-        fixed = self._at.fixed()
         squared = np.zeros(0)
         settled = False
         for iteration in range(1, MAX_ITERATIONS + 1):
-            parts = [fixed, *state.cuts]
-            if state.linearised is not None:
-                parts.append(state.linearised)
-            linear = rows_of.interval_rows(rows_of.join(parts), intervals, self._at.scale)
-            linear.bound[:] /= state.tightened[:, None]
-            found = fastest_speed(linear, self._at.grid)
+            linear = self._interval_rows([*self._cuts, *self._linearised])
+            found = fastest_speed(linear, self._grid)
             if isinstance(found, SolverFailure):
                 return self._solver_failure(found, iteration)
             squared = found
-            settled = self._advance(state, squared) and not self._tighten(state, squared)
+            settled = self._advance(squared) and not self._tighten(squared)
             if settled:
                 break
         return self._finish(squared, iteration, settled)
 
-    def _advance(self, state: _State, squared: Array) -> bool:
+    def _interval_rows(self, rows: list[PointRows]) -> IntervalRows:
+        """The rows of each interval's points in terms of its u'' and its initial u'^2."""
+        alpha, beta, bound = (
+            np.concatenate([getattr(row, name) for row in rows], axis=1)
+            for name in ("alpha", "beta", "bound")
+        )
+        intervals, scale = self._model.intervals, self._scale
+        # Within an interval u'^2 = u'^2_0 + 2 share length u''.
+        progress = np.tile(np.array(INTERVAL_ENDS) * 2.0 * scale / intervals, intervals)[:, None]
+        alpha, beta = alpha / scale, beta / scale**2
+        shape = (intervals, len(INTERVAL_ENDS) * alpha.shape[1])
+        return IntervalRows(
+            (alpha + progress * beta).reshape(shape),
+            beta.reshape(shape),
+            bound.reshape(shape) / self._tightened[:, None],
+        )
+
+    def _at_points(self, squared: Array) -> tuple[Array, Array]:
+        """u'' and u'^2 (points,) of a timing (intervals + 1,) in the scaled coordinate."""
+        slope = np.diff(squared)
+        w = squared[:-1, None] + np.outer(slope, INTERVAL_ENDS)
+        a = np.repeat(slope / (2.0 * np.diff(self._grid)), len(INTERVAL_ENDS))
+        return a / self._scale, w.reshape(-1) / self._scale**2
+
+    def _advance(self, squared: Array) -> bool:
         """Add or renew rows about a timing; whether it already holds and has settled."""
-        w, a = self._at.at_points(squared)
-        cuts, excess = self._at.cut(a, w)
-        state.cuts += cuts
+        a, w = self._at_points(squared)
+        excess = self._cut(a, w)
         ratios = self._at.ratios(a, w)
-        duration = _duration(squared, self._at.grid)
-        change = abs(duration / state.duration - 1.0) if np.isfinite(state.duration) else 1.0
-        state.duration = duration
+        speed = np.sqrt(squared)
+        duration = float(np.sum(2.0 * np.diff(self._grid) / (speed[:-1] + speed[1:])))
+        change = abs(duration / self._duration - 1.0)
+        self._duration = duration
         if ratios.size:
             excess = max(excess, float(np.abs(ratios).max()) - 1.0)
-            state.near |= (np.abs(ratios) > NEAR).any(axis=0)
-        if not state.near.any():
+            self._near |= (np.abs(ratios) > NEAR).any(axis=0)
+        if not self._near.any():
             return excess <= POINT_TOLERANCE
-        state.linearised = self._at.linearise(ratios, state.near, a, w)
+        near, z = self._near, _pairs(a, w)
+        gradient = self._at.ratio_slopes(ratios, a, w)[:, near]
+        value, rest = ratios[:, near], self._rest[:, near]
+        self._linearised = [
+            linearised_rows(sign * value, sign * gradient, sign * rest, z) for sign in (1.0, -1.0)
+        ]
         return excess <= POINT_TOLERANCE and change <= SETTLED
 
-    def _tighten(self, state: _State, squared: Array) -> bool:
+    def _cut(self, a: Array, w: Array) -> float:
+        """Add supporting lines of the convex limits that a timing exceeds; the largest excess."""
+        worst_excess = -1.0
+        for first, second, limit in self._at.accelerations():
+            vector = first * a[:, None] + second * w[:, None]
+            length = np.linalg.norm(vector, axis=1, keepdims=True)
+            excess = float(length.max()) / limit - 1.0
+            worst_excess = max(worst_excess, excess)
+            if excess > POINT_TOLERANCE:
+                direction = vector / np.maximum(length, 1e-12)
+                self._cuts.append(norm_rows(first, second, limit, direction[:, None, :]))
+        forces = self._at.forces(a, w)
+        excess = max((float(force.max()) for force, _ in forces), default=0.0) - 1.0
+        worst_excess = max(worst_excess, excess)
+        # What the force limit leaves for the motion is small, so the whole of it counts.
+        if excess > POINT_TOLERANCE * FORCE_SHARPNESS:
+            self._cuts += [tangent_rows(*force, _pairs(a, w)) for force in forces]
+            worst_excess = max(worst_excess, 2.0 * POINT_TOLERANCE)
+        return worst_excess
+
+    def _tighten(self, squared: Array) -> bool:
         """Tighten the intervals that exceed a limit between their points; whether there are any."""
         ratios = limit_ratios(self._refined(squared), self._model.workcell, self._limits)
         del ratios["friction"]
         use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
         excess = use.reshape(self._model.intervals, -1).max(axis=1)
         exceeded = excess > 1.0 + RECOMPUTED_TOLERANCE / 2.0
-        state.tightened = np.where(exceeded, state.tightened * excess, state.tightened)
+        self._tightened = np.where(exceeded, self._tightened * excess, self._tightened)
         return bool(exceeded.any())
 
     def _finish(self, squared: Array, iterations: int, settled: bool) -> Timing:
@@ -197,18 +272,18 @@ class _Problem:
             place=excess.place,
             carry=carry,
             use=use,
-            grid_speed=np.sqrt(squared) / self._at.scale,
+            grid_speed=np.sqrt(squared) / self._scale,
             iterations=iterations,
             slowed=factor,
         )
 
     def _refined(self, squared: Array) -> Carry:
-        return refined_carry(self._model, self._motion, np.sqrt(squared) / self._at.scale)
+        return refined_carry(self._model, self._motion, np.sqrt(squared) / self._scale)
 
     def _solver_failure(self, failure: SolverFailure, iterations: int) -> Timing:
         point = len(INTERVAL_ENDS) * failure.interval
-        columns = self._at.rest[point]
-        parameter = float(self._at.points.parameter[point])
+        columns = self._rest[point]
+        parameter = float(self._at.motion.parameter[point])
         place = Place("path timing", "", "", failure.interval, parameter)
         detail = ""
         if columns.size:
@@ -223,6 +298,66 @@ class _Problem:
         )
 
 
-def _duration(squared: Array, grid: Array) -> float:
-    speed = np.sqrt(squared)
-    return float(np.sum(2.0 * np.diff(grid) / (speed[:-1] + speed[1:])))
+def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> PointRows:
+    """Supporting lines of |first u'' + second u'^2| <= limit.
+
+    Args:
+        first, second: (n, 3).
+        directions: (n, k, 3) unit vectors e; each gives e.(first u'' + second u'^2) <= limit.
+    """
+    alpha = np.einsum("nkd,nd->nk", directions, first) / limit
+    beta = np.einsum("nkd,nd->nk", directions, second) / limit
+    return PointRows(alpha, beta, np.ones_like(alpha))
+
+
+def spanning_directions(first: Array, second: Array) -> Array:
+    """(n, 4, 3): both signs of two orthogonal unit vectors that span first and second (n, 3)."""
+    one = _unit(first)
+    two = _unit(second - np.sum(second * one, axis=1, keepdims=True) * one)
+    return np.stack([one, -one, two, -two], axis=1)
+
+
+def tangent_rows(value: Array, gradient: Array, z: Array) -> PointRows:
+    """Supporting lines of convex values <= 1, touching them at z.
+
+    Args:
+        value: (n, k) at z.
+        gradient: (n, k, 2) by (u'', u'^2).
+        z: (n, 2).
+    """
+    bound = 1.0 - value + np.einsum("nkd,nd->nk", gradient, z)
+    return PointRows(gradient[..., 0], gradient[..., 1], bound)
+
+
+def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> PointRows:
+    """Linearisation of value <= 1 about z, kept satisfiable at rest.
+
+    Where it would forbid rest, which is truly allowed, it follows the value by u'' and the chord to
+    rest by u'^2: a row whose bound is raised instead cuts off nothing, not even z.
+
+    Args:
+        value: (n, k) at z.
+        gradient: (n, k, 2) by (u'', u'^2).
+        at_rest: (n, k) at u'' = u'^2 = 0, below one.
+        z: (n, 2) the point of linearisation.
+    """
+    lines = tangent_rows(value, gradient, z)
+    least = (1.0 - at_rest) / 2.0
+    a, w = z[:, :1], z[:, 1:]
+    chord = (value - at_rest - lines.alpha * a) / np.maximum(w, 1e-300)
+    forbids = (lines.bound < least) & (w > 0.0)
+    return PointRows(
+        lines.alpha,
+        np.where(forbids, chord, lines.beta),
+        np.where(forbids, 1.0 - at_rest, np.maximum(lines.bound, least)),
+    )
+
+
+def _unit(vectors: Array) -> Array:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit: Array = np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), 0.0)
+    return unit
+
+
+def _pairs(a: Array, w: Array) -> Array:
+    return np.stack([a, w], axis=1)

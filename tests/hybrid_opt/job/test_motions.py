@@ -11,7 +11,7 @@ from hybrid_opt.job.motions import PEAK_RATE, at_even_steps, rise, unit_squeeze
 from hybrid_opt.job.smooth import acceleration_at_ends, rests_at_ends, smoothed
 from hybrid_opt.robust.squeeze import pressed_together
 from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, time_path, time_with_jerk
-from hybrid_opt.timing.use import limit_use, worst
+from hybrid_opt.timing.limits import limit_use, worst
 from symbolic.path.spline import path_basis
 from symbolic.read.cell import load
 from symbolic.records.poses import box_rotation

@@ -15,8 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from hybrid_opt.timing import TimingLimits, TimingModel
-from hybrid_opt.timing.model import REFINEMENT
-from hybrid_opt.timing.path_motion import PathMotion
+from hybrid_opt.timing.model import REFINEMENT, PathMotion
 from symbolic.array import Array
 
 Terms = dict[int, float]

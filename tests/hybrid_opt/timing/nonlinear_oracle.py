@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 
 from hybrid_opt.timing import TimingLimits, TimingModel
+from hybrid_opt.timing.limits import squared_speed_limit
 from hybrid_opt.timing.model import REFINEMENT
-from hybrid_opt.timing.rows import squared_speed_limit
 from symbolic.array import Array
 from symbolic.contact.load import LOAD_OUTPUTS, load_function
 

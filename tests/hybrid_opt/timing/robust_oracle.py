@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hybrid_opt.timing import TimingModel
-from hybrid_opt.timing.path_motion import PathMotion
+from hybrid_opt.timing.model import PathMotion
 from studies.research.plain.load import GRAVITY
 from studies.research.plain.motion import angular_rates, rotation
 from symbolic.array import Array

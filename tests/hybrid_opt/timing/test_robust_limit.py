@@ -9,7 +9,7 @@ import pytest
 
 from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.timing import TimingLimits, TimingModel, TimingStatus, time_path
-from hybrid_opt.timing.use import limit_ratios, limit_use
+from hybrid_opt.timing.limits import limit_ratios, limit_use
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty
 from tests.hybrid_opt.timing.cells import initial, timing_of

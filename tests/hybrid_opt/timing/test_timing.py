@@ -20,7 +20,7 @@ from hybrid_opt.timing import (
     report_timing,
     time_path,
 )
-from hybrid_opt.timing.use import limit_ratios
+from hybrid_opt.timing.limits import limit_ratios
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.timing.cells import (

@@ -1,4 +1,5 @@
-"""How far a carry uses each limit, recomputed from its physical quantities alone."""
+"""What limits a carry: along a path as functions of its timing, and as shares of each limit that a
+carry uses, recomputed from its physical quantities alone."""
 
 from __future__ import annotations
 
@@ -8,8 +9,9 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.robust.cases import is_squeezed
-from hybrid_opt.robust.force import robust_model
-from hybrid_opt.robust.path_force import PathPoints, robust_path
+from hybrid_opt.robust.force import BoxMotion, robust_model
+from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
+from hybrid_opt.timing.model import PathMotion, TimingModel, contact_torque
 from hybrid_opt.timing.records import Excess, Place, TimingLimits
 from symbolic.array import Array
 from symbolic.functions import TIMING_TOLERANCE
@@ -24,7 +26,10 @@ FRICTION_ROUNDING = 1e-6
 RECOMPUTED_TOLERANCE = TIMING_TOLERANCE
 """Largest excess of a recomputed limit, as a share of it."""
 
-NEAR = 0.98
+NEAR = 0.6
+"""Torques and shifts that stay below this share of their limit enter no program."""
+
+EXACT = 0.98
 """Share of a limit of robust forces from which on they are told exactly."""
 
 SPREAD = 20
@@ -35,6 +40,112 @@ AT_A_TIME = 2000
 
 FORCE_FLOOR = 1e-9
 """A contact with less normal force than this carries nothing [N]."""
+
+
+class PathLimits:
+    """The limits of a path at samples of it, over these limits, as functions of (u'', u'^2).
+
+    Speeds are `squared_speed_limit`; robust forces of pads that are not squeezed (`is_squeezed`),
+    and planned ones without slopes, are among the ratios.
+
+    Attributes:
+        motion: the path's geometry at the samples.
+    """
+
+    def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
+        self.motion, self._model, self._limits = motion, model, limits
+        workcell = model.workcell
+        self._squeezed = limits.robust and is_squeezed(workcell)
+        self._grasped = limits.robust and not self._squeezed
+
+    def joint_accelerations(self) -> tuple[Array, Array]:
+        """(n, all joints) by u'' and by u'^2, with limits of both signs."""
+        limit = np.concatenate([robot.acceleration_max for robot in self._model.workcell.robots])
+        return self.motion.q_first / limit, self.motion.q_second / limit
+
+    def accelerations(self) -> tuple[tuple[Array, Array, float], ...]:
+        """The box's two accelerations (n, 3) by u'' and by u'^2, and the limit on their length."""
+        m, payload = self.motion, self._model.workcell.payload
+        return (
+            (m.pose_first[:, :3], m.pose_second[:, :3], payload.acceleration_max),
+            (m.angular_first, m.angular_second, payload.angular_acceleration_max),
+        )
+
+    def forces(self, a: Array, w: Array) -> list[tuple[Array, Array]]:
+        """Normal forces (n, 2) that are convex in (u'', u'^2), and their slopes (n, 2, 2), at
+        u'' = a and u'^2 = w (n,): planned ones, and robust ones where these are limited."""
+        model, limit = self._model, self._limits.force
+        if limit is None:
+            return []
+        found = []
+        if model.workcell.has_force_slopes:
+            found.append(model.path_force(self.motion, a, w))
+        if self._squeezed:
+            force, slope = robust_path(model.workcell).at(self._points(a, w))
+            found.append((force, slope[:, :, BY_TIMING]))
+        return [(force / limit, slope / limit) for force, slope in found]
+
+    def ratios(self, a: Array, w: Array) -> Array:
+        """Limits that are not convex, signed (n, k)."""
+        m, workcell, limits = self.motion, self._model.workcell, self._limits
+        pressure = limits_pressure(workcell, limits)
+        force = None if workcell.has_force_slopes and not self._grasped else limits.force
+        columns = [np.zeros((len(a), 0))]
+        if not (limits.torque or pressure or force):
+            return columns[0]
+        load = self._model.drive(m, np.sqrt(w), a)
+        if limits.torque:
+            own = m.torque_by_acceleration * a[:, None] + m.torque_by_speed * w[:, None]
+            torque = contact_torque(workcell, m.wrench_torque, load) + own + m.torque_at_rest
+            columns.append(torque / np.concatenate([r.torque_max for r in workcell.robots]))
+        if pressure:
+            radius = np.array([contact.patch_radius for contact in workcell.contacts])
+            columns.append(load["pressure_shift"] / radius)
+        if force:
+            needed = load["normal_force"]
+            if self._grasped:
+                moved = BoxMotion(*self._points(a, w).motion)
+                commanded, leading = robust_model(workcell).hold(moved, workcell.uncertainty)
+                needed = np.stack([leading, commanded], axis=1)
+            columns.append(needed / force)
+        return np.concatenate(columns, axis=1)
+
+    def ratio_slopes(self, ratios: Array, a: Array, w: Array) -> Array:
+        """(n, k, 2) of `ratios` at a and w by (u'', u'^2), by forward differences."""
+        step_a = 1e-5 * max(float(np.abs(a).max()), 1e-6)
+        step_w = 1e-5 * max(float(w.max()), 1e-6)
+        by_a = (self.ratios(a + step_a, w) - ratios) / step_a
+        return np.stack([by_a, (self.ratios(a, w + step_w) - ratios) / step_w], axis=-1)
+
+    def _points(self, a: Array, w: Array) -> PathPoints:
+        m = self.motion
+        return PathPoints(m.pose[:, :6], m.pose_first[:, :6], m.pose_second[:, :6], a, w)
+
+
+def squared_speed_limit(motion: PathMotion, workcell: Workcell, limits: TimingLimits) -> Array:
+    """(n,) largest u'^2 by all limits on speeds; infinite where nothing moves."""
+    robots, payload, task = workcell.robots, workcell.payload, workcell.task
+    velocity = np.concatenate([robot.velocity_max for robot in robots])
+    linear = np.linalg.norm(motion.pose_first[:, :3], axis=1)
+    angular = np.linalg.norm(motion.angular_first, axis=1)
+    demands = [
+        (np.abs(motion.q_first) / velocity).max(axis=1),
+        linear / payload.velocity_max,
+        angular / payload.angular_velocity_max,
+    ]
+    if limits.reference_speed:
+        demands += [linear / task.reference_speed, angular / task.reference_angular_speed]
+    demand = np.max(demands, axis=0)
+    with np.errstate(divide="ignore"):
+        limit: Array = 1.0 / demand**2
+    return limit
+
+
+def duration_at_speed_limits(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> float:
+    """Duration of a path driven at its speed limits alone, without ramps [s]."""
+    squared = squared_speed_limit(motion, model.workcell, limits)
+    slowness = 1.0 / np.sqrt(np.minimum(squared, 1e8))
+    return float(np.trapezoid(slowness, motion.parameter))
 
 
 def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict[str, Array]:
@@ -84,14 +195,14 @@ def limited_force(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Arr
 
 
 def _near_limit(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array:
-    """As `limited_force`; robust ones that are below `NEAR` of the limit, and below the largest of
+    """As `limited_force`; robust ones that are below `EXACT` of the limit, and below the largest of
     the carry, may be told as the planned ones: to see that takes a fraction of the time."""
     if not limits.robust or limits.force is None or not is_squeezed(workcell):
         return limited_force(carry, workcell, limits)
     n = len(carry)
     points = PathPoints(carry.pose, carry.rate, carry.second_rate, np.zeros(n), np.ones(n))
     found = carry.normal_force.copy()
-    if _tell_above(NEAR * limits.force, points, workcell, found):
+    if _tell_above(EXACT * limits.force, points, workcell, found):
         return found
     # Nearly the largest one is among a few; only what exceeds that can be larger.
     _tell_above(0.0, points, workcell, found, every=SPREAD)
