@@ -3,6 +3,7 @@
 (function () {
   const COLOURS = { "robot 1": 0x3b6ea8, "robot 2": 0xa8733b, payload: 0xc9a227,
     environment: 0x9aa3ab, ground: 0xdedfd8, marked: 0xb00020 };
+  const ARROW = 0.35; /* Length of the largest force [m]. */
 
   function matrix(rows) {
     return new THREE.Matrix4().set(...rows);
@@ -65,6 +66,17 @@
       this.scene.add(this.box);
       this.arms = data.arms.map((arm) => this.makeArm(arm));
       data.solids.forEach((solid) => this.addSolid(solid));
+      this.arrows = data.contacts.map(({ along }) => {
+        const arrow = new THREE.ArrowHelper(new THREE.Vector3(...along), undefined, ARROW, COLOURS.marked);
+        arrow.visible = false;
+        /* The pads would hide them. */
+        [arrow.line, arrow.cone].forEach((part) => {
+          part.material.depthTest = false;
+          part.renderOrder = 1;
+        });
+        this.box.add(arrow);
+        return arrow;
+      });
       this.path = new THREE.Line(new THREE.BufferGeometry(),
         new THREE.LineBasicMaterial({ color: 0xb00020 }));
       this.path.frustumCulled = false;
@@ -103,8 +115,15 @@
       else this.arms[solid.robot][solid.joint].moving.add(mesh);
     }
 
-    /* pose: x y z and the orientation; q: all joints, the second arm's after the first's. */
-    place(pose, q) {
+    /* pose: x y z and the orientation; q: all joints, the second arm's after the first's; forces:
+       of both arms on the box as shares of what the longest arrow stands for. */
+    place(pose, q, forces = []) {
+      forces.forEach((share, i) => {
+        const { at, along } = this.data.contacts[i], length = ARROW * share;
+        this.arrows[i].visible = share > 0.01;
+        this.arrows[i].setLength(Math.max(length, 1e-3), 0.3 * length, 0.16 * length);
+        this.arrows[i].position.set(...at.map((value, k) => value - length * along[k]));
+      });
       this.box.position.set(pose[0], pose[1], pose[2]);
       this.turn(pose[3], pose[4], pose[5]);
       this.arms.flat().forEach((joint, k) => {
@@ -205,6 +224,14 @@
       canvas.addEventListener("pointerup", release);
       canvas.addEventListener("pointercancel", release);
       canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+      const keys = { ArrowLeft: () => this.orbit(-25, 0), ArrowRight: () => this.orbit(25, 0),
+        ArrowUp: () => this.orbit(0, 25), ArrowDown: () => this.orbit(0, -25),
+        "+": () => this.zoom(0.9), "-": () => this.zoom(1.1), Home: () => this.resetView() };
+      this.element.addEventListener("keydown", (event) => {
+        if (!keys[event.key]) return;
+        event.preventDefault();
+        keys[event.key]();
+      });
       canvas.addEventListener("wheel", (event) => {
         event.preventDefault();
         this.zoom(Math.exp(0.001 * event.deltaY));

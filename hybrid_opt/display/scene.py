@@ -168,6 +168,11 @@ def scene_data(
             for arm in geometry.arms
         ],
         "orientation": {"vector": orientation.is_vector, "reference": reference.tolist()},
+        # Where each arm presses in the box's frame, and which way.
+        "contacts": [
+            {"at": contact.T_box_pad[:3, 3].tolist(), "along": contact.T_box_pad[:3, 2].tolist()}
+            for contact in geometry.workcell.contacts
+        ],
         "solids": [_solid(solid, solid.name in marked) for solid in cell_solids(geometry)],
         "view": {
             "centre": ((lower + upper) / 2.0).tolist(),

@@ -8,15 +8,19 @@ exactly the page's own scripts (by their hashes) and no request at all.
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import html
 import json
 from collections.abc import Callable
 from functools import partial
 from importlib.resources import files
+from io import BytesIO
 from pathlib import Path
 from string import Template
 from typing import Any
+
+from PIL import Image
 
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.display.scene import embedded_json, scene_js, three_js
@@ -37,6 +41,9 @@ from studies.study.tables import margins, study_tables, timings
 BEGIN = "<!-- measured: begin -->"
 END = "<!-- measured: end -->"
 """Between them the tables stand in a Markdown file."""
+
+COLOURS = 160
+"""Of a picture on the page, to which those of its file are reduced."""
 
 
 def write_report(
@@ -157,12 +164,12 @@ def render_page(
         ReportError: the installed plotly does not hold the script that the page embeds.
     """
     texts = files("studies.report") / "page"
-    own = (texts / "page.js").read_text("utf-8")
+    boot, own = ((texts / name).read_text("utf-8") for name in ("boot.js", "page.js"))
     scripts = [plotly_js(), three_js(), scene_js(), own]
     shown = ("workcell", "settings", "environment")
     settings = {key: to_json(getattr(data.summary, key)) for key in shown}
     return Template((texts / "page.html").read_text("utf-8")).substitute(
-        policy=_policy(scripts),
+        policy=_policy([boot, *scripts]),
         title=html.escape(data.workcell.name),
         lead=html.escape(_lead(data)),
         recommendation=_recommendation(data),
@@ -172,8 +179,10 @@ def render_page(
         pictures="".join(_picture(path, caption) for path, caption in pictures),
         configuration=html.escape(json.dumps(settings, indent=2, ensure_ascii=False)),
         workcell=html.escape(data.workcell.source.read_text("utf-8")),
-        data=embedded_json(document),
-        scripts="\n".join(f"<script>{_unclosed(script)}</script>" for script in scripts),
+        blocks="\n".join(
+            [_block(embedded_json(document), " id='report-data'"), *map(_block, scripts)]
+        ),
+        boot=boot,
     )
 
 
@@ -189,15 +198,16 @@ def plotly_js() -> str:
         raise ReportError(f"plotly.js cannot be read ({error}); install plotly anew") from error
 
 
-def _unclosed(script: str) -> str:
-    return script.replace("</script", "<\\/script")
+def _block(text: str, attributes: str = "") -> str:
+    """A compressed text that `boot.js` unpacks; the time of its making is left out."""
+    content = base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
+    return f"<script type='application/gzip'{attributes}>{content}</script>"
 
 
 def _policy(scripts: list[str]) -> str:
     """Only these inline scripts; styles and pictures of the page itself; no request."""
     hashes = [
-        base64.b64encode(hashlib.sha256(_unclosed(script).encode()).digest()).decode()
-        for script in scripts
+        base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts
     ]
     allowed = " ".join(f"'sha256-{value}'" for value in hashes)
     return (
@@ -266,9 +276,13 @@ def _facts(data: ReportData) -> str:
 
 
 def _picture(path: Path, caption: str) -> str:
-    content = base64.b64encode(path.read_bytes()).decode("ascii")
+    with Image.open(path) as whole:
+        small, made = whole.convert("RGB").quantize(COLOURS), BytesIO()
+    small.save(made, "PNG", optimize=True)
+    content = base64.b64encode(made.getvalue()).decode("ascii")
     text = html.escape(caption)
     return (
         f'<figure><img loading="lazy" decoding="async" alt="{text}" '
+        f'width="{small.width}" height="{small.height}" '
         f'src="data:image/png;base64,{content}"><figcaption>{text}</figcaption></figure>'
     )

@@ -349,7 +349,8 @@ def _values(cell: ho.Cell, judged: ho.Carry, timing: ho.Timing, job: DrawnJob | 
     """Title of a trajectory: its objectives, forces and times with their units; of one whose job
     is planned what is commanded."""
     if cell.workcell.task.time_law == "optimal" and job is not None and job.phases:
-        return f"{timing.duration:.2f} s, pressed with {max(job.peaks):.1f} N"
+        carry = next(phase for phase in job.phases if phase["name"] == "carry")
+        return f"{carry['duration']:.2f} s, pressed with {max(job.peaks):.1f} N"
     if cell.workcell.task.time_law == "optimal":
         if timing.carry is not None:
             return f"{timing.duration:.2f} s, {timing.peak_force:.2f} N"

@@ -1,7 +1,7 @@
 "use strict";
 /* Choice of a trajectory, its plots, and play and scrub of its motion. */
 (function () {
-  const data = JSON.parse(document.getElementById("report-data").textContent);
+  const data = window.reportData;
   const $ = (id) => document.getElementById(id);
   const FORCE = 7 + data.joints[0] + data.joints[1];
   const COLUMNS = { pose: 1, q: 7, force: FORCE, width: FORCE + 4 };
@@ -9,10 +9,25 @@
   const OWN = { responsive: true, displaylogo: false, showSendToCloud: false,
     plotlyServerURL: "", showEditInChartStudio: false };
   const CONFIG = { ...OWN,
-    modeBarButtonsToRemove: ["sendChartToCloud", "lasso2d", "select2d", "autoScale2d"] };
+    modeBarButtonsToRemove: ["sendChartToCloud", "lasso2d", "autoScale2d"] };
   const PLAIN = { ...OWN, displayModeBar: false };
   const STAR = "star", NEAR = 12, OVER_TIME = ["force-plot", "pressure-plot"];
-  const FONT = { family: "system-ui, DejaVu Sans, sans-serif", size: 12 };
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
+
+  function colour(name) {
+    return getComputedStyle(document.documentElement).getPropertyValue(name);
+  }
+
+  /* What a layout takes from the page's colours. */
+  function themed(layout) {
+    const line = colour("--line");
+    const axis = { gridcolor: line, linecolor: line, zerolinecolor: line };
+    const polar = layout.polar && { polar: { bgcolor: "rgba(0,0,0,0)", angularaxis: axis,
+      radialaxis: { ...layout.polar.radialaxis, ...axis } } };
+    return { ...layout, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      font: { family: "system-ui, DejaVu Sans, sans-serif", size: 12, color: colour("--ink") },
+      xaxis: { ...layout.xaxis, ...axis }, yaxis: { ...layout.yaxis, ...axis }, ...polar };
+  }
 
   const carries = data.trajectories;
 
@@ -51,9 +66,10 @@
     const below = 60 + legendHeight(view.data, $("front-plot").clientWidth - 85);
     $("front-plot").style.height = `${340 + below}px`;
     const { margin, xaxis, yaxis } = view.layout;
-    const layout = { ...view.layout, font: FONT, margin: { ...margin, b: below },
-      xaxis: { ...xaxis, range: range[0].slice() }, yaxis: { ...yaxis, range: range[1].slice() } };
-    Plotly.react("front-plot", view.data.map((trace) => ({ ...trace })), layout, CONFIG);
+    const layout = themed({ ...view.layout, margin: { ...margin, b: below },
+      xaxis: { ...xaxis, range: range[0].slice() }, yaxis: { ...yaxis, range: range[1].slice() } });
+    Plotly.react("front-plot", view.data.map((trace) => ({ ...trace, selectedpoints: kept(trace) })),
+      layout, CONFIG);
     mark();
     [...$("views").querySelectorAll("button[data-view]")].forEach((button) =>
       button.setAttribute("aria-pressed", String(Number(button.dataset.view) === state.view)));
@@ -61,10 +77,10 @@
   }
 
   /* A ring around the point of the chosen trajectory, where the picture has it: its last trace. */
-  function mark() {
+  function mark(number = state.selected) {
     const place = { x: [[]], y: [[]] }, traces = data.views[state.view].data;
     traces.filter((trace) => trace.customdata).forEach((trace) => {
-      const at = trace.customdata.indexOf(state.selected);
+      const at = trace.customdata.indexOf(number);
       if (at >= 0) { place.x = [[trace.x[at]]]; place.y = [[trace.y[at]]]; }
     });
     Plotly.restyle("front-plot", place, [traces.length - 1]);
@@ -102,24 +118,25 @@
     OVER_TIME.forEach((id) => {
       const { data: traces, layout } = data.plots[id];
       const filled = traces.map((trace) => "level" in trace.meta
-        ? { ...trace, x: [0, samples.end], y: [trace.meta.level, trace.meta.level] }
+        ? { ...trace, x: [0, samples.end], y: [trace.meta.level, trace.meta.level],
+          line: { ...trace.line, color: colour(trace.line.color === "#000" ? "--ink" : "--mark") } }
         : { ...trace, x: samples.times,
           y: samples.rows.map((row) => trace.meta.scale * row[trace.meta.column]) });
-      Plotly.react(id, filled, { ...layout, font: FONT, shapes: marks(motion, 0),
-        xaxis: { ...layout.xaxis, range: [0, samples.end] } }, PLAIN);
+      Plotly.react(id, filled, themed({ ...layout, shapes: marks(motion, 0),
+        xaxis: { ...layout.xaxis, range: [0, samples.end] } }), PLAIN);
     });
   }
 
   function cursor(time) {
     return { type: "line", x0: time, x1: time, yref: "paper", y0: 0, y1: 1,
-      line: { color: "#b00020", width: 1 } };
+      line: { color: colour("--mark"), width: 1 } };
   }
 
   /* The cursor, and where phases begin. */
   function marks(motion, time) {
     const begins = (motion.phases || []).slice(1).map((phase) => ({ type: "line",
       x0: phase.begin, x1: phase.begin, yref: "paper", y0: 0, y1: 1, layer: "below",
-      line: { color: "#d8dde1", width: 1 } }));
+      line: { color: colour("--line"), width: 1 } }));
     return [...begins, cursor(time)];
   }
 
@@ -183,7 +200,7 @@
       return { ...trace, r: [...use, use[0]] };
     });
     const radialaxis = { ...layout.polar.radialaxis, angle: freeDirection(motion.torqueUse) };
-    Plotly.react("torque-plot", filled, { ...layout, font: FONT, polar: { radialaxis } }, PLAIN);
+    Plotly.react("torque-plot", filled, themed({ ...layout, polar: { radialaxis } }), PLAIN);
   }
 
   function select(index) {
@@ -191,6 +208,8 @@
     const carry = carries[index];
     state.motion = Math.max(0, carry.motions.findIndex((m) => m.name === state.kind));
     $("chooser").value = String(index);
+    [...$("carry-table").tBodies[0].rows].forEach((line) =>
+      line.setAttribute("aria-selected", String(Number(line.dataset.carry) === index)));
     $("motion").replaceChildren(...carry.motions.map((m, k) => new Option(m.name, String(k))));
     $("motion").value = String(state.motion);
     $("motion").disabled = carry.motions.length < 2;
@@ -240,7 +259,8 @@
     const time = state.share * samples.end;
     if (scene) {
       const { row } = samples.at(time);
-      scene.place(row.subarray(COLUMNS.pose, COLUMNS.q), row.subarray(COLUMNS.q, COLUMNS.force));
+      scene.place(row.subarray(COLUMNS.pose, COLUMNS.q), row.subarray(COLUMNS.q, COLUMNS.force),
+        shown().peaks.map((_, i) => row[COLUMNS.force + i] / Math.max(...shown().peaks)));
     }
     $("scrub").value = String(Math.round(1000 * state.share));
     const phase = phaseAt(shown(), time);
@@ -286,6 +306,88 @@
     });
   }
 
+  /* --- the table of all carries --- */
+
+  const TOLD = [["carry", (c) => c.label.split(": ")[0]], ["time [s]", (c) => c.motions[0].duration],
+    ["force [N]", (c) => c.force], ["payload at the limit [kg]", (c) => c.motions[0].payloadLimit]];
+  const listing = { column: 1, sign: 1, brushed: null };
+  const recommended = data.lists.find((list) => list.label === "Recommended")?.members[0];
+
+  function passes(k) {
+    const [name, time, force] = TOLD.slice(0, 3).map(([, of]) => of(carries[k]));
+    const most = (id) => ($(id).value === "" ? Infinity : Number($(id).value));
+    return name.toLowerCase().includes($("filter-text").value.toLowerCase()) &&
+      time <= most("filter-time") && force <= most("filter-force") &&
+      (!listing.brushed || listing.brushed.has(k));
+  }
+
+  /* The points of a trace that the filter keeps; all where nothing is filtered. */
+  function kept(trace) {
+    if (!trace.customdata || carries.every((_, k) => passes(k))) return undefined;
+    return trace.customdata.flatMap((k, i) => (passes(k) ? [i] : []));
+  }
+
+  function fillTable() {
+    const value = TOLD[listing.column][1];
+    const order = carries.map((_, k) => k).filter(passes).sort((a, b) => {
+      const [x, y] = [value(carries[a]), value(carries[b])];
+      return listing.sign * (x < y ? -1 : Number(x > y));
+    });
+    $("carry-table").tBodies[0].replaceChildren(...order.map((k) => {
+      const line = document.createElement("tr");
+      line.dataset.carry = String(k);
+      line.setAttribute("aria-selected", String(k === state.selected));
+      TOLD.forEach(([, of], i) => {
+        const told = of(carries[k]), cell = line.insertCell();
+        const text = i ? told.toFixed(2) : (k === recommended ? "\u2605 " : "") + told;
+        if (i) { cell.textContent = text; return; }
+        const button = cell.appendChild(document.createElement("button"));
+        button.type = "button";
+        button.textContent = text;
+        button.addEventListener("click", () => select(k));
+        button.addEventListener("focus", () => pictures && mark(k));
+      });
+      line.addEventListener("mouseenter", () => pictures && mark(k));
+      return line;
+    }));
+    [...$("carry-table").tHead.rows[0].cells].forEach((cell, i) => cell.setAttribute("aria-sort",
+      i !== listing.column ? "none" : listing.sign > 0 ? "ascending" : "descending"));
+    $("filter-count").textContent = `${order.length} of ${carries.length}`;
+  }
+
+  function filtered() {
+    fillTable();
+    if (!pictures) return;
+    const traces = data.views[state.view].data;
+    Plotly.restyle("front-plot", { selectedpoints: traces.map((trace) => kept(trace) ?? null) },
+      traces.map((_, k) => k));
+  }
+
+  function listCarries() {
+    TOLD.forEach(([heading], i) => {
+      const cell = document.createElement("th"), button = document.createElement("button");
+      cell.scope = "col";
+      button.type = "button";
+      button.textContent = heading;
+      button.addEventListener("click", () => {
+        listing.sign = listing.column === i ? -listing.sign : 1;
+        listing.column = i;
+        fillTable();
+      });
+      cell.appendChild(button);
+      $("carry-table").tHead.rows[0].appendChild(cell);
+    });
+    const fields = ["filter-text", "filter-time", "filter-force"];
+    fields.forEach((id) => $(id).addEventListener("input", filtered));
+    $("filter-none").addEventListener("click", () => {
+      fields.forEach((id) => { $(id).value = ""; });
+      listing.brushed = null;
+      filtered();
+    });
+    $("carry-table").addEventListener("mouseleave", () => pictures && mark());
+    fillTable();
+  }
+
   fillChooser();
   const pictures = data.views.some((view) => view.data.some((trace) => trace.customdata));
   if (pictures) {
@@ -294,6 +396,12 @@
     $("front-plot").on("plotly_click", (event) => {
       const found = clicked(event);
       if (found !== undefined) select(found);
+    });
+    $("front-plot").on("plotly_selected", (event) => {
+      const numbers = (event?.points || []).map((p) => p.customdata).filter((k) => k !== undefined);
+      if (!numbers.length) return;
+      listing.brushed = new Set(numbers);
+      filtered();
     });
   } else {
     $("front-plot").remove();
@@ -311,7 +419,19 @@
     seek(Number(event.target.value) / 1000);
   });
   $("reset-view").addEventListener("click", () => scene && scene.resetView());
+  $("scene").addEventListener("keydown", (event) => {
+    if (event.key !== " ") return;
+    event.preventDefault();
+    setPlaying(!state.playing);
+  });
+  dark.addEventListener("change", () => {
+    if (pictures) drawFront();
+    drawOverTime(shown());
+    drawTorque(shown());
+  });
+  listCarries();
   select(data.first);
   window.report = { data, state, select, seek, setPlaying, scene, fileOf };
+  performance.mark("ready");
   document.documentElement.dataset.ready = "true";
 })();

@@ -16,6 +16,7 @@ import pytest
 from selenium import webdriver
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
@@ -113,10 +114,12 @@ def test_is_usable_soon(browser: webdriver.Chrome, report: Path) -> None:
         "for (let i = 0; i < 3e7; i += 1) s += Math.sqrt(i);"
         "return [performance.now() - t, s][0]"
     )
-    ready = browser.execute_script(
-        "return performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd"
-    )
+    ready = browser.execute_script("return performance.getEntriesByName('ready')[0].startTime")
     assert ready < 2000.0 or ready < 60.0 * work
+    painted = browser.execute_script(
+        "return performance.getEntriesByName('first-contentful-paint')[0].startTime"
+    )
+    assert painted < ready
 
 
 def test_a_click_on_a_point_selects_its_trajectory(browser: webdriver.Chrome, report: Path) -> None:
@@ -400,3 +403,108 @@ def test_no_phase_and_no_table_is_cut(browser: webdriver.Chrome, report: Path, w
         "e.scrollWidth > e.clientWidth + 1).map((e) => e.textContent.slice(0, 60))"
     )
     assert cut == []
+
+
+def test_the_table_filters_sorts_and_selects(browser: webdriver.Chrome, report: Path) -> None:
+    def column(index: int) -> list[str]:
+        found: list[str] = browser.execute_script(
+            "return [...document.querySelectorAll('#carry-table tbody tr')]"
+            ".map((r) => r.cells[arguments[0]].textContent)",
+            index,
+        )
+        return found
+
+    opened(browser, report)
+    every = column(1)
+    assert len(every) == browser.execute_script("return report.data.trajectories.length")
+    assert [float(t) for t in every] == sorted(map(float, every))
+    heading = browser.find_elements(By.CSS_SELECTOR, "#carry-table th button")[2]
+    heading.click()
+    heading.click()
+    force = [float(text) for text in column(2)]
+    assert force == sorted(force, reverse=True)
+    limit = sorted(force)[len(force) // 2]
+    browser.find_element(By.ID, "filter-force").send_keys(f"{limit + 0.01:.2f}")
+    kept = column(2)
+    assert 0 < len(kept) < len(force)
+    assert max(map(float, kept)) <= limit + 0.01
+    # The picture dims what the table left out.
+    dimmed = browser.execute_script(
+        "return document.getElementById('front-plot').data.filter((t) => t.customdata)"
+        ".map((t) => t.customdata.length - t.selectedpoints.length)"
+    )
+    assert sum(dimmed) > 0
+    last = browser.find_elements(By.CSS_SELECTOR, "#carry-table tbody button")[-1]
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", last)
+    last.send_keys(Keys.ENTER)
+    chosen = browser.find_element(By.CSS_SELECTOR, "#carry-table tr[aria-selected='true']")
+    assert state(browser)["selected"] == int(chosen.get_attribute("data-carry") or -1)
+    browser.find_element(By.ID, "filter-none").click()
+    assert len(column(2)) == len(every)
+
+
+def test_keys_turn_and_play_the_scene(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    scene, before = browser.find_element(By.ID, "scene"), scene_hash(browser)
+    scene.send_keys(Keys.ARROW_LEFT)
+    assert scene_hash(browser) != before
+    scene.send_keys(Keys.HOME)
+    assert scene_hash(browser) == before
+    scene.send_keys(Keys.SPACE)
+    assert state(browser)["playing"]
+
+
+def test_arrows_are_as_long_as_forces_are_large(browser: webdriver.Chrome, report: Path) -> None:
+    opened(browser, report)
+    lengths = browser.execute_script(
+        "const s = report.scene, d = report.data; report.select(d.first);"
+        "return [0.3, 0.5, 0.7].map((share) => { report.seek(share);"
+        "return s.arrows.map((a) => a.visible ? a.line.scale.y + a.cone.scale.y : 0); })"
+    )
+    longest = np.array(lengths).max()
+    assert 0.3 < longest < 0.36
+    # Opposite pads push towards one another.
+    tips = browser.execute_script(
+        "return report.scene.arrows.map((a, i) => a.position.toArray().map((v, k) =>"
+        "(report.data.contacts[i].at[k] - v) * report.data.contacts[i].along[k])"
+        ".reduce((a, b) => a + b))"
+    )
+    assert min(tips) >= 0.0
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_texts_stand_out_and_fields_have_names(
+    browser: webdriver.Chrome, report: Path, scheme: str
+) -> None:
+    feature = {"name": "prefers-color-scheme", "value": scheme}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+    opened(browser, report)
+    worst, unnamed = browser.execute_script(AUDIT)
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    assert worst[0] >= 4.5, worst  # WCAG AA
+    assert unnamed == []
+
+
+AUDIT = """
+const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
+const linear = (v) => (v <= 10.3 ? v / 3294.6 : ((v / 255 + 0.055) / 1.055) ** 2.4);
+const light = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
+const behind = (e) => {
+  const c = rgb(getComputedStyle(e).backgroundColor);
+  if (c.length < 4 || c[3] > 0.99) return c;
+  return e.parentElement ? behind(e.parentElement) : [255, 255, 255];
+};
+const all = (which) => [...document.querySelectorAll(which)];
+const told = (e) => e.outerHTML.slice(0, 100);
+let worst = [21, ""];
+all("h1, h2, h3, p, dt, dd, th, td, button, label, output, figcaption, li b, li span")
+  .filter((e) => e.textContent.trim() && e.checkVisibility()).forEach((e) => {
+    const [a, b] = [light(rgb(getComputedStyle(e).color)), light(behind(e))];
+    const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+    if (ratio < worst[0]) worst = [ratio, told(e)];
+  });
+const named = (e) => e.textContent.trim() || e.ariaLabel || e.alt || e.labels?.length;
+return [worst, all("button, input, select, img, [role=application]")
+  .filter((e) => !named(e)).map(told)];
+"""
+"""The least contrast of a text to what is behind it, and fields without a name."""
