@@ -51,11 +51,11 @@
     constructor(element, data) {
       this.element = element;
       this.data = data;
-      this.renderer = new THREE.WebGLRenderer({ antialias: true });
+      this.renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
       this.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
       element.appendChild(this.renderer.domElement);
       this.scene = new THREE.Scene();
-      this.scene.background = new THREE.Color(0xeef1f3);
+      this.grounds = [];
       this.scene.add(new THREE.HemisphereLight(0xffffff, 0x9a9a92, 0.75));
       const sun = new THREE.DirectionalLight(0xffffff, 0.55);
       sun.position.set(-2.5, 1.8, 4);
@@ -110,9 +110,16 @@
       flat.computeVertexNormals();
       const colour = COLOURS[solid.ground && solid.group !== "marked" ? "ground" : solid.group];
       const mesh = new THREE.Mesh(flat, new THREE.MeshLambertMaterial({ color: colour }));
+      if (colour === COLOURS.ground) this.grounds.push(mesh);
       if (solid.kind === "world") this.scene.add(mesh);
       else if (solid.kind === "box") this.box.add(mesh);
       else this.arms[solid.robot][solid.joint].moving.add(mesh);
+    }
+
+    /* The ground as dark as the page around; the background is the element's own. */
+    dim(dark) {
+      this.grounds.forEach((mesh) => mesh.material.color.setHex(dark ? 0x3b444b : COLOURS.ground));
+      this.render();
     }
 
     /* pose: x y z and the orientation; q: all joints, the second arm's after the first's; forces:

@@ -26,7 +26,8 @@
       radialaxis: { ...layout.polar.radialaxis, ...axis } } };
     return { ...layout, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { family: "system-ui, DejaVu Sans, sans-serif", size: 12, color: colour("--ink") },
-      xaxis: { ...layout.xaxis, ...axis }, yaxis: { ...layout.yaxis, ...axis }, ...polar };
+      xaxis: { ...layout.xaxis, ...axis }, yaxis: { ...layout.yaxis, ...axis }, ...polar,
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: colour("--soft"), activecolor: colour("--ink") } };
   }
 
   const carries = data.trajectories;
@@ -308,7 +309,13 @@
 
   /* --- the table of all carries --- */
 
-  const TOLD = [["carry", (c) => c.label.split(": ")[0]], ["time [s]", (c) => c.motions[0].duration],
+  /* As its job drives it, where one is planned: in whole cycles of the controllers. */
+  function duration(carry) {
+    const phases = carry.motions.flatMap((motion) => motion.phases || []);
+    return (phases.find((phase) => phase.name === "carry") || carry.motions[0]).duration;
+  }
+
+  const TOLD = [["carry", (c) => c.label.split(": ")[0]], ["time [s]", duration],
     ["force [N]", (c) => c.force], ["payload at the limit [kg]", (c) => c.motions[0].payloadLimit]];
   const listing = { column: 1, sign: 1, brushed: null };
   const recommended = data.lists.find((list) => list.label === "Recommended")?.members[0];
@@ -425,11 +432,13 @@
     setPlaying(!state.playing);
   });
   dark.addEventListener("change", () => {
+    if (scene) scene.dim(dark.matches);
     if (pictures) drawFront();
     drawOverTime(shown());
     drawTorque(shown());
   });
   listCarries();
+  if (scene) scene.dim(dark.matches);
   select(data.first);
   window.report = { data, state, select, seek, setPlaying, scene, fileOf };
   performance.mark("ready");

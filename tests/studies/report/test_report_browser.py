@@ -443,6 +443,60 @@ def test_the_table_filters_sorts_and_selects(browser: webdriver.Chrome, report: 
     assert len(column(2)) == len(every)
 
 
+def test_a_box_drawn_in_the_picture_filters_the_table(
+    browser: webdriver.Chrome, report: Path
+) -> None:
+    opened(browser, report)
+    browser.find_element(By.ID, "whole").click()
+    place = "document.querySelector('#front-plot .nsewdrag').getBoundingClientRect()"
+    browser.execute_script("document.getElementById('front-plot').scrollIntoView()")
+    browser.execute_script("Plotly.relayout('front-plot', {dragmode: 'select'})")
+    box = browser.execute_script(f"return {place}.toJSON()")
+    mouse = ActionChains(browser)
+    mouse.w3c_actions.pointer_action.move_to_location(int(box["left"]) + 3, int(box["top"]) + 3)
+    mouse.w3c_actions.pointer_action.pointer_down()
+    across, along = int(0.6 * box["width"]), int(0.97 * box["height"])
+    for share in (0.3, 0.7, 1.0):
+        mouse.w3c_actions.pointer_action.move_to_location(
+            int(box["left"] + 3 + share * across), int(box["top"] + 3 + share * along)
+        )
+    mouse.w3c_actions.pointer_action.pointer_up()
+    mouse.perform()
+    inside = browser.execute_script(
+        "const plot = document.getElementById('front-plot'), [x, y] = ['x', 'y'].map((axis) =>"
+        "plot.layout.selections[0][axis + '0'] < plot.layout.selections[0][axis + '1']"
+        "? [0, 1].map((k) => plot.layout.selections[0][axis + k])"
+        ": [1, 0].map((k) => plot.layout.selections[0][axis + k]));"
+        "const within = (v, [low, high]) => low <= v && v <= high;"
+        "return plot.data.filter((t) => t.customdata && t.visible !== 'legendonly')"
+        ".flatMap((t) => t.customdata.filter((_, k) => within(t.x[k], x) && within(t.y[k], y)))"
+    )
+    rows = browser.find_elements(By.CSS_SELECTOR, "#carry-table tbody tr")
+    listed = {int(row.get_attribute("data-carry") or -1) for row in rows}
+    assert listed == set(inside)
+    assert 0 < len(listed) < browser.execute_script("return report.data.trajectories.length")
+    browser.find_element(By.ID, "filter-none").click()
+
+
+def test_the_scene_is_as_dark_as_the_page(browser: webdriver.Chrome, report: Path) -> None:
+    light = {}
+    for scheme in ("light", "dark"):
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+        opened(browser, report)
+        light[scheme] = browser.execute_script(
+            "report.scene.render(); const from = report.scene.renderer.domElement,"
+            "to = document.createElement('canvas'); [to.width, to.height] = [50, 40];"
+            "const draw = to.getContext('2d');"
+            "draw.fillStyle = getComputedStyle(document.getElementById('scene')).backgroundColor;"
+            "draw.fillRect(0, 0, 50, 40); draw.drawImage(from, 0, 0, 50, 40);"
+            "const seen = draw.getImageData(0, 0, 50, 40).data.filter((_, k) => k % 4 < 3);"
+            "return seen.reduce((a, b) => a + b) / seen.length"
+        )
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    assert light["dark"] < 90.0 < 180.0 < light["light"]
+
+
 def test_keys_turn_and_play_the_scene(browser: webdriver.Chrome, report: Path) -> None:
     opened(browser, report)
     scene, before = browser.find_element(By.ID, "scene"), scene_hash(browser)
