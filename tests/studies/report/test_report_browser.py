@@ -448,20 +448,15 @@ def test_a_box_drawn_in_the_picture_filters_the_table(
 ) -> None:
     opened(browser, report)
     browser.find_element(By.ID, "whole").click()
-    place = "document.querySelector('#front-plot .nsewdrag').getBoundingClientRect()"
     browser.execute_script("document.getElementById('front-plot').scrollIntoView()")
     browser.execute_script("Plotly.relayout('front-plot', {dragmode: 'select'})")
-    box = browser.execute_script(f"return {place}.toJSON()")
+    inner = browser.find_element(By.CSS_SELECTOR, "#front-plot .nsewdrag")
+    width, height = inner.size["width"], inner.size["height"]
     mouse = ActionChains(browser)
-    mouse.w3c_actions.pointer_action.move_to_location(int(box["left"]) + 3, int(box["top"]) + 3)
-    mouse.w3c_actions.pointer_action.pointer_down()
-    across, along = int(0.6 * box["width"]), int(0.97 * box["height"])
-    for share in (0.3, 0.7, 1.0):
-        mouse.w3c_actions.pointer_action.move_to_location(
-            int(box["left"] + 3 + share * across), int(box["top"] + 3 + share * along)
-        )
-    mouse.w3c_actions.pointer_action.pointer_up()
-    mouse.perform()
+    mouse.move_to_element_with_offset(inner, 3 - width // 2, 3 - height // 2).click_and_hold()
+    for _ in range(3):
+        mouse.move_by_offset(int(0.2 * width), int(0.32 * height))
+    mouse.release().perform()
     inside = browser.execute_script(
         "const plot = document.getElementById('front-plot'), [x, y] = ['x', 'y'].map((axis) =>"
         "plot.layout.selections[0][axis + '0'] < plot.layout.selections[0][axis + '1']"
