@@ -441,7 +441,7 @@ class RobustPrice:
 
     Attributes:
         uncertainty: the set.
-        factors: (k,) multiples of the set.
+        factors: (k,) multiples of the set for which a force was found.
         peak: (k, 2) largest normal force of each robot under them [N].
         commanded: (2,) under the set itself [N].
         limit: (2,) reference forces [N].
@@ -483,10 +483,12 @@ def robust_price(
     (_, motion), limit = thinned(carry), workcell.task.reference_force
     force = model.robust_force(motion, uncertainty, leader)
     factors = FACTORS[allowed_factor(workcell, uncertainty) > FACTORS]
+    peak = model.price(motion, factors, leader, uncertainty)
+    held = np.isfinite(peak).all(axis=1)
     return RobustPrice(
         uncertainty=uncertainty,
-        factors=factors,
-        peak=model.price(motion, factors, leader, uncertainty),
+        factors=factors[held],
+        peak=peak[held],
         commanded=force.peak,
         limit=limit,
         largest_factor=model.largest_factor(motion, limit, leader, uncertainty),

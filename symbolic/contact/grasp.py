@@ -172,10 +172,12 @@ class Grasp:
         moves = self._at([ca.mtimes(ca.DM(by), load - times * rest) for by in slopes], *sizes)
         inside = [p.slack(state) for p, state in zip(self.patches, near, strict=True)]
         taken = [p.lowest(s, move) for p, s, move in zip(self.patches, near, moves, strict=True)]
-        stays = ca.logic_and(least(inside) > 0.0, least(taken) > -REST_SHARE)
+        # With much less friction than the cell's, what is held at rest lies beyond the cones.
+        within = least(inside) > 0.0
+        stays = ca.logic_and(within, least(taken) > -REST_SHARE)
         part = [move + REST_SHARE * s for s, move in zip(near, moves, strict=True)]
         press = ca.if_else(stays, START_FLOOR, self._pressed(given, part))
-        asked, alike = self.asked(load, *sizes), press < ALIKE
+        asked, alike = self.asked(load, *sizes), ca.logic_and(within, press < ALIKE)
         press = ca.if_else(alike, press, self._pressed(given, asked))
         pairs = zip(near, moves, asked, strict=True)
         chosen = [ca.if_else(alike, s + move, a) for s, move, a in pairs]

@@ -10,6 +10,7 @@ import pytest
 
 from codegen.lanes import lane_text
 from codegen.source import dense, generated_c
+from hybrid_opt.robust.cases import nominal_case
 from hybrid_opt.robust.force import (
     LARGEST_FACTOR,
     SAMPLES,
@@ -17,7 +18,7 @@ from hybrid_opt.robust.force import (
     RobustModel,
     allowed_factor,
 )
-from symbolic.contact.worst_cases import case_grasp_function
+from symbolic.contact.worst_cases import CASE_SIZES, case_grasp_function
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.records import Allocation, Uncertainty
@@ -44,6 +45,18 @@ def test_pads_that_press_evenly_hold_displaced_too() -> None:
     assert even.check(moved, force, 200, np.random.default_rng(1)).holds
     weaker = replace(force, commanded=0.85 * force.commanded)
     assert not even.check(moved, weaker, 200, np.random.default_rng(1)).holds
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_more_friction_never_needs_more_force(name: str) -> None:
+    """And a force is found wherever friction closes the grasp, far from the cell's own too."""
+    even, shares = model(name, "soft-finger"), np.linspace(0.7, 1.3, 61)
+    cases = np.tile(nominal_case(even.workcell), (len(shares), 1))
+    assert next(iter(CASE_SIZES)) == "friction"
+    cases[:, : CASE_SIZES["friction"]] *= shares[:, None]
+    force = even.least_squeeze(motion(name), cases)
+    assert np.isfinite(force).all()
+    assert (np.diff(force, axis=0) < 1e-6 * force[1:]).all()
 
 
 def test_what_is_commanded_is_known_without_every_case() -> None:
