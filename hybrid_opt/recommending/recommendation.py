@@ -190,16 +190,17 @@ def _recommended(
         gentle = np.full(2, GENTLE * min(float(each.force.max()) for each in options))
         goal = replace(goal, hardest=gentle)
     refuse(options, wish, goal)
-    option, timing = _driven(cell, paths, options, goal)
+    option, timing = _driven(cell, paths, options, goal, bool(wish.given))
     told()
     carry = timing.carry
     assert carry is not None, "what is driven has a carry"
     forces, squeeze, job, doubts = _job(cell, timing)
     commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
     allowed = cell.workcell.task.reference_force
-    if weak:
+    beyond = (commanded > allowed * (1.0 + BETTER)).any()
+    if weak or (beyond and not wish.given):
         doubts.insert(0, _too_weak(cell.workcell, carry, commanded, forces[:, 1 - LEADER]))
-    elif (commanded > allowed * (1.0 + BETTER)).any():
+    elif beyond:
         doubts.append(
             f"pressing with {commanded.max():.1f} N exceeds the reference force of "
             f"{allowed.min():.1f} N; wish for a longer carry or less force"
@@ -231,10 +232,11 @@ def _recommended(
 
 
 def _driven(
-    cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal
+    cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal, wished: bool
 ) -> tuple[Option, Timing]:
-    """The best of the best paths as robots drive them."""
-    found, reason, model = [], "", cell.timing_model
+    """The best of the best paths as robots drive them; where none keeps to the goal and nothing was
+    wished for, the one that asks for least force."""
+    kept, others, reason, model = [], [], "", cell.timing_model
     for first in best_of_paths(paths, options, goal, TRIED):
         own, asked = [option for option in options if option.index == first.index], goal
         option: Option | None = first
@@ -251,21 +253,22 @@ def _driven(
                 break
             carry, doubt = timing.carry, cell.workcell.uncertainty
             known, motion = thinned(carry)
-            planned = carry.normal_force[known, 1 - LEADER]
-            force = largest_commanded(cell.workcell, motion, planned, doubt, LEADER)
-            late = timing.duration / goal.longest
-            hard = force / float(goal.hardest[1 - LEADER])
+            planned = carry.normal_force[known]
+            most = largest_commanded(cell.workcell, motion, planned, doubt, LEADER)
+            late, hard = timing.duration / goal.longest, float((most / goal.hardest).max())
+            found = (option, timing)
             if max(late, hard) <= 1.0 + BETTER:
-                found.append((goal.cost(timing.duration, force), option, timing))
+                kept.append((goal.cost(timing.duration, float(most[1 - LEADER])), found))
                 break
-            needs = f"it takes {timing.duration:.3f} s and needs {force:.1f} N commanded"
+            others.append((hard, found))
+            needs = f"it takes {timing.duration:.3f} s and needs {most[1 - LEADER]:.1f} N commanded"
             reason = f"without jumps of the acceleration {needs}"
             longest, hardest = asked.longest / max(late, 1.0), asked.hardest / max(hard, 1.0)
             asked = replace(asked, longest=longest, hardest=hardest)
             option = next(best_of_paths(paths, own, asked, 1), None)
-    if not found:
+    if not kept and (wished or not others):
         raise SettingsError(f"no carry of the front can be driven as wished for: {reason}")
-    return min(found, key=lambda each: each[0])[1:]
+    return min(kept or others, key=lambda each: each[0])[1]
 
 
 def _job(cell: Cell, timing: Timing) -> tuple[Array, Squeeze, Job | None, list[str]]:
@@ -298,13 +301,13 @@ def _too_weak(workcell: Workcell, carry: Carry, needed: Array, commanded: Array)
     """That the reference forces are not enough for what has to be commanded (2,) [N], along the
     carry (n,), and what would do."""
     doubt, allowed = workcell.uncertainty, workcell.task.reference_force.min()
-    planned = carry.normal_force[:, 1 - LEADER]
-    rows = np.union1d(np.argsort(-planned)[:MOST], np.argsort(-commanded)[:MOST])
+    planned, pressed = carry.normal_force, np.argsort(-commanded)[:MOST]
+    rows = np.union1d(np.argsort(-planned[:, 1 - LEADER])[:MOST], pressed)
     motion, planned = box_motion(carry).at(rows), planned[rows]
 
     def share(known: Uncertainty) -> float:
         """Of the reference force, of the robot that presses harder."""
-        force = largest_commanded(workcell, motion, planned, known, LEADER)
+        force = largest_commanded(workcell, motion, planned, known, LEADER).max()
         return float(force * harder / allowed)
 
     harder = 1.0

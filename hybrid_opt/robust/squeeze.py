@@ -212,16 +212,24 @@ def _in_every_case(
 
 def largest_commanded(
     workcell: Workcell, motion: HeldMotion, planned: Array, doubt: Uncertainty, leader: int
-) -> float:
-    """`Squeeze.force` of what holds a motion, planned with forces (n,), in every case of a set [N],
-    sooner than by `commanded_forces`.
+) -> Array:
+    """(2,) largest forces of `commanded_forces` for what holds a motion in every case of a set [N],
+    sooner: what the leader feels is asked for where most is planned.
+
+    Args:
+        planned: (n, 2) normal forces [N].
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
     """
-    most, box = np.argsort(-planned)[:MOST], box_motion(motion)
-    level = _in_every_case(workcell, doubt, leader, box.at(most), planned[most]).max()
-    return float(_in_every_case(workcell, doubt, leader, box, level).max())
+    follower, box = 1 - leader, box_motion(motion)
+    most = np.argsort(-planned[:, follower])[:MOST]
+    there, own = box.at(most), planned[most, follower]
+    level = _in_every_case(workcell, doubt, leader, there, own).max()
+    forces = np.full(2, _in_every_case(workcell, doubt, leader, box, level).max())
+    together = pressed_together(workcell, leader)[leader]
+    forces[leader] = (planned[most, leader] + together * (forces[follower] - own)).max()
+    return forces
 
 
 def pressed_together(workcell: Workcell, leader: int) -> Array:

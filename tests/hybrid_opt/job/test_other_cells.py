@@ -1,4 +1,5 @@
-"""Whole jobs of the other cells that ship: over a wall, and two Pandas with redundant elbows."""
+"""Whole jobs of the other cells that ship: over a wall, two Pandas with redundant elbows, and
+pads of every kind."""
 
 from __future__ import annotations
 
@@ -14,13 +15,23 @@ from hybrid_opt.bundles import TARGETS, BundleOptions, export
 from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
+from hybrid_opt.job.smooth import driven_timing
+from hybrid_opt.robust.force import thinned
+from hybrid_opt.robust.squeeze import largest_commanded
 from hybrid_opt.timing import TimingLimits, time_path
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import driven
 from tests.hybrid_opt.bundles.mock_rapid import parse
 from tests.hybrid_opt.cells import shipped
+from tests.symbolic.cells import RACK
 
 CELLS = ["transfer", "pandas"]
+QUICK = ("fork", "uneven")
+"""Of `SHIPPED` what the default run looks at; others compile for minutes."""
+SHIPPED = [
+    pytest.param(path.stem, marks=() if path.stem in QUICK else pytest.mark.slow)
+    for path in sorted(RACK.parent.glob("*.toml"))
+]
 FREE = ("csv", "json", "ros2-control", "mcap")
 """Targets that are nobody's own."""
 
@@ -49,6 +60,21 @@ def test_the_job_is_whole(name: str) -> None:
         assert max(phase.use.values()) <= 1.005
         np.testing.assert_allclose(phase.motion.q_rate[[0, -1]], 0.0, atol=1e-9)
         np.testing.assert_allclose(phase.motion.q_second[[0, -1]], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_cell_that_ships_has_a_job(name: str) -> None:
+    """With the forces that a recommendation knows sooner."""
+    cell = shipped(name).drivable()
+    timing = driven_timing(cell.timing_model, cell.initial)
+    job = JobModel(cell.compiled, cell.timing_model).plan(timing)
+    assert all(phase.certificate.is_free for phase in job.phases)
+    carry, doubt = timing.carry, cell.workcell.uncertainty
+    assert carry is not None
+    rows, motion = thinned(carry)
+    sooner = largest_commanded(cell.workcell, motion, carry.normal_force[rows], doubt, 0)
+    forces = job.phase("carry").force.normal.max(axis=0)
+    np.testing.assert_allclose(sooner, forces, rtol=0.01)
 
 
 @pytest.mark.parametrize("name", CELLS)
